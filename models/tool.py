@@ -1,6 +1,7 @@
 """The touch-based welding tool (paper, Fig. 7): plate with flange ring, finger camera, soft tip with tag, torch."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ class Placed:
     xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    @property
+    @cached_property
     def pose(self) -> RigidTransform:
         """The pose."""
         return RigidTransform(RollPitchYaw(*self.rpy_rad), self.xyz_m)
@@ -150,7 +151,7 @@ class WeldingTool:
         """How far a loaded tip's centre lies below a hard ball's in the same groove, m."""
         return self.seat.below_m
 
-    @property
+    @cached_property
     def X_FT(self) -> RigidTransform:
         """Pose of the soft tip at rest: z_T up, x_T from the torch to the tip."""
         if self.tip_pose is not None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, InputPort
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
@@ -15,6 +16,8 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Algorithm1State
 from weldcal.calibration.published.icp import Verification
+from weldcal.calibration.refinement.local_field import LocalField
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.welding.seam.curve import SeamCurve
 
 
@@ -144,6 +147,21 @@ class VerificationResult(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class Refinement(Message):
+    """What became of the refinement of a live calibration: the arm with corrected kinematics or the local field, where one is applied;
+    the text of the kinematics file, the stated errors of the arm, and the JSON object of `calibrate`."""
+
+    kind: str
+    sentence: str
+    accepted: bool = False
+    arm: ArmModel | None = None
+    local_field: LocalField | None = None
+    kinematics: str = ""
+    arm_errors: dict[str, Any] | None = None
+    document: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
 class CalibrationStatus(Message):
     """The state of the IterativeCalibrator after its newest scan."""
 
@@ -163,6 +181,18 @@ class CalibrationStatus(Message):
     verifications: tuple[VerificationResult, ...] = ()
     done: bool = False
     message: str = ""
+    joints: tuple[NDArray[np.float64], ...] = ()  # (6,) rad at each observation
+    refinement: Refinement | None = None
+
+    def arm_or(self, arm: ArmModel) -> ArmModel:
+        """The arm with the kinematics that the refinement found, else the given one."""
+        found = None if self.refinement is None else self.refinement.arm
+        return arm if found is None else found
+
+    @property
+    def local_field(self) -> LocalField | None:
+        """The local field that belongs to the estimate; None where there is none."""
+        return None if self.refinement is None else self.refinement.local_field
 
     @property
     def X_BC(self) -> RigidTransform | None:
@@ -192,3 +222,11 @@ class PlannedSeam(Message):
     reason: str | None = None
     sigma_m: float = np.nan  # lateral sigma of the planned root
     summary: str = ""  # the result of the scan, in one sentence
+
+
+def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:
+    """The arm with refined kinematics of a `calibration_status` port; the given one where the port is open or has none."""
+    if not port.HasValue(context):
+        return arm
+    status: CalibrationStatus = port.Eval(context)
+    return status.arm_or(arm)

@@ -30,7 +30,7 @@ from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
 from weldcal.systems.recording.answers import RepeatedBackground
 from weldcal.systems.recording.player import Playback, add_player
-from weldcal.systems.scenario.arm import nominal_arm
+from weldcal.systems.scenario.arm import corrected_arm, nominal_arm
 from weldcal.systems.scenario.schema import Scenario, WorkpieceConfig
 from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.scenario.workpiece import made, part_of
@@ -205,6 +205,8 @@ def _make_station(
     played: Playback | None,
 ) -> Station:
     rng = np.random.default_rng(seed)
+    controller = robot.arm  # by which the controller computes, and the true arm deviates
+    robot = dc.replace(robot, arm=corrected_arm(scenario, controller))
     cad, real, X_BP = _workpieces(scenario, rng)
     surroundings = surroundings_of(scenario)
     tool = _tool(scenario, cad)
@@ -212,10 +214,10 @@ def _make_station(
     builder = DiagramBuilder()
     build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot, closables=opened)
     furnishing = Furnishing()
-    world, true_arm = None, robot.arm
+    world, true_arm = None, controller
     if any(config.SIMULATED for config in devices.values()):
         furnishing = Furnishing() if furnish is None else furnish(scenario, rng, real, X_BP)
-        true_arm, true_second = scenario.robot.true_arm(robot.arm, robot.q_start, rng), furnishing.second
+        true_arm, true_second = scenario.robot.true_arm(controller, robot.q_start, rng), furnishing.second
         if true_second is not None:
             of_second = scenario.robot_2.true_arm(true_second.arm, true_second.q_start, rng)
             true_second = dc.replace(true_second, arm=of_second)

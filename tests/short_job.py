@@ -65,6 +65,11 @@ class ShortJobs:
                 self._run()
         return dict(json.loads(self._written.read_text()))
 
+    def folder(self) -> Path:
+        """Its result folder, whichever process ran it."""
+        self.summary()
+        return self._folder
+
     def _job(self) -> ShortJob:
         with self._locked():
             return self._run()
@@ -72,6 +77,10 @@ class ShortJobs:
     @property
     def _written(self) -> Path:
         return self._shared / "short_job.json"
+
+    @property
+    def _folder(self) -> Path:
+        return self._shared / "short_job"
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
@@ -86,7 +95,7 @@ class ShortJobs:
             kept.append(run_scenario(short_job_scenario(), options, progress))
             return kept[0]
 
-        words = ["demo", "--no-browser", "--seed", str(SEED), "--out", str(self._shared / "short_job"), "--json"]
+        words = ["demo", "--no-browser", "--seed", str(SEED), "--out", str(self._folder), "--json"]
         with pytest.MonkeyPatch.context() as patched:
             patched.setitem(RUNNERS, "", short)
             finished = CliRunner().invoke(app, words)

@@ -4,7 +4,10 @@ import dataclasses
 import enum
 import json
 import math
+import re
+import shutil
 import sys
+import textwrap
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -45,13 +48,46 @@ def emit_json(result: Mapping[str, object]) -> None:
     typer.echo(json.dumps(plain(result), allow_nan=False))
 
 
+NARROW, WIDE = 40, 130
+"""Widths of the terminal, in characters, within which text is wrapped; beyond it lines become hard to read."""
+
+
 def emit_summary(title: str, rows: Mapping[str, str]) -> None:
-    """Writes a heading and a two-column list on stdout; rows with empty text are omitted."""
-    width = max((len(name) for name in rows), default=0)
-    typer.secho(title, bold=True)
+    """Writes a heading and a two-column list on stdout, wrapped between words; rows with empty text are omitted.
+
+    Lines of a text stay lines. A name that is too long for its column stands on a line of its own.
+    """
+    known = [name.rstrip() for name, text in rows.items() if text]
+    column = min(max(map(len, known), default=0), MOST_NAME)
+    wide = min(max(shutil.get_terminal_size((100, 24)).columns, NARROW), WIDE)
+    if title:
+        typer.secho(title, bold=True)
     for name, text in rows.items():
         if text:
-            typer.echo(f"  {name:<{width}}  {text}")
+            typer.echo("\n".join(summary_lines(name.rstrip(), text, column, wide)))
+
+
+MOST_NAME = 26
+WHOLE = ("p[", "weldcal ", "[[")
+"""Beginnings of lines that a person copies: they stay whole."""
+
+
+def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
+    """The lines of one row: the name in a column of so many characters, then the text, wrapped between words to a width."""
+    indent = " " * (2 + column + 2)
+    found: list[str] = []
+    for line in text.splitlines():
+        if line.startswith(WHOLE):
+            found.append(line)
+            continue
+        inner = " " * (len(line) - len(line.lstrip()) + (2 if line.startswith("- ") else 0))
+        found += textwrap.wrap(
+            line, max(wide - len(indent), 20), subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
+        ) or [""]  # fmt: skip
+    lines = [indent + line for line in found]
+    if len(name) > column:
+        return [f"  {name}", *lines]
+    return [f"  {name:<{column}}  {found[0]}", *lines[1:]]
 
 
 NAMES = {
@@ -109,13 +145,34 @@ def _short(value: object) -> str:
         known = len(numbers) == len(value) and not any(isinstance(v, float) and math.isnan(v) for v in numbers.values())
         return ", ".join(f"{name} {_short(item)}" for name, item in numbers.items()) if known else ""
     if isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
-        return "; ".join(value)
+        return "\n".join(value)
     return ""
+
+
+def emit_text(text: str) -> None:
+    """Writes a text on stdout; lines that are wider than the terminal are wrapped between words, below their second column."""
+    wide = min(max(shutil.get_terminal_size((100, 24)).columns, NARROW), WIDE)
+    for line in text.splitlines():
+        column = re.match(r"\S.{0,14}?\s{2,}", line)
+        inner = " " * (0 if column is None else column.end())
+        lines = [line] if len(line) <= wide or any(word in line for word in WHOLE) else textwrap.wrap(
+            line, wide, subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
+        )  # fmt: skip
+        typer.echo("\n".join(lines))
+
+
+def _sentence(text: str) -> str:
+    """A sentence for stderr: one line, which a terminal gets wrapped between words."""
+    line = f"weldcal: {text}"
+    if not sys.stderr.isatty():
+        return line
+    wide = min(max(shutil.get_terminal_size((100, 24)).columns, NARROW), WIDE)
+    return textwrap.fill(line, wide, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def emit_warning(text: str) -> None:
     """Writes one sentence on stderr; the command continues."""
-    typer.secho(f"weldcal: {text}", err=True, fg=typer.colors.YELLOW)
+    typer.secho(_sentence(text), err=True, fg=typer.colors.YELLOW)
 
 
 def emit_address(name: str, url: str) -> None:
@@ -153,21 +210,27 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
         return
     if json_wanted:
         emit_json({"state": "failed", "reason": sentence, **details})
-    typer.secho(f"weldcal: {sentence}", err=True, fg=typer.colors.RED)
+    typer.secho(_sentence(sentence), err=True, fg=typer.colors.RED)
     raise typer.Exit(1)
+
+
+SHARE_TOLD = 0.1
+"""Completed share after which a stage that lasts is told again, where stderr is not a terminal."""
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Progress]:
     """A progress bar on stderr, or one line per new stage where stderr is not a terminal; yields the reporter."""
     if not sys.stderr.isatty():
-        last = ""
+        last, told = "", 0.0
 
         def report_line(stage: str, fraction: float) -> None:
-            nonlocal last
-            if stage != last:
+            nonlocal last, told
+            kind = _NUMBER.sub("", stage.partition(", ")[0])  # a count within a stage is no new stage
+            if kind != last or fraction >= told + SHARE_TOLD:
                 typer.echo(f"[{100 * fraction:3.0f} %] {title}: {stage}", err=True)
-                last = stage
+                last, told = kind, fraction
 
         yield report_line
         return

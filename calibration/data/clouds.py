@@ -15,6 +15,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import file_size
 from weldcal.models.limits import LARGEST_NUMBER, MOST_POINTS, expansion_limit
+from weldcal.models.result_files import write_npz
 
 __all__ = ["NO_NOTES", "SUFFIXES", "CloudError", "find_cloud", "read_cloud", "save_cloud"]
 
@@ -87,11 +88,9 @@ def save_cloud(path: Path, points_C: Array, intrinsics: tuple[float, float, floa
     With ``intrinsics`` (fx, fy, cx, cy) an organised cloud is written as its depth map, a third of the size.
     """
     if intrinsics is not None and np.ndim(points_C) == 3:
-        np.savez_compressed(
-            path, depth=np.asarray(points_C[:, :, 2], dtype=np.float32), intrinsics=np.array(intrinsics)
-        )
+        write_npz(path, depth=np.asarray(points_C[:, :, 2], dtype=np.float32), intrinsics=np.array(intrinsics))
         return
-    np.savez_compressed(path, points=np.asarray(points_C, dtype=np.float32))
+    write_npz(path, points=np.asarray(points_C, dtype=np.float32))
 
 
 def _read_npy(path: Path) -> Array:

@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import io
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -35,6 +36,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import sha256
+from weldcal.models.result_files import require_whole, whole_result, write_atomic
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,7 @@ def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
         raise DatasetError(
             f"The dataset folder '{folder}' does not exist; give the path of a folder that holds dataset.yaml."
         )
+    require_whole(folder)
     description = folder / "dataset.yaml"
     bare = folder.is_file() or not description.exists()
     source = None if folder.is_file() else find_poses(folder)
@@ -273,17 +276,18 @@ def save_dataset(
     """
     if set(poses) != set(clouds):
         raise DatasetError("A recording needs one cloud for each pose; the ids of poses and clouds differ.")
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
     document = {**asdict(header), "schema": 1, "units": {"clouds": "m", "poses": "m"}}
-    (folder / "dataset.yaml").write_text(yaml_dump(document), encoding="utf-8")
-    for id, points in clouds.items():
-        save_cloud(folder / "clouds" / f"{id}.npz", points, intrinsics)
-    with (folder / "poses.csv").open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", *(["time"] if times else [])])
-        for id, X_BF in poses.items():
-            taken = [repr(float(times[id]))] if times else []
-            writer.writerow([id, *map(repr, X_BF.translation().tolist()), *map(repr, _wxyz(X_BF)), *taken])
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", *(["time"] if times else [])])
+    for id, X_BF in poses.items():
+        taken = [repr(float(times[id]))] if times else []
+        writer.writerow([id, *map(repr, X_BF.translation().tolist()), *map(repr, _wxyz(X_BF)), *taken])
+    with whole_result(folder):
+        write_atomic(folder / "dataset.yaml", yaml_dump(document))
+        for id, points in clouds.items():
+            save_cloud(folder / "clouds" / f"{id}.npz", points, intrinsics)
+        write_atomic(folder / "poses.csv", table.getvalue())
 
 
 def _wxyz(X: RigidTransform) -> list[float]:

@@ -1,6 +1,7 @@
 """Reads, checks and writes a recording in motion: the robot's stream, the frames' times and their clouds."""
 
 import csv
+import io
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -29,6 +30,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import sha256
 from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.result_files import require_whole, whole_result, write_atomic
 from weldcal.models.robots import ROBOTS, get_chain, get_robot
 
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -118,6 +120,7 @@ def load_motion_dataset(folder: Path, *, robot: str | None = None) -> MotionData
     folder = Path(folder)
     if not folder.is_dir():
         raise DatasetError(f"'{folder}' is no folder; give the path of a folder that holds dataset.yaml.")
+    require_whole(folder)
     header = read_header(folder / "dataset.yaml")
     if header.mode != "motion":
         raise DatasetError(f"'{folder.name}' is no recording in motion; its dataset.yaml does not say 'mode: motion'.")
@@ -173,11 +176,9 @@ def save_motion_dataset(
 
     The stream is written as joints where it has them. ``header.mode`` and ``header.units`` are written as motion and metres.
     """
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
     document = {**asdict(header), "schema": 1, "mode": "motion", "units": {"clouds": "m", "poses": "m"}}
     if header.scanner_guess is None:
         del document["scanner_guess"]
-    (folder / "dataset.yaml").write_text(yaml_dump(document), encoding="utf-8")
     if stream.joints is None:
         names: tuple[str, ...] = POSE_COLUMNS
         wxyz = [RigidTransform(X).rotation().ToQuaternion().wxyz() for X in stream.poses]
@@ -185,19 +186,23 @@ def save_motion_dataset(
     else:
         names = tuple(f"q{i + 1}" for i in range(stream.joints.shape[1]))
         values = stream.joints
-    _write_table(folder / "stream.csv", ("time", *names), np.column_stack([stream.time, values]).tolist())
     device = any(f.device is not None for f in frames)
     rows = [[f.id, f.arrival, *(["" if f.device is None else float(f.device)] if device else [])] for f in frames]
-    _write_table(folder / "frames.csv", ("id", "arrival", *(["device"] if device else [])), rows)
-    for id, points in clouds:
-        save_cloud(folder / "clouds" / f"{id}.npz", points, intrinsics)
+    with whole_result(folder):
+        write_atomic(folder / "dataset.yaml", yaml_dump(document))
+        _write_table(folder / "stream.csv", ("time", *names), np.column_stack([stream.time, values]).tolist())
+        _write_table(folder / "frames.csv", ("id", "arrival", *(["device"] if device else [])), rows)
+        (folder / "clouds").mkdir(exist_ok=True)
+        for id, points in clouds:
+            save_cloud(folder / "clouds" / f"{id}.npz", points, intrinsics)
 
 
 def _write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        writer.writerows([v if isinstance(v, str) else repr(v) for v in row] for row in rows)
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([v if isinstance(v, str) else repr(v) for v in row] for row in rows)
+    write_atomic(path, table.getvalue())
 
 
 def read_stream(path: Path, *, robot: str = "", unit: str = "m") -> tuple[RobotStream, list[str]]:

@@ -1,8 +1,6 @@
 """Reads and writes calibration.yaml, and exports X_BC to URDF, ROS 2, URScript and JSON."""
 
 import json
-import os
-import tempfile
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,6 +17,7 @@ from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.documents import Section, read_document, shown
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import require_whole, write_atomic
 
 ON_BASE = "eye_on_base"
 RESULT_FILE = "calibration.yaml"
@@ -60,7 +59,7 @@ class CalibrationResult:
     ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans; ``local_field``: document of
     what --refine local found, ``kinematics_file``: name of the file beside it with what --refine joints or links found,
     ``arm_errors`` the document of it (values, sigmas, covariance with X_BC and the correction). ``orientations``: mean (quaternion wxyz) of
-    the flange's in the base, and how far they lie from it at most (deg)."""
+    the flange's in the base, and how far they lie from it at most (deg). ``observed``: the poses used, for what a touch of the arm states."""
 
     X_BC: RigidTransform
     covariance: Array
@@ -89,6 +88,7 @@ class CalibrationResult:
     kinematics_file: str = ""
     arm_errors: dict[str, Any] | None = None
     orientations: dict[str, Any] | None = None
+    observed: dict[str, Any] | None = None
 
     @property
     def symbol(self) -> str:
@@ -107,22 +107,6 @@ def software_version() -> str:
 def matrix4(X: RigidTransform) -> list[list[float]]:
     """4 x 4 homogeneous matrix as nested lists."""
     return [[float(v) for v in row] for row in X.GetAsMatrix4()]
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file atomically: a reader sees the old file or the complete new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(name).chmod(0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def save_result(result: CalibrationResult, folder: Path) -> Path:
@@ -164,6 +148,7 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
         **({} if result.local_field is None else {"local_field": result.local_field}),
         **({} if not result.kinematics_file else {"kinematics_file": result.kinematics_file}),
         **({} if result.orientations is None else {"orientations": result.orientations}),
+        **({} if result.observed is None else {"observed": result.observed}),
         **({} if result.arm_errors is None else {"arm_errors": result.arm_errors}),
         "held_out_mm": {k: v if np.isfinite(v) else None for k, v in result.held_out_mm.items()},
         "tilt_deg": result.tilt_deg,
@@ -177,7 +162,7 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
         "data_sha256": dict(result.data_hashes),
     }
     path = folder / RESULT_FILE
-    write_atomically(path, yaml_dump(document))
+    write_atomic(path, yaml_dump(document))
     return path
 
 
@@ -194,6 +179,7 @@ def load_result(path: Path) -> CalibrationResult:
     """
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path
+    require_whole(path)
     if not path.exists():
         raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
     document = read_document(path)
@@ -242,6 +228,7 @@ def load_result(path: Path) -> CalibrationResult:
         kinematics_file=d.text("kinematics_file"),
         arm_errors=d.values.get("arm_errors"),
         orientations=d.values.get("orientations"),
+        observed=d.values.get("observed"),
         clock=clock_from_document(d.values.get("clock"), path.name),
         clock_covariance=_covariance(d, "clock_covariance", len(d.section("clock_covariance").items("matrix")))
         if d.has("clock_covariance")
@@ -370,7 +357,7 @@ def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
         f"{result.symbol}.json": export_json(result),
     }
     for name, text in files.items():
-        write_atomically(folder / name, text)
+        write_atomic(folder / name, text)
     return tuple(folder / name for name in files)
 
 

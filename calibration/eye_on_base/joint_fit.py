@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from pydrake.math import RigidTransform
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import CorrectionEstimate, from_motion
@@ -42,6 +44,20 @@ def estimate_jointly(observations: Sequence[Observation], *, seed: int = 0) -> C
         sigma_position_m=found.sigma_position_m,
         sigma_normal_rad=found.sigma_normal_rad,
     )
+
+
+def solve_jointly(
+    observations: Sequence[Observation], start: RigidTransform, *, correct_scanner: bool = True, seed: int = 0
+) -> tuple[RigidTransform, ScannerCorrection]:
+    """X_BC and correction of estimate_jointly (without ``correct_scanner``: of estimate_eye_on_base) from poses without outliers, near
+    ``start``. Raises InputError where they do not fix it."""
+    if not correct_scanner:
+        return estimate_eye_on_base(
+            tuple(observations), SolveConfig(seed=seed, leave_one_out=False)
+        ).X_BC, ScannerCorrection()
+    found = from_motion(observations, {}, seed=seed, order=_ORDER, usual=True, start=start)
+    assert found.X_BC is not None
+    return found.X_BC, found.correction
 
 
 def _held_out(

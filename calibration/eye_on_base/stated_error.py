@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import CalibrationResult
@@ -72,12 +74,28 @@ def stated_median_limit(
     return limit if floor is None else max(limit, floor)
 
 
-def orientations_of(observations: Sequence[Observation]) -> dict[str, Any]:
-    """Mean orientation of the flange in the base and the largest angle (deg) from it, for CalibrationResult.orientations."""
+def orientations_of(observations: Sequence[Observation], X_FR: RigidTransform | None = None) -> dict[str, Any]:
+    """Mean orientation of the feature in the base and the largest angle (deg) from it, for CalibrationResult.orientations; with the
+    feature's orientation on the flange where X_FR turns it."""
     turned = Rotation.from_matrix(np.array([o.X_BR.rotation().matrix() for o in observations]))
     mean = turned.mean()
     x, y, z, w = (float(v) for v in mean.as_quat())
-    return {"wxyz": [w, x, y, z], "spread_deg": float(np.degrees((mean.inv() * turned).magnitude().max()))}
+    found: dict[str, Any] = {
+        "wxyz": [w, x, y, z],
+        "spread_deg": float(np.degrees((mean.inv() * turned).magnitude().max())),
+    }
+    if X_FR is not None and not X_FR.rotation().IsNearlyIdentity():
+        found["feature_wxyz"] = [float(v) for v in X_FR.rotation().ToQuaternion().wxyz()]
+    return found
+
+
+def feature_rotation(result: CalibrationResult) -> RotationMatrix:
+    """Orientation on the flange of the feature that was measured. Raises InputError where it cannot be read."""
+    wxyz = (result.orientations or {}).get("feature_wxyz")
+    try:
+        return RotationMatrix() if wxyz is None else RotationMatrix(Quaternion(np.array(wxyz, dtype=float)))
+    except (TypeError, ValueError, RuntimeError) as problem:
+        raise InputError("The orientations in the result cannot be read; run 'weldcal calibrate' again.") from problem
 
 
 def scatter_elsewhere(result: CalibrationResult, observations: Sequence[Observation]) -> Array | None:

@@ -5,9 +5,9 @@ from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.geometry.quantiles import t_quantile
 from weldcal.calibration.geometry.se3 import exp_rotation, mean_of
 from weldcal.calibration.hand_eye.fit import Fit, descend, fit, noise_of
 from weldcal.calibration.hand_eye.linearisation import Loss
@@ -254,7 +254,7 @@ def _alike(fits: dict[str, Fit], squares: dict[str, Array]) -> list[str]:
     order = sorted(fits, key=lambda k: (float(max(means[k] / least)), list(fits).index(k)))
     column_best = [list(means)[int(np.argmin([m[c] for m in means.values()]))] for c in range(2)]
     tests = 2.0 * max(len(fits) - 1, 1)
-    limit = float(student.ppf(1.0 - 0.5 * _LEVEL / tests, max(len(squares[order[0]]) - 1, 1)))
+    limit = float(t_quantile(1.0 - 0.5 * _LEVEL / tests, max(len(squares[order[0]]) - 1, 1)))
     out = [order[0]]
     for k in order[1:]:
         apart = False

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize
-from scipy.stats import chi2
 
 from weldcal.calibration.errors import DatasetError
+from weldcal.calibration.geometry.quantiles import chi2_quantile
 from weldcal.calibration.geometry.se3 import difference, pose
 from weldcal.calibration.hand_eye.choice import CANDIDATES
 from weldcal.calibration.hand_eye.files import PosePairs
@@ -88,6 +87,8 @@ def refine_with_corners(pairs: PosePairs, config: HandEyeConfig | None = None) -
 
     first = deviance(np.zeros(2))
     simplex = np.array([[0.0, 0.0], [-1.0, 0.0], [0.0, -1.0]])
+    from scipy.optimize import minimize  # only where corners are used: it takes a fifth of a second to import
+
     found = minimize(
         deviance,
         np.zeros(2),
@@ -104,7 +105,7 @@ def refine_with_corners(pairs: PosePairs, config: HandEyeConfig | None = None) -
             shift, sigma, False, plain, f"Corners: {said} does not help: {why}; poses used as given."
         )
 
-    if first - float(found.fun) < float(chi2.ppf(1.0 - _LEVEL, 2)):
+    if first - float(found.fun) < float(chi2_quantile(1.0 - _LEVEL, 2)):
         return refused("it may be chance")
     if float(np.abs(shift).max()) > _WIDEST_SHARE * half or not np.isfinite(sigma).all():
         return refused("it is too far or too vague to be the principal point")

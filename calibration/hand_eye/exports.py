@@ -14,10 +14,10 @@ from weldcal.calibration.data.results import (
     export_urdf,
     matrix4,
     software_version,
-    write_atomically,
 )
 from weldcal.calibration.hand_eye.mountings import Mounting, Unknown
 from weldcal.calibration.hand_eye.solve import HandEyeResult
+from weldcal.models.result_files import write_atomic
 
 RESULT_FILE = "hand_eye.yaml"
 
@@ -96,7 +96,7 @@ def export_hand_eye(
         files[f"{u.symbol}.ur_pose.script"] = export_ur_pose(X)
         files[f"{u.symbol}.drake.yaml"] = export_drake_directive(X, u.parent, u.child)
     for name, text in files.items():
-        write_atomically(folder / name, text)
+        write_atomic(folder / name, text)
     return tuple(folder / name for name in files)
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as fisher
 
+from weldcal.calibration.geometry.quantiles import f_quantile
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES, most_promising
 from weldcal.calibration.hand_eye.determinacy import diversity
@@ -176,7 +176,7 @@ def _far_better(new: HandEyeResult, new_shift: float, given: HandEyeResult, give
     """Neither kind of residuals much worse, and their product smaller by far more than chance."""
     turn = given.sigma_rotation_rad / max(new.sigma_rotation_rad, 1e-12)
     shift = given_shift / max(new_shift, 1e-12)
-    lucky = float(np.sqrt(fisher.ppf(1.0 - _CHANCE, given.degrees_of_freedom, new.degrees_of_freedom)))
+    lucky = float(np.sqrt(f_quantile(1.0 - _CHANCE, given.degrees_of_freedom, new.degrees_of_freedom)))
     return min(turn, shift) > _HARDLY_WORSE and turn * shift > max(_FAR_BETTER, lucky)
 
 

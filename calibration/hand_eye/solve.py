@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.stats import f as fisher
 
 from weldcal.calibration.errors import UndeterminedPoses
+from weldcal.calibration.geometry.quantiles import f_quantile
 from weldcal.calibration.geometry.se3 import IDENTITY, difference, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate, solve
 from weldcal.calibration.hand_eye.determinacy import (
@@ -114,7 +114,7 @@ class HandEyeResult:
     def region(self, share: float = 0.95) -> float:
         """Bound on ``normalised_error`` that holds the truth with this probability: Hotelling's, since the noise was
         estimated from as many residuals as ``degrees_of_freedom`` says."""
-        return float(6.0 * fisher.ppf(share, 6.0, self.degrees_of_freedom))
+        return float(6.0 * f_quantile(share, 6.0, self.degrees_of_freedom))
 
 
 def pose_difference(estimate: RigidTransform, truth: RigidTransform) -> Array:

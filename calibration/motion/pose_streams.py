@@ -68,16 +68,6 @@ class Synchronised:
         )
 
 
-def is_stream_file(path: Path) -> bool:
-    """Whether a file is an npz with the arrays `hand` and `eye`."""
-    if path.suffix.lower() != ".npz" or not path.is_file():
-        return False
-    try:
-        return {"hand", "eye"} <= set(read_npz(path, ("hand", "eye")))
-    except InputError:
-        return False
-
-
 def read_streams(path: Path) -> PoseStreams:
     """Read an npz with `hand` and `eye`, each (n, 8): t (s), x, y, z (m), qx, qy, qz, qw. Raises DatasetError."""
     try:

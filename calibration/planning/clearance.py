@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arms.urdf import Capsule, link_capsules
 from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
 
 TOOL = 7  # bodies of the tool: on the flange, one link further than wrist 3
 STANDING = (0, 1)  # links: base and shoulder stand on the table by design
@@ -48,15 +50,33 @@ def lowest_point(bodies: list[Body], frames: list[RigidTransform], up: Array = _
 def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
     """Smallest gap (m) between bodies at least three links apart (nearer ones share a joint housing); segments are
     sampled."""
-    placed = [(b, np.linspace(*body_ends(b, frames), len(_SAMPLES))) for b in bodies]
+    ends = np.array([body_ends(b, frames) for b in bodies])
+    links, radii = np.array([b.link for b in bodies]), np.array([float(b.radius) for b in bodies])
+    return float(_smallest_gap(ends, links, radii, _SAMPLES))
+
+
+@compiled()
+def _smallest_gap(ends: Array, links: NDArray[np.int64], radii: Array, samples: Array) -> float:
+    """Smallest gap between bodies at least three links apart; ``ends`` (n, 2, 3) m, ``samples`` (s,) where their axes are sampled."""
+    n, m = len(ends), len(samples)
+    points = np.empty((n, m, 3))
+    for i in range(n):
+        for u in range(m):
+            points[i, u] = ends[i, 0] + samples[u] * (ends[i, 1] - ends[i, 0])
     gap = np.inf
-    for i, (a, pa) in enumerate(placed):
-        for b, pb in placed[i + 1 :]:
-            if abs(a.link - b.link) < 3:
+    for i in range(n):
+        for j in range(i + 1, n):
+            if abs(links[i] - links[j]) < 3:
                 continue
-            d = np.linalg.norm(pa[:, None] - pb[None], axis=2).min()
-            gap = min(gap, float(d) - a.radius - b.radius)
-    return float(gap)
+            nearest = np.inf
+            for u in range(m):
+                for v in range(m):
+                    square = 0.0
+                    for k in range(3):
+                        square += (points[i, u, k] - points[j, v, k]) ** 2
+                    nearest = min(nearest, square)
+            gap = min(gap, np.sqrt(nearest) - radii[i] - radii[j])
+    return gap
 
 
 def path_clearance(
@@ -81,6 +101,8 @@ def occludes(
     A body that holds or touches a target carries it and does not hide it: the face looks away from its own body.
     """
     hidden, gap = False, np.inf
+    # copies: the code is compiled anew for each kind of view
+    eye, targets = np.array(eye, dtype=float), np.array(targets, dtype=float, order="C")
     for body in bodies:
         start, end = body_ends(body, frames)
         gap = min(gap, float(_point_segment(eye[None], start, end)[0]) - body.radius)
@@ -88,8 +110,7 @@ def occludes(
             continue
         if not hidden:
             # an eye that stands elsewhere by the margin moves its line of sight by less and less towards the target
-            near = [_segment_segment(eye, t, start, end) for t in targets]
-            hidden = any(d < body.radius + margin_m * (1.0 - s) for d, s in near)
+            hidden = _in_sight(eye, targets, start, end, float(body.radius), float(margin_m))
     return hidden, gap
 
 
@@ -100,12 +121,19 @@ def _point_segment(points: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.linalg.norm(points - start - s[:, None] * d, axis=1))
 
 
-def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float]:
-    """Smallest distance between two segments and where on the first (0..1): closest points of the lines, clamped in turn."""
-    u, v, w = a1 - a0, b1 - b0, a0 - b0
-    a, b, c, d, e = float(u @ u), float(u @ v), float(v @ v), float(u @ w), float(v @ w)
-    det = a * c - b * b
-    s = float(np.clip((b * e - c * d) / det, 0.0, 1.0)) if det > 1e-12 * max(a * c, 1e-30) else 0.0
-    t = float(np.clip((b * s + e) / c, 0.0, 1.0)) if c > 0.0 else 0.0
-    s = float(np.clip((b * t - d) / a, 0.0, 1.0)) if a > 0.0 else 0.0
-    return float(np.linalg.norm(w + s * u - t * v)), s
+@compiled()
+def _in_sight(eye: Array, targets: Array, b0: Array, b1: Array, radius: float, margin: float) -> bool:
+    """Whether the segment b0 b1 with a radius lies in a line of sight from the eye to a target.
+
+    Smallest distance of two segments and where on the first (0..1): closest points of the lines, clamped in turn.
+    """
+    for i in range(len(targets)):
+        u, v, w = targets[i] - eye, b1 - b0, eye - b0
+        a, b, c, d, e = (u * u).sum(), (u * v).sum(), (v * v).sum(), (u * w).sum(), (v * w).sum()
+        det = a * c - b * b
+        s = min(max((b * e - c * d) / det, 0.0), 1.0) if det > 1e-12 * max(a * c, 1e-30) else 0.0
+        t = min(max((b * s + e) / c, 0.0), 1.0) if c > 0.0 else 0.0
+        s = min(max((b * t - d) / a, 0.0), 1.0) if a > 0.0 else 0.0
+        if np.sqrt(((w + s * u - t * v) ** 2).sum()) < radius + margin * (1.0 - s):
+            return True
+    return False

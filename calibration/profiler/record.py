@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.results import matrix4, software_version, write_atomically
+from weldcal.calibration.data.results import matrix4, software_version
 from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate
@@ -19,6 +19,7 @@ from weldcal.calibration.profiler.sphere.joint import SphereEstimate
 from weldcal.calibration.profiler.sphere.model import corrected
 from weldcal.models.documents import Section, read_document
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import require_whole, write_atomic
 
 RECORD_FILE = "profiler.yaml"
 JSON_FILE = "X_FS.json"
@@ -114,9 +115,9 @@ def save_record(record: ProfilerRecord, folder: Path) -> tuple[Path, Path]:
         "data_sha256": record.data_sha256,
     }
     paths = folder / RECORD_FILE, folder / JSON_FILE
-    write_atomically(paths[0], yaml_dump(document))
+    write_atomic(paths[0], yaml_dump(document))
     exported = {"parent": "flange", "child": "profiler", "X_FS": pose, "covariance": covariance}
-    write_atomically(paths[1], json.dumps(exported, indent=2) + "\n")
+    write_atomic(paths[1], json.dumps(exported, indent=2) + "\n")
     return paths
 
 
@@ -127,6 +128,7 @@ def load_record(path: Path) -> ProfilerRecord:
         InputError: it is not there, or no profiler's calibration.
     """
     path = path / RECORD_FILE if path.is_dir() else path
+    require_whole(path)
     if not path.exists():
         raise InputError(
             f"There is no calibration at '{path}': give a folder written by 'weldcal profiler edge' or 'sphere'."

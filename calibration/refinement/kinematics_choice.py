@@ -15,7 +15,6 @@ from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, pose
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_fit import (
     KINDS,
@@ -25,7 +24,7 @@ from weldcal.calibration.refinement.kinematics_fit import (
     fit_kinematics,
     unsought,
 )
-from weldcal.calibration.refinement.local_choice import GAIN, calibrate_plain
+from weldcal.calibration.refinement.local_choice import GAIN, PlainSolve, calibrate_plain
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arrays import Array
@@ -68,12 +67,14 @@ def choose_kinematics(
     *,
     correct_scanner: bool = True,
     seed: int = 0,
+    plain_solve: PlainSolve | None = None,
 ) -> KinematicsChoice:
     """Fit errors of the arm to n inlier observations at joint angles q (n, joints), from their plain estimate, and decide on them.
 
     In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if the mean falls by
     5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The prior
-    is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more.
+    is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more. ``plain_solve``: how the plain
+    calibration was made, where it is not that of `calibrate`.
 
     Raises TooFewPoses below twelve, InputError for poses of one orientation or an unknown ``kind``.
     """
@@ -101,7 +102,7 @@ def choose_kinematics(
         rest = np.setdiff1d(np.arange(n), test)
         train, new = [observations[i] for i in rest], [observations[i] for i in test]
         try:
-            X, c = calibrate_plain(train, patterns, correct_scanner, seed)
+            X, c = plain_solve(train) if plain_solve else calibrate_plain(train, patterns, correct_scanner, seed)
         except InputError:
             continue
         plain[test] = position_errors(X, [corrected_observation(c, o) for o in new])
@@ -182,10 +183,8 @@ def with_kinematics(
 
 def kinematics_text(fit: KinematicsFit, note: str) -> str:
     """The arm's link transforms with the errors found, as a file of Universal Robots' schema (m, rad; load_arm reads it)."""
-    errors = fit.errors.errors(fit.u)
     links = {}
-    for link, X, e in zip(LINKS, fit.errors.arm.stack, errors, strict=True):
-        moved = X @ pose(exp_rotation(e[:3]), e[3:])
+    for link, moved in zip(LINKS, fit.corrected_stack(), strict=True):
         rpy = RollPitchYaw(RotationMatrix.ProjectToRotationMatrix(moved[:3, :3])).vector()
         links[link] = dict(
             zip(("x", "y", "z", "roll", "pitch", "yaw"), (*map(float, moved[:3, 3]), *map(float, rpy)), strict=True)

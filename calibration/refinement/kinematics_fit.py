@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate, correction_of
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose, skew
 from weldcal.calibration.hand_eye.joints import flange_poses
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array
@@ -116,6 +116,13 @@ class KinematicsFit:
             return self.sigma_considered * self.errors.scale
         k = len(self.u)
         return np.asarray(np.sqrt(np.diag(self.covariance)[-k:]) * self.errors.scale)
+
+    def corrected_stack(self) -> Array:
+        """The arm's link transforms (n, 4, 4) with the errors found: m, rad."""
+        errors = self.errors.errors(self.u)
+        return np.array(
+            [X @ pose(exp_rotation(e[:3]), e[3:]) for X, e in zip(self.errors.arm.stack, errors, strict=True)]
+        )
 
     def applied(self, observations: Sequence[Observation], q: Array) -> list[Observation]:
         """Observations with corrected centres and normals and with the poses that the corrected arm reaches."""
@@ -232,11 +239,18 @@ def _field(data: _Data) -> tuple[float, float, float, float]:
     return float(x.min()) - _FACE_M, float(x.max()) + _FACE_M, float(y.min()) - _FACE_M, float(y.max()) + _FACE_M
 
 
+def usual_scanner(terms: int, corrected: bool) -> Array:
+    """Standard deviations (K,) of a scanner's factors before it is asked; next to nothing where none is estimated."""
+    if not corrected:
+        return np.full(terms, 1e-9)
+    return np.concatenate([_USUAL_SCANNER, np.full(max(terms - 3, 0), _BEND_PRIOR)])[:terms]
+
+
 def _scanner_prior(terms: int, holes: CorrectionEstimate | None, fixed: bool, start: Array) -> tuple[Array, Array]:
     """Mean (K,) and information (K, K) of the factors' change before the robot is asked."""
-    sigma = np.concatenate([_USUAL_SCANNER, np.full(max(terms - 3, 0), _BEND_PRIOR)])[:terms]
+    sigma = usual_scanner(terms, not fixed)
     if fixed:
-        return start, np.diag(np.full(terms, 1e18))
+        return start, np.diag(1.0 / sigma**2)
     information, pull = np.diag(1.0 / sigma**2), np.zeros(terms)
     if holes is not None:
         seen = np.linalg.inv(holes.covariance[:3, :3] + np.diag(CIRCLE_OWN**2))

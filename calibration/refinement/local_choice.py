@@ -1,6 +1,6 @@
 """Decides on a local field by nested held-out errors, and applies it to an estimate."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,8 @@ from weldcal.models.errors import InputError
 
 GAIN = 0.95
 """Share of the nested held-out mean error that a refinement must leave at most."""
+PlainSolve = Callable[[Sequence[Observation]], tuple[RigidTransform, ScannerCorrection]]
+"""Makes the plain calibration from some of the poses; raises InputError where they are too few."""
 _FOLDS = 20  # at most; up to so many poses each is held out alone
 _STARTS = 60
 
@@ -49,12 +51,13 @@ def choose_local(
     *,
     correct_scanner: bool = True,
     seed: int = 0,
+    plain_solve: PlainSolve | None = None,
 ) -> LocalChoice:
     """Fit a field to the held-out residuals of a calibration (``X_BC`` with ``correction``) of n inlier observations, and decide on it.
 
     For every held-out pose (20 folds at most) the whole is repeated without it: the choice of the scanner's correction, the held-out
     residuals of the others, the field and its lengths. The field is accepted if the mean of these errors falls by 5 %.
-    Raises TooFewPoses below ten.
+    ``plain_solve``: how the plain calibration was made, where it is not that of `calibrate`. Raises TooFewPoses below ten.
     """
     n = len(observations)
     if n < LEAST:
@@ -70,7 +73,7 @@ def choose_local(
         held = set(test.tolist())
         rest = [o for i, o in enumerate(observations) if i not in held]
         try:
-            X, c = calibrate_plain(rest, patterns, correct_scanner, seed)
+            X, c = plain_solve(rest) if plain_solve else calibrate_plain(rest, patterns, correct_scanner, seed)
             without = fit_field([o.X_BR for o in rest], held_out_residuals(rest, patterns, X, c, seed))
         except InputError:
             continue

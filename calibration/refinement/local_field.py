@@ -53,6 +53,11 @@ class LocalField:
         left = np.maximum(self.sigma_field_m**2 - known, 0.0) + self.sigma_scan_m**2
         return k @ (self._inverse @ self.residuals), np.asarray(np.sqrt(left))
 
+    def at_places(self, p_B: Array, R_BF: Array) -> Array:
+        """The field (m, 3) m at places (m, 3) m of a feature on a flange of one orientation (3, 3)."""
+        k = _kernel(p_B, R_BF[None], self.places, self.turns, self._values)
+        return np.asarray(k @ (self._inverse @ self.residuals))
+
     def applied(self, X_BC: RigidTransform, observations: Sequence[Observation]) -> list[Observation]:
         """Observations whose centres (camera frame) are moved by the field, so that X_BC maps them to where it expects them."""
         if not observations:
@@ -143,7 +148,7 @@ def _poses(X_BR: Sequence[RigidTransform]) -> tuple[Array, Array]:
 def _distances(p: Array, R: Array, q: Array, S: Array) -> tuple[Array, Array]:
     """Distances (m, n) m and angles (m, n) rad between two lists of poses."""
     d = np.linalg.norm(p[:, None] - q[None], axis=2)
-    trace = np.einsum("mij,nij->mn", R, S)
+    trace = np.einsum("mij,nij->mn", R, S)  # (1, n) where all have one orientation
     return d, np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 

@@ -15,11 +15,11 @@ from weldcal.calibration.data.results import (
     export_urdf,
     matrix4,
     software_version,
-    write_atomically,
 )
 from weldcal.models.documents import Section, as_number, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.result_files import require_whole, write_atomic
 
 RESULT_FILE = "tablet.yaml"
 _CONFIGURATION = "eye_in_hand_tablet"
@@ -90,13 +90,14 @@ def save_tablet_result(result: TabletResult, folder: Path) -> tuple[Path, ...]:
             "ur_pose.script": export_ur_pose(result.X_FC),
         }
     for name, text in files.items():
-        write_atomically(folder / name, text)
+        write_atomic(folder / name, text)
     return tuple(folder / name for name in files)
 
 
 def load_tablet_result(path: Path) -> TabletResult:
     """Read a tablet.yaml, or the folder that holds it; raises InputError where it is none."""
     path = path / RESULT_FILE if path.is_dir() else path
+    require_whole(path)
     if not path.exists():
         raise InputError(f"There is no tablet calibration at '{path}'; give a folder of 'weldcal tablet calibrate'.")
     document = read_document(path)

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.models.arms.kinematics import known_arms, load_arm
-from weldcal.models.arms.urdf_file import read_urdf_chain
+from weldcal.models.arms.kinematics import ArmModel, known_arms, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -64,11 +63,11 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
     if is_urdf(name):
         if not Path(name).is_file():
             raise InputError(f"There is no file '{name}' of an arm.")
+        from weldcal.models.arms.urdf_file import read_urdf_chain  # Drake's parser takes a third of a second to import
+
         return Chain(Path(name).name, *read_urdf_chain(Path(name)))
     if name in known_arms():
-        arm = load_arm(name, kinematics)
-        limits = (arm.position_lower, arm.position_upper, arm.velocity_limit)
-        return Chain(name, arm.joint_names, arm.stack, np.eye(4), *limits)
+        return chain_of(load_arm(name, kinematics))
     path = _HERE / name / "chain.yaml"
     if name not in known_chains():
         raise InputError(f"There is no arm {name!r}; choose one of: {', '.join(known_chains())}.")
@@ -81,6 +80,12 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
         _pose(data["flange"]),
         *(np.array([float(j[key]) for j in joints]) for key in ("lower", "upper", "velocity")),
     )
+
+
+def chain_of(arm: ArmModel) -> Chain:
+    """A Universal Robots arm with its own kinematics as a chain."""
+    limits = (arm.position_lower, arm.position_upper, arm.velocity_limit)
+    return Chain(arm.name, arm.joint_names, arm.stack, np.eye(4), *limits)
 
 
 def chain_forward(chain: Chain, q: ArrayLike) -> RigidTransform:

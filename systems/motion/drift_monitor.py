@@ -17,7 +17,7 @@ from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, Dr
 from weldcal.calibration.motion.drift.watch import drift_config
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
-from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, believed_arm
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
 _HALF_S = 0.01  # about a capture: its velocity
@@ -174,7 +174,8 @@ class DriftMonitor(LeafSystem):
         estimate: FlangeEstimate = self._estimate.Eval(context)
         if new.watched is not None and estimate.sequence > old.status.sequence:
             history: PoseHistory = self._history.Eval(context)
-            new = watched_frame(new, estimate, history, self._arm, self._X_FR, self._config)
+            arm = believed_arm(self._calibration, context, self._arm)
+            new = watched_frame(new, estimate, history, arm, self._X_FR, self._config)
         if new is not old:
             state.get_mutable_abstract_state(self._state).set_value(new)
 

@@ -24,9 +24,9 @@ class SlewLimiter(LeafSystem):
 
     def __init__(self, limits: SlewLimits, period_s: float = 0.002) -> None:
         super().__init__()
-        self._limits, self._period_s = limits, period_s
+        self._limits, self._period_s = SlewLimits(*limits.rows(6)), period_s
         # the first call loads machine code, which no tick has time for
-        slew_limit(np.zeros(6), np.zeros(6), np.zeros(6), limits, period_s)
+        slew_limit(np.zeros(6), np.zeros(6), np.zeros(6), self._limits, period_s)
         self._wanted = self.DeclareVectorInputPort("velocity_wanted", 6)
         state = self.DeclareDiscreteState(np.zeros(12))
         self.DeclareVectorOutputPort("velocity_command", 6, self._output, {self.discrete_state_ticket(state)})

@@ -3,6 +3,9 @@
 import math
 
 from weldcal.calibration.published.algorithm1 import named_cost
+from weldcal.calibration.refinement.kinematics_choice import LEAST as LEAST_OF_ARM
+from weldcal.calibration.refinement.local_field import LEAST as LEAST_OF_FIELD
+from weldcal.calibration.refinement.refined import LIVE_KINDS, PLAIN
 from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
@@ -46,6 +49,25 @@ def check_arm(scenario: Scenario) -> None:
         raise InputError(
             f"The tool weighs {mass:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger arm or a "
             "lighter tool."
+        )
+
+
+def check_refinement(scenario: Scenario) -> None:
+    """Check that the live calibration can be refined as the scenario wants it.
+
+    Raises:
+        InputError: an unknown refinement, or too few scans for it.
+    """
+    c = scenario.calibration
+    if c.refine not in LIVE_KINDS:
+        raise InputError(
+            f"calibration.refine must be {', '.join(LIVE_KINDS[:-1])} or {LIVE_KINDS[-1]}, not '{c.refine}'."
+        )
+    least = {PLAIN: 0, "local": LEAST_OF_FIELD}.get(c.refine, LEAST_OF_ARM)
+    if c.minimum_scans < least:
+        raise InputError(
+            f"calibration.refine: {c.refine} needs {least} scans and more: raise calibration.minimum_scans ({c.minimum_scans}) to {least}, "
+            "and maximum_scans with it."
         )
 
 
@@ -93,6 +115,7 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("calibration.feature tool_ring goes with tool: welding, and flange with tool: none.")
     if not 4 <= calibration.minimum_scans <= calibration.maximum_scans:
         raise InputError("calibration.minimum_scans must be at least 4 and not above calibration.maximum_scans.")
+    check_refinement(scenario)
     if scenario.job.weld and (
         scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)
     ):

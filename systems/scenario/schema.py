@@ -62,6 +62,9 @@ class CalibrationConfig:
     minimum_scans: int = 6
     maximum_scans: int = 10  # k_max, without the verification scans
     correct_scanner: bool = True  # estimate scale, gradient and bends of the scanner with X_BC
+    refine: str = (
+        "none"  # none, local, joints or links: as calibrate --refine, after the last scan; needs 10 scans (local) or 12
+    )
     verification_scans: int = 1
     verification_limit_mm: float = 0.5  # a larger error at a held-out pose holds the job
     cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation
@@ -194,6 +197,8 @@ class Scenario:
     base: PoseConfig = dc.field(default_factory=PoseConfig)
     # a factory calibration in Universal Robots' kinematics.yaml schema
     kinematics: str | None = dc.field(default=None, metadata=FILE)
+    # the kinematics.yaml that calibrate --refine wrote: the cell plans and sees with it, the controller keeps its own
+    corrected_kinematics: str | None = dc.field(default=None, metadata=FILE)
     flange: str = ""  # ISO 9409-1 designation of the arm's flange; empty: that of the arm (`weldcal robots`)
     tool: ToolFile | str = "welding"  # welding, pen or none; or {file: my_tool.yaml}, relative to the scenario
     robot: DriverConfig = dc.field(default_factory=NoDevice)

@@ -20,6 +20,8 @@ from weldcal.welding.seam.curve import SeamCurve
 
 CELL, SCANNER, SEAM = "cell", "scanner", "seam"
 FOLLOW, MOVED = "follow", "moved"
+CAMERAS = {FOLLOW: "Follow the job", CELL: "Cell", SCANNER: "Scanner's eye", SEAM: "Seam"}
+"""The cameras in words."""
 VIEW_OF_PHASE = {
     "move_to_verify": SCANNER,
     "scan_verify": SCANNER,

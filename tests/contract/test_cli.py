@@ -242,7 +242,7 @@ def test_a_person_reads_short_values_with_their_units_and_every_refusal() -> Non
         "held-out error": "median 0.571, p95 1.2 mm",
         "X_BC error": "0.08 mm",
         "refused pose04": "It is empty.",
-        "warnings": "One.; Two.",
+        "warnings": "One.\nTwo.",
     }
 
 

@@ -18,7 +18,7 @@ from tests.documents.execution import ELSEWHERE, FAILED, WRITTEN, Check, Page, e
 from tests.documents.props import PROPS, lay_out, named_in, needs_data
 from tests.documents.yaml_blocks import check_yaml
 from tests.places import ROOT, SHARED_DATA, needs
-from tests.short_job import ShortJob
+from tests.short_job import ShortJobs
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 
@@ -94,9 +94,9 @@ def test_the_examples_of_python_run_in_order_and_have_at_most_eight_lines(tmp_pa
     assert reader.names["report"].verdict.verdict == "use it"  # type: ignore[attr-defined]
 
 
-def test_the_examples_of_a_weld_log_run_on_the_log_of_a_demo(finished_demo: ShortJob, tmp_path: Path) -> None:
+def test_the_examples_of_a_weld_log_run_on_the_log_of_a_demo(short_jobs: ShortJobs, tmp_path: Path) -> None:
     (tmp_path / "weldcal-out").mkdir()
-    (tmp_path / "weldcal-out/demo-s_groove-seed0").symlink_to(finished_demo.result.folder)
+    (tmp_path / "weldcal-out/demo-s_groove-seed0").symlink_to(short_jobs.folder())
     blocks = [block for block in blocks_of(ROOT / "docs/weld_log.md") if block.kind == "python"]
     for block in blocks:
         (done,) = Page(tmp_path, "").execute(block)

@@ -13,9 +13,10 @@ from tests.documents.props import lay_out, needs_data
 from tests.places import ROOT, SHARED_DATA, require_data
 from tests.short_job import ShortJobs
 from weldcal.tools.cli.app import app
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next
 
 PAGE = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
-EVERYWHERE = {"state"}
+EVERYWHERE = {"state", "first_screen"}
 COMMANDS = {
     "calibrate": ("`calibrate FOLDER`", "calibrate three_scans --out my-calibration"),
     "verify": ("`verify RESULT FOLDER`", "verify my-calibration other_scans"),
@@ -83,6 +84,12 @@ def test_a_demo_prints_the_keys_of_its_table(short_jobs: ShortJobs) -> None:
     keys = set(short_jobs.summary()) - EVERYWHERE
     assert always - keys == set()
     assert keys - always - sometimes == set()
+
+
+def test_the_first_screen_has_the_keys_of_its_table() -> None:
+    always, sometimes = keys_of("The first screen")
+    screen = FirstScreen(Findings(), Expected("error", "1 mm", "by nothing"), Next("Verify."))
+    assert always | sometimes == set(screen.document())
 
 
 def test_a_failure_has_its_two_keys(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

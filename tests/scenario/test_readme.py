@@ -54,6 +54,13 @@ def test_the_demo_ends_done_and_leaves_the_files_that_the_readme_names(finished_
     assert promised <= {path.name for path in finished_demo.result.folder.iterdir()}
 
 
+def test_the_terminal_tells_the_weld_by_millimetres_of_seam(finished_demo: ShortJob) -> None:
+    told = [int(mm) for mm in re.findall(r"weld, (\d+) of 30 mm", finished_demo.output)]
+    assert told[0] == 0
+    assert told == sorted(set(told))
+    assert 20 <= told[-1] <= 30
+
+
 @pytest.mark.parametrize("name", ["report.html", "recording.html"])
 def test_its_pages_open_without_a_network(finished_demo: ShortJob, browser: Browser, tmp_path: Path, name: str) -> None:
     ready = "document.querySelector('canvas')" if name == "recording.html" else "document.querySelector('.verdict')"

@@ -77,7 +77,7 @@ def test_the_run_leaves_what_the_calibration_reads(demo: Demo) -> None:
     names = {path.name for path in demo.folder.iterdir()}
     files = {"touches.csv", "poses.csv", "camera.yaml", "picture.png", "tablet.yaml", "ur_pose.script", "report.html"}
     assert files <= names
-    assert "Camera and pen are calibrated" in (demo.folder / "report.html").read_text(encoding="utf-8")
+    assert "pose of the camera C in the robot" in (demo.folder / "report.html").read_text(encoding="utf-8")
 
 
 def test_it_is_the_one_station_with_a_pen_a_camera_and_a_tablet(demo: Demo) -> None:

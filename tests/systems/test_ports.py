@@ -24,6 +24,7 @@ import weldcal.systems
 from tests.systems.cells import Q_HOME, TOOL, plain_station, the_arm
 from tests.systems.drivers.sensors.scripted import Scripted
 from tests.systems.drivers.still_link import StillLink
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
@@ -68,6 +69,9 @@ from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
 from weldcal.systems.jobs.tablet.planning import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletProcedure, TabletState
+from weldcal.systems.jobs.touch.config import TouchConfig
+from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchPlanner, TouchPlanning
+from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
 from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
@@ -185,6 +189,10 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     LiveWriter: lambda: LiveWriter(LiveView(), {}, None),
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
     TabletProcedure: lambda: TabletProcedure(the_arm(), plan_tablet(load_scenario("tablet"), the_arm())),
+    TouchPlanner: lambda: TouchPlanner(
+        TouchPlanning(cast("SeamPlanning", None), X, ScannerCorrection(), TouchConfig())
+    ),
+    TouchProcedure: lambda: TouchProcedure(the_arm(), TOOL, TouchMotion(Q_HOME, 3e-3, 1e-3, 7.0, 20.0, 240.0)),
     WristCamera: lambda: WristCamera(RenderedWristCamera(), 0),
     MountingProcedure: lambda: MountingProcedure((), 0, 0, (Q_HOME, None)),
     MountingCalibrator: lambda: MountingCalibrator(
@@ -233,6 +241,20 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "descent": 6,
         "trigger": 1,
         "state": TabletState,
+    },
+    TouchPlanner: {"scan": Scan, "job": JobCommand, "planned_touches": PlannedTouches},
+    TouchProcedure: {
+        "position_measured": 6,
+        "settled_goal": 1,
+        "robot_status": UrStatus,
+        "planned_touches": PlannedTouches,
+        "deformation": Deformation,
+        "hold": 1,
+        "job": JobCommand,
+        "descent": 6,
+        "trigger": 1,
+        "streaming": 1,
+        "state": TouchState,
     },
     MountingProcedure: {
         "settled_goal": 1,
@@ -339,7 +361,13 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     },
     PicturePoses: {"body_poses": list, "frame_poses": FramePoseVector},
     KnockedStand: {"frame_poses": FramePoseVector},
-    ArucoDeformationEstimator: {"image": Image, "history": PoseHistory, "deformation": Deformation, "deflection": 5},
+    ArucoDeformationEstimator: {
+        "image": Image,
+        "history": PoseHistory,
+        "calibration_status": CalibrationStatus,
+        "deformation": Deformation,
+        "deflection": 5,
+    },
     WeldingVelocityServo: {
         "planned_seam": PlannedSeam,
         "deformation": Deformation,
@@ -348,6 +376,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "job": JobCommand,
         "arc_established": 1,
         "hold": 1,
+        "calibration_status": CalibrationStatus,
         "V_BT": 6,
         "servo_report": ServoReport,
         "telemetry": len(TELEMETRY),

@@ -107,6 +107,29 @@ def hand_eye_cells(
     return Outcome(summary, text=table)
 
 
+@command("benchmark touch", options=FARM)
+def touch(
+    call: Call,
+    runs: Annotated[
+        int, option("--runs", "N", "Number of light worlds of six touches, or of whole cells.", min=1)
+    ] = 500,
+    scenario: Annotated[
+        str | None,
+        option("--scenario", "NAME", "Whole simulated cells of this scenario: calibrate, then touch the part."),
+    ] = None,
+    points: Annotated[
+        int, option("--points", "N", "With --scenario: places to touch in each cell.", min=3, max=60)
+    ] = 8,
+) -> Outcome:
+    """Measure how often points touched by the robot lie in the 95 % region that their calibration states."""
+    from weldcal.tools.studies.touch.coverage import run_touch_cells, run_touch_study
+
+    farm = call.farm(call.folder("benchmark", "touch"))
+    if scenario is not None:
+        return Outcome(run_touch_cells(farm, scenario, runs, points, call.seed))
+    return Outcome(run_touch_study(farm, runs, call.seed))
+
+
 @command("benchmark mountings", options=FARM)
 def mountings(
     call: Call,
@@ -303,6 +326,7 @@ COMMANDS = (
     part_registration,
     hand_eye,
     hand_eye_cells,
+    touch,
     mountings,
     profiler,
     cell,

@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import MOTION, Call, CorrectionOption, FlangeOption, Outcome, command, option, switch
+from weldcal.tools.cli.options import (
+    MOTION,
+    Call,
+    CorrectionOption,
+    FlangeOption,
+    LimitOption,
+    Outcome,
+    command,
+    option,
+    switch,
+)
 from weldcal.tools.cli.runs import run_options
 
 
@@ -64,10 +74,9 @@ def calibrate(
             "Known rotation of the hole pattern about the flange axis; one to three scans are then enough.",
         ),
     ] = None,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate a scanner from a folder of flange scans and robot poses, or live in a scenario."""
-    from weldcal.tools.outcomes.poses import job_rows, pose_rows, work_rows
-
     if dataset is not None and scenario is None:
         from weldcal.calibration.data.motion_dataset import is_motion
 
@@ -80,9 +89,10 @@ def calibrate(
 
             folder = call.folder("calibrate", dataset.resolve().name)
             moving = calibrate_motion(
-                dataset, folder, robot=robot, flange=flange, seed=call.seed, progress=call.progress, centres=centres
-            )
-            return Outcome(moving.summary(), rows=pose_rows(moving.result.X_BC, moving.result.symbol))
+                dataset, folder, robot=robot, flange=flange, seed=call.seed, progress=call.progress, centres=centres,
+                limit_mm=limit_mm,
+            )  # fmt: skip
+            return Outcome(moving.summary(), first=moving.first)
         from weldcal.tools.commands.calibrate import calibrate_dataset
 
         report = calibrate_dataset(
@@ -98,6 +108,7 @@ def calibrate(
             poses=poses,
             refine=refine,
             kinematics=kinematics,
+            limit_mm=limit_mm,
         )
         algorithm1 = report.algorithm1
         rows = {} if algorithm1 is None else {"Algorithm 1": algorithm1.sentence}
@@ -109,12 +120,14 @@ def calibrate(
             rows["mean error of as many new scans"] = f"{interval[0]:.3f} to {interval[1]:.3f} mm (95 %)"
         summary = report.summary()
         rows["error budget"] = report.budget.sentence
-        return Outcome(summary, rows=rows | pose_rows(report.result.X_BC) | work_rows(summary["work_point"]))
+        return Outcome(summary, rows=rows, first=report.first)
     if scenario is None or dataset is not None:
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
     if poses is not None or refine is not None or kinematics is not None:
         raise typer.BadParameter("--poses, --refine and --kinematics are for a dataset; omit them with --scenario")
     from weldcal.tools.commands.procedures import calibrate_live
 
-    found = calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress)
-    return Outcome(found, rows=job_rows(found))
+    if limit_mm is not None:
+        raise typer.BadParameter("--limit-mm is for a dataset; a scenario states calibration.required_error_mm")
+    found, first = calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress)
+    return Outcome(found, first=first)

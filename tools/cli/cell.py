@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option
+from weldcal.tools.cli.options import LOOK, Call, LimitOption, Outcome, command, option
 
 
 @command("check-cell", common=LOOK, short_help="Check every device of a scenario. Nothing moves.")
@@ -81,11 +81,12 @@ def finger_calibrate(
         Path | None,
         option("--tool", "FILE", "Tool file of the tool that carries the tag.", show_default="the welding tool"),
     ] = None,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate the finger: intrinsics from pictures of the board; tag, seat and stiffness from touches on a known plate."""
     from weldcal.tools.commands.finger_calibrate import calibrate_finger
 
-    report = calibrate_finger(folder, board, touches, call.folder("finger-calibrate", folder.name), tool)
+    report = calibrate_finger(folder, board, touches, call.folder("finger-calibrate", folder.name), tool, limit_mm)
     found = report.document()
     camera = found["camera"]
     values = {
@@ -103,4 +104,4 @@ def finger_calibrate(
             "open": " ".join(tip["unknown"]) or "nothing",
         }
     summary = {"state": "done", "out": str(call.written), "without_board": list(report.without_board), **found}
-    return Outcome(summary, values=values)
+    return Outcome(summary, values=values, first=report.first)

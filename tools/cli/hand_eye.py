@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from weldcal.tools.cli.options import Call, Outcome, command, option, switch
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
 
 FileArgument = Annotated[
     Path,
@@ -34,9 +34,10 @@ def ax_xb(
     mounting: MountingOption = None,
     unit: UnitOption = None,
     motions: Annotated[bool, switch("--motions", "The file holds motions (A and B of A X = X B), not poses.")] = False,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = XB for the camera's pose. With poses, the target's pose is estimated too, so that each counts once."""
-    return _solve("ax-xb", call, file, mounting=mounting, unit=unit, motions=motions)
+    return _solve("ax-xb", call, file, mounting=mounting, unit=unit, motions=motions, limit_mm=limit_mm)
 
 
 @command("hand-eye ax-yb")
@@ -63,6 +64,7 @@ def ax_yb(
         Path | None,
         option("--kinematics", "FILE", "With --robot: the arm's own kinematics, such as calibrate --refine writes."),
     ] = None,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""
     return _solve(
@@ -76,6 +78,7 @@ def ax_yb(
         camera=camera,
         refine=refine,
         kinematics=kinematics,
+        limit_mm=limit_mm,
     )
 
 
@@ -87,9 +90,10 @@ def axb_ycz(
     unit: UnitOption = None,
     robot: RobotOption = None,
     camera: ScannerOption = None,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AXB = YCZ for camera, second base and target: one robot carries the camera, another the target."""
-    return _solve("axb-ycz", call, file, mounting=mounting, unit=unit, robot=robot, camera=camera)
+    return _solve("axb-ycz", call, file, mounting=mounting, unit=unit, robot=robot, camera=camera, limit_mm=limit_mm)
 
 
 def _solve(equation: str, call: Call, file: Path, **options: Any) -> Outcome:
@@ -101,4 +105,4 @@ def _solve(equation: str, call: Call, file: Path, **options: Any) -> Outcome:
 
     folder = call.folder("hand-eye", file.resolve().stem)
     report = run_hand_eye(equation, file, folder, seed=call.seed, say=say, **options)
-    return Outcome(report.summary(), text=f"{report.text()}\n\nwritten      {folder}")
+    return Outcome(report.summary(), text=report.text(), first=report.first)

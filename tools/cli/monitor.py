@@ -1,13 +1,18 @@
 """weldcal monitor: watches a calibration while the arm moves."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from weldcal.tools.cli.options import LIVE, Call, FlangeOption, Outcome, command, option, switch
 from weldcal.tools.cli.runs import run_options
+
+if TYPE_CHECKING:
+    from weldcal.tools.outcomes.first_screen import FirstScreen
 
 
 @command("monitor", options=LIVE, short_help="Watch a calibration while the arm moves.", defaults={"browser": False})
@@ -65,7 +70,7 @@ def monitor(
         seed=call.seed,
         progress=call.progress,
     )
-    return _outcome(report.summary(), report.moves)
+    return _outcome(report.summary(), report.moves, report.first)
 
 
 def _is_scenario(name: str) -> bool:
@@ -88,10 +93,10 @@ def _live(
         options, calibration, call.progress, frames=frames, false_alarms_per_hour=false_alarms, recalibrate=recalibrate,
         record=record,
     )  # fmt: skip
-    return _outcome(live.summary(), () if live.report is None else live.report.moves)
+    return _outcome(live.summary(), () if live.report is None else live.report.moves, live.first)
 
 
-def _outcome(summary: dict[str, Any], moves: Sequence[Any]) -> Outcome:
+def _outcome(summary: dict[str, Any], moves: Sequence[Any], first: FirstScreen) -> Outcome:
     """What is printed of a watch."""
     shown = ("verdict", "cause", "rms_mm", "rms_before_synchronisation_mm", "frames", "dropped", "delay_ms")
     values = {key: summary[key] for key in shown if key in summary}
@@ -99,7 +104,7 @@ def _outcome(summary: dict[str, Any], moves: Sequence[Any]) -> Outcome:
         f"{e.kind} at {e.time_s:.2f} s": f"{d['translation_mm']:.3f} mm, {d['rotation_deg']:.4f} deg, found at {e.found_s:.2f} s"
         for e, d in zip(moves, summary["drift"], strict=True)
     }
-    return Outcome(summary, values=values, rows=rows)
+    return Outcome(summary, values=values, rows=rows, first=first)
 
 
 @command("benchmark drift")

@@ -1,6 +1,7 @@
 """What all commands share: their common options, the folder of a result, progress, errors and the printed outcome."""
 
 import inspect
+import os
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -11,10 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import whole_result
 from weldcal.tools import console
 
 if TYPE_CHECKING:
     from weldcal.tools.farm.run import Farm
+    from weldcal.tools.outcomes.first_screen import FirstScreen
+
+
+LEAST_BYTES = 1 << 20
+"""Bytes that must fit on the disk of a result before the work begins."""
 
 
 def option(name: str, metavar: str, help: str, **settings: Any) -> Any:
@@ -50,6 +57,15 @@ _ADDRESS = "Loopback address 127.x.y.z of the emulated controller."
 _PACE = "Emulated controller only: speed relative to real time, 0.05 to 1."
 _SLOWER = "Slow the arm's moves down: 0.05 to 1. The welding speed does not change."
 _RECORD = "Also write recording.mcap, which weldcal replay plays back."
+LimitOption = Annotated[
+    float | None,
+    option(
+        "--limit-mm",
+        "MM",
+        "The error that your job allows, at 95 %: the verdict is measured against it.",
+        show_default="not stated: use with care at best",
+    ),
+]
 _WORKERS = "Processes on this computer."
 _SCHEDULER = "Address of a Dask scheduler; its workers compute, with the same numbers."
 _OUT = "Output folder; default: a new one in weldcal-out."
@@ -92,6 +108,7 @@ class Outcome:
         values: printed as rows instead of the summary; {} for none.
         rows: printed below them.
         text: printed, or called to print, instead of all rows.
+        first: the first screen of its report, printed below the rows with the report's path.
         problem: a sentence for stderr, with exit code 1; None: taken from the summary, "": none.
     """
 
@@ -100,6 +117,7 @@ class Outcome:
     rows: Mapping[str, str] = field(default_factory=dict)
     text: str | Callable[[], object] | None = None
     problem: str | None = None
+    first: "FirstScreen | None" = None
 
 
 class Call:
@@ -128,6 +146,7 @@ class Call:
         """
         self.written = self.out or fresh_folder(command, name, self.seed)
         check_writable(self.written)
+        self._stack.enter_context(whole_result(self.written))
         return self.written
 
     def farm(self, folder: Path) -> "Farm":
@@ -194,6 +213,7 @@ def command(
                 call = Call(title, shared, stack)
                 if call.out is not None:
                     check_writable(call.out)
+                    stack.enter_context(whole_result(call.out))
                 outcome = body(call, **given)
             if outcome is not None:
                 report(title, outcome if isinstance(outcome, Outcome) else Outcome(outcome), call)
@@ -232,12 +252,23 @@ def check_writable(folder: Path) -> None:
     there = next((one for one in (folder, *folder.absolute().parents) if one.exists()), folder)
     try:
         # the only test that holds for every file system, and for root
-        with tempfile.TemporaryFile(dir=there):
-            pass
+        with tempfile.TemporaryFile(dir=there) as file:
+            file.write(bytes(LEAST_BYTES))
+            file.flush()
+            os.fsync(file.fileno())  # a full disk refuses the bytes, not the name
     except OSError as problem:
         raise InputError(
             f"Nothing can be written to '{folder}' ({problem.strerror or problem}). Give another folder with --out."
         ) from problem
+
+
+def _emit_first(first: "FirstScreen", written: Path | None) -> None:
+    """Prints the same as the first screen of the report, and the report's path."""
+    rows = first.rows()
+    if written is not None:
+        rows |= {"written to": str(written), "report": str(written / "report.html")}
+    typer.echo("")
+    console.emit_summary("In short", rows)
 
 
 def report(title: str, outcome: Outcome, call: Call) -> None:
@@ -249,15 +280,19 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     summary = outcome.summary
     state = str(summary.get("state", "done"))
     if call.json:
-        console.emit_json(summary)
+        first = outcome.first
+        console.emit_json(summary if first is None else {**summary, "first_screen": first.document()})
     elif callable(outcome.text):
         outcome.text()
     elif outcome.text is not None:
-        typer.echo(outcome.text)
+        console.emit_text(outcome.text)
     else:
         rows = console.rows(summary if outcome.values is None else outcome.values) | dict(outcome.rows)
-        rows |= {} if call.written is None else {"written to": str(call.written)}
+        if outcome.first is None:
+            rows |= {} if call.written is None else {"written to": str(call.written)}
         console.emit_summary(f"{title}: {state}", rows)
+    if outcome.first is not None and not call.json:
+        _emit_first(outcome.first, call.written)
     problem = outcome.problem
     if problem is None and state != "done":
         problem = str(summary.get("reason") or f"The {title} ended {state}; see the report for the reason.")

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldcal.tools import console
-from weldcal.tools.cli.options import Call, Outcome, command, option, switch
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
 
 if TYPE_CHECKING:
-    from weldcal.calibration.profiler.record import ProfilerRecord
     from weldcal.calibration.profiler.sphere.model import SphereData
     from weldcal.tools.commands.profiler.files import ProfilerFile
+    from weldcal.tools.outcomes.profiler_file import ProfilerFile as ProfilerResult
+    from weldcal.tools.outcomes.profiler_file import ProfilerSeam
 
 FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Measurements, .npz or .csv (docs/profiler.md).")]
 UnitOption = Annotated[str | None, option("--unit", "U", "m or mm, for an NPZ that does not state its unit.")]
@@ -52,18 +53,25 @@ def edge(
     ] = None,
     sigma_z: Annotated[float | None, option("--sigma-z", "MM", Z_SIGMA, show_default=ESTIMATED.format(0.06))] = None,
     plan: PlanOption = 0,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate the profiler's pose on the flange by points of one straight edge, seen in any poses. Needs no initial guess."""
     from weldcal.tools.commands.profiler.calibrate import calibrate_edge
     from weldcal.tools.commands.profiler.files import read_profiler_file
     from weldcal.tools.commands.profiler.noise import Sigmas
+    from weldcal.tools.commands.profiler.results import finish_edge
+    from weldcal.tools.outcomes.first_screen import check_limit
 
+    check_limit(limit_mm)
     given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
     robot, x, z = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
     sigmas = Sigmas(robot, x, z, stated=any(v is not None for v in given))
     data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
     record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan, seed=call.seed)
-    return _calibrated(call, file, record, _with(data, found))
+    made, summary = finish_edge(
+        data, feature, side, record, _with(data, found), file.name, call.folder("profiler", file.stem), limit_mm
+    )
+    return _outcome(call, summary, made)
 
 
 @command("profiler sphere", short_help="Calibrate by a sphere, with or without touches of it.")
@@ -81,17 +89,26 @@ def sphere(
     sigma_robot: Annotated[float, option("--sigma-robot", "MM", ROBOT_SIGMA)] = 0.03,
     sigma_z: Annotated[float, option("--sigma-z", "MM", Z_SIGMA)] = 0.05,
     plan: PlanOption = 0,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate the profiler's pose on the flange by raw profiles of a sphere. Needs no initial guess, no scan sides and no
     pure translations."""
+    from weldcal.calibration.profiler.sphere.model import SphereSigmas
     from weldcal.tools.commands.profiler.calibrate import calibrate_sphere
     from weldcal.tools.commands.profiler.noise import Sigmas
+    from weldcal.tools.commands.profiler.results import finish_sphere
+    from weldcal.tools.outcomes.first_screen import check_limit
 
+    check_limit(limit_mm)
     sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
     lost: list[int] = []
     data, measured = _sphere(call, file, unit, dataset, trial, radius, touches, tip, arm, lost)
     record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=call.seed)
-    return _calibrated(call, file, record, _with(data, found) | {"without_sphere": lost})
+    made, summary = finish_sphere(
+        measured, SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m), record,
+        _with(data, found) | {"without_sphere": lost}, file.name, call.folder("profiler", file.stem), limit_mm,
+    )  # fmt: skip
+    return _outcome(call, summary, made)
 
 
 @command("profiler compensate", short_help="Calibrate by the published sphere method, with compensation by touches.")
@@ -107,17 +124,24 @@ def compensate(
     solve_tip: Annotated[
         bool, switch("--solve-tip", "Also estimate the tip from the touches (not in the paper).")
     ] = False,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate by the sphere paper's two linear steps and its compensation. 'sphere' is more accurate on the same file."""
+    from weldcal.calibration.profiler.sphere.model import SphereSigmas
     from weldcal.tools.commands.profiler.calibrate import calibrate_compensate
+    from weldcal.tools.commands.profiler.results import finish_sphere
+    from weldcal.tools.outcomes.first_screen import check_limit
 
+    check_limit(limit_mm)
     data, measured = _sphere(call, file, unit, dataset, trial, radius, touches, tip)
     record, found = calibrate_compensate(data, measured, solve_tip=solve_tip)
     if found["wrong_sides"]:
         console.emit_warning(
             f"The side of the sphere's centre is likely wrong in scans {found['wrong_sides']}. Check their sign."
         )
-    return _calibrated(call, file, record, _with(data, found))
+    folder = call.folder("profiler", file.stem)
+    made, summary = finish_sphere(measured, SphereSigmas(), record, _with(data, found), file.name, folder, limit_mm)
+    return _outcome(call, summary, made)
 
 
 @command("profiler seam", short_help="Map a V-groove in the base frame.")
@@ -127,14 +151,18 @@ def seam(
     calibration: Annotated[Path, option("--calibration", "FOLDER", "Result folder of edge, sphere or compensate.")],
     unit: UnitOption = None,
     trial: TrialOption = None,
+    limit_mm: LimitOption = None,
 ) -> Outcome:
     """Map both edges and the root of a V-groove from raw profiles into the base frame, as seam.csv."""
-    from weldcal.tools.commands.profiler.calibrate import map_seam
     from weldcal.tools.commands.profiler.files import read_profiler_file
+    from weldcal.tools.commands.profiler.seam import finish_seam, map_seam
+    from weldcal.tools.outcomes.first_screen import check_limit
 
+    check_limit(limit_mm)
     folder = call.folder("profiler", file.stem)
     data = read_profiler_file(file, unit=unit, trial=trial)
-    return _outcome(_with(data, map_seam(data, calibration, folder)), folder)
+    found = _with(data, map_seam(data, calibration, folder))
+    return _outcome(call, found, finish_seam(found, calibration, file.name, folder, limit_mm))
 
 
 @command("profiler clock", short_help="Find a profiler's clock from a straight edge.")
@@ -185,18 +213,12 @@ def _with(data: ProfilerFile, found: Mapping[str, Any]) -> dict[str, Any]:
     return {**found, **({"warnings": [*data.warnings, *found.get("warnings", [])]} if data.warnings else {})}
 
 
-def _calibrated(call: Call, file: Path, record: ProfilerRecord, found: Mapping[str, object]) -> Outcome:
-    from weldcal.tools.commands.profiler.calibrate import write_calibration
-
-    folder = call.folder("profiler", file.stem)
-    return _outcome({**found, **write_calibration(record, folder)}, folder)
-
-
-def _outcome(found: Mapping[str, object], folder: Path) -> Outcome:
+def _outcome(call: Call, found: Mapping[str, object], made: ProfilerResult | ProfilerSeam) -> Outcome:
+    warnings = found.get("warnings")
+    # the first screen has them, and the JSON object has no first screen
+    for sentence in warnings if isinstance(warnings, list) and call.json else []:
+        console.emit_warning(str(sentence))
     rows: dict[str, str] = {}
-    X = found.get("X_FS")
-    if isinstance(X, list):
-        rows |= _pose_rows(X)
     for key in ("outlier_scans", "wrong_scans", "without_feature", "without_sphere", "without_groove", "wrong_sides"):
         numbers = found.get(key)
         if isinstance(numbers, list) and numbers:
@@ -208,19 +230,5 @@ def _outcome(found: Mapping[str, object], folder: Path) -> Outcome:
             turn = ", ".join(f"{v:.4f}" for v in pose[3:])
             left = after["rms_before_and_after_each_mm"]
             rows[f"add pose {k + 1}"] = f"{place} mm, {turn} rad: {left[k]:.3f} to {left[k + 1]:.3f} mm in the field"
-    warnings = found.get("warnings")
-    for sentence in warnings if isinstance(warnings, list) else []:
-        console.emit_warning(str(sentence))
     values = {k: v for k, v in found.items() if v != [] and k != "warnings"}
-    return Outcome({"state": "done", **found, "written_to": str(folder)}, values, rows)
-
-
-def _pose_rows(X_FS: list[list[float]]) -> dict[str, str]:
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_matrix([row[:3] for row in X_FS[:3]]).as_euler("xyz", degrees=True)
-    return {
-        "X_FS": "pose of the scan plane in the flange frame",
-        "position": "  ".join(f"{1e3 * row[3]:+.3f}" for row in X_FS[:3]) + "  mm",
-        "roll pitch yaw": "  ".join(f"{v:+.4f}" for v in turn) + "  deg",
-    }
+    return Outcome({"state": "done", **found, "written_to": str(made.out)}, values, rows, first=made.first)

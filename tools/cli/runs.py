@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -30,29 +29,30 @@ PROFILER_SCENARIO = "profiler_seam"
 def demo(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = DEMO_SCENARIO) -> Outcome:
     """Run the complete job: calibrate, verify, scan the workpiece, plan, weld, retract. A report is written at the end."""
     from weldcal.tools.commands.procedures import run_procedure
-    from weldcal.tools.outcomes.poses import job_rows
 
     options = run_options(call, "demo", _named_once(name, scenario, DEMO_SCENARIO))
-    summary = run_procedure(options, call.progress).summary()
-    return Outcome(summary, rows=job_rows(summary))
+    found = run_procedure(options, call.progress)
+    return Outcome(found.summary(), first=getattr(found, "first", None))
 
 
 @command("weld", options=RECORDED, short_help="Weld a seam in a scenario, without calibrating.")
-def weld(call: Call, scenario: ScenarioOption = "straight_groove") -> Mapping[str, object]:
+def weld(call: Call, scenario: ScenarioOption = "straight_groove") -> Outcome:
     """Weld a seam in a scenario, with the scanner's pose taken from the scenario."""
     from weldcal.tools.commands.demo import run_weld
 
-    return run_weld(run_options(call, "weld", scenario), call.progress).summary()
+    found = run_weld(run_options(call, "weld", scenario), call.progress)
+    return Outcome(found.summary(), first=found.first)
 
 
 @command("tablet demo", options=LIVE, defaults={"browser": False})
-def tablet_demo(call: Call, scenario: ScenarioOption = "tablet", record: RecordOption = False) -> Mapping[str, object]:
+def tablet_demo(call: Call, scenario: ScenarioOption = "tablet", record: RecordOption = False) -> Outcome:
     """Run the tablet calibration: look, touch each landmark, calibrate, compare with the truth."""
     from weldcal.systems.scenario.loading import load_scenario
     from weldcal.tools.commands.tablet.demo import run_tablet_demo
 
     options = run_options(call, "tablet", scenario, recording=record)
-    return run_tablet_demo(load_scenario(scenario), options, call.progress).summary()
+    found = run_tablet_demo(load_scenario(scenario), options, call.progress)
+    return Outcome(found.summary(), first=found.first)
 
 
 @command("hand-eye live", options=LIVE, defaults={"browser": False})
@@ -69,7 +69,7 @@ def hand_eye_live(
 
     options = run_options(call, "hand-eye", scenario, recording=record)
     result = run_mounting_live(load_scenario(scenario), options, call.progress)
-    return Outcome(result.summary(), text=f"{result.text()}\n\nwritten      {call.written}")
+    return Outcome(result.summary(), text=result.text(), first=result.first)
 
 
 @command("profiler live", options=LIVE, defaults={"browser": False})
@@ -81,7 +81,7 @@ def profiler_live(
     ] = PROFILER_SCENARIO,
     runs: Annotated[int, option("--runs", "N", "Number of seeds, from --seed on.", min=1)] = 1,
     record: RecordOption = False,
-) -> Mapping[str, object]:
+) -> Outcome:
     """Calibrate a profiler on the arm by an edge and a touched sphere, then scan and follow a seam."""
     from weldcal.systems.scenario.loading import load_scenario
     from weldcal.tools.commands.profiler.live import run_profiler_live, run_profiler_seeds
@@ -90,8 +90,9 @@ def profiler_live(
     options = run_options(call, "profiler-live", chosen, recording=record)
     loaded = load_scenario(chosen)
     if runs > 1:
-        return run_profiler_seeds(loaded, options, runs, call.progress)
-    return run_profiler_live(loaded, options, call.progress).summary()
+        return Outcome(run_profiler_seeds(loaded, options, runs, call.progress))
+    found = run_profiler_live(loaded, options, call.progress)
+    return Outcome(found.summary(), first=found.first)
 
 
 def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:

@@ -1,12 +1,11 @@
 """weldcal tablet serve and calibrate: a tablet as the calibration target."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import Call, check_writable, command, option, switch
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, check_writable, command, option, switch
 
 
 @command("tablet serve", common=("debug",))
@@ -56,7 +55,8 @@ def calibrate(
         bool, switch("--printed-sign", "npz: use the sign of the touching error as printed in the paper.")
     ] = False,
     two_stages: Annotated[bool, switch("--two-stages", "npz: also run the paper's two stages.")] = False,
-) -> Mapping[str, object]:
+    limit_mm: LimitOption = None,
+) -> Outcome:
     """Calibrate camera and pen on the wrist from one image of the tablet and a touch of each landmark."""
     from weldcal.tools.commands.tablet.calibrate import TabletInputs, calibrate_tablet
 
@@ -72,5 +72,7 @@ def calibrate(
         None if hand_step_mm is None else 1e-3 * hand_step_mm,
         printed_sign,
         two_stages,
+        limit_mm,
     )
-    return calibrate_tablet(inputs, call.folder("tablet", file.stem)).summary()
+    made = calibrate_tablet(inputs, call.folder("tablet", file.stem))
+    return Outcome(made.summary(), first=made.first)

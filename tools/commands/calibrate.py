@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
@@ -21,14 +21,19 @@ from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.joint_angles import joint_angles
+from weldcal.calibration.refinement.refined import KINEMATICS_FILE, REFINEMENTS, Plain, Refined
+from weldcal.calibration.touch.arm_prior import observed_document
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.contradictions import estimate_consistent
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
-from weldcal.tools.commands.refine import KINEMATICS_FILE, REFINEMENTS, Refinable, Refined, refine_calibration
+from weldcal.tools.commands.refine import Refinable, refine_calibration
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
+from weldcal.tools.outcomes.first_screen import check_limit
 from weldcal.tools.report.calibration import calibration_report
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
@@ -50,6 +55,7 @@ def calibrate_dataset(
     poses: str | None = None,
     refine: str | None = None,
     kinematics: Path | None = None,
+    limit_mm: float | None = None,
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
@@ -60,12 +66,13 @@ def calibrate_dataset(
     leaves, "joints" or "links" errors of the arm (beyond its factory calibration ``kinematics``), each applied where nested held-out
     errors fall. A cloud that cannot be used is refused and
     reported, as long as enough remain. Where five scans or more contradict each other only
-    observations.csv is written, for `weldcal doctor`.
+    observations.csv is written, for `weldcal doctor`. ``limit_mm`` is the error, at 95 %, that the job allows.
 
     Raises:
         InputError: the data cannot be used; TooFewPoses: too few scans can be used.
     """
     started = time.monotonic()
+    check_limit(limit_mm)
     if refine is not None and refine not in REFINEMENTS:
         raise InputError(f"There is no refinement '{refine}'. Choose one of {', '.join(REFINEMENTS)}.")
     tell: Progress = progress or (lambda stage, fraction: None)
@@ -101,15 +108,17 @@ def calibrate_dataset(
             refine,
             Refinable(
                 data,
-                observations,
-                seen.patterns,
-                estimate,
-                tuple(corrected),
-                scanner,
+                Plain(
+                    observations,
+                    tuple(corrected),
+                    seen.patterns,
+                    estimate,
+                    None if scanner is None else scanner.accepted,
+                    correct_scanner and not few,
+                ),
                 robot or data.header.robot,
                 kinematics,
             ),
-            correct_scanner=correct_scanner and not few,
             seed=seed,
         )
         estimate, corrected = refined.estimate, list(refined.observations)
@@ -173,7 +182,12 @@ def calibrate_dataset(
         joint_covariance=estimate.joint,
         axis_turn_deg=_axis_turn(inliers, seen.patterns, rigid.X_BC) if axis_turn_deg is None else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
-        orientations=orientations_of(inliers) if not data.pairs or all(p.has_orientation for p in data.pairs) else None,
+        orientations=orientations_of(inliers, None if data.pairs else data.X_FR)
+        if not data.pairs or all(p.has_orientation for p in data.pairs)
+        else None,
+        observed=observed_document(inliers, RigidTransform() if data.pairs else data.X_FR, _angles(data, inliers))
+        if not data.pairs or all(p.has_orientation for p in data.pairs)
+        else None,
         arm_errors=None if refined is None else refined.arm,
         kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
         software=software_version(),
@@ -195,6 +209,7 @@ def calibrate_dataset(
         seen.patterns,
         data.notes,
         None if refined is None else refined.document(refine or ""),
+        limit_mm,
     )
     tell("writing the report", 0.95)
     html = calibration_report(report, dataset=Path(folder).name)
@@ -210,6 +225,15 @@ def calibrate_dataset(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
+
+
+def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
+    """Joint angles (n, joints) rad of the poses; none where the table has none."""
+    for joints in (7, 6):
+        q = joint_angles(data, [o.id for o in inliers], joints)
+        if q is not None:
+            return list(q)
+    return []
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:

@@ -19,6 +19,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.outcomes.first_screen import check_limit
 from weldcal.tools.outcomes.motion import MotionReport
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.motion_calibration import motion_report
@@ -37,6 +38,7 @@ def calibrate_motion(
     seed: int = 0,
     progress: Progress | None = None,
     centres: bool = False,
+    limit_mm: float | None = None,
 ) -> MotionReport:
     """Calibrate from a recording in motion, of a scanner beside the robot that sees the flange or of one on the flange
     (eye_in_hand) that sees a fixed target of the flange's shape, and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
@@ -49,6 +51,7 @@ def calibrate_motion(
         InputError: the data cannot be used, or the motion leaves X_BC open; TooFewPoses: too few frames can be used.
     """
     started = time.monotonic()
+    check_limit(limit_mm)
     tell: Progress = progress or (lambda stage, fraction: None)
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
@@ -95,7 +98,9 @@ def calibrate_motion(
         configuration=data.header.configuration,
         target=_target(estimate) if data.in_hand else None,
     )
-    report = MotionReport(result, estimate, frames, tuple(refused), outliers, time.monotonic() - started, Path(out))
+    report = MotionReport(
+        result, estimate, frames, tuple(refused), outliers, time.monotonic() - started, Path(out), limit_mm
+    )
     tell("writing the report", 0.95)
     write_atomic(Path(out) / "report.html", motion_report(report, dataset=Path(folder).name))
     export_all(result, Path(out))

@@ -1,5 +1,6 @@
 """Runs the weld job of a scenario and writes its results; for `demo`, live calibration and `weld`."""
 
+from weldcal.models.result_files import whole_result
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.runner import Progress, Run, no_progress
@@ -68,22 +69,27 @@ def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = n
 def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") -> DemoResult:
     """Compare the run with the ground truth of its simulation."""
     cell, status = run.cell, run.cell.job.calibration_status(run.root)
-    error = None if status.estimate is None else live_calibration_error(cell, status.estimate)
+    error = (
+        None
+        if status.estimate is None
+        else live_calibration_error(cell, status.estimate, status.arm_or(cell.station.arm))
+    )
     return DemoResult(options, run, status, error, weld_outcome(cell, run.root), robot)
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:
     """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, summary.json, report.html."""
     folder, run = result.folder, result.run
-    folder.mkdir(parents=True, exist_ok=True)
-    write_calibration(run.cell, result.status, result.options.seed, folder)
-    write_scans(run, result.status, folder / SCANS, result.robot)
-    if result.weld is not None:
-        record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
-        write_weld_log(record, folder)
-    finished.write_recording(folder)
-    pictures = demo_pictures(result)
-    for name, picture in pictures.items():
-        write_atomic(folder / "plots" / f"{name}.svg", picture)
-    write_json(folder / SUMMARY, result.summary())
-    write_atomic(folder / "report.html", demo_report(result, pictures, recording=finished.meshcat is not None))
+    with whole_result(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_calibration(run.cell, result.status, result.options.seed, folder)
+        write_scans(run, result.status, folder / SCANS, result.robot)
+        if result.weld is not None:
+            record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
+            write_weld_log(record, folder)
+        finished.write_recording(folder)
+        pictures = demo_pictures(result)
+        for name, picture in pictures.items():
+            write_atomic(folder / "plots" / f"{name}.svg", picture)
+        write_json(folder / SUMMARY, result.summary())
+        write_atomic(folder / "report.html", demo_report(result, pictures, recording=finished.meshcat is not None))

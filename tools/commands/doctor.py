@@ -19,6 +19,7 @@ from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import STANDARDS, FlangeStandard, get_flange
+from weldcal.models.result_files import require_whole
 from weldcal.systems.cell import Cell
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.dataset_case import dataset_case
@@ -45,6 +46,7 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
     if path.suffix == ".mcap":
         return worded("recording", _recorded(path, progress))
     folder = path if path.is_dir() else path.parent
+    require_whole(folder)
     of_weld = _of_weld(folder)
     if (folder / NAME).is_file():
         return worded("result", _both(diagnose(read_case(folder / NAME)), of_weld))

@@ -1,6 +1,6 @@
 """`weldcal finger calibrate`: intrinsics from pictures of a board, tag, seat and stiffness from touches on a known plate."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.commands.print_board import Board
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, Tolerance, check_limit
+from weldcal.tools.report.render import render, write_atomic
 from weldcal.welding.servo.deformation import TagModel, TagObservation, deflection_from_tag, detect_tag
 from weldcal.welding.servo.finger_calibration import (
     Intrinsics,
@@ -30,6 +31,7 @@ from weldcal.welding.servo.finger_calibration import (
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 COLUMNS = ("x_mm", "y_mm", "z_mm")
 FORCES = ("fx_n", "fy_n", "fz_n")
+_NO_TOUCHES = "Only the camera is calibrated: without touches nothing says how exactly the tip is measured."
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,51 @@ class FingerReport:
     without_board: tuple[str, ...]
     tag_size_mm: float | None = None
     tag_at_rest_mm: tuple[float, ...] | None = None  # p_KM
+    touches: int = 0
+    limit_mm: float | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. There is no work point: the error of a touch that the fit did not use stands in its place; without touches
+        the reprojection of pictures that were left out."""
+        c, tip = self.camera, self.tip
+        concerns = [] if tip is None else [f"Open: {text}" for text in tip.unknown]
+        lost = f"The board was not found in {len(self.without_board)} pictures ({', '.join(self.without_board[:4])})."
+        notes = [lost] if self.without_board else []
+        pictures = (
+            f"{c.held_out} of {c.held_out + c.used} pictures were left out of the fit: {c.held_out_px:.3f} px rms"
+        )
+        more = {
+            "camera": f"focal length {c.K[0, 0]:.2f}, {c.K[1, 1]:.2f} px, +- {c.focal_sigma_px:.2f}; centre {c.K[0, 2]:.2f}, {c.K[1, 2]:.2f} px",
+            "pose": "none is computed; the tool file states that of the camera",
+        }
+        if self.tag_at_rest_mm is not None:
+            more["tag at rest"] = "({:.3f}, {:.3f}, {:.3f}) mm in the camera".format(*self.tag_at_rest_mm)
+        if tip is None:
+            found = Findings(unseen=c.held_out, concerns=concerns, notes=notes, no_tolerance=_NO_TOUCHES)
+            after = Next(
+                "Touch a plate at known displacements, a picture each, and calibrate again with --touches FILE."
+            )
+            return FirstScreen(
+                found,
+                Expected("reprojection of pictures left out", f"{c.held_out_px:.3f} px", pictures),
+                after,
+                (),
+                more,
+            )
+        error, what = 1e3 * tip.held_out_m, "error of a touch, median"
+        tolerance = None if self.limit_mm is None else Tolerance(f"the {what},", error, self.limit_mm, "--limit-mm")
+        found = Findings(tolerance=tolerance, unseen=self.touches, concerns=concerns, notes=notes)
+        expected = Expected(
+            what,
+            f"{error:.3f} mm",
+            f"of {self.touches} touches, each left out of the fit; too few for a 95 % figure. {pictures}",
+        )
+        after = Next(
+            "Name the finger.yaml in the tool file, and see the tag in pictures of the cell.",
+            "weldcal check-cell SCENARIO",
+        )
+        return FirstScreen(found, expected, after, (), more)
 
     def document(self) -> dict[str, Any]:
         """The contents of finger.yaml, and the JSON object of the command."""
@@ -78,14 +125,23 @@ class FingerReport:
 
 
 def calibrate_finger(
-    folder: Path, board: Path, touches: Path | None, out: Path, tool: Path | None = None
+    folder: Path,
+    board: Path,
+    touches: Path | None,
+    out: Path,
+    tool: Path | None = None,
+    limit_mm: float | None = None,
 ) -> FingerReport:
-    """Calibrate from a folder of pictures of the board, and a table of touches with a picture each; writes finger.yaml to `out`.
+    """Calibrate from a folder of pictures of the board, and a table of touches with a picture each; writes finger.yaml and report.html
+    to `out`. `limit_mm` is the error of a touch that the job allows.
     `tool` is the file of the tool that carries the tag; None: the welding tool.
 
     Raises:
         InputError: what was given cannot be used; nothing is written.
     """
+    check_limit(limit_mm)
+    if limit_mm is not None and touches is None:
+        raise InputError("--limit-mm is measured by touches: give them with --touches, or omit it.")
     opencv = read_board(board).opencv()
     carrier = load_tool(WELDING if tool is None else tool).tool
     names = sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES) if folder.is_dir() else []
@@ -105,9 +161,34 @@ def calibrate_finger(
     report = FingerReport(camera, None, tuple(without))
     if touches is not None:
         report = _with_touches(report, touches, size, carrier)
+    report = replace(report, limit_mm=limit_mm)
     out.mkdir(parents=True, exist_ok=True)
+    write_atomic(out / "report.html", finger_page(report, folder))
     write_atomic(out / "finger.yaml", yaml.safe_dump(report.document(), sort_keys=False))
     return report
+
+
+def finger_page(report: FingerReport, folder: Path) -> str:
+    """The report as one self-contained HTML text."""
+    c, t = report.camera, report.tip
+    rows = [
+        ("reprojection, rms, of the pictures used", f"{c.rms_px:.3f} px"),
+        ("of the pictures left out", f"{c.held_out_px:.3f} px"),
+        ("distortion", ", ".join(f"{v:.5f}" for v in c.distortion)),
+    ]
+    if t is not None and report.tag_size_mm is not None:
+        seat = ", ".join("open" if np.isnan(v) else f"{1e3 * v:.3f}" for v in t.seat_m)
+        turn = "open" if t.rotation_deg is None else f"{t.rotation_deg:.2f} deg"
+        rows += [
+            ("tag", f"{report.tag_size_mm:.3f} mm, +- {report.tag_size_mm * t.scale_sigma / t.scale:.3f}"),
+            ("seat in the tool's axes", f"{seat} mm"),
+            ("turn of the camera's displacements", turn),
+            *((f"stiffness along {axis}", f"{1e-3 * v:.2f} N/mm") for axis, v in t.stiffness_N_per_m.items()),
+        ]
+    return render(
+        "finger.html.j2", first=report.first, folder=folder.name, rows=rows, unknown=[] if t is None else t.unknown,
+        without_board=report.without_board,
+    )  # fmt: skip
 
 
 def read_board(path: Path) -> Board:
@@ -163,7 +244,7 @@ def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool
     assert rest is not None
     assert rest.X_KM is not None
     at_rest = tuple(float(1e3 * v / tip.scale) for v in rest.X_KM.translation())
-    return FingerReport(camera, tip, report.without_board, 1e3 * tag.size_m / tip.scale, at_rest)
+    return FingerReport(camera, tip, report.without_board, 1e3 * tag.size_m / tip.scale, at_rest, len(pressed))
 
 
 def _number(table: Path, line: int, row: dict[str, str], key: str) -> float:

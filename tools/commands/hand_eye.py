@@ -20,13 +20,16 @@ from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.motion.pose_streams import is_stream_file, read_streams, synchronise
+from weldcal.calibration.motion.stream_file import is_stream_file
 from weldcal.calibration.planning.next_pose import next_pose
 from weldcal.calibration.planning.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
+from weldcal.tools.outcomes.first_screen import check_limit
 from weldcal.tools.outcomes.hand_eye import HandEyeReport, MethodRow
+from weldcal.tools.report.hand_eye import hand_eye_report
+from weldcal.tools.report.render import write_atomic
 
 EQUATIONS = ("ax-xb", "ax-yb", "axb-ycz")
 
@@ -45,20 +48,22 @@ def run_hand_eye(
     refine: str | None = None,
     kinematics: Path | None = None,
     seed: int = 0,
+    limit_mm: float | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> HandEyeReport:
-    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved.
+    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved. Writes report.html besides the exports.
 
     ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the scanner, for
     the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and robot errors is applied:
     the robot's errors are sought in the poses that the corners left); ``kinematics``: file of that robot's own kinematics, whose poses
-    at the joint angles replace the stated ones.
+    at the joint angles replace the stated ones. ``limit_mm`` is the held-out error at the target, 95 %, that the job allows.
 
     Raises:
         InputError, WeldcalError: the file or the options cannot be used. Where the poses contradict each other, the
             sentence names the mistake (unit, inverse, mounting) whose correction makes them agree, if there is one.
     """
     begin = time.perf_counter()
+    check_limit(limit_mm)
     if equation not in EQUATIONS:
         raise InputError(f"There is no equation '{equation}'. Choose one of {', '.join(EQUATIONS)}.")
     if kinematics is not None and robot is None:
@@ -71,6 +76,8 @@ def run_hand_eye(
     if is_stream_file(file):
         if unit not in (None, "m") or motions:
             raise InputError("Two streams of poses are in metres; omit --unit and --motions.")
+        from weldcal.calibration.motion.pose_streams import read_streams, synchronise
+
         streams = synchronise(read_streams(file), mounting=mounting or "eye_in_hand", source=file.name)
         say(streams.sentence)
     pairs = read_pairs(file, mounting=mounting, length=unit) if streams is None else streams.pairs
@@ -120,7 +127,11 @@ def run_hand_eye(
     provenance = Provenance(file.name, sha256(_file(file).read_bytes()).hexdigest())
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
-    return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said), sentence, streams)
+    report = HandEyeReport(
+        result, found, comparison, advice, files, seconds, " ".join(said), sentence, streams, limit_mm, out
+    )
+    write_atomic(out / "report.html", hand_eye_report(report, file.name, provenance.sha256))
+    return report
 
 
 def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, optional: bool) -> CornerRefinement | None:

@@ -28,6 +28,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.monitor import causes, rate_checked, recalibrated_result, told_apart
 from weldcal.tools.commands.run import JobRun, run_job
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next
 from weldcal.tools.outcomes.monitor import MonitorReport, drift_document
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.monitor import monitor_page
@@ -51,6 +52,22 @@ class LiveMonitor:
         run = self.finished.run
         job: AddedMotion = run.cell.job
         return job.drift(run.root).events
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen; a held run decides against the calibration only where a move was found."""
+        run = self.finished.run
+        held = [run.reason or "The job was held."] if run.held else []
+        if self.report is None:
+            found = Findings(against=held or ["No frame showed the flange."], unseen=0)
+            after = Next("See that the scanner streams and sees the flange, then watch again.")
+            return FirstScreen(
+                found, Expected("error of the tracked flange, 95 %", "not known", "no frame showed it"), after
+            )
+        first = self.report.first
+        if not held:
+            return first
+        return replace(first, found=replace(first.found, against=[*held, *first.found.against]))
 
     def summary(self) -> dict[str, Any]:
         """The JSON object: the run, then what `monitor` says of a recording, which it ends with."""

@@ -17,9 +17,13 @@ from weldcal.systems.jobs.motion.messages import MotionRecord
 from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
+from weldcal.tools.console import rows as console_rows
 from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.outcomes.motion import motion_screen
 from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import render, write_atomic
+from weldcal.tools.report.robot_timing import robot_timing
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +62,24 @@ class MotionOutcome:
             stepped = log.sample_times() - world.plant.time_step()
             behind = follower_delay(stepped, log.data()[:6].T, self.record)
         return {int(n): float(t) - behind for n, t in zip(numbers, times, strict=True) if n}
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen: of the estimate as `calibrate` gives it on the same recording."""
+        e, run = self.estimate, self.run
+        against = [run.reason or "The job was held."] if run.held else []
+        if e is None:
+            expected = Expected("error in the middle of the frames, 95 %", "not known", "there is no calibration")
+            found = Findings(against=against or ["There is no calibration."], unseen=0)
+            return FirstScreen(
+                found, expected, Next("Settle the reason, then run the job again."), more={"pose": "none was found"}
+            )
+        seen = self.record.seen
+        p_C = np.array([fit.center_C for _, fit in seen])
+        return motion_screen(
+            calibration_result(self, e), e, p_C, self.record.refused, self.folder, None, against,
+            "No scenario key states the error that is allowed: compare it with what your job allows.",
+        )  # fmt: skip
 
     def truth(self) -> dict[str, object]:
         """Errors against the simulation: X_BC at the cube's centre, and the clock's offset (mean over the frames)."""
@@ -124,7 +146,7 @@ def follower_delay(t: Array, joints: Array, record: MotionRecord) -> float:
 
 
 def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MotionOutcome:
-    """Run the job; write calibration.yaml with its exports, run.json and the recordings. Raises as run_job."""
+    """Run the job; write calibration.yaml with its exports, report.html, run.json and the recordings. Raises as run_job."""
     job = scenario.part(MotionJob)
     if job is not None and job.record:
         job.recording_folder = str(options.out / "recording")
@@ -142,6 +164,12 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
         stream, scanner = posed_stream(record, finished.cell.station.arm), scenario.scanner_config()
         assert scanner is not None
         added.recorder.finish(stream, scenario.arm, scenario.flange_name(), scanner.scanner())
+    page = render(
+        "motion_live.html.j2", first=outcome.first, scenario=options.scenario, description=scenario.description,
+        rows=[(k, str(v)) for k, v in console_rows(outcome.summary()).items() if v], recording=finished.meshcat is not None,
+        **robot_timing(finished.run),
+    )  # fmt: skip
+    write_atomic(options.out / "report.html", page)
     write_atomic(options.out / "run.json", json.dumps(outcome.summary(), indent=1) + "\n")
     finished.write_recording(options.out)
     return outcome

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import write_atomic
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.run import run_job
@@ -63,5 +64,5 @@ def write_example(folder: Path, seed: int, progress: Progress = no_progress, for
     text = OTHER.format(folder=folder, form=form, files=FILES[form]) if form else README.format(folder=folder)
     if form:
         rewrite(folder, form)
-    (folder / "README.md").write_text(text, encoding="utf-8")
+    write_atomic(folder / "README.md", text)
     return written

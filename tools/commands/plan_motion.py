@@ -14,6 +14,7 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import closed_moves, recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import write_atomic
 from weldcal.systems.jobs.motion.config import MotionJob
 from weldcal.systems.jobs.motion.job import plan_corners
 from weldcal.systems.runner import Progress
@@ -74,7 +75,7 @@ def plan_motions(
     write_json(out / "plan.json", result)
     if best.corners_deg:
         speed = (loaded.part(MotionJob) or MotionJob()).speed_m_s
-        (out / "best.script").write_text(_script(best, speed), encoding="utf-8")
+        write_atomic(out / "best.script", _script(best, speed))
     return result | {"written_to": str(out)}
 
 

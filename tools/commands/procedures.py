@@ -14,6 +14,8 @@ from weldcal.tools.commands.motion_live import run_motion_live
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
+from weldcal.tools.commands.touch_live import run_touches
+from weldcal.tools.outcomes.first_screen import FirstScreen
 from weldcal.tools.outcomes.options import RunOptions
 
 
@@ -35,6 +37,7 @@ RUNNERS: dict[str, Runner] = {
     "mounting": run_mounting_live,
     "motion": run_motion_live,
     "profiler_job": run_profiler_live,
+    "touch": run_touches,
 }
 
 
@@ -53,11 +56,14 @@ def run_procedure(options: RunOptions, progress: Progress) -> Outcome:
     return RUNNERS.get(kind_of(scenario), run_any)(scenario, options, progress)
 
 
-def calibrate_live(options: RunOptions, progress: Progress) -> dict[str, object]:
-    """Run `calibrate --scenario` and return its JSON object: the mounting or motion job, or only the calibration of the weld job."""
+def calibrate_live(options: RunOptions, progress: Progress) -> tuple[dict[str, object], FirstScreen]:
+    """Run `calibrate --scenario`: the mounting or motion job, or only the calibration of the weld job; JSON object and first screen."""
     scenario = load_scenario(options.scenario)
     if kind_of(scenario) == "mounting":
-        return run_mounting_live(scenario, options, progress).summary()
+        mounted = run_mounting_live(scenario, options, progress)
+        return mounted.summary(), mounted.first
     if kind_of(scenario) == "motion":
-        return run_motion_live(scenario, options, progress).summary()
-    return run_calibration_live(options, progress).calibration_summary()
+        moved = run_motion_live(scenario, options, progress)
+        return moved.summary(), moved.first
+    found = run_calibration_live(options, progress)
+    return found.calibration_summary(), found.first

@@ -68,7 +68,11 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
         scenario.job.speed_factor = options.speed_factor
         check_scenario(scenario)
     meshcat = None
+    from threadpoolctl import threadpool_limits
+
     with (
+        # The products of a tick are small: a second thread waits busily for the next one and takes a core from the robot's peer.
+        threadpool_limits(1, user_api="blas"),
         chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot,
         person_at() as person,
     ):

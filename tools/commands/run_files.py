@@ -12,6 +12,9 @@ from weldcal.calibration.data.results import CalibrationResult, PoseRecord, expo
 from weldcal.calibration.doctor.case import Case
 from weldcal.calibration.doctor.record import case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
+from weldcal.calibration.eye_on_base.stated_error import orientations_of
+from weldcal.calibration.refinement.refined import KINEMATICS_FILE
+from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import feature_standard
@@ -32,9 +35,10 @@ PHASE_NAMES = [str(phase) for phase in Phase]
 
 def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> CalibrationResult | None:
     """The live calibration in the form that `weldcal calibrate` writes; None without an estimate."""
-    estimate = status.estimate
+    estimate, refinement = status.estimate, status.refinement
     if estimate is None:
         return None
+    inliers = [o for o, keep in zip(status.observations, estimate.inliers, strict=True) if keep]
     scanner = cell.scenario.scanner_config()
     records = [_record(observation.id, estimate, k) for k, observation in enumerate(status.observations)]
     records += [PoseRecord(id=label, used=False, reason=reason) for label, reason in status.refused]
@@ -45,7 +49,7 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
         tilt_deg={"median": live_errors(np.degrees(estimate.held_out.tilt_rad)).get("median")},
         poses=tuple(records),
         unobservable=estimate.unobservable,
-        warnings=estimate.warnings,
+        warnings=estimate.warnings if refinement is None else (*estimate.warnings, refinement.sentence),
         robot=cell.scenario.arm,
         flange=cell.scenario.calibration.feature,
         scanner="" if scanner is None else scanner.scanner().name,
@@ -54,6 +58,13 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
         seed=seed,
         scanner_correction=None if estimate.scanner is None else estimate.scanner.document(),
         joint_covariance=estimate.joint,
+        orientations=orientations_of(inliers, cell.job.X_FR),
+        observed=observed_document(
+            inliers, cell.job.X_FR, [q for q, keep in zip(status.joints, estimate.inliers, strict=False) if keep]
+        ),
+        local_field=None if refinement is None or refinement.local_field is None else refinement.local_field.document(),
+        arm_errors=None if refinement is None else refinement.arm_errors,
+        kinematics_file=KINEMATICS_FILE if refinement is not None and refinement.kinematics else "",
     )
 
 
@@ -76,6 +87,8 @@ def write_calibration(cell: Cell[WeldJob], status: CalibrationStatus, seed: int,
     if result is None:
         return None
     export_all(result, folder)
+    if status.refinement is not None and status.refinement.kinematics:
+        write_atomic(folder / KINEMATICS_FILE, status.refinement.kinematics)
     return save_result(result, folder)
 
 

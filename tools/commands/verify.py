@@ -102,7 +102,7 @@ def verify_dataset(
         limit_mm = stated_median_limit(calibration, [observations[k] for k in new], correction, spread, ours)
         source = f"which {100 * FALSE_ALARM:.0f} % of verifications of a calibration as good as it states exceed"
     else:
-        source = "as given"
+        source = "as given with --limit-mm"
     diagnostics = [*differences, *gross, *uncorrected, *_alike(data, observations)]
     verdict = _verdict([poses[k] for k in new], limit_mm, source, diagnostics)
     warnings = (
@@ -122,6 +122,8 @@ def verify_dataset(
         data.hashes,
         Path(out),
         verdict,
+        source,
+        str(dataset),
     )
     tell("writing the report", 0.9)
     write_atomic(Path(out) / "report.html", verify_report(report, dataset=Path(dataset).resolve().name))

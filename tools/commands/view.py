@@ -4,6 +4,7 @@ import webbrowser
 from pathlib import Path
 
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import require_whole
 
 PAGES = ("report.html", "recording.html")
 
@@ -16,6 +17,7 @@ def find_pages(result: Path) -> list[Path]:
     """
     if not result.exists():
         raise InputError(f"There is no {result}. Give the result folder of a weldcal command.")
+    require_whole(result)
     candidates = [result] if result.is_file() else [result / name for name in PAGES]
     pages = [page.resolve() for page in candidates if page.is_file() and page.suffix == ".html"]
     if not pages:

@@ -21,7 +21,7 @@ from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
-from weldcal.systems.viewer.phase_labels import (
+from weldcal.systems.phase_words import (
     MOTION_STEPS,
     MOUNTING_STEPS,
     PROFILER_STEPS,

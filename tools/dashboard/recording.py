@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from weldcal.systems.cell import Cell
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
-from weldcal.systems.viewer.cameras import ZOOM
+from weldcal.systems.viewer.cameras import CAMERAS, ZOOM
 from weldcal.systems.viewer.live import LiveView
-from weldcal.systems.viewer.phase_labels import CAMERAS
 from weldcal.systems.viewer.scene import RESIDUAL_MM, legend
 from weldcal.tools.dashboard.facts import facts_of
-from weldcal.tools.dashboard.values import phase_text, scan_rows, weld_rows
+from weldcal.tools.dashboard.values import scan_rows, weld_rows
 
 _PAGE = Path(__file__).parent / "page"
 _ROWS = 1500  # of the weld, in the page
@@ -38,7 +38,7 @@ def _told(cell: Cell[Any], run: Run[Any], live: LiveView, title: str) -> dict[st
     places = [[p.time, p.view, p.eye, p.target] for p in live.views.places]
     return {
         "title": title,
-        "phases": [[t, phase_text(name)] for name, t, _ in run.phases],
+        "phases": [[t, phase_words(name)] for name, t, _ in run.phases],
         "legends": [
             [t, [k._asdict() for k in legend(name, 0)] if words or live.weld else []] for name, t, _ in run.phases
         ],

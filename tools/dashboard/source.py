@@ -7,6 +7,7 @@ from collections import deque
 from typing import Any
 
 from weldcal.systems.person import Person
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.viewer.live import LiveView
 from weldcal.tools.dashboard.facts import Facts
 from weldcal.tools.dashboard.panels import panel, stage_of
@@ -19,7 +20,6 @@ from weldcal.tools.dashboard.values import (
     STARTING,
     STOPPING,
     left_s,
-    phase_text,
     scan_rows,
     scan_values,
     scene_values,
@@ -139,7 +139,7 @@ class DashboardSource:
         moment = self.live.moment
         if moment.time <= 0.0:
             return self._stage
-        return phase_text(moment.command.phase) if "calibration_status" in moment.shown else self._stage
+        return phase_words(moment.command.phase) if "calibration_status" in moment.shown else self._stage
 
     def picture(self) -> bytes | None:
         """The newest scan or picture as a PNG, or None."""

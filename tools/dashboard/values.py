@@ -9,9 +9,8 @@ from typing import Any
 from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
-from weldcal.systems.viewer.cameras import FOLLOW, Views
+from weldcal.systems.viewer.cameras import CAMERAS, FOLLOW, Views
 from weldcal.systems.viewer.live import ACTIVE, Moment, ScanRow, WeldRow
-from weldcal.systems.viewer.phase_labels import CAMERAS, TEXT
 from weldcal.systems.viewer.scene import RESIDUAL_MM, WELDING_PHASES, Key, legend, uncertainty_at
 from weldcal.tools.dashboard.facts import SCAN, Facts
 from weldcal.tools.dashboard.panels import stage_of
@@ -31,11 +30,6 @@ def mm(metres: float, digits: int = 3) -> float | None:
 def number(value: float, digits: int = 3) -> float | None:
     """A number for JSON, rounded; None for one that is not finite."""
     return round(value, digits) if math.isfinite(value) else None
-
-
-def phase_text(phase: str) -> str:
-    """A phase in words."""
-    return TEXT.get(phase, phase.replace("_", " "))
 
 
 def steps(facts: Facts, phase: str) -> list[dict[str, str]]:

@@ -1,13 +1,13 @@
 """The results that the reports of `calibrate` and `verify` show, and their JSON objects."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import CalibrationResult, matrix4
+from weldcal.calibration.data.results import CalibrationResult, correction_note, matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.nested import bootstrap_interval, mean_interval
 from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
@@ -21,7 +21,23 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.models.robots import get_robot
-from weldcal.tools.outcomes.poses import WorkPoint, work_point_error
+from weldcal.tools.outcomes.first_screen import (
+    CARE,
+    DO_NOT,
+    ENOUGH_UNSEEN,
+    USE,
+    Expected,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    refused_note,
+    work_point_expected,
+)
+from weldcal.tools.outcomes.poses import SCANNER, WorkPoint, work_point_error
+
+__all__ = ["CARE", "DO_NOT", "NONE", "USE", "CalibrationReport", "Verdict", "VerifyReport", "error_summary"]
 
 
 def error_summary(values: Array) -> dict[str, float]:
@@ -68,7 +84,8 @@ class Algorithm1Outcome:
 @dataclass(frozen=True)
 class CalibrationReport:
     """The result of `weldcal calibrate`: the estimate, the records written, and the folder. ``observations`` include the
-    scanner correction where one was accepted; ``notes`` say in which form the dataset was read."""
+    scanner correction where one was accepted; ``notes`` say in which form the dataset was read; ``limit_mm`` is the error that the
+    job allows (None: not stated)."""
 
     result: CalibrationResult
     estimate: CalibrationEstimate
@@ -86,6 +103,44 @@ class CalibrationReport:
     patterns: dict[str, HolePattern] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     refinement: dict[str, Any] | None = None
+    limit_mm: float | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. The error is the larger of two at 95 %: the calibration's own at the work point, and the held-out one."""
+        r, work = self.result, self.work_point
+        said = self._remarks
+        # what is not observable and matters to X_BC is among the warnings
+        concerns = [text for text in r.warnings if text not in said]
+        expected, figure = work_point_expected(work)
+        tolerance = None
+        if self.limit_mm is not None:
+            tolerance = Tolerance("the error at the work point, 95 %,", figure, self.limit_mm, "--limit-mm")
+        notes = [*filter(None, (correction_note(r),)), *refused_note(self.refused, len(r.poses)), *self._refined]
+        found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
+        return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),))
+
+    @property
+    def _remarks(self) -> list[str]:
+        """Those of the warnings that tell what was done, not what could be wrong."""
+        applied = self.scanner is not None and self.scanner.accepted is not None
+        return [*([self.scanner.sentence] if applied and self.scanner is not None else []), *self._refined]
+
+    @property
+    def _refined(self) -> list[str]:
+        """What --refine found and applied."""
+        return [] if self.refinement is None else [str(self.refinement["sentence"])]
+
+    def _next(self, tolerance: Tolerance | None, concerns: Sequence[str]) -> Next:
+        missed = tolerance is not None and not tolerance.met
+        if self.advice and (missed or self.work_point.unseen_poses < ENOUGH_UNSEEN):
+            return Next(f"{' '.join(self.advice[:2])} Then calibrate again.")
+        if concerns:
+            return Next(
+                "See what disturbs the scans, then verify on scans that the calibration has not seen.",
+                f"weldcal doctor {self.out}",
+            )
+        return Next("Take four or more new scans, and verify with them.", f"weldcal verify {self.out} NEW_SCANS")
 
     @property
     def work_point(self) -> WorkPoint:
@@ -162,6 +217,11 @@ class CalibrationReport:
         }
 
 
+def scanner_pose(result: CalibrationResult) -> ShownPose:
+    """The result's pose with its frames in words."""
+    return ShownPose(result.symbol, SCANNER[result.symbol], result.X_BC)
+
+
 def interval_rows(what: str, errors_mm: Array) -> dict[str, str]:
     """Median and 95 % of errors (n,) mm, each beside the interval of as many new ones; {} for fewer than four."""
     rows = {}
@@ -184,7 +244,7 @@ class PoseError:
     used_before: bool
 
 
-USE, CARE, DO_NOT, NONE = "use it", "use with care", "do not use", "not a verification"
+NONE = "not a verification"
 
 
 @dataclass(frozen=True)
@@ -216,6 +276,46 @@ class VerifyReport:
     hashes: dict[str, str]
     out: Path
     verdict: Verdict
+    source: str = ""
+    dataset: str = "NEW_SCANS"
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen; its verdict is this command's own, on the new scans. What is no verification says so."""
+        v, r = self.verdict, self.result
+        new = np.array([p.error_mm for p in self.poses if not p.used_before])
+        reason = f"This is no verification. {v.reason}" if v.verdict == NONE else v.reason
+        settled = (CARE if v.verdict == NONE else v.verdict, reason)
+        tolerance = None
+        if v.limit_mm is not None and len(new):
+            tolerance = Tolerance("the median error of the new scans", float(np.median(new)), v.limit_mm, self.source)
+        found = Findings(
+            tolerance=tolerance,
+            unseen=len(new),
+            concerns=self.warnings,
+            notes=tuple(filter(None, (correction_note(r),))),
+            settled=settled,
+        )
+        if len(new):
+            what = f"{len(new)} new scan{'' if len(new) == 1 else 's'}, which the calibration did not use"
+            expected = Expected(
+                "error at the flange, 95 %",
+                f"{np.percentile(new, 95):.3f} mm",
+                f"of {what}; median {np.median(new):.3f} mm",
+            )
+        else:
+            expected = Expected("error at the flange, 95 %", "not known", "every scan here was used in the calibration")
+        return FirstScreen(found, expected, self._next(), (scanner_pose(r),))
+
+    def _next(self) -> Next:
+        v = self.verdict
+        if v.verdict == USE:
+            return Next("Use X_BC. Verify again after any knock, and after work at the robot or the scanner.")
+        if v.verdict == DO_NOT:
+            return Next("See what has changed, then calibrate again.", f"weldcal doctor {self.dataset}")
+        if v.verdict == NONE or sum(not p.used_before for p in self.poses) < ENOUGH_UNSEEN:
+            return Next("Take four or more new scans across the work space, and verify with them.")
+        return Next("Settle what could be wrong, then verify again.", f"weldcal doctor {self.dataset}")
 
     @property
     def position_error_mm(self) -> dict[str, float]:

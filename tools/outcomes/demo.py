@@ -11,9 +11,19 @@ from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.outcomes.first_screen import (
+    Expected,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    refused_note,
+    work_point_expected,
+)
 from weldcal.tools.outcomes.monitor import drift_document
 from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.poses import work_point_error
+from weldcal.tools.outcomes.poses import SCANNER, work_point_error
 from weldcal.tools.outcomes.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
 from weldcal.welding.record.process import PathError
 
@@ -59,6 +69,84 @@ class DemoResult:
         sequencer = self.run.cell.job.sequencer
         return sequencer.job_state(sequencer.GetMyContextFromRoot(self.run.root)).warnings
 
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen: of the calibration, by the job's own required error; of a weld alone, whether it was welded."""
+        scenario, status = self.run.cell.scenario, self.status
+        estimate, c = status.estimate, self.run.cell.scenario.calibration
+        against = [self.run.reason or "The job was held."] if self.state == "held" else []
+        more = self._welded()
+        if estimate is None:
+            found = Findings(
+                against=against,
+                no_tolerance="No scenario key states how far the torch may be off: compare the error below with what your joint allows.",
+                concerns=self.warnings,
+            )
+            more["pose"] = (
+                "none was computed: X_BC is the scenario's" if not scenario.job.calibrate else "none was found"
+            )
+            none = Expected("error at the work point, 95 %", "not known", "there is no calibration")
+            return FirstScreen(
+                found, none if scenario.job.calibrate else self._torch(), self._next(), (), more, self._lead()
+            )
+        work = work_point_error(estimate, work_point(scenario))
+        expected, _ = work_point_expected(work)
+        for v in status.verifications:
+            limit = f"limit {c.verification_limit_mm:g} mm, calibration.verification_limit_mm"
+            backing = f"{expected.backing}; at '{v.label}', held out by the job: {1e3 * v.error_m:.3f} mm ({limit})"
+            expected = Expected(expected.what, expected.figure, backing)
+        tolerance = Tolerance(
+            "the expected error at the work point, one sigma,", 1e3 * status.predicted_error_m, c.required_error_mm,
+            "calibration.required_error_mm",
+        )  # fmt: skip
+        # what is not observable and matters to X_BC is among the warnings
+        concerns = (*self.warnings, *estimate.warnings)
+        notes = [*refused_note(status.refused, self.n_scans)]
+        if estimate.scanner is not None:
+            # as calibration.yaml says to programs that use X_BC
+            notes.insert(
+                0,
+                f"X_BC applies to corrected scanner points: multiply every point, in metres, by {estimate.scanner.formula}.",
+            )
+        found = Findings(against, tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
+        pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
+        return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())
+
+    def _lead(self) -> str:
+        if self.weld is None or self.weld.speed is None or self.state != "done":
+            return ""
+        return f"{1e3 * self.weld.speed.welded_m:.0f} mm of seam are welded."
+
+    def _welded(self) -> dict[str, str]:
+        """The torch's error where a simulation knows it, as a row."""
+        if self.weld is None or self.weld.error is None:
+            return {}
+        torch = self._torch()
+        return {"torch": f"{torch.figure} ({torch.backing})"} if self.status.estimate is not None else {}
+
+    def _torch(self) -> Expected:
+        """The torch's distance from the true seam."""
+        if self.weld is None or self.weld.error is None:
+            return Expected("torch off the seam", "not known", "the true seam is known in simulation only")
+        distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
+        backing = (
+            f"95 % of the weld; mean {distance.mean():.3f}, at most {distance.max():.3f} mm; known in simulation only"
+        )
+        return Expected("torch off the seam", f"{np.percentile(distance, 95):.3f} mm", backing)
+
+    def _next(self) -> Next:
+        folder, robot = self.folder, self.robot != "simulated"
+        if self.state == "held":
+            return Next(
+                "Settle the reason; nothing goes on by itself. The doctor looks at scans and weld.",
+                f"weldcal doctor {folder}",
+            )
+        if self.weld is not None and robot:
+            return Next("Look at the weld and at its log, weld.csv.", f"weldcal view {folder}")
+        if self.weld is not None:
+            return Next("See it again; then try your own part.", f"weldcal view {folder}")
+        return Next("Verify with scans that the calibration has not seen.", f"weldcal verify {folder} NEW_SCANS")
+
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""
         found: dict[str, object] = {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
@@ -79,6 +167,13 @@ class DemoResult:
             found["work_point"] = work_point_error(self.status.estimate, work_point(self.run.cell.scenario)).document()
             found["expected_error_mm"] = 1e3 * self.status.predicted_error_m
             found["held_out_mm"] = live_errors(1e3 * self.status.estimate.held_out.position_m)
+            if self.status.refinement is not None:
+                refinement = self.status.refinement
+                found["refinement"] = refinement.document or {
+                    "kind": refinement.kind,
+                    "accepted": False,
+                    "sentence": refinement.sentence,
+                }
             found["verification_mm"] = [1e3 * v.error_m for v in self.status.verifications]
         found["n_scans"] = self.n_scans
         found["refused"] = [{"id": id, "reason": reason} for id, reason in self.status.refused]

@@ -1,7 +1,10 @@
 """The result of `weldcal hand-eye`: poses with their uncertainty, the comparison of methods, the next pose."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,9 +12,12 @@ from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
-from weldcal.calibration.motion.pose_streams import Synchronised
 from weldcal.calibration.planning.next_pose import NextPose
 from weldcal.models.arrays import Array
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+
+if TYPE_CHECKING:
+    from weldcal.calibration.motion.pose_streams import Synchronised
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,27 @@ class HandEyeReport:
     corners: str = ""
     advice: str = ""
     streams: Synchronised | None = None
+    limit_mm: float | None = None
+    folder: Path | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. Pose pairs have no work point: the held-out error at the target stands in its place."""
+        r = self.result
+        expected, p95, n = held_out_error(r)
+        tolerance = None
+        if self.limit_mm is not None:
+            tolerance = Tolerance(f"the {expected.what},", p95, self.limit_mm, "--limit-mm")
+        outliers = int((~r.inliers).sum())
+        notes = (
+            [f"{outliers} of {len(r.inliers)} poses disagree with the others and were not used."] if outliers else []
+        )
+        concerns = [*(f"Not observable: {text}" for text in r.unobservable), *r.warnings]
+        found = Findings(tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
+        after = Next(f"To know it better, add a pose. {self.advice}") if self.advice else Next(
+            "Compare with poses that were not in the file: the target must stay where the result puts it."
+        )  # fmt: skip
+        return FirstScreen(found, expected, after, shown_poses(r, self.mounting))
 
     def summary(self) -> dict[str, object]:
         """The JSON object of the command."""
@@ -122,3 +149,27 @@ def _held_out(held_out: HandEyeHeldOut, of: str) -> str:
 
 def _sigmas(values: Array, certain: float) -> str:
     return "  ".join("open" if v > certain else f"{v:.3f}" for v in values)
+
+
+def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
+    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and their number."""
+    held = 1e3 * r.held_out.translation[r.inliers]
+    held = held[np.isfinite(held)]
+    what = "held-out error at the target, 95 %"
+    if not len(held):
+        return (
+            Expected(what, "not known", "too few poses to leave any out; it stands in place of a work point"),
+            float("nan"),
+            0,
+        )
+    p95 = float(np.percentile(held, 95))
+    backing = f"of {len(held)} poses, each unseen by its calibration; rms {r.held_out.rms_deg:.3f} degrees; in place of a work point"
+    return Expected(what, f"{p95:.3f} mm", backing), p95, len(held)
+
+
+def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:
+    """The poses that were solved for, with their frames in words."""
+    return tuple(
+        ShownPose(u.symbol, f"pose of the {u.child_words} in the {u.parent_words} frame", X)
+        for u, X in ((mounting.unknowns[k], X) for k, X in r.poses.items())
+    )

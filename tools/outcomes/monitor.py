@@ -12,6 +12,8 @@ from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftEvent
 from weldcal.calibration.motion.drift.watch import Watched
 from weldcal.models.arrays import Array
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.outcomes.poses import SCANNER
 
 CALM, DRIFTED, WARMED = "no drift found", "the scanner has moved", "the scanner warms up"
 
@@ -28,6 +30,68 @@ class MonitorReport:
     warnings: tuple[str, ...]
     seconds: float
     out: Path
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. The tolerance is the test's threshold, which --false-alarms sets; there is no work point in a watch."""
+        w = self.watched
+        largest = float(np.nanmax(w.statistic)) if len(w.statistic) else float("nan")
+        source = f"--false-alarms {self.false_alarms_per_hour:g} per hour"
+        against = [f"{self.verdict[:1].upper()}{self.verdict[1:]}: {self.change}"] if self.moves else []
+        concerns = [*self.warnings]
+        if self.verdict == WARMED:
+            concerns = [f"The scanner warms up: {self.change}", *concerns]
+        found = Findings(
+            against=against,
+            tolerance=None if w.events else Tolerance("The largest test statistic", largest, w.threshold, source, ""),
+            no_tolerance=f"The test at {source} has found a change.",
+            unseen=len(w.ids),
+            concerns=concerns,
+        )
+        errors = 1e3 * np.linalg.norm(w.residuals, axis=1)
+        errors = errors[np.isfinite(errors)]
+        expected = Expected(
+            "error of the tracked flange, 95 %",
+            f"{np.percentile(errors, 95):.3f} mm" if len(errors) else "not known",
+            f"of {len(w.ids)} frames, which the calibration did not use; rms {1e3 * w.rms_m:.3f} mm",
+        )
+        return FirstScreen(found, expected, self._next(), (ShownPose("X_BC", self._words, w.X_BC),))
+
+    @property
+    def _words(self) -> str:
+        if not self.moves:
+            return f"{SCANNER['X_BC']}, as calibrated"
+        return f"{SCANNER['X_BC']}, after the last change, estimated from the frames since"
+
+    def _next(self) -> Next:
+        if self.recalibrated is not None and self.moves:
+            folder = self.out / "recalibrated"
+            return Next(
+                "Verify the pose after the change with new scans before you use it.",
+                f"weldcal verify {folder} NEW_SCANS",
+            )
+        if self.moves:
+            return Next(
+                "Find what moved and fix it, then calibrate again; --recalibrate writes the pose after the change."
+            )
+        if self.verdict == WARMED:
+            return Next("Let the scanner warm up until its scale stands still, then watch again.")
+        return Next("Go on; watch again after any knock, and after work at the robot or the scanner.")
+
+    @property
+    def change(self) -> str:
+        """The last change that was found, in a sentence; empty where there is none."""
+        if not self.watched.events:
+            return ""
+        e = self.watched.events[-1]
+        d = drift_document(e)
+        if not self.moves:
+            return f"from {e.time_s:.1f} s on its scale changed by {1e6 * e.scale:.0f} ppm; the pose is unchanged."
+        return (
+            f"at {e.time_s:.2f} s (robot clock) by {d['translation_mm']:.3f} mm and {d['rotation_deg']:.4f} degrees, "
+            f"found {max(e.found_s - e.time_s, 0.0):.1f} s later. {self.cause[:1].upper()}{self.cause[1:]}".rstrip(". ")
+            + "."
+        )
 
     @property
     def moves(self) -> tuple[DriftEvent, ...]:

@@ -1,5 +1,6 @@
 """The result of `weldcal calibrate` on a recording in motion, and its JSON object."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,19 @@ import numpy as np
 from weldcal.calibration.data.results import CalibrationResult, matrix4, target_document
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.models.arrays import Array
+from weldcal.tools.outcomes.calibration import scanner_pose
+from weldcal.tools.outcomes.first_screen import (
+    NO_TOLERANCE,
+    Findings,
+    FirstScreen,
+    Next,
+    Tolerance,
+    expected_error,
+    point_covariance,
+    refused_note,
+)
+from weldcal.tools.outcomes.poses import radius_95
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +36,12 @@ class MotionReport:
     outliers: tuple[str, ...]
     seconds: float
     out: Path
+    limit_mm: float | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. The error is the larger of two at 95 %: the pose's own in the middle of the frames, and the held-out one."""
+        return motion_screen(self.result, self.estimate, self.frames.p_C, self.refused, self.out, self.limit_mm)
 
     @property
     def rms_mm(self) -> float:
@@ -87,3 +107,40 @@ def _ms(seconds: float | None) -> float | None:
 
 def _number(value: float) -> float | None:
     return value if np.isfinite(value) else None
+
+
+def motion_screen(
+    r: CalibrationResult,
+    e: MotionEstimate,
+    p_C: Array,
+    refused: Sequence[tuple[str, str]],
+    out: Path,
+    limit_mm: float | None,
+    against: Sequence[str] = (),
+    no_tolerance: str = NO_TOLERANCE,
+) -> FirstScreen:
+    """The first screen of a calibration in motion; ``p_C`` (n, 3) m are the centres of all its frames."""
+    used, held = e.inliers, 1e3 * e.held_out_m[e.inliers]
+    held = held[np.isfinite(held)]
+    middle = np.asarray(p_C[used].mean(axis=0))
+    own = 1e3 * radius_95(point_covariance(r.X_BC, r.covariance, np.asarray(r.X_BC @ middle)))
+    p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
+    place = "in the middle of the frames" if r.symbol == "X_BC" else "at the target"
+    what = f"error {place}, 95 %"
+    expected, larger = expected_error(what, own, p95, len(held), "frames")
+    tolerance = None
+    if limit_mm is not None:
+        tolerance = Tolerance(f"the {what},", larger, limit_mm, "--limit-mm")
+    notes = refused_note(refused, len(p_C) + len(refused), "frames")
+    concerns = (*r.warnings, *r.unobservable)
+    found = Findings(against, tolerance, no_tolerance, len(held), concerns, notes)
+    if tolerance is not None and not tolerance.met:
+        after = Next("Record a longer motion, with more turns, or scans at rest: plan it first.", "weldcal plan-motion")
+    elif r.symbol == "X_BC":
+        after = Next(
+            "Verify with scans at rest that the calibration has not seen, or watch it while the arm works.",
+            f"weldcal monitor RECORDING --calibration {out}",
+        )
+    else:
+        after = Next("Record a second motion and calibrate again: the two poses should agree within their errors.")
+    return FirstScreen(found, expected, after, (scanner_pose(r),))

@@ -11,7 +11,18 @@ from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.systems.jobs.mounting.job import FOOT, AddedMounting
 from weldcal.systems.jobs.mounting.messages import MountingStatus
 from weldcal.systems.runner import Run
-from weldcal.tools.outcomes.hand_eye import HandEyeReport
+from weldcal.tools.outcomes.first_screen import (
+    Expected,
+    Findings,
+    FirstScreen,
+    Next,
+    Tolerance,
+    expected_error,
+    point_covariance,
+    refused_note,
+)
+from weldcal.tools.outcomes.hand_eye import HandEyeReport, held_out_error, shown_poses
+from weldcal.tools.outcomes.poses import radius_95
 
 
 @dataclass(frozen=True)
@@ -61,6 +72,45 @@ class MountingReport:
         if self.state == "done":
             return ""
         return self.run.reason or self.status.message
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen: the job's own tolerance on its expected error, at the scanner's best distance."""
+        status, result, scenario = self.status, self.result, self.run.cell.scenario
+        against = [self.reason] if self.state != "done" else []
+        aside = [1e3 * k.error_m for k in status.held_out]
+        what = f"error {1e3 * self.job.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
+        if result is None:
+            found = Findings(against=against or ["There is no result."], unseen=0)
+            after = Next("Settle the reason, then run the job again.")
+            return FirstScreen(
+                found, Expected(what, "not known", "there is no calibration"), after, more={"pose": "none was found"}
+            )
+        X = result.X
+        p = np.asarray(X @ work_point(self.job.scene))
+        own = 1e3 * radius_95(point_covariance(X, result.covariance["X"], p))
+        _, p95, n = held_out_error(result)
+        expected, _ = expected_error(what, own, p95, n, "poses")
+        if aside:
+            more = f"{expected.backing}; {len(aside)} held out by the job: at most {max(aside):.3f} mm"
+            expected = Expected(what, expected.figure, more)
+        tolerance = Tolerance(
+            "the expected error, one sigma,", 1e3 * status.sigma_work_m, scenario.calibration.required_error_mm,
+            "calibration.required_error_mm",
+        )  # fmt: skip
+        concerns = [*(f"Not observable: {text}" for text in result.unobservable), *result.warnings]
+        notes = refused_note(status.refused, status.sequence)
+        found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
+        if status.next_best is not None:
+            after = Next(f"To know it better, add the pose {status.next_best.sentence()}")
+        else:
+            after = Next("Use the pose; calibrate again after any knock.")
+        return FirstScreen(
+            found,
+            expected,
+            after,
+            shown_poses(result, self.mounting),
+        )
 
     def truth_errors(self) -> dict[str, TruthError]:
         """Symbol (X_FC ...) -> error against the truth."""

@@ -13,7 +13,18 @@ from weldcal.systems.jobs.profiler.estimates import pose_sigmas
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.runner import Run
+from weldcal.tools.outcomes.first_screen import (
+    Expected,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    point_covariance,
+)
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.outcomes.poses import radius_95
+from weldcal.tools.outcomes.profiler_file import WORDS
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -131,6 +142,7 @@ def _off(p: Array, line: SeamCurve) -> PathOutcome:
 
 
 WITHIN_MM = 0.3
+_NO_KEY = "No scenario key states the error that is allowed: compare it with what your job allows."
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +164,53 @@ class ProfilerLive:
         """The final state of the job, with all its estimates."""
         found: ProfilerState = self.run.cell.job.state(self.run.root)
         return found
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen: X_FS by the edge and by the sphere, each in the middle of its profiles; held-out scans back them."""
+        s, held = self.state, self.run.held
+        against = [self.run.reason or "The job was held."] if held else []
+        poses, errors, unseen, backing = [], [], 0, []
+        for name, found, scans in (("edge", s.edge, s.edge_scans), ("sphere", s.sphere, s.sphere_scans)):
+            if found is None:
+                continue
+            e = found.estimate
+            X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(e.rotation), e.translation)
+            seen = np.vstack([scan.points for scan in scans])
+            x, z = np.median(seen[np.isfinite(seen).all(axis=1)], axis=0)
+            p_F = np.asarray(X.multiply(np.array([x, 0.0, z])))
+            errors.append(1e3 * radius_95(point_covariance(X, e.covariance, p_F)))
+            poses.append(ShownPose("X_FS", f"{WORDS}, by the {name}", X))
+            unseen += found.held_out_mm.size
+            if found.held_out_mm.size:
+                backing.append(
+                    f"{found.held_out_mm.size} held-out scans of the {name}: at most {found.held_out_mm.max():.3f} mm"
+                )
+        figure = " and ".join(f"{v:.3f} mm" for v in errors) or "not known"
+        said = "; ".join(backing) or "no scan was held out"
+        expected = Expected(
+            "error in the middle of the profiles, 95 %", figure, f"of the calibration itself, by each target; {said}"
+        )
+        o, tolerance = self.outcome, None
+        if o.torch is not None:
+            what = "the torch's largest distance from its line, known in simulation only,"
+            tolerance = Tolerance(what, float(o.torch.distance_mm.max()), WITHIN_MM, "the target of this command")
+        known = [p for p in (o.edge, o.sphere) if p is not None]
+        concerns = (
+            ["A pose is farther from the truth than its covariance says (99.7 %)."]
+            if any(not p.within_3_sigma for p in known)
+            else []
+        )
+        found_all = Findings(against, tolerance, _NO_KEY, unseen, concerns)
+        if held:
+            after = Next("Settle the reason, then run the job again.")
+        else:
+            after = Next(
+                "Take the same scans with your own profiler and calibrate from the file.",
+                "weldcal profiler sphere FILE",
+            )
+        more = {} if poses else {"pose": "none was found"}
+        return FirstScreen(found_all, expected, after, tuple(poses), more)
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `profiler live`, and of `demo` for such a scenario."""

@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import numbered
 from weldcal.systems.cell import Cell
@@ -87,10 +88,12 @@ def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: 
     )
 
 
-def live_calibration_error(cell: Cell[WeldJob], estimate: CalibrationEstimate) -> CalibrationError | None:
+def live_calibration_error(
+    cell: Cell[WeldJob], estimate: CalibrationEstimate, arm: ArmModel | None = None
+) -> CalibrationError | None:
     """Error of a live calibration in a simulated world whose scanner and arm have errors of their own; None without truth.
 
-    `at_work_m` is the distance between where scanner and calibration put the work point and where the arm reports it.
+    `at_work_m` is the distance between where scanner and calibration put the work point and where the arm reports it: by ``arm``, the refined one, where given.
     """
     station, scenario = cell.station, cell.scenario
     truth, work = station.truth, work_point(scenario)
@@ -98,7 +101,7 @@ def live_calibration_error(cell: Cell[WeldJob], estimate: CalibrationEstimate) -
         return None
     X_FT = None if station.tool is None else station.tool.X_FT
     poses = [p.q for p in cell.job.poses]
-    p_true = true_work_point(station.arm, truth.arm, X_FT, work, np.deg2rad(scenario.home_deg), poses)
+    p_true = true_work_point(arm or station.arm, truth.arm, X_FT, work, np.deg2rad(scenario.home_deg), poses)
     p_C = truth.X_BC.inverse().multiply(p_true)
     seen = p_C if truth.scanner is None else truth.scanner.device.measured(p_C)
     corrected = seen if estimate.scanner is None else estimate.scanner.points(seen)

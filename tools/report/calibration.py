@@ -4,9 +4,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import export_ros2, export_ur_pose
+from weldcal.calibration.data.results import export_ros2
 from weldcal.calibration.eye_on_base.solve import point_error_covariance
-from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.tools.outcomes.calibration import CalibrationReport
 from weldcal.tools.report.calibration_map import knowledge_map
@@ -39,16 +38,13 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         feature_rows=feature_table(report.fits, report.patterns),
         feature_header=HEADER,
         refused=report.refused,
-        matrix=[[fixed(float(v), 6) for v in row] for row in r.X_BC.GetAsMatrix4()],
+        first=report.first,
         pose_facts=[
-            ("position, mm", fixed_row(1e3 * r.X_BC.translation(), 3)),
-            ("one sigma, mm", fixed_row(1e3 * sigma[3:], 3)),
-            ("rotation vector, deg", fixed_row(np.degrees(rotation_vector(r.X_BC.rotation())), 4)),
-            ("one sigma, deg", fixed_row(np.degrees(sigma[:3]), 4)),
+            ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
+            ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
             ("noise per axis, one sigma", f"{r.sigma_position_mm:.3f} mm"),
             *_axis_turn(r.axis_turn_deg),
             ("ROS 2", export_ros2(r.X_BC).strip()),
-            ("URScript", export_ur_pose(r.X_BC).strip()),
         ],
         budget=budget,
         budget_rows=[

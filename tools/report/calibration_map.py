@@ -32,7 +32,7 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
                 p = middle.copy()
                 p[i], p[j] = a, b
                 sigma[row, column] = 1e3 * sigma_at(estimate, p)
-        drawn = axes.contourf(1e3 * u, 1e3 * v, sigma, levels=levels, cmap=_SHADES, extend="max")
+        drawn = axes.contourf(1e3 * u, 1e3 * v, sigma, levels=levels, cmap=_SHADES, extend="both")
         axes.plot(
             1e3 * p_B[:, i],
             1e3 * p_B[:, j],
@@ -56,7 +56,7 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_aspect("equal")
     assert drawn is not None
-    bar = figure.colorbar(drawn, ax=all_axes, shrink=0.85, format="%.2f")
+    bar = figure.colorbar(drawn, ax=all_axes, shrink=0.85, format="%.3g")
     bar.set_label("one sigma of a scanned point, mm")
     all_axes[0].legend(fontsize=8, loc="lower left", framealpha=0.9)
     return svg(figure, *all_axes)

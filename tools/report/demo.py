@@ -4,29 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.results import export_ros2, export_ur_pose
+from weldcal.calibration.data.results import export_ros2
+from weldcal.systems.phase_words import phase_words
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.weld import heat_input_kJ_mm
 from weldcal.tools.report import plots_demo, plots_weld
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.robot_timing import robot_timing
-
-STORY = {
-    "start": "get ready",
-    "move_to_verification_cloud": "move to the verification pose of Algorithm 1",
-    "scan_verification_cloud": "scan it",
-    "move_to_pose": "move to calibration poses",
-    "scan_pose": "scan the feature and solve",
-    "move_to_verify": "move to an unseen pose",
-    "scan_verify": "scan it and verify",
-    "park": "park",
-    "scan_workpiece": "scan the workpiece and plan the seam",
-    "approach_above": "move above the seam",
-    "approach": "approach",
-    "weld": "feel the seam and weld behind",
-    "retract": "retract",
-    "home": "go home",
-}
 
 
 def demo_pictures(result: DemoResult) -> dict[str, bytes]:
@@ -52,15 +36,14 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
     if estimate is not None:
         sigma = np.sqrt(np.diag(estimate.covariance))
         pose = [
-            ("position in the base, mm", "  ".join(fixed(1e3 * float(v), 3) for v in estimate.X_BC.translation())),
-            ("one sigma, mm", "  ".join(fixed(1e3 * float(v), 3) for v in sigma[3:])),
+            ("one sigma of the position, mm", "  ".join(fixed(1e3 * float(v), 3) for v in sigma[3:])),
             ("one sigma of the rotation, deg", "  ".join(fixed(float(np.degrees(v)), 4) for v in sigma[:3])),
             ("ROS 2", export_ros2(estimate.X_BC).strip()),
-            ("URScript", export_ur_pose(estimate.X_BC).strip()),
         ]
     return render(
         "demo.html.j2",
         result=result,
+        first=result.first,
         summary=result.summary(),
         scenario=cell.scenario,
         scenario_name=Path(result.options.scenario).stem,
@@ -138,7 +121,7 @@ def _timing(result: DemoResult) -> list[tuple[str, ...]]:
     ends = [*phases[1:], ("", float(result.run.root.get_time()), result.run.wall_seconds)]
     total: dict[str, list[float]] = {}
     for (name, t0, w0), (_, t1, w1) in zip(phases, ends, strict=True):
-        spent = total.setdefault(STORY.get(name, name), [0.0, 0.0])
+        spent = total.setdefault(phase_words(name), [0.0, 0.0])
         spent[0] += t1 - t0
         spent[1] += w1 - w0
     rows = [(name, fixed(s, 1), fixed(w, 1)) for name, (s, w) in total.items() if s > 0.0 or w > 0.05]

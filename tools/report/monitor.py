@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from weldcal.calibration.motion.drift.sequential import DriftEvent
 from weldcal.models.arrays import Array
-from weldcal.tools.outcomes.monitor import CALM, MonitorReport, drift_document
+from weldcal.tools.outcomes.monitor import MonitorReport
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
@@ -23,8 +23,7 @@ def monitor_page(report: MonitorReport, *, recording: str) -> str:
         recording=recording,
         r=report.calibration,
         m=summary,
-        tone="good" if report.verdict == CALM else "warn",
-        sentence=_sentence(report),
+        first=report.first,
         event_rows=[_row(e) for e in w.events],
         before=_errors(t, w.before, "error, mm", w.events),
         after=_errors(t, w.residuals, "error, mm", w.events),
@@ -37,23 +36,6 @@ def monitor_page(report: MonitorReport, *, recording: str) -> str:
         dropped=[(d["reason"], d["frames"]) for d in summary["dropped_for"]],
         threshold=w.threshold,
         seconds=report.seconds,
-    )
-
-
-def _sentence(report: MonitorReport) -> str:
-    w = report.watched
-    if not w.events:
-        return (
-            f"{len(w.ids)} frames agree with the calibration. A test without any change raises "
-            f"{report.false_alarms_per_hour:g} alarms per hour."
-        )
-    e = w.events[-1]
-    d = drift_document(e)
-    if not report.moves:
-        return f"From {e.time_s:.1f} s on its scale changed by {1e6 * e.scale:.0f} ppm; the pose is unchanged."
-    return (
-        f"At {e.time_s:.2f} s (robot clock): {d['translation_mm']:.3f} mm and {d['rotation_deg']:.4f} degrees, "
-        f"found {max(e.found_s - e.time_s, 0.0):.1f} s later. {report.cause[:1].upper()}{report.cause[1:]}."
     )
 
 

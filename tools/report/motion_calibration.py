@@ -3,9 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import export_ros2, export_ur_pose
+from weldcal.calibration.data.results import export_ros2
 from weldcal.calibration.data.scanner_clock import DEVICE
-from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.tools.outcomes.motion import MotionReport
 from weldcal.tools.report.pictures import GREY, OURS, TRUTH, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
@@ -42,14 +41,11 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
         after_mm=after,
         offset_ms=None if clock.offset_s is None else 1e3 * clock.offset_s,
         offset_sigma_ms=None if clock.sigma_s is None else 1e3 * clock.sigma_s,
-        matrix=[[fixed(float(v), 6) for v in row] for row in r.X_BC.GetAsMatrix4()],
+        first=report.first,
         pose_facts=[
-            ("position, mm", fixed_row(1e3 * r.X_BC.translation(), 3)),
-            ("one sigma, mm", fixed_row(1e3 * sigma[3:], 3)),
-            ("rotation vector, deg", fixed_row(np.degrees(rotation_vector(r.X_BC.rotation())), 4)),
-            ("one sigma, deg", fixed_row(np.degrees(sigma[:3]), 4)),
+            ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
+            ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
             ("ROS 2", export_ros2(r.X_BC).strip()),
-            ("URScript", export_ur_pose(r.X_BC).strip()),
         ],
         clock_facts=facts,
         along=_along(report),

@@ -4,7 +4,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.report.pictures import OURS, error_bars, svg
+from weldcal.tools.report.hand_eye import unknown_tables
+from weldcal.tools.report.pictures import OURS, error_bars, millimetres, svg
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.robot_timing import robot_timing
 
@@ -13,18 +14,11 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
     """The whole report as one self-contained HTML text."""
     status, mounting, result = report.status, report.mounting, report.result
     aside = np.array([1e3 * k.error_m for k in status.held_out])
-    unknowns, errors = [], report.truth_errors()
-    for k, X in {} if result is None else result.poses.items():
-        u = mounting.unknowns[k]
-        sigma = np.sqrt(np.diag(result.covariance[k])) if result is not None else np.zeros(6)
-        rpy = np.degrees(X.rotation().ToRollPitchYaw().vector())
-        e = errors.get(u.symbol)
-        off = "" if e is None else f" (off the truth by {fixed(e.mm, 3)} mm and {fixed(e.deg, 4)} deg; simulation)"
-        lengths = zip(("x, mm", "y, mm", "z, mm"), 1e3 * X.translation(), 1e3 * sigma[3:], strict=True)
-        angles = zip(("roll, deg", "pitch, deg", "yaw, deg"), rpy, np.degrees(sigma[:3]), strict=True)
-        cells = [(name, fixed(v, 3), _spread(s, 3, 1e3)) for name, v, s in lengths]
-        cells += [(name, fixed(v, 4), _spread(s, 4, 57.3)) for name, v, s in angles]
-        unknowns.append((u.sentence[0].upper() + u.sentence[1:] + off, cells))
+    off = {
+        symbol: f" (off the truth by {fixed(e.mm, 3)} mm and {fixed(e.deg, 4)} deg; simulation)"
+        for symbol, e in report.truth_errors().items()
+    }
+    unknowns = [] if result is None else unknown_tables(result, mounting, off)
     rows = []
     for i, s in enumerate(status.seen):
         used = result is None or bool(result.inliers[i])
@@ -38,14 +32,13 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
     return render(
         "mounting.html.j2",
         **robot_timing(report.run),
+        first=report.first,
         name=mounting.name,
         words=mounting.words,
         equation=mounting.equation,
         source=mounting.source,
         sketch=mounting.sketch,
         given=report.given(),
-        state=report.state,
-        reason=report.reason,
         description=report.run.cell.scenario.description,
         picture=picture,
         unknowns=unknowns,
@@ -69,10 +62,6 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
     )
 
 
-def _spread(sigma: float, digits: int, certain: float) -> str:
-    return "open" if sigma > certain else fixed(float(sigma), digits)
-
-
 def _growth(report: MountingReport) -> bytes:
     """Expected error of a point at the work distance after every scan."""
     n, sigma = np.array(report.status.history).T
@@ -83,6 +72,7 @@ def _growth(report: MountingReport) -> bytes:
     axes.axhline(required, color="#a8402f", linewidth=1, linestyle=":")
     axes.annotate(f"required {required:.2f}", (n[0], required), fontsize=9, va="bottom", color="#a8402f")
     axes.set_yscale("log")
+    millimetres(axes)
     axes.set_xticks(n)
     axes.set_xlabel("scans")
     axes.set_ylabel("expected error, mm")

@@ -9,6 +9,7 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
@@ -89,6 +90,18 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
         axes.margins(0.15)
     left.set_title(f"errors, enlarged {scale:.0f} times", fontsize=9, loc="left")
     return svg(figure, left, right)
+
+
+def millimetres(axes: Axes) -> None:
+    """Ticks of a logarithmic axis as a person writes lengths: 0.04, not 4 times ten to the minus two."""
+    axes.yaxis.set_major_formatter("{x:g}")
+    low, high = axes.get_ylim()
+    digits = "123456789" if high < 2.5 * low else "235" if high < 30.0 * low else ""
+
+    def label(x: float, _: int | None) -> str:
+        return f"{x:g}" if f"{x:e}"[0] in digits else ""
+
+    axes.yaxis.set_minor_formatter(FuncFormatter(label))
 
 
 def plain(axes: Axes, x: str, y: str) -> None:

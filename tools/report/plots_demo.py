@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from weldcal.models.arrays import Array
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.tools.outcomes.weld import WeldOutcome
-from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, plain, svg
+from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, svg
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.welding.record.process import path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
@@ -24,6 +24,7 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
     if np.isfinite(figure).any():
         axes.semilogy(n, 1e3 * figure, "^:", color=THEIRS, label="Algorithm 1: its own ICP figure")
     axes.axhline(1e3 * required_m, color=TRUTH, lw=1.0, label="required")
+    millimetres(axes)
     axes.set_xticks(n)
     plain(axes, "scans used", "error, mm")
     picture.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)

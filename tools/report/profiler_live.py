@@ -8,6 +8,7 @@ import numpy as np
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.runner import Run
+from weldcal.tools.outcomes.first_screen import FirstScreen
 from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome
 from weldcal.tools.report.plots_profiler_live import path_picture, profiles_picture, sigmas_picture, torch_bars
 from weldcal.tools.report.render import fixed, render
@@ -17,7 +18,13 @@ LIMIT_MM = 0.3
 
 
 def live_report(
-    summary: Mapping[str, object], outcome: LiveOutcome, state: ProfilerState, run: Run[Any], *, recording: bool
+    summary: Mapping[str, object],
+    outcome: LiveOutcome,
+    state: ProfilerState,
+    run: Run[Any],
+    *,
+    first: FirstScreen,
+    recording: bool,
 ) -> str:
     """One run's page as one self-contained HTML text."""
     poses = {name: [p] for name, p in _poses(outcome).items()}
@@ -30,6 +37,7 @@ def live_report(
     return render(
         "profiler_live.html.j2",
         many=False,
+        first=first,
         s=summary,
         rows=[_row(n, p) for n, p in _poses(outcome).items()],
         sigmas=sigmas_picture(poses) if poses else None,
@@ -55,6 +63,7 @@ def seeds_report(
     return render(
         "profiler_live.html.j2",
         many=True,
+        first=None,
         s=found,
         rows=[],
         sigmas=sigmas_picture(poses) if poses else None,

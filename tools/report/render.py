@@ -1,19 +1,21 @@
-"""Renders report templates to self-contained HTML, formats numbers, and writes files atomically."""
+"""Renders report templates to self-contained HTML, and formats numbers."""
 
 import base64
-import contextlib
+import hashlib
 import math
-import os
-import tempfile
+import re
 from collections.abc import Iterable
-from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from weldcal.calibration.data.results import software_version
+from weldcal.models.result_files import write_atomic as write_atomic
+from weldcal.tools.report.inline_svg import inline_svg
 
 _MEDIA_TYPES = ((b"\x89PNG", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"<svg", "image/svg+xml"))
+
+_OPTION = re.compile(r"(?<![\w-])(--[a-z][a-z-]*)")
 
 
 def render(template: str, **context: object) -> str:
@@ -30,6 +32,18 @@ def render(template: str, **context: object) -> str:
         jinja2.UndefinedError: if the context lacks a name.
     """
     return environment().get_template(template).render(software=software_version(), **context)
+
+
+def optioned(text: str) -> Markup:
+    """The escaped text, with options of the command line (--limit-mm) that are not broken at their hyphens."""
+    return Markup(_OPTION.sub(r'<span class="option">\1</span>', str(escape(text))))
+
+
+def inlined(picture: bytes, alt: str) -> Markup:
+    """The picture as a part of the page: an SVG in the colours of the page, any other picture as an image."""
+    if b"<svg" in picture[:1024]:
+        return inline_svg(picture.decode(), alt)
+    return Markup('<img src="{}" alt="{}">').format(data_uri(picture), alt)
 
 
 def data_uri(picture: bytes) -> str:
@@ -60,25 +74,6 @@ def fixed_row(values: Iterable[float], digits: int = 2) -> str:
     return "  ".join(fixed(float(value), digits) for value in values)
 
 
-def write_atomic(path: Path, content: str | bytes) -> None:
-    """Writes a file and creates its folder: another process sees the old content or the new, never a part of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)  # mkstemp makes it private; a result is for everybody
-        Path(temporary).replace(path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            Path(temporary).unlink()
-        raise
-
-
 def environment() -> Environment:
     """The Jinja environment of the reports: everything escaped, every name required, one stylesheet."""
     reports = Environment(
@@ -90,7 +85,9 @@ def environment() -> Environment:
     )
     reports.filters["data_uri"] = data_uri
     reports.filters["fixed"] = fixed
-    reports.globals["stylesheet"] = _stylesheet
+    reports.filters["inlined"] = inlined
+    reports.filters["optioned"] = optioned
+    reports.globals |= {"stylesheet": _stylesheet, "script": _script, "script_hash": _script_hash}
     return reports
 
 
@@ -99,3 +96,17 @@ def _stylesheet(reports: Environment) -> Markup:
     loader = reports.loader
     assert loader is not None
     return Markup(loader.get_source(reports, "style.css")[0])
+
+
+@pass_environment
+def _script(reports: Environment) -> Markup:
+    loader = reports.loader
+    assert loader is not None
+    return Markup(loader.get_source(reports, "copy.js")[0])
+
+
+@pass_environment
+def _script_hash(reports: Environment) -> str:
+    """The script's name in the page's policy: no other script runs in it."""
+    digest = hashlib.sha256(_script(reports).encode()).digest()
+    return f"sha256-{base64.b64encode(digest).decode('ascii')}"

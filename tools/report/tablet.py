@@ -9,11 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
+from weldcal.calibration.data.results import export_ros2, software_version
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
+from weldcal.tools.outcomes.first_screen import FirstScreen
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 from weldcal.tools.report.robot_timing import robot_timing
@@ -47,12 +49,12 @@ class Page:
 
     title: str
     subtitle: str
-    verdict: tuple[str, str, str]
     cards: Sequence[Card]
     provenance: Sequence[tuple[str, str]]
     notes: Sequence[str] = ()
     truth: Sequence[tuple[str, ...]] = ()
     arrows: bytes | None = None
+    errors: bytes | None = None
     header: tuple[str, ...] = ()
     rows: Sequence[tuple[str, ...]] = ()
     picture: bytes | None = None
@@ -110,7 +112,7 @@ def landmark_rows(result: TabletResult, names: Sequence[str]) -> tuple[tuple[str
 
 
 def calibration_report(
-    result: TabletResult, shown: Shown, seconds: float, held_out: Mapping[str, float] | None = None
+    result: TabletResult, shown: Shown, first: FirstScreen, seconds: float, held_out: Mapping[str, float] | None = None
 ) -> str:
     """The page of `weldcal tablet calibrate`."""
     left = [v for v in result.leave_one_out_mm if v is not None]
@@ -124,20 +126,19 @@ def calibration_report(
     if held_out is not None:
         worst = f"largest {fixed(held_out['max'], 3)}; not used in the fit"
         cards.insert(0, ("The file's queries, mean", fixed(held_out["mean"], 3), "mm", "good", worst))
-    sentence = f"Mean error of held-out landmarks: {fixed(mean, 2)} mm." if left else "No landmark could be held out."
     return render(
         "tablet.html.j2",
+        first=first,
         page=Page(
             title="Calibration of camera and pen by a tablet",
             subtitle=f"Model: {_MODELS.get(result.model, result.model)}.",
-            verdict=_verdict(result, sentence),
             cards=cards,
             notes=(*result.warnings, *result.unobservable),
             arrows=miss_arrows(shown),
             header=header,
             rows=rows,
             picture=shown.picture,
-            pose_title="Camera on the flange" if result.X_FC is not None else "Parameters",
+            pose_title="Uncertainty of camera and pen" if result.X_FC is not None else "Parameters",
             pose=_pose(result),
             provenance=[*_files(result), ("seconds", fixed(seconds, 3))],
         ),
@@ -146,7 +147,7 @@ def calibration_report(
 
 def visit_report(
     run: Run[AddedVisit], found: Mapping[str, Any], result: TabletResult | None, shown: Shown | None,
-    *, recording: bool,
+    *, first: FirstScreen, recording: bool,
 ) -> str:  # fmt: skip
     """The page of a run in a scenario; `result` and `shown` are None if it was held before its end."""
     scenario, job, name = run.cell.scenario, run.cell.job, str(found["scenario"])
@@ -164,10 +165,10 @@ def visit_report(
     }
     touched = ("Landmarks touched", str(found["n_touches"]), f"of {len(job.plan.q_above)}", "plain", "by contact")
     if result is None or shown is None:
-        verdict = ("bad", "The run was held", str(found.get("reason", "")))
         return render(
             "tablet.html.j2",
-            page=Page(verdict=verdict, cards=[touched], provenance=provenance, **common),
+            first=first,
+            page=Page(cards=[touched], provenance=provenance, **common),
             **robot_timing(run),
         )
     unseen = found["unseen_touch_mm"]
@@ -181,9 +182,9 @@ def visit_report(
     ]  # fmt: skip
     return render(
         "tablet.html.j2",
+        first=first,
         **robot_timing(run),
         page=Page(
-            verdict=_verdict(result, f"Error at untouched points: at most {fixed(unseen['max'], 2)} mm."),
             cards=cards,
             notes=(*result.warnings, *result.unobservable),
             truth=_truth(job, found),
@@ -191,19 +192,12 @@ def visit_report(
             header=header,
             rows=rows,
             picture=shown.picture,
-            pose_title="Camera on the flange",
+            pose_title="Uncertainty of camera and pen",
             pose=_pose(result),
             provenance=[*provenance, *_files(result)],
             **common,
         ),
     )  # fmt: skip
-
-
-def _verdict(result: TabletResult, sentence: str) -> tuple[str, str, str]:
-    """Tone, headline and sentence."""
-    if result.warnings or result.unobservable:
-        return ("warn", "Camera and pen are calibrated, with warnings", sentence)
-    return ("good", "Camera and pen are calibrated", sentence)
 
 
 def _truth(job: AddedVisit, found: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -227,13 +221,11 @@ def _pose(result: TabletResult) -> list[tuple[str, str]]:
     sigma = np.sqrt(np.diag(np.array(result.X_FC_covariance)))
     pen = np.sqrt(np.diag(np.array(result.p_FP_covariance)))
     return [
-        ("position on the flange, mm", fixed_row(1e3 * result.X_FC.translation(), 3)),
-        ("one sigma, mm", fixed_row(1e3 * sigma[3:], 3)),
+        ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
         ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
         ("pen tip on the flange, mm", fixed_row(1e3 * np.array(result.p_FP_m), 3)),
         ("one sigma of the tip, mm", fixed_row(1e3 * pen, 3)),
         ("ROS 2", export_ros2(result.X_FC, "flange", "camera_optical_frame").strip()),
-        ("URScript", export_ur_pose(result.X_FC).strip()),
     ]
 
 
@@ -243,12 +235,10 @@ def _files(result: TabletResult) -> list[tuple[str, str]]:
 
 def _timing(run: Run[AddedVisit]) -> list[tuple[str, str]]:
     """Simulated seconds per kind of phase."""
-    says = {"to_start": "moves", "to_look": "moves", "to_above": "moves", "lift": "moves", "to_home": "moves"}
-    says |= {"look": "look", "descend": "descend and touch"}
     ends = [*(t for _, t, _ in run.phases[1:]), run.seconds]
     spent: dict[str, float] = {}
     for (name, since, _), until in zip(run.phases, ends, strict=True):
-        kind = says.get(name)
-        if kind is not None:
+        if name not in ("done", "held"):
+            kind = phase_words(name)
             spent[kind] = spent.get(kind, 0.0) + until - since
     return [*((kind, fixed(s, 1)) for kind, s in spent.items()), ("all", fixed(run.seconds, 1))]

@@ -33,6 +33,7 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
         dataset=dataset,
         r=report.result,
         v=report.verdict,
+        first=report.first,
         n_new=int(fresh.sum()),
         error=report.position_error_mm,
         tilt=report.tilt_deg,

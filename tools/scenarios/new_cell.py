@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from weldcal.calibration.data.results import write_atomically
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import write_atomic
 from weldcal.systems.drivers.config import DEVICES, NoDevice
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -55,7 +55,7 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
         add_part(scenario, folder, part.file, list(part.edges), part.joint)
     if tool is not None:
         add_tool(scenario, folder, tool)
-    write_atomically(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
+    write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
     _write(path, scenario)
     if part is not None and scenario.workpiece is not None and (place := weldable_place(load_scenario(str(path)))):
         scenario.workpiece.pose_guess = place
@@ -64,7 +64,7 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
 
 
 def _write(path: Path, scenario: Scenario) -> None:
-    write_atomically(path, HEAD.format(schema=SCHEMA, path=path) + "".join(_parts(scenario)))
+    write_atomic(path, HEAD.format(schema=SCHEMA, path=path) + "".join(_parts(scenario)))
 
 
 def _parts(scenario: Scenario) -> Iterator[str]:

@@ -19,6 +19,7 @@ from weldcal.models.documents import as_number, parse_document, shown
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 from weldcal.models.limits import LARGEST_TEXT
+from weldcal.models.result_files import require_whole
 from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import WeldProcess
 
@@ -165,6 +166,7 @@ def load_weld_log(path: Path | str) -> WeldRecord:
     """
     given = Path(path)
     folder = given if given.is_dir() else given.parent
+    require_whole(folder)
     stem = CSV_NAME.removesuffix(".csv") if given.is_dir() else given.stem
     header_path, csv_path = folder / f"{stem}.json", folder / f"{stem}.csv"
     header = _header(_text(header_path), header_path)

@@ -157,6 +157,15 @@ class SlewLimits:
             if not (np.isfinite(value).all() and (value > 0.0).all()):
                 raise GuardError(f"The slew limit '{name}' must be positive and finite.")
 
+    def rows(self, n: int) -> tuple[Array, Array, Array]:
+        """Speed, acceleration and jerk of each joint, (n,) each."""
+
+        def row(bound: Array | float) -> Array:
+            whole = isinstance(bound, np.ndarray) and bound.shape == (n,) and bound.dtype == np.float64
+            return np.asarray(bound) if whole else np.full(n, bound, dtype=float)
+
+        return row(self.speed), row(self.acceleration), row(self.jerk)
+
 
 def command_is_finite(v_des: ArrayLike) -> bool:
     """Whether every number of a command is finite; `slew_limit` brings the arm to rest when one is not."""
@@ -177,8 +186,7 @@ def slew_limit(v_des: ArrayLike, v_prev: Array, a_prev: Array, limits: SlewLimit
         limits: bounds.
         dt: tick in s.
     """
-    n = len(v_prev)
-    speed, top, jerk = (np.full(n, b, dtype=float) for b in (limits.speed, limits.acceleration, limits.jerk))
+    speed, top, jerk = limits.rows(len(v_prev))
     v, a = np.array(v_prev, dtype=float), np.array(a_prev, dtype=float)
     _slew(np.array(v_des, dtype=float), v, a, speed, top, jerk, dt)
     return v, a

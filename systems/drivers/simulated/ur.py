@@ -95,11 +95,11 @@ class SpeedJointServo(LeafSystem):
     def _sample(self, context: Context, discrete: DiscreteValues) -> None:
         new = np.array(context.get_discrete_state_vector().value())
         measured = np.array(self._arm_state.Eval(context))
-        moved = new[6:12].any()
-        _follow(new, measured, np.array(self._command.Eval(context)), self._limits, self._config.control_period_s)
+        command = np.array(self._command.Eval(context))
+        starts = _follow(new, measured, command, self._limits, self._config.control_period_s)
         own = new[26:]
         if own.size:
-            if not moved and new[6:12].any():  # the arm starts to move
+            if starts:
                 own[6] += 1.0
                 own[:6] = self._offset(measured[:6], int(own[6]))
             measured[:6] -= own[:6]
@@ -140,12 +140,15 @@ class SpeedJointServo(LeafSystem):
 
 
 @compiled()
-def _follow(state: Array, measured: Array, command: Array, limits: Array, dt: float) -> None:
-    """Advance reference (6,), its velocity (6,) and the fault at index 25 of the servo's state, in place.
+def _follow(state: Array, measured: Array, command: Array, limits: Array, dt: float) -> bool:
+    """Advance reference (6,), its velocity (6,) and the fault at index 25 of the servo's state, in place; whether the arm starts
+    to move.
 
     ``limits`` (5, 6): velocity, acceleration, lower and upper position, following error; rad and s.
     """
+    moved, moves = False, False
     for k in range(6):
+        moved = moved or state[6 + k] != 0.0
         if not np.isfinite(command[k]) or abs(state[k] - measured[k]) > limits[4, k]:
             state[25] = 1.0
     for k in range(6):
@@ -153,6 +156,8 @@ def _follow(state: Array, measured: Array, command: Array, limits: Array, dt: fl
         step = limits[1, k] * dt
         state[6 + k] += min(max(wanted - state[6 + k], -step), step)
         state[k] = min(max(state[k] + dt * state[6 + k], limits[2, k]), limits[3, k])
+        moves = moves or state[6 + k] != 0.0
+    return moves and not moved
 
 
 def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:

@@ -27,6 +27,7 @@ from weldcal.systems.motion.clear_moves import clear_move, station_bodies
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.viewer.drift_view import DriftView
@@ -89,7 +90,7 @@ class AddedMotion(AddedJob):
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
         share = len(self.record(root).seen) / self.frames
-        return self.drift(root).summary or phases[-1][0], 0.05 + 0.85 * min(share, 1.0)
+        return self.drift(root).summary or phase_words(phases[-1][0]), 0.05 + 0.85 * min(share, 1.0)
 
 
 def _stream_delay_s(scenario: Scenario) -> float | None:

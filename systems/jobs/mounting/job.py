@@ -23,6 +23,7 @@ from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.station import Station
@@ -65,7 +66,9 @@ class AddedMounting(AddedJob):
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
         state: MountingState = self.state(root)
-        return state.label or "go home", 0.05 + 0.85 * min((state.visit + 1) / max(self.scans, 1), 1.0)
+        return phase_words(state.phase, state.label) if state.label else phase_words("home"), 0.05 + 0.85 * min(
+            (state.visit + 1) / max(self.scans, 1), 1.0
+        )
 
 
 class Mounting(Job[MountingPlanned]):

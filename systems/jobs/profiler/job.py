@@ -20,6 +20,7 @@ from weldcal.systems.jobs.profiler.procedure import PLANS, ProfilerProcedure
 from weldcal.systems.jobs.profiler.robot_error import RobotError
 from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
@@ -38,7 +39,7 @@ class AddedProfilerJob(AddedJob):
         """See AddedJob."""
         state: ProfilerState = self.state(root)
         steps = sum(len(PLANS[stage]) for stage in self.job.stages)
-        return state.step or "get ready", 0.05 + 0.9 * (steps - len(state.steps_left)) / max(steps + 1, 1)
+        return state.step or phase_words("start"), 0.05 + 0.9 * (steps - len(state.steps_left)) / max(steps + 1, 1)
 
 
 class Profiler(Job[PlanningContext]):

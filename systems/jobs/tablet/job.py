@@ -17,22 +17,10 @@ from weldcal.systems.jobs.tablet.messages import TabletTruth, WristPicture
 from weldcal.systems.jobs.tablet.planning import camera_of, check_moves, plan_tablet, tablet_of
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
-
-SAYS = {
-    "start": "get ready",
-    "to_start": "go home",
-    "to_look": "to the look",
-    "look": "look",
-    "to_above": "touch landmark {0}",
-    "descend": "touch landmark {0}",
-    "lift": "touch landmark {0}",
-    "to_home": "go home",
-    "done": "done",
-    "held": "held",
-}
 
 
 @dataclass(eq=False)
@@ -69,7 +57,8 @@ class AddedVisit(AddedJob):
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob: the picture is a tenth of the run, the touches are nearly all of the rest."""
         state: TabletState = self.state(root)
-        text = SAYS[state.phase].format(state.landmark + 1)
+        touching = state.phase in ("to_above", "descend", "lift")
+        text = phase_words(state.phase, f"{state.landmark + 1} of {len(self.plan.q_above)}" if touching else "")
         touched = 0.80 * len(state.touches) / len(self.plan.q_above)
         return text, 0.95 if state.finished else 0.05 + 0.05 * (state.trigger > 0) + touched
 

@@ -11,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import FingerCamera, WeldingTool
 from weldcal.systems.background import Answer, Background, Inline, import_module
-from weldcal.systems.messages import Image, Message
+from weldcal.systems.messages import CalibrationStatus, Image, Message, believed_arm
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.servo.deformation import TagModel, deflection_from_tag, detect_tag
 from weldcal.welding.servo.state import DeflectionSample
@@ -48,6 +48,7 @@ class ArucoDeformationEstimator(LeafSystem):
         input_ports:
         - image
         - history
+        - calibration_status
         output_ports:
         - deformation
         - deflection
@@ -55,7 +56,8 @@ class ArucoDeformationEstimator(LeafSystem):
     `deformation` carries a `Deformation`; `deflection` (5) is [tangential, normal, axial] in m, valid (1 or 0) and age s.
     A frame without a reliable tag is reported as invalid with its reason, not as an old value. Images wait for poses that
     arrive later than they do; if only the newest image were used, its pose would never be known. The tag is detected beside
-    the control loop; a detection that takes longer than a frame skips the frames between.
+    the control loop; a detection that takes longer than a frame skips the frames between. Poses are those of the arm with refined
+    kinematics, where `calibration_status` (may stay open) has one.
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class ArucoDeformationEstimator(LeafSystem):
         self._tag = TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
         self._image = self.DeclareAbstractInputPort("image", AbstractValue.Make(Image()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
+        self._calibration = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(_Work()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("deformation", lambda: AbstractValue.Make(Deformation()), self._output, ticket)
@@ -87,17 +90,18 @@ class ArucoDeformationEstimator(LeafSystem):
             waiting = (*work.waiting, image)[-IMAGES_KEPT:]
             work = dc.replace(work, newest_sequence=image.sequence, waiting=waiting)
         if work.asked is None and work.waiting:
-            work = self._asked(work, self._history.Eval(context))
+            arm = believed_arm(self._calibration, context, self._arm)
+            work = self._asked(work, self._history.Eval(context), arm)
         if work.asked is not None and work.asked.ready:
             work = dc.replace(work, found=work.asked.value, asked=None)
         if work is not old:
             state.get_mutable_abstract_state(self._state).set_value(work)
 
-    def _asked(self, work: _Work, history: PoseHistory) -> _Work:
+    def _asked(self, work: _Work, history: PoseHistory, arm: ArmModel) -> _Work:
         """Start the detection in the newest image with a known pose; older images are discarded."""
         for k in reversed(range(len(work.waiting))):
             image = work.waiting[k]
-            X_BF = history.pose_at(self._arm, image.capture_time)
+            X_BF = history.pose_at(arm, image.capture_time)
             if X_BF is not None:
                 asked = self._background.ask(measure_deformation, image, X_BF, self._tool, self._tag, self._K)
                 return dc.replace(work, waiting=work.waiting[k + 1 :], asked=asked)

@@ -21,11 +21,13 @@ from weldcal.calibration.published.algorithm1 import (
     named_cost,
 )
 from weldcal.calibration.published.icp import make_verification
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.calibration.refinement.refined import PLAIN
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.jobs.weld.refinement import refined_status
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, VerificationResult
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
@@ -43,6 +45,7 @@ class CalibratorConfig:
     work_radius_m: float = 0.2
     cost_axes: tuple[str, ...] = COST_AXES
     correct_scanner: bool = True
+    refine: str = PLAIN
 
 
 class IterativeCalibrator(BackgroundSystem):
@@ -58,7 +61,8 @@ class IterativeCalibrator(BackgroundSystem):
         - calibration_status
 
     The estimate contains a correction of the scanner's own errors, unless `correct_scanner` is off. It is done when the
-    expected error at the work point is within the required one. Algorithm 1's figure is kept
+    expected error at the work point is within the required one; then it is refined (`refine`), and what the status says of the arm
+    holds for the verification and all that follows. Algorithm 1's figure is kept
     for display only, because it does not measure the remaining error (docs/calibration.md).
     """
 
@@ -87,9 +91,9 @@ class IterativeCalibrator(BackgroundSystem):
         estimate: FlangeEstimate = self._estimate.Eval(context)
         if estimate.sequence <= newest.sequence:
             return None
-        X_BF = self._history.Eval(context).pose_at(self._arm, estimate.capture_time)
-        X_BR = None if X_BF is None else X_BF @ self._X_FR
-        return self.background.ask(digest, newest, estimate, X_BR, self._standard, self._config)
+        arm, q = newest.arm_or(self._arm), self._history.Eval(context).joints_at(estimate.capture_time)
+        X_BR = None if q is None else forward_kinematics(arm, q) @ self._X_FR
+        return self.background.ask(digest, newest, estimate, X_BR, self._standard, self._config, q, self._arm)
 
 
 def digest(
@@ -98,8 +102,13 @@ def digest(
     X_BR: RigidTransform | None,
     standard: FlangeStandard,
     config: CalibratorConfig,
+    q: NDArray[np.float64] | None = None,
+    arm: ArmModel | None = None,
 ) -> CalibrationStatus:
-    """Compute the status after one more flange estimate; an unusable scan is listed as refused with its label and the reason."""
+    """Compute the status after one more flange estimate; an unusable scan is listed as refused with its label and the reason.
+
+    ``q`` (6,) rad are the joint angles of ``arm`` at the scan; a refinement needs both.
+    """
     counts = seen.purpose == "calibrate"
     status = dc.replace(status, sequence=seen.sequence, calibration_scans=status.calibration_scans + int(counts))
     if seen.fit is None or X_BR is None:
@@ -111,7 +120,10 @@ def digest(
         return dc.replace(status, verifications=(*status.verifications, verify_at(status, seen, X_BR)))
     observation = observation_from_fit(seen.label, X_BR, seen.fit)
     observations = (*status.observations, observation)
-    status = dc.replace(status, observations=observations, algorithm_1=_algorithm_1(status, observation, config))
+    joints = status.joints if q is None else (*status.joints, q)
+    status = dc.replace(
+        status, observations=observations, joints=joints, algorithm_1=_algorithm_1(status, observation, config)
+    )
     try:
         estimate = estimate_jointly(observations) if config.correct_scanner else estimate_eye_on_base(observations)
     except WeldcalError as error:
@@ -119,14 +131,20 @@ def digest(
     predicted = expected_error(estimate, config.p_BWork)
     figure = status.algorithm_1.cost if status.algorithm_1 is not None else np.nan
     held_out = float(np.median(estimate.held_out.position_m))
-    return dc.replace(
+    done = len(observations) >= config.minimum_scans and predicted <= config.required_error_m
+    status = dc.replace(
         status,
         estimate=estimate,
         predicted_error_m=predicted,
         history=(*status.history, (len(observations), predicted, held_out, figure)),
-        done=len(observations) >= config.minimum_scans and predicted <= config.required_error_m,
+        done=done,
         message="",
     )
+    if not done or arm is None:
+        return status
+    status = refined_status(status, config.refine, arm, config.correct_scanner)
+    assert status.estimate is not None
+    return dc.replace(status, predicted_error_m=expected_error(status.estimate, config.p_BWork))
 
 
 def expected_error(estimate: CalibrationEstimate, p_BWork: NDArray[np.float64]) -> float:
@@ -140,6 +158,8 @@ def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransf
         return VerificationResult(seen.label, np.inf, np.inf)
     seen_at = [corrected_observation(status.correction, observation_from_fit(seen.label, X_BR, seen.fit))]
     X_BC = status.estimate.X_BC
+    if status.local_field is not None:
+        seen_at = status.local_field.applied(X_BC, seen_at)
     return VerificationResult(
         seen.label, float(position_errors(X_BC, seen_at)[0]), float(tilt_errors(X_BC, seen_at)[0])
     )

@@ -32,6 +32,7 @@ from weldcal.systems.messages import CalibrationStatus, PlannedSeam
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
@@ -56,7 +57,6 @@ SHARES = {
     "done": 0.98,
     "held": 0.98,
 }
-WHOLE_SEAM_M = 0.3  # assumed length of a seam without a length limit, for the progress bar
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +125,16 @@ class WeldJob(AddedJob):
         if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
             scans = sum(1 for name, _, _ in phases if name == "scan_pose")
             share = min(0.02 + 0.03 * scans, 0.27)
-        if phase == "weld":
-            begun = next((t for name, t, _ in reversed(phases) if name == "weld"), root.get_time())
-            seam_mm = self.scenario.welding.seam_length_mm
-            length = WHOLE_SEAM_M if seam_mm is None else seam_mm * 1e-3
-            expected = (length + 0.06) / self.servo_config.weld_speed_m_s + 5.0
-            share += 0.58 * min(float(root.get_time() - begun) / expected, 1.0)
+        detail = f"seam {command.seam + 1} of {seams}" if seams > 1 and share >= SHARES["approach_above"] else ""
+        report, planned = self.servo_report(root), self.planned_seam(root).seam
+        if phase == "weld" and report.command is not None and planned is not None:
+            at = report.command.diagnostics.s_torch
+            along = min(max(at, 0.0), planned.length) if np.isfinite(at) else 0.0
+            share += 0.58 * along / planned.length
+            detail = ", ".join(filter(None, (detail, f"{1e3 * along:.0f} of {1e3 * planned.length:.0f} mm")))
         if seams > 1 and share > SHARES["park"]:
             share = SHARES["park"] + (1.0 - SHARES["park"]) * (command.seam + share) / seams
-        return phase.replace("_", " "), share
+        return phase_words(phase, detail), share
 
 
 class Weld(Job[tuple[PlannedPose, ...]]):
@@ -273,7 +274,7 @@ def _add_welding(
         "deformation_estimator",
         ArucoDeformationEstimator(station.arm, tool, scenario.finger_camera.camera(), station.background),
     )
-    wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history)
+    wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history, calibration_status=status)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
     others = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
     servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, others))
@@ -285,6 +286,7 @@ def _add_welding(
         sample_time=out("arm.sample_time"),
         job=command,
         hold=spine.hold,
+        calibration_status=status,
     )
     if station.diagram.HasOutputPort("arm.arc_established"):
         wiring.connect(servo, arc_established=out("arm.arc_established"))

@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.planning.clearance import arm_bodies
 from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
+from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
@@ -50,12 +51,23 @@ class SeamPlanning:
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
     surroundings: Surroundings = dc.field(default_factory=Surroundings)
+    local_field: LocalField | None = None
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
         if self.method.method == "cloud":
             return None
         return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
+
+    def field_at(self, points_B: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The local field (n, 3) m at points (n, 3) m of the part, for the orientation in which the flange would weld them as drawn.
+
+        Where that orientation is none of the calibration's, or the points lie far from its poses, this is zero.
+        """
+        assert self.local_field is not None
+        seam = tip_seam(self.workpiece, self.X_BP_guess, self.tool, self.seam_length_m)
+        R = touch_start_pose(seam, self.config).rotation() @ self.tool.X_FT.rotation().inverse()
+        return self.local_field.at_places(points_B, R.matrix())
 
     def waypoints(
         self, seam: SeamCurve, X_BP: RigidTransform | None
@@ -122,11 +134,12 @@ class SeamPlanner(BackgroundSystem):
         job: JobCommand = self._job.Eval(context)
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
             return None
-        X_BC, correction = self._X_BC_known, ScannerCorrection()
+        X_BC, correction, planning = self._X_BC_known, ScannerCorrection(), self._planning
         if X_BC is None:
             status: CalibrationStatus = self._status.Eval(context)
             X_BC, correction = status.X_BC, status.correction
-        planning = dc.replace(self._planning, workpiece=numbered(self._planning.workpiece, job.seam))
+            planning = dc.replace(planning, arm=status.arm_or(planning.arm), local_field=status.local_field)
+        planning = dc.replace(planning, workpiece=numbered(planning.workpiece, job.seam))
         return self.plan(planning, scan, X_BC, correction)
 
     def plan(
@@ -147,6 +160,8 @@ def plan_seam(
     points_C = scan.points_C.reshape(-1, 3).astype(float)
     points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
     points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
+    if planning.local_field is not None:
+        points_B = points_B - planning.field_at(points_B)
     try:
         found = plan_root_anyhow(
             points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up

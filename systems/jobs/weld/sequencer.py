@@ -15,6 +15,8 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, Pla
 from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.motion.goals import stands_at
 
+SCAN_TIMEOUT_S = 8.0
+
 
 @dc.dataclass(frozen=True)
 class JobPlan:
@@ -29,7 +31,7 @@ class JobPlan:
     required_error_m: float
     minimum_scans: int = 0
     dwell_s: float = 0.3
-    scan_timeout_s: float = 8.0
+    scan_timeout_s: float = SCAN_TIMEOUT_S
     move_timeout_s: float = 20.0
     maximum_time_s: float = 240.0
     seams: int = 1

@@ -1,17 +1,24 @@
 """Computes the weld job's settings from scenario and station: feature, poses, stop criterion, servo."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
+from weldcal.calibration.refinement.kinematics_fit import KINDS
+from weldcal.calibration.refinement.poses import informative_poses
+from weldcal.calibration.refinement.refined import PLAIN
+from weldcal.models.arms.chain import chain_of
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.workpieces.part import numbered
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig
-from weldcal.systems.jobs.weld.sequencer import JobPlan
+from weldcal.systems.jobs.weld.refinement import TIME_S
+from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
 from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
@@ -25,6 +32,8 @@ from weldcal.welding.servo.settings import (
     TouchConfig,
 )
 
+_POOL = (3, 2)
+"""Times the poses: how many to choose from, as many as the cell allows."""
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
 TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
@@ -99,20 +108,47 @@ def plan_poses(scenario: Scenario, station: Station, seed: int, *, count: int | 
     )
     if count is not None:
         # from half as many candidates again, which may lie closer together
-        config = replace(
-            config, candidates=max(config.candidates, 3 * count // 2), min_spacing_m=0.01, max_trials=60 * count
+        config = _denser(config, count)
+    wanted = c.maximum_scans + c.verification_scans + SPARE_POSES if count is None else count
+
+    def planned(config: PlannerConfig, n: int) -> list[PlannedPose]:
+        return plan_calibration_poses(
+            station.arm,
+            feature_on_flange(scenario, station),
+            c.mounting_guess.pose(),
+            preset,
+            n,
+            q_start=np.deg2rad(scenario.home_deg),
+            config=config,
+            tool=() if tool is None else tool.capsules(),
         )
-    poses = plan_calibration_poses(
-        station.arm,
-        feature_on_flange(scenario, station),
-        c.mounting_guess.pose(),
-        preset,
-        c.maximum_scans + c.verification_scans + SPARE_POSES if count is None else count,
-        q_start=np.deg2rad(scenario.home_deg),
-        config=config,
-        tool=() if tool is None else tool.capsules(),
-    )
+
+    refines = count is None and c.refine in KINDS
+    poses = _telling_of_the_arm(scenario, station, planned, config, wanted) if refines else planned(config, wanted)
     return clear_poses(scenario, station, poses, station_bodies(station))
+
+
+def _denser(config: PlannerConfig, count: int) -> PlannerConfig:
+    return replace(config, candidates=max(config.candidates, 3 * count // 2), min_spacing_m=0.01, max_trials=60 * count)
+
+
+def _telling_of_the_arm(
+    scenario: Scenario,
+    station: Station,
+    planned: Callable[[PlannerConfig, int], list[PlannedPose]],
+    config: PlannerConfig,
+    wanted: int,
+) -> list[PlannedPose]:
+    """Of more poses than are wanted those that tell most of camera, scanner and arm together, the first ones most."""
+    for times in _POOL:
+        try:
+            pool = planned(_denser(config, times * wanted), times * wanted)
+        except UnreachableScanner:
+            continue
+        q = np.array([p.q for p in pool])
+        guess, kind = scenario.calibration.mounting_guess.pose(), scenario.calibration.refine
+        return [pool[i] for i in informative_poses(chain_of(station.arm), guess, q, wanted, kind)]
+    return planned(config, wanted)
 
 
 def work_point(scenario: Scenario) -> np.ndarray:
@@ -136,6 +172,7 @@ def job_plan(scenario: Scenario) -> JobPlan:
         verification_limit_m=c.verification_limit_mm * 1e-3,
         required_error_m=c.required_error_mm * 1e-3,
         minimum_scans=c.minimum_scans,
+        scan_timeout_s=SCAN_TIMEOUT_S if c.refine == PLAIN else TIME_S,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
         maximum_time_s=job.maximum_time_s * slower * seams,
         seams=seams,
@@ -154,4 +191,5 @@ def calibrator_config(scenario: Scenario) -> CalibratorConfig:
         work_radius_m=c.work_radius_mm * 1e-3,
         cost_axes=tuple(c.cost_axes),
         correct_scanner=c.correct_scanner,
+        refine=c.refine,
     )

@@ -11,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
-from weldcal.systems.messages import JobCommand, Message, PlannedSeam
+from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, believed_arm
 from weldcal.welding.servo.interruption import Interruption, interruptible_step
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase, ServoSample, WeldingCommand, WeldingState
@@ -61,6 +61,7 @@ class WeldingVelocityServo(LeafSystem):
         - job
         - arc_established
         - hold
+        - calibration_status
         output_ports:
         - V_BT
         - servo_report
@@ -70,7 +71,8 @@ class WeldingVelocityServo(LeafSystem):
     `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B, zero unless the job's mode is `weld`; `telemetry` as named in TELEMETRY (SI), all of one tick; `torch_on`
     (1) is the request for the process: job and servo must both enable it, and it passes the ProcessSwitch. While it is on and
     `arc_established` (1; unconnected: always) is 0 the tool stands. While `hold` (1; unconnected: never) is 1 the torch is off and the
-    tool stands; it goes on from a little before that place.
+    tool stands; it goes on from a little before that place. Where `calibration_status` (may stay open) has an arm with refined kinematics,
+    that one is used.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class WeldingVelocityServo(LeafSystem):
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._arc = self.DeclareVectorInputPort("arc_established", 1)
         self._hold = self.DeclareVectorInputPort("hold", 1)
+        self._calibration = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(ServoReport()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareVectorOutputPort("V_BT", 6, self._velocity, ticket | {self._job.ticket()})
@@ -105,7 +108,8 @@ class WeldingVelocityServo(LeafSystem):
                 report = dc.replace(old, phase="IDLE", torch_on=False, command=None, interruption=Interruption())
                 state.get_mutable_abstract_state(self._state).set_value(report)
             return
-        X_BT = forward_kinematics(self._arm, self._q.Eval(context)) @ self._tool.X_FT
+        arm = believed_arm(self._calibration, context, self._arm)
+        X_BT = forward_kinematics(arm, self._q.Eval(context)) @ self._tool.X_FT
         arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else WeldingState()

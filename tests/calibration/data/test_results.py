@@ -23,10 +23,10 @@ from weldcal.calibration.data.results import (
     export_urdf,
     load_result,
     save_result,
-    write_atomically,
 )
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import write_atomic
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
 
@@ -63,9 +63,9 @@ def test_what_is_read_back_is_what_was_written(result: CalibrationResult, tmp_pa
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "f.txt"
-    write_atomically(path, "old")
+    write_atomic(path, "old")
     with pytest.raises(UnicodeEncodeError):
-        write_atomically(path, "new \ud800")
+        write_atomic(path, "new \ud800")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["f.txt"]
 

@@ -25,9 +25,9 @@ from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, PlannedSeam, Scan
+from weldcal.systems.phase_words import TEXT
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.viewer.cell_visualizer import ROOT, CellVisualizer, face_residuals
-from weldcal.systems.viewer.phase_labels import TEXT
 from weldcal.systems.viewer.scene import uncertainty_at
 from weldcal.systems.viewer.shapes import diverging
 from weldcal.welding.seam.curve import SeamCurve

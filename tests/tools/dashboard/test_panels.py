@@ -22,14 +22,14 @@ from weldcal.systems.jobs.tablet.procedure import TabletState, Touched
 from weldcal.systems.messages import FlangeEstimate, JobCommand, Scan
 from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.person import Person
-from weldcal.systems.viewer.live import LiveView, Moment
-from weldcal.systems.viewer.phase_labels import (
+from weldcal.systems.phase_words import (
     MOTION_STEPS,
     MOUNTING_STEPS,
     PROFILER_STEPS,
     TABLET_STEPS,
     WATCH_STEPS,
 )
+from weldcal.systems.viewer.live import LiveView, Moment
 from weldcal.tools.dashboard.facts import Facts
 from weldcal.tools.dashboard.picture import depth_picture
 from weldcal.tools.dashboard.server import Dashboard

@@ -15,7 +15,6 @@ from weldcal.calibration.profiler.edge.joint import EdgeEstimate
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.errors import ArcNotFound, FeatureNotFound
-from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
 from weldcal.calibration.profiler.plan import (
     Field,
@@ -24,7 +23,7 @@ from weldcal.calibration.profiler.plan import (
     sample_edge_poses,
     sample_sphere_poses,
 )
-from weldcal.calibration.profiler.record import ProfilerRecord, load_record, save_record
+from weldcal.calibration.profiler.record import ProfilerRecord, save_record
 from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
 from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, choose_model, sphere_joint
@@ -41,8 +40,6 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.commands.profiler.files import ProfilerFile
 from weldcal.tools.commands.profiler.noise import Sigmas, edge_by_noise
-from weldcal.tools.report.files import csv_text
-from weldcal.tools.report.render import write_atomic
 
 CANDIDATES = 300
 POORLY = 1.5  # reduced chi-square from which another convention of the poses is tried
@@ -71,9 +68,9 @@ def calibrate_edge(
     if side not in ("left", "right"):
         raise InputError(f"The side is left or right, not '{side}'.")
     poses = cast(FlangePoses, file.poses())
-    points, lost = _edge_points(file, feature, side)
+    points, lost = edge_points(file, feature, side)
     keep = np.asarray(np.isfinite(points).all(axis=1), bool)
-    _check_number(poses, points.shape, "profile points [x, z]", (2,))
+    check_number(poses, points.shape, "profile points [x, z]", (2,))
     poses, points = poses[keep], points[keep]
     found: dict[str, Any] = {"scans": len(keep), "without_feature": lost}
     if method == "paper":
@@ -107,7 +104,7 @@ def calibrate_edge(
     return ProfilerRecord.of("edge, joint", e, found, file.digest), found
 
 
-def _edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, list[int]]:
+def edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, list[int]]:
     """Points (n, 2) m, not finite where a profile shows no edge, and the numbers of those."""
     if not feature:
         return file.needed(
@@ -151,7 +148,7 @@ def sphere_data(
         raise InputError("There are touches but no tip. Give its position in the flange frame as --tip x,y,z in mm.")
     table = DhArm.of(load_arm(arm)) if arm else file.arm()
     poses = cast(FlangePoses, file.poses())
-    _check_number(poses, (len(file.profiles),), "profiles")
+    check_number(poses, (len(file.profiles),), "profiles")
     profiles, kept = [], []
     for k, p in enumerate(file.profiles):
         try:
@@ -165,7 +162,7 @@ def sphere_data(
         raise ArcNotFound("No scan shows an arc of the sphere. Check the radius, the unit and which column is z.")
     q = file.arrays.get("q")
     if q is not None:
-        _check_number(poses, (len(q),), "joint vectors q")
+        check_number(poses, (len(q),), "joint vectors q")
     return SphereData(
         poses[np.array(kept)], profiles, radius, felt, tip if felt is not None else None, table,
         None if q is None else q[kept], file.arrays.get("touch_q"),
@@ -190,7 +187,8 @@ def parse_tip(text: str) -> Floats | None:
     return tip
 
 
-def _check_number(poses: FlangePoses, shape: tuple[int, ...], what: str, each: tuple[int, ...] = ()) -> None:
+def check_number(poses: FlangePoses, shape: tuple[int, ...], what: str, each: tuple[int, ...] = ()) -> None:
+    """Check that an array of this shape has an entry (of the shape ``each``) for every pose. Raises InputError."""
     if shape != (len(poses), *each):
         found = str(shape[0]) if len(shape) == 1 else f"an array of shape {shape}"
         raise InputError(f"{len(poses)} poses need {len(poses)} {what}, not {found}.")
@@ -309,7 +307,7 @@ def calibrate_compensate(
         raise InputError(
             "The compensation needs touches. Give 'touch_T' and 'tip' in the file, or --touches and --tip."
         )
-    _check_number(data.poses, sign.shape, "signs")
+    check_number(data.poses, sign.shape, "signs")
     check_radius(data, SphereSigmas(), None)
     if "translated" in file.arrays:
         translated = file.arrays["translated"] > 0.5
@@ -340,38 +338,6 @@ def calibrate_compensate(
     }
     name, pose = "sphere, linear and compensated", (best.rotation, best.translation)
     return ProfilerRecord(name, *pose, tip=felt.tip, figures=found, data_sha256=file.digest), found
-
-
-def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, Any]:
-    """Writes a V-groove's three features of every profile in the base frame as seam.csv; returns the summary."""
-    record = load_record(calibration)
-    if file.profiles is None:
-        raise InputError("The file has no 'profiles' of the groove. Give (n, m, 2), or 'xz' with the lengths 'n'.")
-    poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
-    _check_number(poses, (len(file.profiles),), "profiles")
-    columns = ["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"]
-    rows, lost, rms = [], [], []
-    for k, p in enumerate(file.profiles):
-        try:
-            f = groove_features(p)
-        except FeatureNotFound:
-            lost.append(k)
-            continue
-        at = record.points_F(f.points) @ poses.rotation[k].T + poses.translation[k]
-        rows.append([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * f.rms_m:.4f}"])
-        rms.append(f.rms_m)
-    if not rms:
-        raise FeatureNotFound(
-            "No profile of the file shows a V-groove with plate on both sides. Check the file and its unit."
-        )
-    write_atomic(folder / "seam.csv", csv_text(columns, rows))
-    return {
-        "scans": len(poses),
-        "found": len(rms),
-        "without_groove": lost,
-        "rms_mm": 1e3 * float(np.median(rms)),
-        "method": record.method,
-    }
 
 
 def _figures(e: ProfilerEstimate) -> dict[str, Any]:

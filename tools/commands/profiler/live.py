@@ -61,7 +61,9 @@ def write_live(live: ProfilerLive, finished: JobRun) -> None:
     finished.write_recording(folder)
     write_atomic(
         folder / "report.html",
-        live_report(live.summary(), live.outcome, s, finished.run, recording=finished.meshcat is not None),
+        live_report(
+            live.summary(), live.outcome, s, finished.run, first=live.first, recording=finished.meshcat is not None
+        ),
     )
 
 

@@ -19,6 +19,8 @@ from weldcal.calibration.tablet.wrist.fit import WristFit, fit_wrist
 from weldcal.models.errors import InputError
 from weldcal.tools.commands.tablet.planar import NAMES, best_model, fit_visit
 from weldcal.tools.commands.tablet.visits import ManyVisits, error_figures, fit_many
+from weldcal.tools.outcomes.first_screen import NO_TOLERANCE, FirstScreen, check_limit
+from weldcal.tools.outcomes.tablet import tablet_screen
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tablet import Shown, calibration_report, marked_picture
 
@@ -38,6 +40,7 @@ class TabletInputs:
     hand_step_m: float | None = None  # None: detected
     printed_sign: bool = False
     two_stages: bool = False
+    limit_mm: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +54,13 @@ class TabletCalibration:
     step_m: float = 0.0
     held_out_mm: np.ndarray = field(default_factory=lambda: np.zeros(0))
     seconds: float = 0.0
+    limit_mm: float | None = None
+    no_tolerance: str = NO_TOLERANCE
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen."""
+        return tablet_screen(self.result, self.held_out_mm, self.limit_mm, self.no_tolerance)
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `tablet calibrate`."""
@@ -78,7 +88,7 @@ class TabletCalibration:
     def write(self, folder: Path) -> None:
         """Write the result folder, its report included."""
         save_tablet_result(self.result, folder)
-        page = calibration_report(self.result, self.shown, self.seconds, error_figures(self.held_out_mm))
+        page = calibration_report(self.result, self.shown, self.first, self.seconds, error_figures(self.held_out_mm))
         write_atomic(folder / "report.html", page)
 
 
@@ -88,6 +98,7 @@ def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration | 
     Raises:
         InputError and other WeldcalErrors: the files cannot be used; nothing is written.
     """
+    check_limit(inputs.limit_mm)
     if not inputs.file.is_file():
         raise InputError(f"There is no file '{inputs.file}'. Give the page's CSV, or an npz of planar touches.")
     if inputs.file.suffix.lower() not in (".npz", ".csv"):
@@ -96,7 +107,7 @@ def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration | 
         )
     start = time.perf_counter()
     made = _planar(inputs) if inputs.file.suffix.lower() == ".npz" else _wrist(inputs)
-    made = replace(made, seconds=time.perf_counter() - start)
+    made = replace(made, seconds=time.perf_counter() - start, limit_mm=inputs.limit_mm)
     made.write(folder)
     return made
 

@@ -1,6 +1,6 @@
 """Runs the tablet job of a scenario: files for `weldcal tablet calibrate`, the calibration, and its errors against the truth."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,9 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
 from weldcal.tools.commands.tablet.files import write_visit
+from weldcal.tools.outcomes.first_screen import FirstScreen
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.outcomes.tablet import NO_KEY, run_screen
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tablet import visit_report
 
@@ -39,6 +41,12 @@ class TabletDemo:
     def folder(self) -> Path:
         """The result folder."""
         return self.options.out
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen."""
+        made = None if self.calibration is None else replace(self.calibration, no_tolerance=NO_KEY).first
+        return run_screen(made, self.run.reason or "", self.found)
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `tablet demo`."""
@@ -72,7 +80,7 @@ def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress)
     finished.write_recording(options.out)
     done = demo.calibration
     result, shown = (None, None) if done is None else (done.result, done.shown)
-    page = visit_report(run, demo.summary(), result, shown, recording=finished.meshcat is not None)
+    page = visit_report(run, demo.summary(), result, shown, first=demo.first, recording=finished.meshcat is not None)
     write_atomic(options.out / "report.html", page)
     return demo
 

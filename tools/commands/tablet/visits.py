@@ -16,7 +16,10 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.tablet.planar import NAMES, VisitFits, best_model, fit_visit
 from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.outcomes.first_screen import FirstScreen
+from weldcal.tools.outcomes.tablet import visits_screen
 from weldcal.tools.report.files import mappings_csv
+from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.report.tablet import Page
 
@@ -32,6 +35,17 @@ class ManyVisits:
     errors_mm: dict[str, float]
     step_m: float
     seconds: float = 0.0
+    limit_mm: float | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen: of all visits together."""
+        held = self.held_out_mm(self.model)
+        queried = bool(held.size)
+        if not queried:
+            held = np.concatenate([v.left_out_mm(self.model) for v in self.visits])
+        warnings = [f"Visit {v.visit.name}: {text}" for v in self.visits for text in v.warnings]
+        return visits_screen(held[np.isfinite(held)], queried, warnings, self.refused, len(self.visits), self.limit_mm)
 
     def held_out_mm(self, model: str) -> Array:
         """Errors at the queries of all visits, mm; empty where there are none."""
@@ -95,12 +109,18 @@ class ManyVisits:
         models = ", ".join(f"{m} {fixed(e, 3)} mm" for m, e in self.errors_mm.items())
         return render(
             "tablet.html.j2",
+            first=self.first,
             page=Page(
                 title="Calibration of camera and pen by a tablet: all visits",
                 subtitle=f"{self.file.name}: {len(self.visits)} visits. Held-out landmarks by model: {models}.",
-                verdict=("warn" if self.refused else "good", f"{len(self.visits)} visits calibrated", f"Model: {self.model}."),
                 cards=cards,
                 notes=[*(f"Visit {name} was refused: {reason}" for name, reason in self.refused), *warnings],
+                errors=error_bars(
+                    [v.visit.name for v in self.visits],
+                    np.array([np.nan if (e := self._visit(v)["leave_one_out_mm"]) is None else e for v in self.visits]),
+                    np.ones(len(self.visits), bool),
+                    "held-out landmark, mean, mm",
+                ),
                 header=("visit", "queries, mm", "held out, mm", "fit, mm", "landmarks"),
                 rows=rows,
                 provenance=[

@@ -86,7 +86,7 @@ def write_cell(part: MadePart, folder: Path, trial: Trial) -> Path:
         seam_mm="null" if trial.seam_mm is None else trial.seam_mm,
     )
     path = folder / f"{part.name}.yaml"
-    path.write_text(text, encoding="utf-8")
+    write_atomic(path, text)
     return path
 
 

@@ -1,4 +1,4 @@
-"""The phases of the weld job in words, and its steps: one list for the 3D view, the dashboard and the reports."""
+"""The words for the phases of every job: one list, for the terminal, the dashboard, the 3D view and the report."""
 
 TEXT = {
     "start": "ready",
@@ -19,6 +19,26 @@ TEXT = {
     "done": "done",
     "held": "HELD: see the report",
 }
+"""The phases of the weld job."""
+OTHERS = {
+    "to_start": "home",
+    "to_look": "to the look",
+    "look": "look at the tablet",
+    "to_above": "touch the landmarks",
+    "descend": "touch the landmarks",
+    "lift": "touch the landmarks",
+    "to_home": "home",
+    "move": "to the next pose",
+    "scan": "scan",
+    "collect": "stream scans in motion",
+    "calibrate": "calibrate",
+    "compute": "compute",
+    "dwell": "come to rest",
+    "await": "wait for the scan",
+    "run": "move along the seam",
+}
+"""The phases of the other jobs that the weld job does not have."""
+
 STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
     (
         "Calibrate",
@@ -65,5 +85,9 @@ PROFILER_STEPS = {
     "home": "Go home",
 }
 """Steps of the other jobs: name, and the keys of the step (see the dashboard's `stage_of`)."""
-CAMERAS = {"follow": "Follow the job", "cell": "Cell", "scanner": "Scanner's eye", "seam": "Seam"}
-"""The cameras of the 3D view in words."""
+
+
+def phase_words(phase: str, detail: str = "") -> str:
+    """A phase in words, with a detail after a comma; a phase that is not listed (of an installed job) as it is written."""
+    words = TEXT.get(phase) or OTHERS.get(phase) or phase.replace("_", " ")
+    return f"{words}, {detail}" if detail else words

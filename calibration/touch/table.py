@@ -1,0 +1,163 @@
+"""Reads touches.csv: one row for each touch, metres and unit quaternions, with a feature's numbers or the cloud that shows it."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.data.checks import check_reach, row_numbers, table_rows, unit_quaternion
+from weldcal.calibration.data.clouds import read_cloud
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.errors import DatasetError
+from weldcal.calibration.touch.fitted import around, fit_touched_plane, fit_touched_sphere
+from weldcal.calibration.touch.touches import (
+    EDGE,
+    FEATURES,
+    PLANE,
+    POINT,
+    SIGMA_RADIUS_M,
+    SIGMA_SCAN_M,
+    SIGMA_TIP_M,
+    SPHERE,
+    Touch,
+    require_touches,
+)
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+TIP = ("tip_x", "tip_y", "tip_z", "tip_radius")
+CAMERA = ("camera_x", "camera_y", "camera_z")
+DIRECTION = ("camera_nx", "camera_ny", "camera_nz")
+REQUIRED = ("id", "feature", *POSE, *TIP, *CAMERA)
+_WITHIN_M = 0.01
+_LONGEST_TIP_M = 2.0
+_LARGEST_RADIUS_M = 0.2
+
+
+def read_touches(path: Path, correction: ScannerCorrection | None = None) -> tuple[Touch, ...]:
+    """The touches of a table; ``correction`` is the result's, for spheres that are fitted to a cloud.
+
+    Raises:
+        InputError: the file, a cell or a cloud cannot be used: one sentence with the row and what to change.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DatasetError(f"There is no file '{path}' of touches: give a CSV with the columns {','.join(REQUIRED)}.")
+    rows = table_rows(path, REQUIRED)
+    touches = tuple(_touch(row, path, correction) for row in rows)
+    check_reach(np.array([t.X_BF.translation() for t in touches]), path, "m")
+    check_reach(np.array([t.p_C for t in touches]), path, "m", "scanner")
+    require_touches(touches)
+    return touches
+
+
+def touches_text(touches: Sequence[Touch]) -> str:
+    """The table of touches, which read_touches reads."""
+    joints = max((len(t.q) for t in touches if t.q is not None), default=0)
+    names = [*REQUIRED, *DIRECTION, "feature_radius", "sigma_tip", "sigma_radius", "sigma_scan"]
+    names += [f"q{i + 1}" for i in range(joints)]
+    lines = [",".join(names)]
+    for t in touches:
+        numbers = [*t.X_BF.translation(), *t.X_BF.rotation().ToQuaternion().wxyz(), *t.p_FT, t.radius, *t.p_C]
+        direction = ["", "", ""] if t.direction_C is None else [repr(float(v)) for v in t.direction_C]
+        own = [t.feature_radius, t.sigma_tip, t.sigma_radius, t.sigma_scan]
+        q = [""] * joints if t.q is None else [repr(float(v)) for v in t.q]
+        lines.append(
+            ",".join(
+                [t.id, t.feature, *(repr(float(v)) for v in numbers), *direction, *(repr(float(v)) for v in own), *q]
+            )
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _touch(row: dict[str, str], path: Path, correction: ScannerCorrection | None) -> Touch:
+    name, feature = row["id"], row["feature"].lower()
+    if feature not in FEATURES:
+        raise DatasetError(
+            f"'{path.name}': the feature of '{name}' is '{row['feature'][:40]}'; write {', '.join(FEATURES[:-1])} or {FEATURES[-1]}."
+        )
+    xyz, wxyz = np.split(np.array(row_numbers(row, POSE, path)), [3])
+    *tip, radius = row_numbers(row, TIP, path)
+    if float(np.linalg.norm(tip)) > _LONGEST_TIP_M or not 0.0 <= radius <= _LARGEST_RADIUS_M:
+        raise DatasetError(
+            f"'{path.name}': the tip of '{name}' must be in metres on the flange, with a radius from 0 to {_LARGEST_RADIUS_M:g} m."
+        )
+    joints = tuple(sorted((c for c in row if re.fullmatch(r"q\d+", c) and row[c]), key=lambda c: int(c[1:])))
+    touch = Touch(
+        name,
+        feature,
+        RigidTransform(unit_quaternion(list(wxyz), name), xyz),
+        np.array(tip),
+        radius,
+        np.array(row_numbers(row, CAMERA, path)),
+        _direction(row, path),
+        _positive(row, "feature_radius", 0.0, path),
+        _positive(row, "sigma_tip", SIGMA_TIP_M, path),
+        _positive(row, "sigma_radius", SIGMA_RADIUS_M, path),
+        _positive(row, "sigma_scan", SIGMA_SCAN_M, path),
+        np.array(row_numbers(row, joints, path)) if joints else None,
+    )
+    return touch if not row.get("cloud") else _fitted(touch, row, path, correction)
+
+
+def _fitted(touch: Touch, row: dict[str, str], path: Path, correction: ScannerCorrection | None) -> Touch:
+    """The touch with its plane or sphere from the row's cloud, around the place that the row gives."""
+    if touch.feature in (POINT, EDGE):
+        raise DatasetError(
+            f"'{path.name}': a {touch.feature} ('{touch.id}') is not fitted to a cloud; give its place"
+            + (
+                " and direction (camera_nx, camera_ny, camera_nz)."
+                if touch.feature == EDGE
+                else ", and leave cloud empty."
+            )
+        )
+    try:
+        cloud = read_cloud(path.parent / row["cloud"])
+    except InputError as problem:
+        raise DatasetError(f"'{path.name}', touch '{touch.id}': {problem}") from problem
+    near = around(cloud, touch.p_C, _positive(row, "within", _WITHIN_M, path), touch.id)
+    given = row.get("sigma_scan")
+    if touch.feature == PLANE:
+        p, n, sigma = fit_touched_plane(near)
+        return replace(touch, p_C=p, direction_C=n, sigma_scan=touch.sigma_scan if given else _no_less(sigma))
+    if touch.feature == SPHERE and not touch.feature_radius > 0.0:
+        raise DatasetError(
+            f"'{path.name}': the sphere of '{touch.id}' needs its radius in the column feature_radius (m)."
+        )
+    c, sigma = fit_touched_sphere(near, touch.feature_radius, correction)
+    return replace(touch, p_C=c, sigma_scan=touch.sigma_scan if given else _no_less(sigma))
+
+
+def _no_less(sigma: float) -> float:
+    """Points of one scan err together: their mean is not known better than half of what is assumed without them."""
+    return max(sigma, 0.5 * SIGMA_SCAN_M)
+
+
+def _direction(row: dict[str, str], path: Path) -> Array | None:
+    if not any(row.get(c) for c in DIRECTION):
+        return None
+    missing = [c for c in DIRECTION if not row.get(c)]
+    if missing:
+        raise DatasetError(f"'{path.name}': the direction of '{row['id']}' lacks {', '.join(missing)}.")
+    n = np.array(row_numbers(row, DIRECTION, path))
+    length = float(np.linalg.norm(n))
+    if not abs(length - 1.0) < 1e-2:
+        raise DatasetError(
+            f"'{path.name}': the direction of '{row['id']}' has the length {length:.3f}; give a unit vector."
+        )
+    return n / length
+
+
+def _positive(row: dict[str, str], column: str, otherwise: float, path: Path) -> float:
+    if not row.get(column):
+        return otherwise
+    (value,) = row_numbers(row, (column,), path)
+    if not 0.0 <= value < 1.0:
+        raise DatasetError(
+            f"'{path.name}': {column} of '{row['id']}' is {value:g}; it is a length in metres, from 0 to 1."
+        )
+    return value

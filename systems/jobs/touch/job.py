@@ -1,0 +1,133 @@
+"""The touch job: one scan of the part, then the soft tip touches flat places beside its groove."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
+
+from weldcal.calibration.data.results import CalibrationResult, load_result
+from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
+from weldcal.calibration.touch.touches import PLANE, Touch
+from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.config import FingerCameraConfig
+from weldcal.systems.jobs.job import AddedJob, Job, Phases
+from weldcal.systems.jobs.touch.config import TouchConfig, check_touch
+from weldcal.systems.jobs.touch.planner import TouchPlanner, TouchPlanning
+from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
+from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
+from weldcal.systems.jobs.weld.job import seam_planning
+from weldcal.systems.jobs.weld.settings import servo_config
+from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, JobPorts, Spine
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station
+from weldcal.systems.wiring import Wiring
+
+
+@dataclass(eq=False)
+class AddedTouches(AddedJob):
+    """The systems of the job, and the calibration that it judges."""
+
+    result: CalibrationResult
+    station: Station
+    points: int
+    procedure: TouchProcedure
+    ports: JobPorts
+    maximum_time_s: float
+
+    def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
+        """See AddedJob."""
+        state: TouchState = self.state(root)
+        return state.phase.replace("_", " "), 0.95 if state.finished else 0.1 + 0.8 * len(state.felt) / self.points
+
+    def touches(self, root: Context) -> tuple[Touch, ...]:
+        """The touches so far: the tip where it was pressed to, its ball less by what it gave way, and the plane of the scan there."""
+        tool, arm = self.station.tool, self.station.arm
+        assert tool is not None
+        found = []
+        for k, felt in enumerate(self.state(root).felt):
+            X_FT = tool.X_FT
+            force = tool.axial_stiffness_N_per_m * max(float(felt.deflection_T[2]), 0.0)
+            found.append(
+                Touch(
+                    f"touch{k + 1:02d}",
+                    PLANE,
+                    forward_kinematics(arm, felt.q),
+                    np.asarray(X_FT.multiply(felt.deflection_T)),
+                    tool.tip_radius_m - tool.indentation(force),
+                    felt.place.p_C,
+                    felt.place.n_C,
+                    sigma_scan=max(felt.place.sigma_m, 2.5e-5),
+                    q=felt.q,
+                )
+            )
+        return tuple(found)
+
+
+class TouchJob(Job[TouchPlanning]):
+    """The job of a scenario with a `touch` part."""
+
+    key = "touch"
+    config = TouchConfig
+
+    def check(self, scenario: Scenario) -> None:
+        """See Job."""
+        check_touch(scenario)
+
+    def plan(self, scenario: Scenario, station: Station, seed: int) -> TouchPlanning:
+        """See Job: what is planned from once the part is scanned."""
+        config = scenario.part(TouchConfig)
+        assert config is not None
+        result = load_result(Path(config.result))
+        if result.robot and result.robot != scenario.arm:
+            raise InputError(f"touch.result is of the arm '{result.robot}', and the scenario has a {scenario.arm}.")
+        correction = correction_from_document(result.scanner_correction) or ScannerCorrection()
+        return TouchPlanning(
+            seam_planning(scenario, station, servo_config(scenario, station)),
+            RigidTransform(result.X_BC),
+            correction,
+            config,
+        )
+
+    def add(self, wiring: Wiring, spine: Spine, plan: TouchPlanning) -> AddedTouches:
+        """See Job."""
+        station, scenario, config = wiring.station, wiring.scenario, plan.config
+        assert station.tool is not None
+        assert isinstance(scenario.finger_camera, FingerCameraConfig)
+        slower = 1.0 / scenario.job.speed_factor
+        motion = TouchMotion(
+            np.deg2rad(scenario.home_deg),
+            1e-3 * config.descent_mm_s,
+            1e-3 * config.press_mm,
+            (config.clearance_mm + config.deepest_mm + config.press_mm) / config.descent_mm_s,
+            MOVE_TIMEOUT_S * slower,
+            scenario.job.maximum_time_s * slower,
+        )
+        planner = wiring.add("touch_planner", TouchPlanner(plan, station.background))
+        finger = wiring.add(
+            "deformation_estimator",
+            ArucoDeformationEstimator(station.arm, station.tool, scenario.finger_camera.camera(), station.background),
+        )
+        procedure = wiring.add("touch_procedure", TouchProcedure(station.arm, station.tool, motion))
+        command = procedure.GetOutputPort("job")
+        wiring.connect(planner, scan=wiring.out("scanner.scan"), job=command)
+        wiring.connect(finger, image=wiring.out("finger_camera.image"), history=spine.arm.history)
+        wiring.connect(
+            procedure,
+            position_measured=spine.arm.position,
+            settled_goal=spine.arm.settled_goal,
+            robot_status=spine.arm.status,
+            planned_touches=planner.GetOutputPort("planned_touches"),
+            deformation=finger.GetOutputPort("deformation"),
+            hold=spine.end,
+        )
+        wiring.feed("scanner.trigger", procedure.GetOutputPort("trigger"))
+        wiring.feed("finger_camera.streaming", procedure.GetOutputPort("streaming"))
+        ports = JobPorts((command,), procedure.GetOutputPort("state"), procedure.GetOutputPort("descent"))
+        result = load_result(Path(config.result))
+        return AddedTouches(result, station, config.points, procedure, ports, motion.maximum_time_s)
+
+
+JOB = TouchJob()

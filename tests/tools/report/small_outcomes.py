@@ -1,0 +1,295 @@
+"""Small outcomes of every command that computes a pose, put together without a job, and the pages of their reports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from tests.calibration.eye_on_base.test_solve import make_observations
+from tests.calibration.hand_eye.poses import eye_in_hand, random_poses
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord
+from weldcal.calibration.data.scanner_clock import ScannerClock
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import Convergence
+from weldcal.calibration.hand_eye.mountings import get_mounting
+from weldcal.calibration.hand_eye.problem import full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
+from weldcal.calibration.motion.drift.sequential import MOVED, DriftEvent
+from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.tablet.result import TabletResult
+from weldcal.systems.messages import CalibrationStatus, VerificationResult
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.outcomes.calibration import (
+    CARE,
+    CalibrationReport,
+    PoseError,
+    Verdict,
+    VerifyReport,
+    error_summary,
+)
+from weldcal.tools.outcomes.demo import DemoResult
+from weldcal.tools.outcomes.first_screen import NO_TOLERANCE, FirstScreen
+from weldcal.tools.outcomes.hand_eye import HandEyeReport, MethodRow
+from weldcal.tools.outcomes.monitor import MonitorReport
+from weldcal.tools.outcomes.motion import MotionReport
+from weldcal.tools.outcomes.mounting import MountingReport
+from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome, ProfilerLive
+from weldcal.tools.outcomes.profiler_file import ProfilerFile, ProfilerSeam
+from weldcal.tools.outcomes.tablet import tablet_screen
+from weldcal.tools.report.calibration import calibration_report
+from weldcal.tools.report.demo import demo_pictures, demo_report
+from weldcal.tools.report.hand_eye import hand_eye_report
+from weldcal.tools.report.monitor import monitor_page
+from weldcal.tools.report.motion_calibration import motion_report
+from weldcal.tools.report.mounting import mounting_report
+from weldcal.tools.report.profiler_file import profiler_report, seam_report
+from weldcal.tools.report.profiler_live import live_report
+from weldcal.tools.report.tablet import Shown
+from weldcal.tools.report.tablet import calibration_report as tablet_report
+from weldcal.tools.report.verify import verify_report
+
+Made = tuple[FirstScreen, str]
+OUT = Path("result")
+X = RigidTransform(RollPitchYaw(3.1, 0.02, 0.4), [0.65, 0.02, 0.94])
+COVARIANCE = np.diag([1e-4] * 3 + [5e-5] * 3) ** 2
+OBSERVATIONS = make_observations(10, 3)
+ESTIMATE = estimate_eye_on_base(OBSERVATIONS, SolveConfig(hypotheses=40))
+RESULT = CalibrationResult(
+    ESTIMATE.X_BC,
+    ESTIMATE.covariance,
+    error_summary(1e3 * ESTIMATE.held_out.position_m),
+    {"median": 0.01, "p95": 0.03},
+    tuple(PoseRecord(o.id, True, "", 0.1, 0.2, 0.01, 0.02) for o in OBSERVATIONS),
+    warnings=("A <warning> of this calibration.",),
+    robot="ur10e",
+    flange="iso9409-1-50-4-m6",
+    scanner="phoxi_m",
+    sigma_position_mm=1e3 * ESTIMATE.sigma_position_m,
+    data_hashes={"clouds/p0.ply": "0123456789abcdef" * 4},
+)
+
+
+def calibrate() -> Made:
+    """`calibrate` of ten scans within its tolerance, with a warning."""
+    counts = np.arange(4, 10)
+    curve = Convergence(counts, *(1e-4 * np.ones((2, len(counts))) for _ in range(3)))
+    report = CalibrationReport(
+        RESULT, ESTIMATE, tuple(OBSERVATIONS), None, {}, (("p99", "No flange was found."),), (), None, curve,
+        error_summary(np.array([0.2])), 1.0, OUT, ("Add a pose near (1, 2, 3).",), limit_mm=2.0,
+    )  # fmt: skip
+    return report.first, calibration_report(report, dataset="scans")
+
+
+def verify() -> Made:
+    """`verify` on scans of which some were used before."""
+    poses = tuple(PoseError(o.id, 0.1 + 0.01 * k, 0.02, k < 3) for k, o in enumerate(OBSERVATIONS))
+    verdict = Verdict(CARE, 0.4, "The median error is within the limit. But: something.")
+    report = VerifyReport(
+        RESULT, None, tuple(OBSERVATIONS), {}, poses, (("p99", "Empty."),), ("Take new scans.",), {}, OUT, verdict, "given"
+    )  # fmt: skip
+    return report.first, verify_report(report, dataset="others")
+
+
+def motion() -> Made:
+    """`calibrate` of a recording in motion."""
+    n = 30
+    rng = np.random.default_rng(0)
+    values = 1e-4 * np.abs(rng.standard_normal((6, n)))
+    p_C = np.array([o.p_CR for o in make_observations(n, 1)])
+    estimate = SimpleNamespace(
+        X_BC=RESULT.X_BC,
+        clock=ScannerClock("arrival", 0.03, 1e-4, 1e-3, 0.0, reason="There is no other."),
+        start=SimpleNamespace(delays=np.linspace(0.0, 0.1, 20), rms_m=1e-3 * np.ones(20), delay_s=0.03),
+        inliers=np.ones(n, bool), capture=np.linspace(0.0, 3.0, n), residual_m=values[0], along_m=values[1], before_m=values[2],
+        held_out_m=values[3],
+    )  # fmt: skip
+    frames = ObservedFrames(
+        tuple(map(str, range(n))), np.linspace(0.0, 3.0, n), None, p_C, np.tile([0.0, 0.0, 1.0], (n, 1)),
+        np.tile(1e-9 * np.eye(3), (n, 1, 1)), 1e-3 * np.ones(n),
+    )  # fmt: skip
+    report = MotionReport(RESULT, cast(Any, estimate), frames, (("31", "No flange."),), (), 1.0, OUT)
+    return report.first, motion_report(report, dataset="moving")
+
+
+def monitor() -> Made:
+    """`monitor` that found a move."""
+    n = 60
+    rng = np.random.default_rng(0)
+    event = DriftEvent(
+        MOVED, 2.0, 0.05, 2.3, np.array([1e-3, 0.0, 0.0]), np.zeros(3), COVARIANCE, X, "translation", 80.0, 30.0,
+        "the scanner or the base has moved",
+    )  # fmt: skip
+    clock = SimpleNamespace(
+        clock=SimpleNamespace(kind="arrival"), delay_s=0.1, sigma_s=1e-3, jitter_s=1e-3, source="recording"
+    )
+    watched = SimpleNamespace(
+        ids=tuple(map(str, range(n))), rows=SimpleNamespace(times=np.linspace(0.0, 4.0, n)),
+        residuals=1e-4 * rng.standard_normal((n, 3)), tilts=1e-4 * rng.standard_normal((n, 2)),
+        before=1e-3 * rng.standard_normal((n, 3)), offsets=1e-3 * rng.standard_normal(n), gross=np.zeros(n, bool),
+        statistic=np.linspace(1.0, 80.0, n), threshold=30.0, events=(event,), X_BC=X, covariance=COVARIANCE, since_s=2.0,
+        clock=clock, noise=SimpleNamespace(jitter_s=1e-3), dropped=(("q", "No flange: 3"),), rms_m=2e-4, rms_after_m=1e-4,
+    )  # fmt: skip
+    report = MonitorReport(cast(Any, watched), RESULT, None, event.cause, 1e-3, (), 1.0, OUT)
+    return report.first, monitor_page(report, recording="moving")
+
+
+def _hand_eye() -> Any:
+    F, G, *_ = eye_in_hand(12, np.random.default_rng(2), 1e-4, 1e-4)
+    mounting = get_mounting("eye_in_hand")
+    return solve_problem(
+        full_problem(F, G, free=(True, True, False)),
+        config=HandEyeConfig(),
+        equation=mounting.equation,
+        labels=mounting.labels,
+    )
+
+
+def hand_eye() -> Made:
+    """`hand-eye ax-yb` without a tolerance."""
+    comparison = (MethodRow("weldcal", 0.01, 0.1), MethodRow("TSAI", float("nan"), float("nan")))
+    mounting = get_mounting("eye_in_hand")
+    report = HandEyeReport(
+        _hand_eye(), mounting, comparison, None, (), 0.1, advice="Like sample 3, turned.", folder=OUT
+    )
+    return report.first, hand_eye_report(report, "samples.npz", "ab" * 32)
+
+
+def _run(name: str, **job: Any) -> Any:
+    """A finished run of a scenario that was not run."""
+    scenario = load_scenario(name)
+    timing: dict[str, object] = {"simulated_seconds": 10.0, "wall_seconds": 5.0, "real_time_factor": 2.0}
+    context = SimpleNamespace(get_time=lambda: 10.0)
+    cell = SimpleNamespace(scenario=scenario, job=SimpleNamespace(**job))
+    return SimpleNamespace(
+        cell=cell, root=context, held=False, reason=None, clock=None, seconds=10.0, wall_seconds=5.0,
+        phases=[("start", 0.0, 0.0), ("scan_pose", 1.0, 0.5), ("done", 9.0, 4.5)], timing=lambda: timing,
+    )  # fmt: skip
+
+
+class LiveMounting(MountingReport):
+    """A mounting's report without ground truth."""
+
+    def truth_errors(self) -> dict[str, Any]:
+        """None."""
+        return {}
+
+
+def mounting() -> Made:
+    """`hand-eye live`."""
+    from weldcal.models.scanners import get_scanner
+
+    scanner = get_scanner("phoxi_s")
+    scene = SimpleNamespace(
+        mounting=get_mounting("eye_in_hand"), scanner=scanner, known=(), configuration="eye_in_hand", two=False
+    )
+    status = SimpleNamespace(
+        sequence=9, seen=(), refused=(("pose3", "No circle."),), sigma_work_m=2e-5, history=((4, 4e-5), (9, 2e-5)),
+        held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),), next_best=None, message="",
+    )  # fmt: skip
+    run = _run("eye_in_hand", scene=scene, truth={}, status=lambda root: status)
+    report = LiveMounting(run, _hand_eye(), OUT, 5.0)
+    return report.first, mounting_report(report, None)
+
+
+def _demo(estimate: Any, *, held: bool) -> Made:
+    sequencer = SimpleNamespace(
+        GetMyContextFromRoot=lambda root: root, job_state=lambda context: SimpleNamespace(warnings=("A remark.",))
+    )
+    run = _run(
+        "calibrate_only",
+        sequencer=sequencer,
+        drift=lambda root: None,
+        planned_seam=lambda root: SimpleNamespace(seam=None),
+    )
+    if held:
+        run.held, run.reason = True, "The tag was lost."
+    status = CalibrationStatus(
+        11, 10, tuple(OBSERVATIONS), (("p77", "No ring."),), estimate, 9e-5,
+        history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)), verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
+    )  # fmt: skip
+    result = DemoResult(RunOptions("calibrate_only", OUT), run, status, None, None)
+    return result.first, demo_report(result, demo_pictures(result), recording=True)
+
+
+def demo() -> Made:
+    """`demo` that calibrated."""
+    return _demo(ESTIMATE, held=False)
+
+
+def held() -> Made:
+    """`demo` that was held before it had a pose."""
+    return _demo(None, held=True)
+
+
+RECORD = ProfilerRecord("sphere, affine", X.rotation().matrix(), np.array([0.03, -0.07, 0.16]), COVARIANCE)
+
+
+def profiler() -> Made:
+    """`profiler sphere` with a tolerance that it misses."""
+    points = np.random.default_rng(0).uniform([-0.02, 0.15], [0.02, 0.2], (100, 2))
+    found = {"scans": 20, "model": "affine", "rms_mm": 0.05, "without_sphere": [3], "warnings": ["Check the radius."]}
+    made = ProfilerFile(RECORD, found, points, np.linspace(0.1, 0.4, 19), "sphere.npz", OUT, 0.2)
+    return made.first, profiler_report(made)
+
+
+def seam() -> Made:
+    """`profiler seam`."""
+    found = {"scans": 20, "found": 19, "without_groove": [4], "rms_mm": 0.05, "error_95_mm": 0.12, "method": "sphere"}
+    made = ProfilerSeam(RECORD, found, np.random.default_rng(0).uniform(0.0, 100.0, (19, 3)), "groove.npz", OUT, OUT)
+    return made.first, seam_report(made)
+
+
+def profiler_live() -> Made:
+    """`profiler live` of an edge."""
+    estimate = SimpleNamespace(rotation=RECORD.rotation, translation=RECORD.translation, covariance=COVARIANCE)
+    edge = SimpleNamespace(estimate=estimate, held_out_mm=np.array([0.1, 0.2, 0.1, 0.3, 0.2]), lost=0)
+    estimate.inliers, estimate.reduced_chi2 = np.ones(5, bool), 1.0
+    scans = tuple(SimpleNamespace(points=np.array([[0.0, 0.2], [0.01, 0.2]])) for _ in range(5))
+    state = SimpleNamespace(
+        edge=edge, sphere=None, seam=None, edge_scans=scans, sphere_scans=(), seam_scans=(), touches=()
+    )
+    run = _run("profiler_edge", state=lambda root: state)
+    outcome = LiveOutcome(PoseOutcome(0.1, 0.01, 0.1, 0.01, np.ones(6), 6.0), None, None, None, None, None, None)
+    live = ProfilerLive(RunOptions("profiler_edge", OUT), run, outcome)
+    page = live_report(live.summary(), outcome, cast(Any, state), run, first=live.first, recording=False)
+    return live.first, page
+
+
+def tablet() -> Made:
+    """`tablet calibrate` with poses of the wrist."""
+    n = 9
+    covariance = COVARIANCE.tolist()
+    result = TabletResult(
+        "wrist", {"x": 0.1}, covariance, [0.1] * n, [0.2 + 0.01 * k for k in range(n)], X, covariance, [0.0, 0.0, 0.15],
+        (1e-9 * np.eye(3)).tolist(), data_sha256={"touches.csv": "ab" * 32},
+    )  # fmt: skip
+    grid = 0.05 * np.array([(i, j) for i in range(3) for j in range(3)], dtype=float)
+    shown = Shown(grid, 1e-4 * random_poses(n, np.random.default_rng(1))[:, :2, 3], tuple(map(str, range(n))))
+    first = tablet_screen(result, np.zeros(0), 0.5, NO_TOLERANCE)
+    return first, tablet_report(result, shown, first, 0.1)
+
+
+def finger() -> Made:
+    """`finger calibrate` with touches."""
+    from weldcal.tools.commands.finger_calibrate import FingerReport, finger_page
+    from weldcal.welding.servo.finger_calibration import Intrinsics, TipCalibration
+
+    camera = Intrinsics(np.diag([900.0, 900.0, 1.0]), np.zeros(5), 640, 480, 0.2, 0.3, 20, 5, 1.0)
+    tip = TipCalibration(1.0, 1e-3, None, np.array([0.0, 1e-4, np.nan]), {"x": 900.0}, 2e-5, ("pressed along x only",))
+    report = FingerReport(camera, tip, ("lost.png",), 10.0, (0.0, 1.0, 30.0), 8, 0.05)
+    return report.first, finger_page(report, Path("pictures"))
+
+
+PAGES: dict[str, Callable[[], Made]] = {
+    made.__name__: made
+    for made in (
+        calibrate, verify, motion, monitor, hand_eye, mounting, demo, held, profiler, seam, profiler_live, tablet, finger,
+    )
+}  # fmt: skip

@@ -1,0 +1,63 @@
+"""`weldcal profiler seam`: maps a V-groove into the base with a calibrated profiler, and writes it with its report."""
+
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from weldcal.calibration.profiler.errors import FeatureNotFound
+from weldcal.calibration.profiler.features.groove import groove_features
+from weldcal.calibration.profiler.motion import FlangePoses
+from weldcal.calibration.profiler.record import load_record
+from weldcal.models.errors import InputError
+from weldcal.tools.commands.profiler.calibrate import check_number
+from weldcal.tools.commands.profiler.files import ProfilerFile
+from weldcal.tools.outcomes.profiler_file import ProfilerSeam, middle_error_mm
+from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.profiler_file import seam_report
+from weldcal.tools.report.render import write_atomic
+
+
+def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, Any]:
+    """Writes a V-groove's three features of every profile in the base frame as seam.csv; returns the summary."""
+    record = load_record(calibration)
+    if file.profiles is None:
+        raise InputError("The file has no 'profiles' of the groove. Give (n, m, 2), or 'xz' with the lengths 'n'.")
+    poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
+    check_number(poses, (len(file.profiles),), "profiles")
+    columns = ["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"]
+    rows, lost, rms, seen = [], [], [], []
+    for k, p in enumerate(file.profiles):
+        try:
+            f = groove_features(p)
+        except FeatureNotFound:
+            lost.append(k)
+            continue
+        seen.append(record.points_F(f.points))
+        at = seen[-1] @ poses.rotation[k].T + poses.translation[k]
+        rows.append([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * f.rms_m:.4f}"])
+        rms.append(f.rms_m)
+    if not rms:
+        raise FeatureNotFound(
+            "No profile of the file shows a V-groove with plate on both sides. Check the file and its unit."
+        )
+    write_atomic(folder / "seam.csv", csv_text(columns, rows))
+    return {
+        "scans": len(poses),
+        "found": len(rms),
+        "without_groove": lost,
+        "rms_mm": 1e3 * float(np.median(rms)),
+        "error_95_mm": middle_error_mm(record, np.vstack(seen)),
+        "method": record.method,
+    }
+
+
+def finish_seam(
+    found: dict[str, Any], calibration: Path, source: str, out: Path, limit_mm: float | None
+) -> ProfilerSeam:
+    """Write the report of a mapped seam, from the seam.csv beside it."""
+    columns = np.genfromtxt(out / "seam.csv", delimiter=",", names=True)
+    root = np.column_stack([np.atleast_1d(columns[f"root_{a}_mm"]) for a in "xyz"])
+    seam = ProfilerSeam(load_record(calibration), found, root, source, calibration, out, limit_mm)
+    write_atomic(out / "report.html", seam_report(seam))
+    return seam

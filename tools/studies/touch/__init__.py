@@ -1,0 +1,1 @@
+"""Studies of touches as the judge of a calibration."""
