@@ -20,6 +20,7 @@ from weldcal.systems.recording.player import Playback
 from weldcal.systems.recording.tap import OpenSink, add_recorder
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
+from weldcal.systems.viewer.cameras import Views, add_cameras
 from weldcal.systems.viewer.live import LiveView, add_live_view
 from weldcal.systems.wiring import Wiring
 
@@ -102,6 +103,7 @@ def _build(
     if live is not None:
         add_live_view(wiring, added.ports, live)
     if wiring.meshcat is not None:
+        add_cameras(wiring, added.ports, added.view(), Views() if live is None else live.views)
         period_s = 1.0 / scenario.visualization.recording_fps
         params = MeshcatVisualizerParams(role=Role.kIllustration, prefix="cell", publish_period=period_s)
         visualizer = builder.AddSystem(MeshcatVisualizer(wiring.meshcat, params))

@@ -61,6 +61,31 @@ STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
 )
 """Steps of the weld job: name, the part of the job that it belongs to (None: both), and its phases."""
 
+Steps = tuple[tuple[str, tuple[str, ...]], ...]
+MOUNTING_STEPS: Steps = (("Calibrate", ("start", "calibrate")), ("Verify", ("verify",)), ("Go home", ("home",)))
+MOTION_STEPS: Steps = (
+    ("Approach", ("start", "approach")),
+    ("Collect frames", ("collect",)),
+    ("Go home", ("home",)),
+    ("Calibrate", ("calibrate",)),
+)
+WATCH_STEPS: Steps = (("Approach", ("start", "approach")), ("Watch", ("collect",)), ("Go home", ("home",)))
+TABLET_STEPS: Steps = (
+    ("Look", ("start", "to_start", "to_look", "look")),
+    ("Touch", ("to_above", "descend", "lift")),
+    ("Go home", ("to_home",)),
+)
+PROFILER_STEPS = {
+    "start": "Get ready",
+    "edge": "Scan the edge",
+    "sphere": "Scan the sphere",
+    "touch": "Touch the sphere",
+    "pass": "Scan the seam",
+    "torch": "Move along the seam",
+    "home": "Go home",
+}
+"""Steps of the other jobs: name, and the keys of the step (see the dashboard's `stage_of`)."""
+
 
 def phase_words(phase: str, detail: str = "") -> str:
     """A phase in words, with a detail after a comma; a phase that is not listed (of an installed job) as it is written."""

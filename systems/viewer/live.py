@@ -13,6 +13,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import JobCommand, PlannedSeam
 from weldcal.systems.motion.spine import JobPorts
+from weldcal.systems.viewer.cameras import Views
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.servo.state import Phase
 
@@ -54,12 +55,15 @@ class Moment:
 
 
 class LiveView:
-    """The newest moment and the rows of the plots. One thread writes; readers take `moment` and slices of the lists, which only grow."""
+    """The newest moment and the rows of the plots. One thread writes; readers take `moment` and slices of the lists, which only grow.
+    `scan_times`: when the rows of `scans` came, s. `views`: the cameras of the 3D view, which readers may pick."""
 
     def __init__(self) -> None:
         self.moment = Moment()
+        self.views = Views()
         self.weld: list[WeldRow] = []
         self.scans: list[ScanRow] = []
+        self.scan_times: list[float] = []
 
 
 class LiveWriter(LeafSystem):
@@ -72,7 +76,7 @@ class LiveWriter(LeafSystem):
         - job
         - margin
 
-    Each message that the job shows has an input port of its own besides, under its name. `margin` (2) of the SingularityGuard
+    The job's `state` and each message that it shows have input ports of their own besides. `margin` (2) of the SingularityGuard
     may stay open. `p_TW` (3,) m is the torch in the tool's frame; None: the job has no torch.
     """
 
@@ -91,6 +95,7 @@ class LiveWriter(LeafSystem):
         self._view.moment = Moment(context.get_time(), self._job.Eval(context), shown, margin)
         history = getattr(shown.get("calibration_status"), "history", ())
         for row in history[len(self._view.scans) :]:
+            self._view.scan_times.append(context.get_time())
             self._view.scans.append(ScanRow(*row[:3]))
         report = shown.get("servo_report")
         if isinstance(report, ServoReport) and self._p_TW is not None:
@@ -119,8 +124,9 @@ def add_live_view(wiring: Wiring, ports: JobPorts, view: LiveView) -> LiveWriter
     """Add the writer of a job's view, and connect it."""
     tool = wiring.station.tool
     models = {name: port.Allocate() for name, port in ports.shown.items()}
+    models["state"] = ports.state.Allocate()
     writer = wiring.add("live_writer", LiveWriter(view, models, None if tool is None else np.asarray(tool.p_TW)))
-    wiring.connect(writer, job=ports.commands[0], **ports.shown)
+    wiring.connect(writer, job=ports.commands[0], state=ports.state, **ports.shown)
     if ports.margin is not None:
         wiring.connect(writer, margin=ports.margin)
     return writer

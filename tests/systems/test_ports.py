@@ -107,6 +107,7 @@ from weldcal.systems.recording.port_recorder import PortRecorder, PortSink
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import CheatPoses
+from weldcal.systems.viewer.cameras import CameraDirector, Views
 from weldcal.systems.viewer.cell_visualizer import CellVisualizer
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.viewer.live import LiveView, LiveWriter
@@ -182,6 +183,9 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     PortRecorder: lambda: PortRecorder((6, 2), {}, {}, cast("PortSink", None)),
     PortPlayer: lambda: PortPlayer({}, {}),
     OperatorPanel: lambda: OperatorPanel(Person(), Meshcat(MeshcatParams(host="localhost", port=0))),
+    CameraDirector: lambda: CameraDirector(
+        Meshcat(MeshcatParams(host="localhost", port=0)), Views(), (np.ones(3), np.zeros(3)), {}, X
+    ),
     LiveWriter: lambda: LiveWriter(LiveView(), {}, None),
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
     TabletProcedure: lambda: TabletProcedure(the_arm(), plan_tablet(load_scenario("tablet"), the_arm())),
@@ -439,6 +443,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     },
     PortRecorder: {"entered": 6, "left": 2},
     PortPlayer: {},
+    CameraDirector: {"job": JobCommand},
     LiveWriter: {"job": JobCommand, "margin": 2},
     OperatorPanel: {"hold": 1, "end": 1, "pace": 1},
     CheatPoses: {"body_poses": list, "contact": 6, "torch": 3},

@@ -24,6 +24,7 @@ from weldcal.tools import console
 from weldcal.tools.commands.record import RunRecorder
 from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.dashboard.facts import facts_of
+from weldcal.tools.dashboard.recording import with_overlay
 from weldcal.tools.dashboard.source import DashboardSource
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
@@ -31,11 +32,12 @@ from weldcal.tools.report.render import write_atomic
 
 @dataclass(frozen=True, eq=False)
 class JobRun:
-    """A completed run, done or held; its recording viewer, or None; the name of its robot."""
+    """A completed run, done or held; its recording viewer, or None; the name of its robot; what was shown of it, or None."""
 
     run: Run[Any]
     meshcat: Meshcat | None
     robot: str
+    live: LiveView | None = None
 
     @property
     def cell(self) -> Cell[Any]:
@@ -45,7 +47,10 @@ class JobRun:
     def write_recording(self, folder: Path) -> None:
         """Write recording.html where the run was recorded."""
         if self.meshcat is not None:
-            write_atomic(folder / "recording.html", self.meshcat.StaticHtml())
+            page = self.meshcat.StaticHtml()
+            if self.live is not None:
+                page = with_overlay(page, self.run, self.live, self.cell.scenario.description or "weldcal")
+            write_atomic(folder / "recording.html", page)
 
 
 def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: str | None = None) -> JobRun:
@@ -89,7 +94,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
                     source.end(finished.held, finished.reason, replays=True)
 
             told("build the cell", 0.0)
-            live = None if source is None else source.live
+            live = None if meshcat is None else LiveView() if source is None else source.live
             cell = build_cell(
                 scenario, options.seed, meshcat, robot.prepared, open_sink=open_sink, person=person, live=live
             )
@@ -102,7 +107,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
                 run = run_cell(cell, told, meshcat, options.realtime, ended)
                 if recorder is not None:
                     recorder.close(run)
-    return JobRun(run, meshcat, robot.title)
+    return JobRun(run, meshcat, robot.title, live)
 
 
 @contextmanager

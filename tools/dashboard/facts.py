@@ -10,12 +10,25 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.planning.calibration_poses import PlannerConfig, predicted_sigma
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.cell import Cell
+from weldcal.systems.jobs.motion.job import AddedMotion
+from weldcal.systems.jobs.mounting.job import AddedMounting
+from weldcal.systems.jobs.profiler.job import AddedProfilerJob
+from weldcal.systems.jobs.profiler.procedure import PLANS
+from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
-from weldcal.systems.phase_words import STEPS
+from weldcal.systems.phase_words import (
+    MOTION_STEPS,
+    MOUNTING_STEPS,
+    PROFILER_STEPS,
+    STEPS,
+    TABLET_STEPS,
+    WATCH_STEPS,
+)
 from weldcal.welding.servo.guards import ArmGuardConfig
 
 SCAN = "scan"
@@ -29,7 +42,8 @@ class Facts:
 
     `band_mm`: least and largest deflection of the tip with which the seam is followed. `gain` computes the expected error after
     the next pose from the present status. `settable_pace`: a simulation, whose pace may be chosen. `seconds`: about how long each
-    step takes, and SCAN, the scan of a pose with the way to it.
+    step takes, and SCAN, the scan of a pose with the way to it; empty: the time left follows from the completed share of the run.
+    `work_B` (3,) m: where the calibration's error is shown.
     """
 
     title: str = ""
@@ -46,6 +60,7 @@ class Facts:
     sigma_slow: float = ArmGuardConfig().sigma_slow
     sigma_stop: float = ArmGuardConfig().sigma_stop
     gain: Callable[[CalibrationStatus, int], float] | None = field(default=None, repr=False)
+    work_B: Array | None = field(default=None, repr=False)
 
 
 def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
@@ -53,7 +68,7 @@ def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
     settable = cell.station.robot.clock is None
     job, scenario = cell.job, cell.scenario
     if not isinstance(job, WeldJob):
-        return Facts(title, robot, settable)
+        return _other_facts(cell, title, robot, settable)
     wanted = {"calibrate": scenario.job.calibrate, "weld": scenario.job.weld}
     steps = tuple((name, phases) for name, needs, phases in STEPS if needs is None or wanted[needs])
     c, servo = scenario.calibration, job.servo_config
@@ -75,7 +90,26 @@ def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
         1e3 * servo.deflection.delta_d_m,
         (1e3 * servo.contact.normal_min_m, 1e3 * servo.faults.lateral_m),
         gain=_gain_of(job),
+        work_B=work_point(scenario),
     )
+
+
+def _other_facts(cell: Cell[Any], title: str, robot: str, settable: bool) -> Facts:
+    """Steps and limits of the jobs besides the weld; a job of another package has none."""
+    job, c = cell.job, cell.scenario.calibration
+    if isinstance(job, AddedMounting):
+        scans = c.maximum_scans
+        return Facts(title, robot, settable, MOUNTING_STEPS, c.required_error_mm, scans, c.minimum_scans)
+    if isinstance(job, AddedMotion):
+        watches = job.monitor is not None
+        steps = WATCH_STEPS if watches else MOTION_STEPS
+        return Facts(title, robot, settable, steps, maximum_scans=job.frames)
+    if isinstance(job, AddedVisit):
+        return Facts(title, robot, settable, TABLET_STEPS, maximum_scans=len(job.plan.q_above))
+    if isinstance(job, AddedProfilerJob):
+        keys = ["start", *(step for stage in job.job.stages for step in PLANS[stage]), "home"]
+        return Facts(title, robot, settable, tuple((PROFILER_STEPS[key], (key,)) for key in keys))
+    return Facts(title, robot, settable)
 
 
 def _gain_of(job: WeldJob) -> Callable[[CalibrationStatus, int], float]:

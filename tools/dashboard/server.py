@@ -110,6 +110,13 @@ class Dashboard:
         def script() -> Response:
             return Response((_PAGE / "dashboard.js").read_text(), mimetype="text/javascript")
 
+        @app.get(f"{root}/picture/<int:number>")
+        def picture(number: int) -> Response:
+            found = self.source.picture()
+            if found is None:
+                abort(404)
+            return Response(found, mimetype="image/png")
+
         @app.get(f"{root}/values")
         def values() -> Response:
             return jsonify(self.source.values())

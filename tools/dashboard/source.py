@@ -10,6 +10,8 @@ from weldcal.systems.person import Person
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.viewer.live import LiveView
 from weldcal.tools.dashboard.facts import Facts
+from weldcal.tools.dashboard.panels import panel, stage_of
+from weldcal.tools.dashboard.picture import picture_number, picture_png
 from weldcal.tools.dashboard.values import (
     DONE,
     ENDED,
@@ -20,6 +22,7 @@ from weldcal.tools.dashboard.values import (
     left_s,
     scan_rows,
     scan_values,
+    scene_values,
     steps,
     weld_rows,
     weld_values,
@@ -56,7 +59,7 @@ class DashboardSource:
         return self._ended is not None
 
     def act(self, what: str, value: float | None = None) -> bool:
-        """Do what a button asks: "hold", "go_on", "end" or "pace"; False where there is no such button now."""
+        """Do what a button asks: "hold", "go_on", "end", "pace" or "camera-NAME"; False where there is no such button now."""
         person = self.person
         if self.ended:
             return False
@@ -66,6 +69,8 @@ class DashboardSource:
             person.go_on()
         elif what == "end":
             person.end(BY)
+        elif what.startswith("camera-"):
+            return self.live.views.pick(what.removeprefix("camera-"))
         elif what == "pace" and value is not None and self.facts.settable_pace:
             person.ask_pace(value)
         else:
@@ -80,7 +85,7 @@ class DashboardSource:
         """All present values of the page."""
         moment, facts, person = self.live.moment, self.facts, self.person
         state, line = self._state()
-        command, weld = moment.command, weld_values(facts, moment, self.live.weld)
+        weld = weld_values(facts, moment, self.live.weld)
         running = not self.ended
         return {
             "state": state,
@@ -94,13 +99,16 @@ class DashboardSource:
                 "end": running and not person.ends,
                 "pace": running and facts.settable_pace,
             },
-            "steps": steps(facts, "done" if state == DONE else command.phase),
+            "steps": steps(facts, "done" if state == DONE else stage_of(moment)),
             "share": round(self._share, 3) if running else 1.0,
-            "left_s": left_s(facts, moment) if running else None,
+            "left_s": left_s(facts, moment, self._share) if running else None,
             "time_s": round(moment.time, 1),
             "pace": {"asked": person.pace or 0.0, "now": self._pace(moment.time)},
             "weld": weld,
             "calibration": scan_values(facts, moment),
+            "panel": panel(facts, moment),
+            "scene": scene_values(facts, moment, self.live.views),
+            "picture": picture_number(moment),
             "limits": {
                 "speed": facts.weld_speed_mm_s if weld else None,
                 "deflection": facts.wanted_deflection_mm if weld else None,
@@ -111,7 +119,7 @@ class DashboardSource:
     def _state(self) -> tuple[str, str]:
         """The state in large letters, and the line under it: by whom and why, or what the arm does."""
         moment, person = self.live.moment, self.person
-        doing = phase_words(moment.command.phase) if moment.time > 0.0 else self._stage
+        doing = self._doing()
         if self._ended is not None:
             state, reason = self._ended
             return state, reason or "The job is complete."
@@ -125,6 +133,17 @@ class DashboardSource:
         if getattr(report, "phase", "") == "BACK":
             return RUNNING, "on the way back along the seam; the torch is off"
         return (RUNNING, doing) if moment.time > 0.0 else (STARTING, self._stage)
+
+    def _doing(self) -> str:
+        """What the job does now, in words: the phase's own, or what the job says."""
+        moment = self.live.moment
+        if moment.time <= 0.0:
+            return self._stage
+        return phase_words(moment.command.phase) if "calibration_status" in moment.shown else self._stage
+
+    def picture(self) -> bytes | None:
+        """The newest scan or picture as a PNG, or None."""
+        return picture_png(self.live.moment)
 
     def _go_on_line(self) -> str:
         """What Go on does."""

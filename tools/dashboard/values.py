@@ -9,10 +9,15 @@ from typing import Any
 from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
+from weldcal.systems.viewer.cameras import CAMERAS, FOLLOW, Views
 from weldcal.systems.viewer.live import ACTIVE, Moment, ScanRow, WeldRow
+from weldcal.systems.viewer.scene import RESIDUAL_MM, WELDING_PHASES, Key, legend, uncertainty_at
 from weldcal.tools.dashboard.facts import SCAN, Facts
+from weldcal.tools.dashboard.panels import stage_of
 
 STARTING, RUNNING, STOPPING, HELD, DONE, ENDED = "STARTING", "RUNNING", "STOPPING", "HELD", "DONE", "ENDED"
+LEAST_SHARE = 0.1
+"""Share of a run from which on the time left can be told by the time so far."""
 LOW_MARGIN = 0.5
 """Share of the steering margin below which the page shows it."""
 
@@ -67,11 +72,13 @@ def weld_values(facts: Facts, moment: Moment, newest: Sequence[WeldRow]) -> dict
     }
 
 
-def left_s(facts: Facts, moment: Moment) -> float | None:
-    """Seconds of the job that are left, about; None for a job that states no steps."""
-    at = [k for k, step in enumerate(steps(facts, moment.command.phase)) if step["is"] == "now"]
+def left_s(facts: Facts, moment: Moment, share: float = 0.0) -> float | None:
+    """Seconds of the job that are left, about, of which this share is done; None while that is not known."""
+    at = [k for k, step in enumerate(steps(facts, stage_of(moment))) if step["is"] == "now"]
     if not at or moment.time <= 0.0:
         return None
+    if not facts.seconds:
+        return round(moment.time * (1.0 - share) / share) if share > LEAST_SHARE else None
     name, after = facts.steps[at[0]][0], [name for name, _ in facts.steps[at[0] + 1 :]]
     now, weld = facts.seconds.get(name, 0.0), weld_values(facts, moment, ())
     status = moment.shown.get("calibration_status")
@@ -142,3 +149,29 @@ def weld_rows(rows: Sequence[WeldRow]) -> list[list[float | None]]:
 def scan_rows(rows: Sequence[ScanRow]) -> list[list[float | None]]:
     """Rows of the calibration's plot: scans, expected error mm, held-out median mm."""
     return [[r.scans, mm(r.predicted), mm(r.held_out)] for r in rows]
+
+
+def scene_values(facts: Facts, moment: Moment, views: Views) -> dict[str, Any]:
+    """What lies over the 3D view: the cameras, and the legend of what is drawn now."""
+    status = moment.shown.get("calibration_status")
+    keys: list[Key] = []
+    estimate, scale = None, None
+    if isinstance(status, CalibrationStatus):
+        estimate = status.estimate if math.isfinite(facts.required_mm) else None
+        phase = moment.command.phase
+        times = None
+        if estimate is not None and facts.work_B is not None:
+            times = uncertainty_at(estimate, facts.work_B).magnification
+        if math.isfinite(facts.required_mm) or phase in WELDING_PHASES:
+            keys = legend(phase, times)
+        if estimate is not None and phase not in (*WELDING_PHASES, "scan_workpiece", "park", "home", "done", "held"):
+            scale = RESIDUAL_MM
+    return {
+        "cameras": [{"key": name, "name": CAMERAS[name]} for name in (FOLLOW, *views.known)]
+        if len(views.known) > 1
+        else [],
+        "wanted": views.wanted,
+        "showing": views.showing,
+        "legend": [key._asdict() for key in keys],
+        "scale_mm": scale,
+    }

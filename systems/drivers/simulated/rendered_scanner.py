@@ -194,7 +194,7 @@ def _show_housing(world: SimulatedWorld, X_BC: RigidTransform, carrier: RigidBod
         return
     source = scene_graph.RegisterSource("scanner_housing")
     housing = GeometryInstance(X_BC @ RigidTransform([0.0, 0.0, -0.045]), Box(0.41, 0.08, 0.09), "scanner_housing")
-    housing.set_illustration_properties(MakePhongIllustrationProperties(np.array([0.18, 0.20, 0.23, 1.0])))
+    housing.set_illustration_properties(MakePhongIllustrationProperties(np.array([0.18, 0.20, 0.23, 0.30])))
     scene_graph.RegisterAnchoredGeometry(source, housing)
 
 

@@ -201,7 +201,12 @@ class Motion(Job[MotionPlanned]):
         for name in ("scanner_capture", "joints"):  # for reports only
             if station.diagram.HasOutputPort(f"cheat.{name}"):
                 logged[name] = wiring.out(f"cheat.{name}")
-        ports = JobPorts((procedure.GetOutputPort("job"),), state, logged=logged)
+        shown = {"record": record, "scan": queue.GetOutputPort("scan"), "flange_estimate": estimate}
+        if calibrator is not None:
+            shown["calibration"] = calibrator.GetOutputPort("calibration")
+        if monitor is not None:
+            shown["drift"] = monitor.GetOutputPort("drift")
+        ports = JobPorts((procedure.GetOutputPort("job"),), state, logged=logged, shown=shown)
         return AddedMotion(
             plan, X_FR, procedure, collector, calibrator, monitor, queue, recorder, job.frames, ports, maximum_time_s
         )

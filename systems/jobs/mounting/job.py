@@ -136,6 +136,7 @@ class Mounting(Job[MountingPlanned]):
             wiring.connect(
                 procedure, **{f"settled_goal{suffix}": arm.settled_goal, f"robot_status{suffix}": arm.status}
             )
+        shown = {"status": calibrator.GetOutputPort("status"), "scan": wiring.out("scanner.scan")}
         commands = tuple(procedure.GetOutputPort(name) for name in ("job", "job_2"))[: len(spine.arms)]
         return AddedMounting(
             scene,
@@ -144,7 +145,7 @@ class Mounting(Job[MountingPlanned]):
             procedure,
             calibrator,
             true_poses(scene, wiring.station),
-            JobPorts(commands, state),
+            JobPorts(commands, state, shown=shown),
             maximum_time_s,
         )
 

@@ -102,7 +102,10 @@ class Tablet(Job[TabletPlan]):
         )
         wiring.feed("wrist_camera.trigger", procedure.GetOutputPort("trigger"))
         ports = JobPorts(
-            (procedure.GetOutputPort("job"),), procedure.GetOutputPort("state"), procedure.GetOutputPort("descent")
+            (procedure.GetOutputPort("job"),),
+            procedure.GetOutputPort("state"),
+            procedure.GetOutputPort("descent"),
+            shown={"picture": wiring.out("wrist_camera.picture")},
         )
         return AddedVisit(
             plan,

@@ -7,6 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, OutputPort
 
 from weldcal.calibration.planning.calibration_poses import PlannedPose
+from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
@@ -23,6 +24,7 @@ from weldcal.systems.jobs.weld.settings import (
     job_plan,
     plan_poses,
     servo_config,
+    work_point,
 )
 from weldcal.systems.jobs.weld.watch import add_watch
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
@@ -102,6 +104,10 @@ class WeldJob(AddedJob):
         """The servo's newest report."""
         report: ServoReport = self.welding.report.Eval(self.welding.report.get_system().GetMyContextFromRoot(root))
         return report
+
+    def view(self) -> tuple[Array, Array]:
+        """See AddedJob: from the scanner down to the workpiece."""
+        return np.array([1.36, -0.62, 0.84]), np.array([0.46, 0.0, 0.52])
 
     def can_stand(self, root: Context) -> bool:
         """See AddedJob: the servo turns the torch off and brings the tool to rest."""
@@ -190,7 +196,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
                 "planned_seam": welding.seam,
                 "servo_report": welding.report,
             }
-            add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, config.weld_speed_m_s, drawn)
+            add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, work_point(scenario), drawn)
         logged = dict(welding.logged)
         if logged:
             logged["torch_on"] = spine.switch.GetOutputPort("process_on")
@@ -203,6 +209,8 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         shown = {
             "calibration_status": status,
             "next_pose": chooser.GetOutputPort("next_pose"),
+            "scan": wiring.out("scanner.scan"),
+            "flange_estimate": estimator.GetOutputPort("flange_estimate"),
             "planned_seam": welding.seam,
             "servo_report": welding.report,
         }

@@ -20,8 +20,11 @@ function node(name, attributes, text) {
 }
 
 // points: [x, y | null]; o: {x: [low, high], y: [low, high], unit, limit, limitName, band: [low, high], dots, places}
-function plot(id, points, o) {
-  const svg = el(id), W = svg.clientWidth || 320, H = svg.clientHeight || 92;
+function plot(id, points, o) { draw(el(id), [{ points }], o); }
+
+// curves: [{points, colour}]
+function draw(svg, curves, o) {
+  const W = svg.clientWidth || 320, H = svg.clientHeight || 92;
   const L = 38, R = 6, T = 6, B = 16;
   const X = v => L + (W - L - R) * (v - o.x[0]) / Math.max(o.x[1] - o.x[0], 1e-9);
   const Y = v => T + (H - T - B) * (1 - (Math.min(Math.max(v, o.y[0]), o.y[1]) - o.y[0]) / Math.max(o.y[1] - o.y[0], 1e-9));
@@ -40,14 +43,17 @@ function plot(id, points, o) {
     parts.push(node("line", { class: "limit", x1: L, x2: W - R, y1: Y(o.limit), y2: Y(o.limit) }));
     if (o.limitName) parts.push(node("text", { class: "limitname", x: W - R - 4, y: Y(o.limit) - 4, "text-anchor": "end" }, o.limitName));
   }
-  let path = "", pen = false;
-  for (const [x, y] of points) {
-    if (y === null || y === undefined) { pen = false; continue; }
-    path += (pen ? "L" : "M") + X(x).toFixed(1) + " " + Y(y).toFixed(1);
-    pen = true;
-    if (o.dots) parts.push(node("circle", { class: "dot", cx: X(x), cy: Y(y), r: 3.5 }));
+  for (const curve of curves) {
+    const colour = curve.colour && curve.colour !== "line" ? " " + curve.colour : "";
+    let path = "", pen = false;
+    for (const [x, y] of curve.points) {
+      if (y === null || y === undefined) { pen = false; continue; }
+      path += (pen ? "L" : "M") + X(x).toFixed(1) + " " + Y(y).toFixed(1);
+      pen = true;
+      if (o.dots) parts.push(node("circle", { class: "dot" + colour, cx: X(x), cy: Y(y), r: 3.5 }));
+    }
+    if (path && o.line !== false) parts.push(node("path", { class: "curve" + colour, d: path }));
   }
-  if (path) parts.push(node("path", { class: "curve", d: path }));
   svg.replaceChildren(...parts);
 }
 
@@ -83,6 +89,102 @@ function drawScans(c) {
   plot("plot_error", points, { x: [0, Math.max(c.maximum, c.scans, 1)], y: [0, high], unit: "scans", places: 2, dots: true, limit: c.required_mm, limitName: "required " + c.required_mm.toFixed(2) + " mm" });
 }
 
+// --- the scene: cameras, legend -----------------------------------------------------------------------------------------
+function element(name, text, className) {
+  const e = document.createElement(name);
+  if (text) e.textContent = text;
+  if (className) e.className = className;
+  return e;
+}
+
+const drawnOf = {};  // what was last drawn of a part, so that it is drawn anew only where it changed
+const changed = (part, value) => { const text = JSON.stringify(value); if (drawnOf[part] === text) return false; drawnOf[part] = text; return true; };
+
+function scene(v) {
+  const s = v.scene;
+  if (!el("over")) return;
+  if (el("cameras") && changed("cameras", [s.cameras, s.wanted, s.showing, v.can.end])) {
+    el("cameras").replaceChildren(...s.cameras.map(c => {
+      const b = element("button", c.name);
+      b.type = "button";
+      b.dataset.key = c.key;
+      b.setAttribute("aria-pressed", String(s.wanted === c.key));
+      if (s.wanted === "follow" && s.showing === c.key) b.className = "showing";
+      b.addEventListener("click", () => ask("camera-" + c.key));
+      return b;
+    }));
+    show("cameras", s.cameras.length > 0 && v.can.end);
+    show("moved", s.wanted === "moved" && v.can.end);
+  }
+  if (changed("keys", [s.legend, s.scale_mm])) {
+    el("keys").replaceChildren(...s.legend.map(k => {
+      const row = element("div"), i = element("i", "", k.style);
+      if (k.style === "area") i.style.background = k.colour; else i.style.borderTopColor = k.colour;
+      row.append(i, k.text);
+      return row;
+    }));
+    if (s.scale_mm !== null) {
+      const row = element("div", "", "scale"), ends = element("span", "", "ends");
+      ends.append(...["-" + s.scale_mm, "0", "+" + s.scale_mm].map(t => element("span", t)));
+      row.append("Flange face beside the calibration, mm", element("i"), ends);
+      el("keys").append(row);
+    }
+  }
+  show("keys", s.legend.length > 0 && !v.replay);
+  const doing = v.state === "HELD" ? "held" : v.state === "RUNNING" ? v.line : "";
+  show("over", doing !== "");
+  say("over_phase", doing);
+  const w = v.weld, c = v.calibration, figures = [];
+  if (w) {
+    figures.push(w.at_mm.toFixed(0) + " of " + w.length_mm.toFixed(0) + " mm");
+    if (w.deflection_mm !== null) figures.push("deflection " + w.deflection_mm.toFixed(2) + " mm");
+    if (w.speed_mm_s !== null) figures.push("torch " + w.speed_mm_s.toFixed(1) + " mm/s");
+  } else if (c && c.error_mm !== null && s.scale_mm !== null) figures.push(c.error_mm.toFixed(2) + " mm expected at the work point");
+  say("over_figures", figures.join(", "));
+}
+
+// --- jobs besides the weld: what the program lists -----------------------------------------------------------------------
+function panel(v) {
+  const p = v.panel;
+  show("panel", !!p);
+  if (!p) return;
+  say("panel_heading", p.heading);
+  say("panel_note", p.note);
+  show("panel_warning", !!p.warning);
+  say("panel_warning", p.warning || "");
+  if (changed("panel_titles", p.plots.map(q => q.title))) {
+    el("panel_plots").replaceChildren(...p.plots.map(q => {
+      const figure = element("figure"), caption = element("figcaption", q.title);
+      const svg = node("svg", { role: "img", "aria-label": q.title + " over " + q.unit });
+      if (q.curves.length > 1) {
+        const curves = element("span", "", "curves");
+        for (const c of q.curves) { const one = element("span"); one.append(element("i", "", c.colour), c.name); curves.append(one); }
+        caption.append(curves);
+      }
+      caption.append(element("b"));
+      figure.append(caption, svg);
+      return figure;
+    }));
+    drawnOf.panel_plots = "";
+  }
+  if (changed("panel_plots", [p.plots, innerWidth])) p.plots.forEach((q, k) => {
+    const figure = el("panel_plots").children[k];
+    figure.querySelector("b").textContent = q.now;
+    draw(figure.querySelector("svg"), q.curves, { x: q.x, y: q.y, unit: q.unit, places: q.places, dots: q.dots, line: q.line, limit: q.limit, limitName: q.limit_name });
+  });
+  if (changed("panel_lines", p.lines)) {
+    el("panel_lines").replaceChildren(...p.lines.flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
+  }
+}
+
+let pictured = 0;
+function picture(v) {
+  const img = el(v.panel ? "picture_panel" : "picture_calibration");
+  if (v.picture && v.picture !== pictured && !v.closing) { pictured = v.picture; img.src = "picture/" + v.picture; }
+  img.onload = () => { img.hidden = false; };
+  img.onerror = () => { img.hidden = true; };
+}
+
 // --- values --------------------------------------------------------------------------------------------------------------
 function update(v) {
   last = v;
@@ -105,6 +207,9 @@ function update(v) {
     if (s.is === "now") li.setAttribute("aria-current", "step");
     return li;
   }));
+  scene(v);
+  panel(v);
+  picture(v);
   const w = v.weld, c = v.calibration;
   if (w || rows.weld.length) {
     show("welding", true);

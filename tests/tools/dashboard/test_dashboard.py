@@ -79,7 +79,7 @@ def page(source: DashboardSource, view: Meshcat) -> Iterator[Dashboard]:
 
 
 def opened(browser: Browser, url: str, state: str) -> None:
-    browser.open(url, wait_for=f"document.getElementById('state').textContent === '{state}'")
+    browser.open(url, wait_for=f"document.getElementById('state')?.textContent === '{state}'")
 
 
 def click(browser: Browser, button: str) -> None:
