@@ -28,6 +28,7 @@ extends: s_groove
 arm: ur10e
 base: {xyz_m: [0.1, 0.2, 0.3], rpy_deg: [180.0, 1.0, 2.0]}
 kinematics: my_robot/kinematics.yaml
+corrected_kinematics: corrected.yaml
 flange: iso9409-1-80-6-m8
 tool: pen
 robot: !SimulatedUr
@@ -155,6 +156,15 @@ profiler_job:
   half_width_mm: 15.0
   maximum_time_s: 300.0
 home_deg: [1.0, -81.0, 111.0, -121.0, -91.0, 1.0]
+touch:
+  result: my-calibration
+  points: 5
+  aside_mm: 8.0
+  clearance_mm: 12.0
+  descent_mm_s: 2.0
+  press_mm: 0.8
+  deepest_mm: 4.0
+  turn_deg: 10.0
 mounting:
   target_known: false
   spread_deg: 20.0
@@ -175,6 +185,7 @@ calibration:
   required_error_mm: 0.2
   minimum_scans: 5
   correct_scanner: false
+  refine: links
   maximum_scans: 9
   verification_scans: 2
   verification_limit_mm: 0.4
