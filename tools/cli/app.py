@@ -8,6 +8,7 @@ import typer
 from weldcal.tools.cli import (
     benchmark,
     benchmark_flange,
+    benchmark_wired,
     calibrate,
     cell,
     doctor,
@@ -51,6 +52,7 @@ COMMANDS = (
     *(cell.check_cell, cell.print_board, cell.finger_calibrate, tool.tool_check),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
+    *benchmark_wired.COMMANDS,
     *reproduce.COMMANDS,
     *monitor.COMMANDS,
     *motion.COMMANDS,

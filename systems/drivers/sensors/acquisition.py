@@ -12,7 +12,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
-from weldcal.systems.drivers.sensors.stamps import DeviceClock, Stamp, unix_to_monotonic
+from weldcal.systems.drivers.sensors.stamps import DeviceClock, Stamp, UnixClock
 
 Datum = TypeVar("Datum")
 POLL_S = 0.02  # longest time that a source is waited for before requests are looked at
@@ -147,6 +147,7 @@ class Acquisition(Generic[Datum]):
         self.source, self.rules = source, rules
         self._kept, self._latency_s, self._prepare = kept, latency_s, prepare
         self.clock = DeviceClock(latency_s, rules.late_s)
+        self._unix = UnixClock()
         self._frames: tuple[Frame[Datum], ...] = ()
         self._seen = _Seen()
         self._read = self._wanted = self._number = 0
@@ -355,7 +356,7 @@ class Acquisition(Generic[Datum]):
 
     def _stamp(self, d: Delivery[Datum]) -> Stamp:
         if d.unix_time is not None:
-            captured = unix_to_monotonic(d.unix_time)
+            captured = self._unix.to_monotonic(d.unix_time, d.arrived)
             late = d.arrived - captured - self._latency_s
             return Stamp(min(captured, d.arrived), "host", max(late, 0.0))
         if d.device_time is not None:

@@ -3,6 +3,7 @@
 import time
 from bisect import bisect_right
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 KEPT = 4096  # pairs of host and Diagram time: 32 s at 125 Hz
@@ -10,12 +11,10 @@ BIN_S = 0.5
 BINS = 120
 DRIFT_LIMIT = 5e-4  # the drift of two quartz clocks is below 1e-4
 BINS_FOR_DRIFT = 8
+SET_S = 0.02  # by which the host's clock is set and not only disciplined, between two frames
+SET_KEPT_S = 10.0
+READINGS, QUICK_S = 5, 1e-4  # of two clocks one after the other, between which this process may have to wait
 RELEARN_S = 3.0  # frames that stay late for so long belong to another offset: the device's clock was set back
-
-
-def unix_to_monotonic(unix_s: float) -> float:
-    """The host's monotonic time (s) of a Unix time, by both clocks as they are now."""
-    return unix_s - time.time() + time.monotonic()
 
 
 @dataclass(frozen=True)
@@ -25,6 +24,42 @@ class Stamp:
     captured: float
     clock: str  # device, host or arrival
     late_s: float = 0.0
+
+
+class UnixClock:
+    """Maps Unix time to the host's monotonic time, also while somebody sets the host's clock.
+
+    A frame on its way when the clock is set has a stamp of the clock as it was before. For SET_KEPT_S both are tried: the stamp
+    that makes the frame the least late is right, because no frame comes before its time.
+    """
+
+    def __init__(self, unix: Callable[[], float] = time.time, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._unix, self._monotonic = unix, monotonic
+        self._offset = self._read()[1]
+        self._before: float | None = None
+        self._set_at = float("-inf")
+
+    def to_monotonic(self, unix_s: float, arrived: float) -> float:
+        """The host's monotonic time (s) of a frame's Unix time; the frame arrived at `arrived` (s, monotonic)."""
+        now, offset = self._read()
+        if abs(offset - self._offset) > SET_S:
+            self._before, self._set_at = self._offset, now
+        self._offset = offset
+        found = unix_s + offset
+        if self._before is None or now - self._set_at > SET_KEPT_S:
+            return found
+        return min(found, unix_s + self._before, key=lambda t: abs(arrived - t))
+
+    def _read(self) -> tuple[float, float]:
+        """The monotonic time and its distance from Unix time (s), of the quickest of some readings."""
+        readings = []
+        for _ in range(READINGS):
+            before, unix, after = self._monotonic(), self._unix(), self._monotonic()
+            readings.append((after - before, after, 0.5 * (before + after) - unix))
+            if after - before < QUICK_S:
+                break
+        _, now, offset = min(readings)
+        return now, offset
 
 
 class EarliestLine:

@@ -145,7 +145,9 @@ def _digested(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     status = seen.calibration
     if status.sequence < state.command.scan_sequence:
         if seen.time - state.since > plan.scan_timeout_s:
-            return hold(state, seen, f"No scan arrived within {plan.scan_timeout_s:.0f} s of its trigger.")
+            return hold(
+                state, seen, f"No scan arrived within {plan.scan_timeout_s:.0f} s of its trigger. Look at the scanner."
+            )
         return state
     if status.done:
         return _to_next_pose(state, seen, "move_to_verify")
@@ -176,7 +178,9 @@ def _verified(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     status = seen.calibration
     if status.sequence < state.command.scan_sequence:
         if seen.time - state.since > plan.scan_timeout_s:
-            return hold(state, seen, f"No scan arrived within {plan.scan_timeout_s:.0f} s of its trigger.")
+            return hold(
+                state, seen, f"No scan arrived within {plan.scan_timeout_s:.0f} s of its trigger. Look at the scanner."
+            )
         return state
     if len(status.verifications) < plan.verification_scans:
         return _to_next_pose(state, seen, "move_to_verify")
@@ -203,7 +207,11 @@ def _parked(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
 def _planned(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if seen.seam.sequence < state.command.scan_sequence:
         if seen.time - state.since > plan.scan_timeout_s:
-            return hold(state, seen, f"No workpiece scan arrived within {plan.scan_timeout_s:.0f} s of its trigger.")
+            return hold(
+                state,
+                seen,
+                f"No workpiece scan arrived within {plan.scan_timeout_s:.0f} s of its trigger. Look at the scanner.",
+            )
         return state
     if seen.seam.seam is None or seen.seam.q_above is None or seen.seam.q_start is None:
         return hold(state, seen, seen.seam.reason or "No seam could be planned.")

@@ -3,7 +3,7 @@
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -26,6 +26,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.emulators.cell.arc import Arc
 from weldcal.tools.emulators.cell.finger_process import FingerSetup, run_finger_camera
+from weldcal.tools.emulators.cell.input_wire import InputWire
 from weldcal.tools.emulators.cell.physics import STEP_S, Physics
 from weldcal.tools.emulators.cell.scanner_process import ScannerSetup, run_scanner, unix_now
 from weldcal.tools.emulators.cell.score import score
@@ -108,7 +109,7 @@ class _World:
     ) -> None:
         self._controller, self._physics, self._wires = controller, physics, wires
         self._scanner, self._finger, self._wanted_m, self._write = scanner, finger, wanted_m, write
-        self._arc = Arc()
+        self._arc, self._wire = Arc(), InputWire()
         self._every = 1.0 / camera.rate_hz
         self._latency_s = camera.latency_s
         self._next_picture = 0.0
@@ -123,8 +124,9 @@ class _World:
         enabled = wires.process_output is not None and bool(c.terminals.digital_outputs >> wires.process_output & 1)
         burned = self._arc.burns
         self._arc.step(enabled, STEP_S)
-        self._set_input(wires.arc_input, self._arc.burns)
-        self._set_input(wires.fault_input, self._arc.fault)
+        burns, fault = self._wire.step(physics.time_s, self._arc.burns, self._arc.fault)
+        self._set_input(wires.arc_input, burns)
+        self._set_input(wires.fault_input, fault)
         if c.script_count != self._programs:
             if not c.terminals.digital_outputs and c.program is not None and c.program.kind != "sec":
                 physics.forget()
@@ -137,6 +139,13 @@ class _World:
         self._dirty |= burned != self._arc.burns or not rests
         if self._dirty and ((burned and not self._arc.burns) or self._rests_s > RESTS_S):
             self.write()
+
+    def faults(self) -> dict[str, Callable[[Mapping[str, Any], float], None]]:
+        """Faults of the power source and its wires, for the control channel."""
+        return {
+            "arc_inputs": lambda r, now: setattr(self._wire, "how", str(r.get("how", ""))),
+            "arc_fails": lambda r, now: setattr(self._arc, "fails", bool(r.get("on", True))),
+        }
 
     def write(self) -> None:
         """Write the truth as it is now."""
@@ -244,6 +253,7 @@ def run_world(
             seed,
             after_step=inside.step,
             while_waiting=inside.answer_scanner,
+            more_faults=inside.faults(),
         )
         stack.callback(inside.write)
         for child in (scanner, finger):

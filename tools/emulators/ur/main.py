@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, Lockstep
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
-from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, World
+from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, Request, World
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer
 from weldcal.tools.emulators.ur.wire.external_control import ExternalControl
 from weldcal.tools.emulators.ur.wire.net import Connection, Network
@@ -94,7 +94,7 @@ def run_emulator(
 class Emulation:
     """A controller's ports and its loop. `after_step` is called with the host's time (s) after every step of the controller,
     before its frame is sent: what it does belongs to the same time, and the controller waits for it. `while_waiting` is called
-    while the controller's time waits for its client.
+    while the controller's time waits for its client. `more_faults` are those of what stands around the controller.
     """
 
     def __init__(
@@ -107,6 +107,7 @@ class Emulation:
         seed: int,
         after_step: Callable[[float], None] | None = None,
         while_waiting: Callable[[], None] | None = None,
+        more_faults: Mapping[str, Callable[[Request, float], None]] | None = None,
     ) -> None:
         self._controller = controller
         self._after_step, self._while_waiting = after_step, while_waiting
@@ -124,7 +125,7 @@ class Emulation:
         real_time = RealTimeServer(controller, heard)
         external = ExternalControl(controller)
         control = ControlServer(
-            controller, self._network, self._rtde, external, self._checker, self._lockstep, self._world
+            controller, self._network, self._rtde, external, self._checker, self._lockstep, self._world, more_faults
         )
         self._servers = (self._rtde, self._primary, secondary, real_time, external)
         ports = [(self._rtde, RTDE_PORT), (self._primary, PRIMARY_PORT), (secondary, SECONDARY_PORT)]

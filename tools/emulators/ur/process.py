@@ -80,6 +80,12 @@ class Emulator:
             time.sleep(0.01)
         return state
 
+    def leave(self) -> None:
+        """Closes the control channel; the process goes on."""
+        with suppress(OSError):
+            self._file.close()
+            self._socket.close()
+
     def close(self) -> None:
         """Ends the process, whatever it does; may be called again."""
         with suppress(OSError):

@@ -14,6 +14,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.commands.record import RECORDING
 from weldcal.tools.commands.replay import IDENTICAL, replay
+from weldcal.tools.emulators.cell.process import X_BC, wired_world
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
@@ -22,7 +23,6 @@ from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.output import markdown_table
-from weldcal.tools.studies.replay.wired_world import X_BC, wired_world
 
 COLUMNS = ("kind", "seed", "run", "reason", "replayed", "first", "seconds", "compared", "size_mb")
 SEAM_MM = 30.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.systems.drivers.sensors.stamps import DeviceClock, DiagramTime
+from weldcal.systems.drivers.sensors.stamps import DeviceClock, DiagramTime, UnixClock
 
 
 def stream(rate_hz: float, seconds: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,3 +63,32 @@ def test_the_diagrams_time_is_read_between_its_notes() -> None:
     assert times.at(10.3) == pytest.approx(0.1)  # it stood
     assert times.at(10.55) == pytest.approx(0.125)
     assert times.at(11.0) == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize("jump_s", [3600.0, -3600.0, 0.5, -0.5])
+def test_a_clock_that_is_set_moves_no_capture_time(jump_s: float) -> None:
+    """Frames on their way while the clock is set have stamps of the old one."""
+    host, jumped = [100.0], [0.0]
+    clock = UnixClock(lambda: 1.7e9 + host[0] + jumped[0], lambda: host[0])
+    errors = []
+    for k in range(300):
+        captured = 100.0 + 0.033 * k
+        stamp = 1.7e9 + captured + (jump_s if captured > 103.0 else 0.0)
+        host[0] = captured + 0.06
+        jumped[0] = jump_s if host[0] > 103.0 else 0.0
+        errors.append(clock.to_monotonic(stamp, host[0]) - captured)
+    assert np.abs(errors).max() < 1e-4
+
+
+def test_a_process_that_waits_between_two_clocks_reads_them_again() -> None:
+    waits = iter([0.3, 0.0, 0.0, 0.3, 0.0])
+    host = [100.0]
+
+    def unix() -> float:
+        host[0] += next(waits, 0.0)
+        return 1.7e9 + host[0]
+
+    clock = UnixClock(unix, lambda: host[0])
+    for _ in range(3):
+        captured = host[0] - 0.05
+        assert clock.to_monotonic(1.7e9 + captured, host[0]) == pytest.approx(captured, abs=1e-4)

@@ -216,6 +216,7 @@ class Controller(ControllerState):
             "command": self.inputs.integers[0],
             "answer": self.outputs.integers[0],
             "digital_outputs": self.terminals.digital_outputs,
+            "digital_inputs": self.terminals.digital_inputs,
             "script_line": self.program.line if self.program else 0,
             "watchdogs": sorted(self.watchdogs),
         }

@@ -47,6 +47,7 @@ class ControlServer(Server):
         checker: Checker,
         lockstep: Lockstep,
         world: World,
+        more_faults: Mapping[str, Callable[[Request, float], None]] | None = None,
     ) -> None:
         self._controller, self._network, self._external = controller, network, external
         self._rtde, self._checker, self._lockstep, self._world = rtde, checker, lockstep, world
@@ -91,6 +92,7 @@ class ControlServer(Server):
             "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
             "tool_contact": lambda r, now: setattr(c, "tool_contact_steps", int(_number(r, "n", 1))),
         }
+        self._faults |= more_faults or {}
         self._actions: dict[str, Callable[[Request, float], None]] = {
             "estop_release": lambda r, now: c.set_safety_mode(SafetyMode.NORMAL),
             "safeguard_release": lambda r, now: c.set_safety_mode(SafetyMode.NORMAL),
@@ -113,6 +115,7 @@ class ControlServer(Server):
                 _several(r, "point", 3), _several(r, "normal", 3), _number(r, "stiffness")
             ),
             "push": lambda r, now: setattr(c.surroundings, "push", np.array(_several(r, "wrench", 6))),
+            "note_fault": lambda r, now: checker.fault(str(r["what"]), now),
             "reset_checker": lambda r, now: checker.reset(),
             "quit": lambda r, now: setattr(self._world, "quit", True),
         }

@@ -1,0 +1,127 @@
+"""A straight groove played by `weldcal emulate-cell` in processes of its own, with a cell that welds it by wire."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from weldcal.models.errors import WeldcalError
+from weldcal.systems.scenario.loading import SCENARIO_FOLDER
+from weldcal.tools.emulators.cell.bridges import Bridge, PictureBridge, ScannerBridge
+from weldcal.tools.emulators.ur.process import CONTROL_PORT, Emulator
+
+PLAYED_HOST, PLAYED_SCANS = "127.30.0.1", "/tmp/weldcal-cell/scans"
+CELL = "wired_straight_groove"
+TRIGGER_PORT, STREAM_PORT, BRIDGED = 5020, 8081, 100  # a bridge's port is so much above its device's
+X_BC = "{xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"
+WELD_ONLY = "job: {{calibrate: false, X_BC: {X_BC}}}\nwelding: {{seam_length_mm: {seam_mm}}}\n"
+WORLD = """\
+description: A straight groove whose scanner stands where the drawing has it.
+robot: !SimulatedUr {}
+scanner: !RenderedScanner
+  {preset: ideal, width: 824, height: 616, mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0}
+finger_camera: !RenderedFingerCamera {}
+workpiece:
+  shape: straight
+  pose_guess: {xyz_m: [0.65, 0.0, 0.02], rpy_deg: [0.0, 0.0, 90.0]}
+  placement_error: {translation_mm: 3.0, rotation_deg: 0.5}
+  groove_error: {translation_mm: 1.0, rotation_deg: 0.2}
+home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
+"""
+
+
+class NoWorld(WeldcalError):
+    """The process that plays the world has not begun."""
+
+
+@dataclass(frozen=True)
+class WiredWorld:
+    """A running world: its process, those of scanner and finger camera, the cell's scenario file, and the file of its truth."""
+
+    process: subprocess.Popen[str]
+    host: str
+    cell: Path
+    truth_file: Path
+    scanner: int
+    finger: int
+    bridges: Mapping[str, Bridge]
+
+    @contextmanager
+    def control(self) -> Iterator[Emulator]:
+        """A connection to the controller's control channel, for one thread."""
+        emulator = Emulator(self.process, self.host, CONTROL_PORT)
+        try:
+            yield emulator
+        finally:
+            emulator.leave()
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """One request to the controller's control channel."""
+        with self.control() as controller:
+            return controller.ask(**request)
+
+    def truth(self) -> dict[str, Any]:
+        """The contents of the truth file."""
+        found: dict[str, Any] = json.loads(self.truth_file.read_text(encoding="utf-8"))
+        return found
+
+
+@contextmanager
+def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: bool = False) -> Iterator[WiredWorld]:
+    """Play the world at a loopback address for the duration of the block; `bridged`: scanner and camera through bridges.
+
+    Raises:
+        NoWorld: it has not begun.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {name: folder / name for name in ("cell.yaml", "wires.yaml", "world.yaml", "truth.json", "log")}
+    scans, passed = folder / "scans", folder / "passed"
+    text = (SCENARIO_FOLDER / f"{CELL}.yaml").read_text(encoding="utf-8")
+    text = text.replace("pace: 0.5", "pace: 1.0") + WELD_ONLY.format(X_BC=X_BC, seam_mm=seam_mm)
+    text = text.replace(PLAYED_HOST, host)
+    paths["wires.yaml"].write_text(text.replace(PLAYED_SCANS, str(scans)), encoding="utf-8")
+    if bridged:
+        passed.mkdir(exist_ok=True)
+        for port in (TRIGGER_PORT, STREAM_PORT):
+            text = text.replace(f"{host}:{port}", f"{host}:{port + BRIDGED}")
+    paths["cell.yaml"].write_text(text.replace(PLAYED_SCANS, str(passed if bridged else scans)), encoding="utf-8")
+    paths["world.yaml"].write_text(WORLD, encoding="utf-8")
+    command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(paths["world.yaml"])]
+    command += ["--cell", str(paths["wires.yaml"]), "--seed", str(seed), "--truth", str(paths["truth.json"])]
+    with paths["log"].open("w") as log:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True)
+    children: list[int] = []
+    with contextlib.ExitStack() as stack:
+        stack.callback(_end, process, children)
+        line = process.stdout.readline() if process.stdout is not None else ""
+        children += [int(pid) for pid in re.findall(r"process (\d+)", line)]
+        if len(children) < 2:
+            words = line + paths["log"].read_text(encoding="utf-8")
+            raise NoWorld(f"The world at {host} has not begun: {words.strip() or 'it ended without a word'}")
+        bridges: dict[str, Bridge] = {}
+        if bridged:
+            trigger, stream = (host, TRIGGER_PORT), (host, STREAM_PORT)
+            bridges["scanner"] = ScannerBridge((host, TRIGGER_PORT + BRIDGED), trigger, scans, passed)
+            bridges["finger camera"] = PictureBridge((host, STREAM_PORT + BRIDGED), stream)
+            for bridge in bridges.values():
+                stack.callback(bridge.close)
+        yield WiredWorld(process, host, paths["cell.yaml"], paths["truth.json"], children[0], children[-1], bridges)
+
+
+def _end(process: subprocess.Popen[str], children: list[int]) -> None:
+    for pid in children:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
+    process.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(10.0)
+    process.kill()
+    process.wait()

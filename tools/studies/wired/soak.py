@@ -1,0 +1,166 @@
+"""Calibrate and weld cycles by wire for minutes or hours with random faults: memory, stuck processes, names, motion and arc."""
+
+import gc
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from weldcal.models.errors import WeldcalError
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
+from weldcal.tools.report.files import csv_text, write_json
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.output import markdown_table
+from weldcal.tools.studies.wired.fault_run import DEVICES, FAULTS, OF_THE_CONTROLLER, PHASES, Happening, run_job
+
+SEAM_MM = 20.0
+CALIBRATES = 0.25  # share of the cycles
+FAULTY = 0.75
+WARM_UP = 2  # cycles that do not count for the memory: what is loaded and compiled once
+FLAT_MB_H = 10.0  # memory is flat where growth above this is not shown at 95 %
+FEWEST = 5  # cycles for a slope
+COLUMNS = (
+    "cycle", "at_s", "job", "device", "fault", "phase", "state", "reason", "rest_after_s", "torch_off_after_s", "wall_s", "moved",
+    "arc_s", "problems", "stuck", "cell_mb", "world_mb", "scanner_mb", "finger_mb",
+)  # fmt: skip
+PROCESSES = ("cell", "world", "scanner", "finger")
+
+
+def run_soak(
+    folder: Path, minutes: float, seed: int, progress: Progress = no_progress
+) -> tuple[dict[str, object], str]:
+    """Cycles until the time is over: the JSON object, and the printed table. Writes cycles.csv after each cycle, and soak.json."""
+    rng = np.random.default_rng([seed, 20])
+    rows: list[dict[str, object]] = []
+    host = f"127.36.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
+    begun, length = time.monotonic(), 60.0 * minutes
+    with wired_world(folder / "world", host, seed, SEAM_MM, bridged=True) as world:
+        while (at := time.monotonic() - begun) < length or not rows:
+            happening, calibrates = _drawn(rng)
+            what = "no fault" if happening is None else f"{happening.device} {happening.fault} in {happening.phase}"
+            progress(f"cycle {len(rows) + 1}: {what}", min(at / length, 0.99))
+            row: dict[str, object] = {"cycle": len(rows) + 1, "at_s": at}
+            try:
+                row |= run_job(world, folder / "job", seed, calibrates=calibrates, happening=happening)
+            except WeldcalError as problem:
+                row |= {
+                    "job": "",
+                    "device": what,
+                    "state": "failed",
+                    "reason": str(problem),
+                    "problems": [str(problem)],
+                }
+            rows.append(row | _processes(world))
+            write_atomic(
+                folder / "cycles.csv", csv_text(COLUMNS, ([r.get(name, "") for name in COLUMNS] for r in rows))
+            )
+            if not _alive(world.process.pid):
+                break
+        world_lives = _alive(world.process.pid)
+    found = _summary(rows, time.monotonic() - begun, world_lives=world_lives)
+    write_json(folder / "soak.json", found | {"rows": rows})
+    return found, _table(found)
+
+
+def _drawn(rng: np.random.Generator) -> tuple[Happening | None, bool]:
+    """The next cycle's fault, or None, and whether it calibrates."""
+    calibrates = bool(rng.random() < CALIBRATES)
+    if rng.random() >= FAULTY:
+        return None, calibrates
+    device = str(rng.choice(DEVICES))
+    faults = (*FAULTS, *OF_THE_CONTROLLER) if device == "controller" else FAULTS
+    phase = "calibrate" if calibrates else str(rng.choice([name for name in PHASES if name != "calibrate"]))
+    return Happening(device, str(rng.choice(faults)), phase), calibrates
+
+
+def _processes(world: WiredWorld) -> dict[str, object]:
+    """Resident memory (MB) of each process, and the processes that a cycle left behind."""
+    gc.collect()
+    pids = dict(zip(PROCESSES, (os.getpid(), world.process.pid, world.scanner, world.finger), strict=True))
+    stuck = [pid for pid in _children(os.getpid()) if pid != world.process.pid and not _is_pythons_own(pid)]
+    return {"stuck": len(stuck), **{f"{name}_mb": _resident_mb(pid) for name, pid in pids.items()}}
+
+
+def _resident_mb(pid: int) -> float:
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return float("nan")
+    kilobytes = [int(line.split()[1]) for line in lines if line.startswith("VmRSS")]
+    return kilobytes[0] / 1024 if kilobytes else float("nan")
+
+
+def _children(pid: int) -> list[int]:
+    """Living child processes."""
+    found = [int(n) for file in Path(f"/proc/{pid}/task").glob("*/children") for n in file.read_text().split()]
+    return [child for child in found if _alive(child)]
+
+
+def _is_pythons_own(pid: int) -> bool:
+    """Whether it is the one process with which Python keeps count of shared memory, until its owner ends."""
+    try:
+        return b"resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return True
+
+
+def _alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def growth(hours: np.ndarray, megabytes: np.ndarray) -> dict[str, float | bool | None]:
+    """The slope of a memory (MB/h) with its 95 % interval by least squares; `flat`: growth above FLAT_MB_H is not shown."""
+    kept = np.isfinite(megabytes)
+    hours, megabytes = hours[kept][WARM_UP:], megabytes[kept][WARM_UP:]
+    if len(hours) < FEWEST:
+        return {"mb_per_h": None, "low": None, "high": None, "flat": None}
+    line = stats.linregress(hours, megabytes)
+    half = float(stats.t.ppf(0.975, len(hours) - 2)) * line.stderr
+    low, high = line.slope - half, line.slope + half
+    return {"mb_per_h": line.slope, "low": low, "high": high, "flat": bool(low <= FLAT_MB_H)}
+
+
+def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool) -> dict[str, object]:
+    hours = np.array([float(str(row["at_s"])) for row in rows]) / 3600.0
+    memory = {}
+    for name in PROCESSES:
+        mb = np.array([float(str(row[f"{name}_mb"])) for row in rows])
+        memory[name] = {"first_mb": mb[0], "last_mb": mb[-1], **growth(hours, mb)}
+    faults = [row for row in rows if row.get("fault")]
+    wrong = [f"cycle {row['cycle']} ({row['device']} {row.get('fault', '')}, {row.get('phase', '')}): {'; '.join(map(str, row['problems']))}"  # type: ignore[call-overload]
+             for row in rows if row["problems"]]  # fmt: skip
+    total = {name: sum(float(str(row.get(name) or 0.0)) for row in rows) for name in ("moved", "arc_s", "stuck")}
+    good = (
+        not wrong and world_lives and not any(total.values()) and all(m["flat"] is not False for m in memory.values())
+    )
+    return {
+        "state": "done" if good else "failed", "seconds": seconds, "cycles": len(rows),
+        "calibrated": sum(row["job"] == "calibrate" for row in rows), "welded": sum(row["job"] == "weld" for row in rows),
+        "done": sum(row["state"] == "done" for row in rows), "held": sum(row["state"] == "held" for row in rows),
+        "faults": len(faults), "faults_held_by_name": sum(row["state"] == "held" and not row["problems"] for row in faults),
+        "faults_without_effect": sum(row["state"] == "done" and not row["problems"] for row in faults),
+        "motions_without_a_command": total["moved"], "arc_without_a_command_s": total["arc_s"],
+        "stuck_processes": total["stuck"], "world_lives": world_lives, "memory": memory, "wrong": wrong,
+        **({} if good else {"reason": wrong[0] if wrong else "Memory grew, a process is stuck, or the world has ended: see the table."}),
+    }  # fmt: skip
+
+
+def _table(found: Mapping[str, object]) -> str:
+    rows = [(key.replace("_", " "), f"{value:.1f}" if isinstance(value, float) else str(value))
+            for key, value in found.items() if not isinstance(value, dict | list)]  # fmt: skip
+    for name, m in found["memory"].items():  # type: ignore[attr-defined]
+        slope = (
+            "too few cycles"
+            if m["mb_per_h"] is None
+            else f"{m['mb_per_h']:+.1f} MB/h ({m['low']:+.1f} to {m['high']:+.1f})"
+        )
+        rows.append((f"memory: {name}", f"{m['first_mb']:.0f} to {m['last_mb']:.0f} MB, {slope}"))
+    rows += [("wrong", text) for text in found["wrong"]]  # type: ignore[attr-defined]
+    return markdown_table(("what", "value"), rows)
