@@ -13,6 +13,7 @@ from tests.held_weld import held_weld, short_weld
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.person import Person
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -57,7 +58,7 @@ def test_the_arm_rests_on_its_path_while_it_is_held_and_then_ends_its_way(contro
         person.go_on()
 
     def watch(stage: str, _: float) -> None:
-        if stage == "move home" and not seen:
+        if stage == phase_words("move_home") and not seen:
             seen["begun"] = {}
             threading.Thread(target=hold_for_a_while, daemon=True).start()
 

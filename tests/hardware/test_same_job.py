@@ -13,6 +13,7 @@ from tests.short_job import SEED, ShortJobs, short_job_scenario
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import run_scenario
@@ -107,7 +108,7 @@ def run_until(controller: Emulator, folder: Path, stage: str, happens: Callable[
     """A weld on the controller's arm; something happens when a phase begins."""
 
     def watch(phase: str, _: float) -> None:
-        if phase == stage:
+        if phase == phase_words(stage):
             happens()
 
     options = RunOptions("a test's own", folder, pace=PACE, recording=False)
@@ -128,14 +129,14 @@ def test_ctrl_c_brings_the_arm_to_rest_and_ends_the_program(controller: Emulator
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    result = run_until(controller, tmp_path / "run", "approach above", interrupt)
+    result = run_until(controller, tmp_path / "run", "approach_above", interrupt)
     assert result.summary()["reason"] == "A person stopped the run with Ctrl-C, in the phase 'approach_above'."
     phases = [name for name, _, _ in result.run.phases]
     assert phases[:3] == ["start", "move_home", "park"], "it stood elsewhere, and went home first"
 
 
 def test_a_fault_holds_the_job_and_names_itself(controller: Emulator, tmp_path: Path) -> None:
-    result = run_until(controller, tmp_path / "run", "approach above", lambda: controller.fault("protective_stop"))
+    result = run_until(controller, tmp_path / "run", "approach_above", lambda: controller.fault("protective_stop"))
     reason = str(result.summary()["reason"])
     assert reason.startswith("PROTECTIVE STOP: ")
     assert "Enable Robot" in reason

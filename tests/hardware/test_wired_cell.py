@@ -21,6 +21,7 @@ from pydrake.systems.primitives import VectorLogSink
 
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import run_scenario
@@ -199,7 +200,7 @@ def held_by(played: Played, folder: Path, stage: str, happens: Callable[[], obje
     seen: list[str] = []
 
     def watch(phase: str, _: float) -> None:
-        if phase == stage and not seen:
+        if phase == phase_words(stage) and not seen:
             seen.append(phase)
             happens()
 
@@ -241,7 +242,7 @@ def test_a_scanner_that_does_not_answer_ends_the_job_by_name(
         reason = held_by(
             played,
             tmp_path / "run",
-            "scan workpiece",
+            "scan_workpiece",
             lambda: os.kill(scanner, signal.SIGSTOP),
             f"scanner: !FolderScanner {{{wires}, scan_timeout_s: 2.0}}",
         )

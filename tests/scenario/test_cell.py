@@ -21,6 +21,7 @@ from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.jobs.weld.settings import job_plan
 from weldcal.systems.motion.clear_moves import clear_poses
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -323,7 +324,7 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
             closed.append(True)
 
     def interrupt(stage: str, _: float) -> None:
-        if stage == "approach above":
+        if stage == phase_words("approach_above"):
             raise KeyboardInterrupt
 
     home = np.deg2rad(scenario.home_deg)

@@ -14,6 +14,7 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.person import Person, person_at
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
 
@@ -48,7 +49,7 @@ def test_a_terminal_is_listened_to_until_it_ends() -> None:
         assert person.holds
 
 
-@pytest.mark.parametrize("phase", ["move home", "park", "start"])
+@pytest.mark.parametrize("phase", ["move_home", "park", "start"])
 def test_a_job_that_was_held_goes_on_as_if_nothing_had_been(phase: str) -> None:
     ends = []
     for hold in (False, True):
@@ -56,7 +57,7 @@ def test_a_job_that_was_held_goes_on_as_if_nothing_had_been(phase: str) -> None:
 
         def watch(stage: str, _: float, person: Person = person, told: list[str] = told, hold: bool = hold) -> None:
             told.append(stage)
-            if hold and stage == phase and phase not in told[:-1]:
+            if hold and stage == phase_words(phase) and stage not in told[:-1]:
                 person.hold()
                 threading.Timer(HELD_S, person.go_on).start()
 

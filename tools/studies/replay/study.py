@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -56,9 +57,9 @@ KINDS = {
     "weld by wire": Kind("", "", "wired"),
     "the tag is hidden": Kind("straight_groove", f"welding: {{seam_length_mm: 60.0}}\n{KNOWN}\n{HIDDEN}"),
     "contact is lost": Kind("straight_groove", f"welding: {{seam_length_mm: 80.0}}\n{KNOWN}", fault="hole"),
-    "protective stop": Kind("straight_groove", f"{SHORT}\n{KNOWN}", "emulated", "protective_stop", "approach above"),
+    "protective stop": Kind("straight_groove", f"{SHORT}\n{KNOWN}", "emulated", "protective_stop", "approach_above"),
     "pictures stop": Kind("", "", "wired", "finger", "start"),
-    "the scanner stops": Kind("", "", "wired", "scanner", "scan workpiece"),
+    "the scanner stops": Kind("", "", "wired", "scanner", "scan_workpiece"),
 }
 
 
@@ -148,7 +149,7 @@ def _run(scenario: Scenario, options: RunOptions, phase: str = "", happens: Happ
     seen: list[str] = []
 
     def watch(stage: str, _: float) -> None:
-        if phase and stage == phase and not seen:
+        if phase and stage == phase_words(phase) and not seen:
             seen.append(stage)
             happens()
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.emulators.cell.process import WiredWorld
@@ -19,9 +20,9 @@ DEVICES = ("scanner", "finger camera", "controller", "digital inputs")
 FAULTS = ("killed", "frozen", "delayed", "garbage")
 OF_THE_CONTROLLER = ("protective_stop", "estop", "stop_program")
 PHASES = {
-    "calibrate": "scan pose",
-    "scan": "scan workpiece",
-    "approach": "approach above",
+    "calibrate": "scan_pose",
+    "scan": "scan_workpiece",
+    "approach": "approach_above",
     "feel": "weld",
     "weld": "weld",
 }
@@ -162,7 +163,7 @@ def _thrown(world: WiredWorld, happening: Happening | None, stage: list[str], th
     def wait_and_throw(it: Happening) -> None:
         with world.control() as controller:
             while not over.is_set():
-                if stage[0] == PHASES[it.phase] and (
+                if stage[0].startswith(phase_words(PHASES[it.phase])) and (
                     it.phase != "weld" or controller.state()["digital_inputs"] >> ARC & 1
                 ):
                     if it.phase == "weld":
