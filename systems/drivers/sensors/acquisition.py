@@ -119,6 +119,7 @@ class _Seen:
 
     counts: Counts = field(default_factory=Counts)
     connected: bool = False
+    opened_at: float = 0.0
     lost_since: float = 0.0
     trouble: str = ""  # the newest, as a sentence
     good_at: float = 0.0
@@ -286,7 +287,7 @@ class Acquisition(Generic[Datum]):
         try:
             if not seen.connected:
                 self.source.open()
-                seen.connected, seen.refused = True, 0
+                seen.connected, seen.refused, seen.opened_at = True, 0, time.monotonic()
                 self.clock = DeviceClock(self._latency_s, self.rules.late_s)
                 self._device_number = None
                 seen.asked = min(seen.asked, max(self._wanted - 1, 0))  # an unanswered request is repeated
@@ -322,7 +323,9 @@ class Acquisition(Generic[Datum]):
         with suppress(Exception):  # whatever state its library is in
             self.source.close()
         if seen.connected:
-            seen.lost_since = now
+            # a connection that ends at once, again and again, is none
+            if seen.good_at > seen.opened_at or now - seen.opened_at > self.rules.lost_s:
+                seen.lost_since = now
             seen.counts = replace(seen.counts, reconnects=seen.counts.reconnects + 1)
         else:
             seen.refused += 1

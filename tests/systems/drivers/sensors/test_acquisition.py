@@ -110,6 +110,25 @@ def test_a_lost_device_is_named_and_connected_again(started: Acquisition[Any], d
     assert device.closed >= 1
 
 
+def test_a_device_that_connects_and_drops_again_and_again_is_not_connected(device: Scripted) -> None:
+    acquisition = Acquisition(device, Rules(late_s=float("inf"), lost_s=0.3))
+    device.script.clear()
+    acquisition.start(2.0, first_frame=False)
+    try:
+        time.sleep(0.35)  # the connection has lasted
+        device.script.extend([DeviceLost("it ended the connection")] * 20)
+        begun = time.monotonic()
+        assert wait_until(lambda: acquisition.fault(time.monotonic()) is not None)
+        assert time.monotonic() - begun > 0.25, "one loss alone is forgiven"
+        assert acquisition.fault(time.monotonic()) in (
+            None,  # the moment in which it is connected
+            "The scripted device is not connected: it ended the connection.",
+        )
+        assert acquisition.counts.reconnects > 1
+    finally:
+        acquisition.close()
+
+
 def test_any_exception_of_a_devices_library_is_a_loss_and_the_thread_goes_on(
     started: Acquisition[Any], device: Scripted
 ) -> None:
