@@ -22,6 +22,7 @@ def emulate_cell(
     control_port: Annotated[
         int, option("--control-port", "PORT", "Port that takes injected faults, as JSON lines.")
     ] = 30090,
+    parent: Annotated[int | None, option("--parent", "PID", "End when this process ends.")] = None,
 ) -> None:
     """Play robot, scanner, finger camera, torch and workpiece of a cell on loopback, until it is interrupted."""
     from weldcal.tools.commands.emulate_cell import emulate
@@ -33,5 +34,6 @@ def emulate_cell(
         truth=truth,
         pace=pace,
         control_port=control_port,
+        parent=parent,
         ready=lambda s: typer.echo(f"ready: {s}"),
     )

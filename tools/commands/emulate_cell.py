@@ -18,6 +18,7 @@ def emulate(
     truth: Path | None,
     pace: float | None,
     control_port: int,
+    parent: int | None = None,
     ready: Callable[[str], None],
 ) -> None:
     """Serve until the process is asked to end; see run_world. `truth` holds what the world knows whenever that has changed.
@@ -32,4 +33,4 @@ def emulate(
             write_atomic(truth, json.dumps({"scenario": world, "seed": seed} | found, indent=1) + "\n")
 
     known = cell or f"{WIRED}{Path(world).stem}"
-    run_world(world, known, seed, write=write, ready=ready, pace=pace, control_port=control_port)
+    run_world(world, known, seed, write=write, ready=ready, pace=pace, control_port=control_port, parent=parent)

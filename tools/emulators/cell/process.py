@@ -96,6 +96,7 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
     paths["world.yaml"].write_text(WORLD, encoding="utf-8")
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(paths["world.yaml"])]
     command += ["--cell", str(paths["wires.yaml"]), "--seed", str(seed), "--truth", str(paths["truth.json"])]
+    command += ["--parent", str(os.getpid())]
     with paths["log"].open("w") as log:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True)
     children: list[int] = []

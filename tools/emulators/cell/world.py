@@ -192,8 +192,9 @@ def run_world(
     ready: Callable[[str], None],
     pace: float | None = None,
     control_port: int = CONTROL_PORT,
+    parent: int | None = None,
 ) -> None:
-    """Play the world behind a cell's wires until the process is asked to end (SIGTERM or SIGINT).
+    """Play the world behind a cell's wires until the process is asked to end (SIGTERM or SIGINT), or process ``parent`` is gone.
 
     Args:
         world_name: what is true: a scenario, by name or path, with simulated devices; its deviations follow from `seed`.
@@ -203,6 +204,7 @@ def run_world(
         ready: called once with a sentence when every device answers.
         pace: fastest controller seconds per host second; None: the cell's. The controller waits for the physics.
         control_port: port that takes the controller's injected faults.
+        parent: process whose end ends the world; None: no such process.
 
     Raises:
         InputError: the scenarios cannot be played, or an address is taken.
@@ -264,7 +266,7 @@ def run_world(
             f"{control_port}."
         )
         inside.write()
-        emulation.run(None, lambda _: ready(sentence))
+        emulation.run(parent, lambda _: ready(sentence))
 
 
 class _Child:
