@@ -5,12 +5,14 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
+from selenium.common.exceptions import WebDriverException
 from selenium.webdriver import Chrome, ChromeOptions, ChromeService
 from selenium.webdriver.support.ui import WebDriverWait
 
@@ -59,6 +61,11 @@ class Browser:
         self.console_messages()
         self._driver.get(page.resolve().as_uri() if isinstance(page, Path) else page)
         self.wait(wait_for, timeout_s)
+
+    def rest(self) -> None:
+        """Leaves the page: a 3D scene is drawn again and again as long as it is open, which takes a whole core."""
+        with suppress(WebDriverException):  # one that has died is told by the next test that needs it
+            self._driver.get("about:blank")
 
     def wait(self, condition: str, timeout_s: float = 30) -> None:
         """Waits until a JavaScript expression is true; raises selenium.common.TimeoutException if it never is."""
@@ -123,8 +130,11 @@ def colours(pixels: Pixels) -> int:
     return int(np.unique(levels @ np.array([256, 16, 1])).size)
 
 
+RUNNING = pytest.StashKey[Browser]()
+
+
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """One headless browser for the whole test session; tests that need it are skipped where there is none."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     chromedriver = shutil.which("chromedriver")
@@ -137,6 +147,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         options.add_argument(flag)
     driver = Chrome(options=options, service=ChromeService(chromedriver))
     try:
-        yield Browser(driver)
+        request.session.stash[RUNNING] = Browser(driver)
+        yield request.session.stash[RUNNING]
     finally:
         driver.quit()

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser import browser
+from tests.browser import RUNNING, browser
 from tests.places import SHARED_DATA, require_data
 from tests.scheduling import Scheduling, order, processes
 from tests.short_job import finished_demo, short_jobs
@@ -33,6 +33,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before any fixture is made, the data must be there."""
     for mark in item.iter_markers("needs_data"):
         require_data(*mark.args)
+
+
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """The browser leaves the last page of a file."""
+    running = item.session.stash.get(RUNNING, None)
+    if running is not None and (nextitem is None or nextitem.path != item.path):
+        running.rest()
 
 
 @pytest.hookimpl(optionalhook=True)
