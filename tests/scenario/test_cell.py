@@ -190,6 +190,28 @@ def test_the_weld_log_needs_nothing_that_only_a_simulation_knows(short_job: Demo
     assert 0.0 < gap.max() < 2e-4
 
 
+def test_a_run_that_was_interrupted_within_a_tick_has_an_outcome(short_job: DemoResult) -> None:
+    """Ctrl-C between two logs of a tick leaves the later ones a row shorter."""
+    run = short_job.run
+    whole = {name: sink.FindLog(run.root).data() for name, sink in run.cell.logs.items()}
+
+    class Shorter:
+        def __init__(self, rows: np.ndarray) -> None:
+            self._rows = rows
+
+        def FindLog(self, _: object) -> Shorter:
+            return self
+
+        def data(self) -> np.ndarray:
+            return self._rows
+
+    cut = {name: Shorter(rows[:, :-1] if name in ("deflection", "margin") else rows) for name, rows in whole.items()}
+    found, known = weld_outcome(dc.replace(run.cell, logs=cut), run.root), short_job.weld  # type: ignore[arg-type]
+    assert found is not None
+    assert known is not None
+    assert len(known.log.time) - 1 <= len(found.log.time) <= len(known.log.time)
+
+
 def test_a_hidden_tag_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:
     hidden = "finger_camera: !RenderedFingerCamera {hidden_from_s: 8.0}"
     result = run(load_scenario("straight_groove", f"{TOLD}\n{FAST}\n{hidden}"), tmp_path)

@@ -136,8 +136,11 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
     """The log rows in which the servo was active; None where there are none."""
     if not cell.logs:
         return None
-    series = {name: sink.FindLog(root) for name, sink in cell.logs.items()}
-    telemetry = series["telemetry"].data()
+    series = {name: sink.FindLog(root).data() for name, sink in cell.logs.items()}
+    # a run that is interrupted within a tick leaves some logs a row shorter
+    rows = min(data.shape[1] for data in series.values())
+    series = {name: data[:, :rows] for name, data in series.items()}
+    telemetry = series["telemetry"]
     ticks = telemetry[TELEMETRY.index("tick_time")]
     keep = (telemetry[0] >= 0.0) & (telemetry[0] != PHASE_CODES[Phase.DONE])
     keep &= new_ticks(ticks)
@@ -149,17 +152,17 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
     p_BRobot = columns(named, "p_BT")
     q = columns(named, "q_BT", "wxyz")
     R_BT = np.array([RotationMatrix(Quaternion(w / np.linalg.norm(w))).matrix() for w in q])
-    deflection = series["deflection"].data()[:3, keep].T
+    deflection = series["deflection"][:3, keep].T
     return WeldLog(
         time=named["tick_time"],
         telemetry=named,
-        torch_on=np.array(series["torch_on"].data()[0, keep] > 0.5),
+        torch_on=np.array(series["torch_on"][0, keep] > 0.5),
         p_BTip=p_BRobot + np.einsum("nij,nj->ni", R_BT, deflection),
         p_BRobot=p_BRobot,
         R_BT=R_BT,
-        p_BTorch=np.array(series["torch"].data()[:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW,
+        p_BTorch=np.array(series["torch"][:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW,
         deflection_T=np.array(deflection),
-        sigma_min=np.array(series["margin"].data()[0, keep]),
+        sigma_min=np.array(series["margin"][0, keep]),
     )
 
 
