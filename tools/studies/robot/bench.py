@@ -31,6 +31,7 @@ STROKE_M = 0.04  # to either side of where the arm starts
 RUNWAY_M = 0.022  # left before the turn where a fault is thrown in: 0.44 s at full speed
 DIRECTION = np.array([0.0, 0.6, 0.8])
 CRUISE_LIMIT_S = 8.0
+CRUISES = "cruising"
 OUTPUT = 3  # the digital output of the process
 
 
@@ -161,7 +162,7 @@ class Bench:
         return self._workers
 
     def cruise(self) -> None:
-        """Wait until the arm moves at full speed with the runway ahead.
+        """Wait until the arm moves at full speed with the runway ahead, here or in the process of `start_elsewhere`.
 
         Raises:
             StoppedUnasked: the link has stopped it.
@@ -172,8 +173,9 @@ class Bench:
             assert self._child.stdout is not None
             self._child.stdin.write("tell me when it cruises\n")
             self._child.stdin.flush()
-            if not self._child.stdout.readline():
-                raise InputError("The process that was to be killed did not get the arm to move.")
+            answer = self._child.stdout.readline().strip()
+            if answer != CRUISES:
+                raise StoppedUnasked(f"Before anything was done: {answer or 'the process that was to be killed ended'}")
             return
         until = time.monotonic() + CRUISE_LIMIT_S
         while not self.stream.cruising:
@@ -252,7 +254,7 @@ class Bench:
 
 
 def main() -> None:
-    """Moves the arm at argv[1] until stdin closes or the process is killed; answers each line when it cruises."""
+    """Moves the arm at argv[1] until stdin closes or the process is killed; answers each line when it cruises, or why it does not."""
     host = sys.argv[1]
     arm, config = load_arm(), UrRtde(host=host)
     x, y, z = config.payload_cog_m
@@ -260,9 +262,15 @@ def main() -> None:
     stream = Stream(link, arm, np.array(HOME))
     stream.start()
     for _ in sys.stdin:
-        while not stream.cruising:
+        until = time.monotonic() + CRUISE_LIMIT_S
+        while not stream.cruising and stream.state.fault is Fault.NONE and time.monotonic() < until:
             time.sleep(0.002)
-        sys.stdout.write("cruising\n")
+        answer = (
+            CRUISES
+            if stream.cruising
+            else stream.state.status.fault or "The arm does not move though it is commanded to."
+        )
+        sys.stdout.write(f"{answer}\n")
         sys.stdout.flush()
     stream.stop()
     link.close()
