@@ -213,11 +213,17 @@ def kinematics_and_jacobian(arm: ArmModel, q: Array, p_FP: Array = _ORIGIN) -> t
     J is geometric: column i is [z_i; z_i x (p_P - o_i)] with z_i, o_i the axis and origin of joint i
     (Siciliano et al., Robotics, 2009, Eq. 3.30, with rotation first as Drake orders spatial vectors).
     """
-    from weldcal.models.arms.compiled_chain import geometric_jacobian  # slow to import
-
-    X, p, J = _chain(arm.stack, q), np.empty(3), np.empty((6, 6))
-    geometric_jacobian(X, np.array(p_FP, dtype=np.float64), p, J)
-    return X[5, :3, :3], p, J
+    X = _chain(arm.stack, q)
+    R = X[5, :3, :3]
+    p = R @ p_FP + X[5, :3, 3]
+    z0, z1, z2 = z = X[:, :3, 2].T
+    r0, r1, r2 = p[:, None] - X[:, :3, 3].T
+    J = np.empty((6, 6))
+    J[:3] = z
+    J[3] = z1 * r2 - z2 * r1
+    J[4] = z2 * r0 - z0 * r2
+    J[5] = z0 * r1 - z1 * r0
+    return R, p, J
 
 
 def sigma_min(J: ArrayLike, length: float = 1.0) -> float:
@@ -233,12 +239,14 @@ def sigma_min(J: ArrayLike, length: float = 1.0) -> float:
 
 def _chain(stack: Array, q: Array) -> Array:
     """Poses (6, 4, 4) of the six links in B."""
-    from weldcal.models.arms.compiled_chain import turn_and_chain  # slow to import
-
-    # copies: the code is compiled anew for each kind of view
-    poses = np.array(stack, dtype=np.float64, order="C")
-    turn_and_chain(poses, np.array(q, dtype=np.float64))
-    return poses
+    c, s = np.cos(q)[:, None], np.sin(q)[:, None]
+    x, y = stack[:, :, 0], stack[:, :, 1]
+    step = stack.copy()
+    step[:, :, 0] = x * c + y * s
+    step[:, :, 1] = y * c - x * s
+    for i in range(1, 6):
+        step[i] = step[i - 1] @ step[i]
+    return step
 
 
 def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
