@@ -31,6 +31,12 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     _replace(path, data)
 
 
+def write_apart(path: Path, content: str | bytes) -> None:
+    """Write a file that is whole by itself, as ``write_atomic`` does: it does not make its folder an unfinished result."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _replace(path, content.encode() if isinstance(content, str) else content)
+
+
 def write_npz(path: Path, **arrays: Any) -> None:
     """Write arrays as a compressed NPZ file, as ``write_atomic`` does."""
     import numpy as np  # the command line's help does without it

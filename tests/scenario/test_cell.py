@@ -218,7 +218,7 @@ def test_a_hidden_tag_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:
     assert result.state == "held"
     assert "tag" in str(result.summary()["reason"])
     assert_at_rest_with_torch_off(result)
-    assert "held" in (tmp_path / "report.html").read_text()
+    assert "Do not use" in (tmp_path / "report.html").read_text()
 
 
 def test_lost_contact_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:

@@ -281,7 +281,7 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     state = str(summary.get("state", "done"))
     if call.json:
         first = outcome.first
-        console.emit_json(summary if first is None else {**summary, "first_screen": first.document()})
+        console.emit_json(summary if first is None else {"first_screen": first.document(), **summary})
     elif callable(outcome.text):
         outcome.text()
     elif outcome.text is not None:

@@ -14,8 +14,8 @@ from weldcal.calibration.doctor.record import NAME, case_of, case_text
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
+from weldcal.models.result_files import write_apart
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.report.render import write_atomic
 
 
 def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> Case:
@@ -43,7 +43,7 @@ def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard
 
 def write_case(folder: Path, case: Case) -> None:
     """Write what was seen of the flange beside a result, for `weldcal doctor`."""
-    write_atomic(folder / NAME, case_text(case))
+    write_apart(folder / NAME, case_text(case))
 
 
 @contextmanager

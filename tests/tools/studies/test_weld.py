@@ -259,7 +259,7 @@ def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:
     assert {tick["phase"] for tick in ticks} >= {"TOUCH", "TRACK", "FINISH", "DONE"}
     report = (out / "report.html").read_text()
     assert "Corner of 1 mm, convex" in report
-    assert report.count("data:image/svg+xml") == 2
+    assert report.count("<svg") == 2
 
 
 def test_an_unknown_row_is_one_sentence_and_exit_code_one(tmp_path: Path) -> None:
