@@ -50,7 +50,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
-    """File by file; what streams to an emulated robot in two rows."""
+    """File by file; what streams to an emulated robot one by one."""
     return Scheduling(config, log)
 
 

@@ -1,4 +1,4 @@
-"""How the tests are dealt to the processes of pytest-xdist: file by file, what streams to an emulated robot in two rows."""
+"""How the tests are dealt to the processes of pytest-xdist: file by file, what streams to an emulated robot one by one."""
 
 from __future__ import annotations
 
@@ -7,22 +7,20 @@ import os
 import pytest
 from xdist.scheduler.loadfile import LoadFileScheduling
 
-# They stream in time with a clock. Whole jobs by turns: a Diagram that runs so takes a core, and two at once would only slow each
-# other down. The others sleep most of their time.
-JOBS = ("test_same_job.py", "test_other_jobs.py", "test_hold_and_go_on.py", "test_wired_cell.py")
-LINES = (
-    *("test_fault_matrix.py", "test_station_backends.py", "test_process_output.py", "test_robot_stream.py"),
-    "test_emulator_lockstep.py",
+# They stream in time with a clock, and a Diagram that does takes a core: two at once would only slow each other down.
+STREAMING = (
+    *("test_same_job.py", "test_other_jobs.py", "test_fault_matrix.py", "test_station_backends.py"),
+    *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py", "test_hold_and_go_on.py"),
+    "test_wired_cell.py",
 )
-STREAMING = (*JOBS, *LINES)
 # They look at the finished demo. A core that is left with them at the end keeps the other waiting.
 DEMO = ("tests/scenario/test_readme.py", "tests/scenario/test_cell.py")
 MOST_PROCESSES = 4
 
 
 def processes() -> int:
-    """One for each core, and two for the streaming tests."""
-    return min(len(os.sched_getaffinity(0)), MOST_PROCESSES) + 2
+    """One for each core, and one for the streaming tests, which sleep most of their time."""
+    return min(len(os.sched_getaffinity(0)), MOST_PROCESSES) + 1
 
 
 def order(item: pytest.Item) -> tuple[object, ...]:
@@ -33,11 +31,10 @@ def order(item: pytest.Item) -> tuple[object, ...]:
 
 
 class Scheduling(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types
-    """File by file, but all jobs that stream are one file, all other streams, and all that look at the finished demo."""
+    """File by file, but all that stream are one file, and all that look at the finished demo."""
 
     def _split_scope(self, nodeid: str) -> str:
         path = nodeid.split("::", 1)[0]
         if path in DEMO:
             return "demo"
-        name = path.rsplit("/", 1)[-1]
-        return "jobs" if name in JOBS else "lines" if name in LINES else path
+        return "streaming" if path.rsplit("/", 1)[-1] in STREAMING else path
