@@ -8,7 +8,8 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arms.compiled_kinematics import tick_flange_pose
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.messages import Message
 
 LENGTH_S = 10.0  # an estimate of a scan is paired with its pose when it is ready, which a job waits 8 s for
@@ -33,7 +34,7 @@ class PoseHistory(Message):
     def pose_at(self, arm: ArmModel, time: float) -> RigidTransform | None:
         """Flange pose X_BF at `time` s; None as in joints_at."""
         q = self.joints_at(time)
-        return None if q is None else forward_kinematics(arm, q)
+        return None if q is None else tick_flange_pose(arm, q)
 
 
 class PoseRecorder(LeafSystem):
