@@ -64,6 +64,8 @@ class PoseRecorder(LeafSystem):
         time = float(self._time.Eval(context)[0])
         if old.times.size and time <= old.times[-1]:
             return
-        times = np.append(old.times[-self._length :], time)
-        positions = np.vstack([old.positions[-self._length :], self._position.Eval(context)])
+        n = min(old.times.size, self._length)
+        times, positions = np.empty(n + 1), np.empty((n + 1, 6))
+        times[:n], positions[:n] = old.times[old.times.size - n :], old.positions[old.times.size - n :]
+        times[n], positions[n] = time, self._position.Eval(context)
         state.get_mutable_abstract_state(self._state).set_value(PoseHistory(times, positions))
