@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.stats import chi2
 
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.quantiles import chi2_below
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arrays import Array
 
@@ -59,7 +59,7 @@ class CorrectionEstimate:
     def certainty(self) -> float:
         """Probability that the correction is not zero by chance."""
         v = self.values - np.eye(len(self.values))[0]
-        return float(chi2.cdf(v @ np.linalg.solve(self.covariance, v), len(v)))
+        return chi2_below(v @ np.linalg.solve(self.covariance, v), len(v))
 
 
 def from_motion(

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.special import gammaincinv
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.quantiles import chi2_exceeded, f_quantile
 from weldcal.calibration.geometry.rigid import fit_rigid, fit_rigid_sets, fit_rotation
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
@@ -250,7 +249,7 @@ def _reweighted(data: _Data, start: RigidTransform, usual: float = 0.0) -> tuple
 def _loose(redundancy: int) -> float:
     """How much wider a gate must be whose scale was found from few spare numbers: it may be far too small by chance. The ratio of
     the quantiles of F (3, redundancy) and chi-square (3) that one good pose in ten thousand exceeds."""
-    wide = 3.0 * f_distribution.isf(1e-4, 3, max(redundancy, 1)) / chi2.isf(1e-4, 3)
+    wide = 3.0 * f_quantile(1.0 - 1e-4, 3, max(redundancy, 1)) / chi2_exceeded(1e-4, 3)
     return float(min(np.sqrt(wide), _WIDEST_GATE))
 
 
