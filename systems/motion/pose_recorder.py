@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 
 LENGTH_S = 10.0  # an estimate of a scan is paired with its pose when it is ready, which a job waits 8 s for

@@ -2,9 +2,10 @@
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.welding.servo.guards import ArmGuardConfig, guarded_joint_velocity
 
 

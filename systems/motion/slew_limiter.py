@@ -3,8 +3,9 @@
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.welding.servo.guards import SlewLimits, slew_limit
 
 

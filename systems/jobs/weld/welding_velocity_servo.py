@@ -6,11 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, believed_arm
 from weldcal.welding.servo.interruption import Interruption, interruptible_step
 from weldcal.welding.servo.settings import ServoConfig
