@@ -41,7 +41,7 @@ def said_twice(printed: str) -> list[str]:
     """Poses, and lines of words, that a terminal shows more than once."""
     poses = re.findall(r"p\[.*?\]", printed)
     lines = [text for line in printed.splitlines() if len(text := re.sub(r"^ *(\S.*?)?  +|^- ", "", line).strip()) > 30]
-    return [text for text, count in Counter([*poses, *lines]).items() if count > 1]
+    return [text for found in (poses, lines) for text, count in Counter(found).items() if count > 1]
 
 
 @pytest.fixture(scope="module")
