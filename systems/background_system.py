@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 
 from weldcal.systems.background import Answer, Background, Inline, import_module
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 
 

@@ -24,10 +24,14 @@ OTHERS = {
     "to_start": "home",
     "to_look": "to the look",
     "look": "look at the tablet",
-    "to_above": "touch the landmarks",
-    "descend": "touch the landmarks",
-    "lift": "touch the landmarks",
+    "to_above": "to the next touch",
+    "zero": "read the free tip",
+    "descend": "touch down",
+    "press": "read the pressed tip",
+    "lift": "lift off",
     "to_home": "home",
+    "go_home": "home",
+    "rest": "come to rest",
     "move": "to the next pose",
     "scan": "scan",
     "collect": "stream scans in motion",
@@ -74,6 +78,11 @@ TABLET_STEPS: Steps = (
     ("Look", ("start", "to_start", "to_look", "look")),
     ("Touch", ("to_above", "descend", "lift")),
     ("Go home", ("to_home",)),
+)
+TOUCH_STEPS: Steps = (
+    ("Scan the part", ("start", "to_home", "rest", "scan")),
+    ("Touch", ("to_above", "zero", "descend", "press", "lift")),
+    ("Go home", ("go_home",)),
 )
 PROFILER_STEPS = {
     "start": "Get ready",

@@ -193,6 +193,7 @@ def run_cell(
         )
         run.interrupted = f"{who}, in the phase '{run.command.phase}'."
     finally:
+        simulator.clear_monitor()  # it knows the run, and the run the simulator: C++ would keep both
         station.close()
     run.wall_seconds = time.perf_counter() - start
     ended(run)

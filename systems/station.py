@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.calibration.planning.surroundings import Surroundings
@@ -27,6 +27,7 @@ from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND, PlacedAr
 from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.messages import TabletTruth
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 from weldcal.systems.recording.answers import RepeatedBackground
 from weldcal.systems.recording.player import Playback, add_player

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
@@ -17,6 +17,7 @@ from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, Dr
 from weldcal.calibration.motion.drift.watch import drift_config
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, believed_arm
 from weldcal.systems.motion.pose_recorder import PoseHistory
 

@@ -5,8 +5,9 @@ import dataclasses as dc
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, Message
 
 FEEDBACK_PER_S = 8.0  # proportional correction towards the path

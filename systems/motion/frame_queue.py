@@ -4,8 +4,9 @@ import dataclasses as dc
 from typing import Any
 
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import FlangeEstimate, Message, ScanStream, StreamedScan
 
 

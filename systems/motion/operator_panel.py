@@ -1,9 +1,11 @@
 """OperatorPanel: reads what a person asks for, at the terminal, on the dashboard or in Meshcat, into the Diagram."""
 
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.person import FASTEST, Person
+from weldcal.systems.viewer.kept import keep
 
 HOLD_BUTTON = "Hold the job"
 PACE_SLIDER = "Pace (1 = real time, 0 = as fast as it goes)"
@@ -28,7 +30,7 @@ class OperatorPanel(LeafSystem):
 
     def __init__(self, person: Person, meshcat: Meshcat | None = None, period_s: float = PERIOD_S) -> None:
         super().__init__()
-        self._person, self._meshcat = person, meshcat
+        self._person, self._meshcat = person, None if meshcat is None else keep(meshcat)
         pace = person.pace or 0.0
         if meshcat is not None:
             meshcat.AddButton(HOLD_BUTTON, "Escape")

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 
 from weldcal.models.arms.compiled_kinematics import tick_flange_pose
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 
 LENGTH_S = 10.0  # an estimate of a scan is paired with its pose when it is ready, which a job waits 8 s for

@@ -1,8 +1,9 @@
 """ProcessSwitch: computes the process output; every cause that stops the arm first turns the torch off, latched."""
 
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, UrStatus
 
 

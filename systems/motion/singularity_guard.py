@@ -2,10 +2,11 @@
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
 from weldcal.models.arms.compiled_kinematics import tick_jacobian
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.welding.servo.guards import ArmGuardConfig, guarded_joint_velocity
 
 

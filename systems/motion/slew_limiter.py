@@ -1,8 +1,9 @@
 """SlewLimiter: limits speed, acceleration and jerk of the joint velocity command and replaces non-finite commands."""
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.welding.servo.guards import SlewLimits, slew_limit
 
 

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.recording.port_recorder import BEFORE, PERIOD_S, STAGES, UPDATE_TICKS, UPDATED, tick_of
 
 

@@ -8,7 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus
+
+from weldcal.systems.leaf_system import LeafSystem
 
 PERIOD_S = 0.002  # of the systems that are updated most often
 UPDATE_TICKS = 4  # unrestricted updates are made at each fourth tick, 8 ms

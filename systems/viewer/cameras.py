@@ -8,13 +8,15 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, EventStatus
 
 from weldcal.models.arrays import Array
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.settings import work_point
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
 from weldcal.systems.motion.spine import JobPorts
+from weldcal.systems.viewer.kept import keep
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -93,7 +95,7 @@ class CameraDirector(LeafSystem):
         work_B: Array | None = None,
     ) -> None:
         super().__init__()
-        self._meshcat, self._views, self._cell, self._X_WB = meshcat, views, cell, X_WB
+        self._meshcat, self._views, self._cell, self._X_WB = keep(meshcat), views, cell, X_WB
         self._X_BC_guess, self._tool, self._work_B = X_BC_guess, tool, work_B
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         read = ("calibration_status", "planned_seam", "servo_report")

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Context, EventStatus, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, EventStatus, OutputPort
 
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.arrays import Array
@@ -15,8 +15,10 @@ from weldcal.models.scanners import ScannerPreset
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.sequencer import JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, PlannedSeam, Scan
 from weldcal.systems.scenario.schema import VisualizationConfig
+from weldcal.systems.viewer.kept import keep
 from weldcal.systems.viewer.scene import (
     CIRCLE,
     CLOUD,
@@ -101,7 +103,7 @@ class CellVisualizer(LeafSystem):
         work_B: Array | None = None,
     ) -> None:
         super().__init__()
-        self._meshcat, self._config, self._scanner, self._work_B = meshcat, config, scanner, work_B
+        self._meshcat, self._config, self._scanner, self._work_B = keep(meshcat), config, scanner, work_B
         self._X_BC_guess, self._circle_radius_m = X_BC_guess, circle_radius_m
         messages: dict[str, Message] = {
             "job_state": JobState(),

@@ -6,11 +6,13 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, EventStatus
 
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import FlangeEstimate
 from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.scenario.schema import VisualizationConfig
+from weldcal.systems.viewer.kept import keep
 from weldcal.systems.viewer.scene import CIRCLE
 from weldcal.systems.viewer.shapes import draw_ring, draw_triad
 
@@ -43,7 +45,7 @@ class DriftView(LeafSystem):
         self, meshcat: Meshcat, circle_radius_m: float, config: VisualizationConfig, period_s: float = 1.0
     ) -> None:
         super().__init__()
-        self._meshcat, self._radius_m, self._period_s = meshcat, circle_radius_m, period_s
+        self._meshcat, self._radius_m, self._period_s = keep(meshcat), circle_radius_m, period_s
         self._drift = self.DeclareAbstractInputPort("drift", AbstractValue.Make(DriftStatus()))
         self._estimate = self.DeclareAbstractInputPort("flange_estimate", AbstractValue.Make(FlangeEstimate()))
         self._drawn = _Drawn()

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, EventStatus
 
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, PlannedSeam
 from weldcal.systems.motion.spine import JobPorts
 from weldcal.systems.viewer.cameras import Views

@@ -34,6 +34,15 @@ SHORT = (
     (r"^demo --scenario (straight_groove|s_groove)", r"demo --scenario short.yaml"),
     (r"^demo --scenario my_cell/cell\.yaml", r"demo --scenario short_cell.yaml"),
     (r"^demo (--robot|--record|--seed|--share)", r"demo --scenario short.yaml \1"),
+    (r"^demo --scenario wired_s_groove", "demo --scenario short_wired.yaml"),
+    (
+        r"(benchmark part-registration)( --part lap --scenes 3 --plans 1 --refusals 0)?$",
+        r"\1 --part lap --scenes 1 --plans 1 --refusals 0",
+    ),
+    (
+        r"(benchmark seam-planning) --preset phoxi_m --full-resolution --no-troubles",
+        r"\1 --runs 1 --preset phoxi_m --full-resolution --no-troubles",
+    ),
     (r"(benchmark hand-eye) --data \S+", r"\1 --quick"),
     (r"(benchmark mountings) --runs 3", r"\1 --runs 1 --scenario eye_on_base"),
     (r"benchmark robot-faults$", "benchmark robot-faults --sequences 1 --seconds 5"),

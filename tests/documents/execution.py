@@ -23,7 +23,7 @@ from tests.places import ROOT, SHARED_DATA
 
 WRITTEN, SHORT, ELSEWHERE, LEFT_OUT, FAILED = "as written", "in a short form", "elsewhere", "left out", "failed"
 SCRIPT_PORT = 30002
-ANSWERS_WITHIN_S = 60.0  # of a server or an emulated robot
+ANSWERS_WITHIN_S = 180.0  # of a server or an emulated robot, also on a busy computer
 LARGEST_TIME_S = 3600.0
 
 

@@ -29,6 +29,9 @@ from weldcal.tools.studies.touch.world import touch_world
 
 # An angle bracket of plates 10 mm thick; lengths in mm. Its inner corner is the longest concave edge.
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])
+SHORT_WIRED = (
+    "calibration: {minimum_scans: 4, maximum_scans: 6, required_error_mm: 1.0}\nwelding: {seam_length_mm: 20.0}\n"
+)
 HELD_AFTER_3_S = "extends: calibrate_only\njob: {maximum_time_s: 3.0}\nscanner: {width: 412, height: 308}\n"
 
 
@@ -166,6 +169,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "my_cell": lambda path: write_cell(path, "s_groove"),
     "short.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "short_cell.yaml": lambda path: path.write_text(f"extends: my_cell/cell.yaml\n{SHORT_JOB}", encoding="utf-8"),
+    "short_wired.yaml": lambda path: path.write_text(f"extends: wired_s_groove\n{SHORT_WIRED}", encoding="utf-8"),
     "weldcal-out/demo-s_groove-seed0": _demo,
     "recording.mcap": _recording,
     "my_cell.yaml": lambda path: path.write_text(HELD_AFTER_3_S, encoding="utf-8"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,13 @@ def named(block: Block) -> str:
     return f"{block.page}:{block.line}"
 
 
+def said_twice(printed: str) -> list[str]:
+    """Poses, and lines of words, that a terminal shows more than once."""
+    poses = re.findall(r"p\[.*?\]", printed)
+    lines = [text for line in printed.splitlines() if len(text := re.sub(r"^ *(\S.*?)?  +|^- ", "", line).strip()) > 30]
+    return [text for found in (poses, lines) for text, count in Counter(found).items() if count > 1]
+
+
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that all commands share, as one reader has it."""
@@ -56,6 +64,7 @@ def test_a_command_without_a_simulation_does_what_the_page_says(
     finished = CliRunner().invoke(app, line.words)
     assert finished.exit_code == 0, finished.output
     assert all((place / made).is_dir() for made in line.makes)
+    assert said_twice(finished.stdout) == []
 
 
 @pytest.mark.parametrize("block", SNIPPETS, ids=named)
@@ -166,7 +175,11 @@ def test_every_short_form_is_of_a_line_and_can_be_typed() -> None:
 
 
 def test_every_file_that_can_be_made_is_named_by_a_page() -> None:
-    named = {name for block in BLOCKS for name in named_in(block.text)} | {"short.yaml", "short_cell.yaml"}
+    named = {name for block in BLOCKS for name in named_in(block.text)} | {
+        "short.yaml",
+        "short_cell.yaml",
+        "short_wired.yaml",
+    }
     assert set(PROPS) - named == set()
 
 

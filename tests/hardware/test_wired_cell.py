@@ -19,6 +19,7 @@ import pytest
 from pydrake.systems.framework import Diagram
 from pydrake.systems.primitives import VectorLogSink
 
+from weldcal.models.result_files import UNFINISHED
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.phase_words import phase_words
@@ -52,6 +53,17 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 """
 
 
+# What a host's clock shows that somebody sets: each process reads by how much from a file.
+SET_CLOCK = """
+import time
+from pathlib import Path
+
+true_time = time.time
+time.time = lambda: true_time() + float(Path({file!r}).read_text())
+"""
+HOUR_S = 3600.0
+
+
 @dataclass
 class Played:
     """A world that plays a cell's devices: its process, those of its devices, the cell's scenario and the truth file."""
@@ -61,6 +73,7 @@ class Played:
     host: str
     cell: Path
     truth: Path
+    clock: Path
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """One request to the controller's control channel."""
@@ -98,15 +111,22 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
     world.write_text(WORLD)
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(world)]
     command += ["--cell", str(cell), "--seed", str(SEED), "--truth", str(truth)]
+    clock = folder / "clock_is_set_by"
+    clock.write_text("0.0")
+    (folder / "at_start").mkdir()
+    (folder / "at_start" / "sitecustomize.py").write_text(SET_CLOCK.format(file=str(clock)))
+    own = {**os.environ, "PYTHONPATH": str(folder / "at_start")}
     with (folder / "log").open("w+") as log:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True)
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True, env=own
+        )
         try:
             assert process.stdout is not None
             line = process.stdout.readline()
             assert line.startswith("ready"), line + (folder / "log").read_text()
             children = [int(pid) for pid in re.findall(r"process (\d+)", line)]
             assert len(children) == 2
-            yield Played(process, children, host, cell, truth)
+            yield Played(process, children, host, cell, truth, clock)
         finally:
             process.kill()
             process.wait()
@@ -114,16 +134,37 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
 
 @pytest.fixture(scope="module")
 def welded(played: Played, tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoResult, dict[str, Any]]:
-    """The job without its calibration, on a short seam, and the truth as it is when the job has ended."""
+    """The job without its calibration, on a short seam, and the truth as it is when the job has ended. Somebody sets the computer's clock
+    back by an hour when the workpiece is scanned, and forward by two in the middle of the weld."""
     options = RunOptions("a test's own", tmp_path_factory.mktemp("job") / "run", SEED, recording=False)
-    result = run_scenario(played.scenario(), options)
+    unix, stages = time.time, list[str]()
+
+    def set_clock(by_s: float) -> None:
+        replaced = played.clock.with_suffix(".new")
+        replaced.write_text(str(by_s))
+        os.replace(replaced, played.clock)
+        patched.setattr(time, "time", lambda: unix() + by_s)
+
+    def watch(phase: str, _: float) -> None:
+        stages.append(phase)
+        if phase == phase_words("scan_workpiece") and stages.count(phase) == 1:
+            set_clock(-HOUR_S)
+        if sum(said.startswith(phase_words("weld")) for said in stages) == 3:
+            set_clock(HOUR_S)
+
+    with pytest.MonkeyPatch.context() as patched:
+        result = run_scenario(played.scenario(), options, watch)
+        assert time.time() - unix() == pytest.approx(HOUR_S, abs=1.0), "the clock was set twice"
+    played.clock.write_text("0.0")
     until = time.monotonic() + 20.0  # the world writes when it has seen the arm at rest
     while (truth := json.loads(played.truth.read_text()))["state"] != "done" and time.monotonic() < until:
         time.sleep(0.1)
     return result, truth
 
 
-def test_the_job_is_done_and_the_truth_file_says_how_well(welded: tuple[DemoResult, dict[str, Any]]) -> None:
+def test_the_job_is_done_though_the_clock_is_set_and_the_truth_file_says_how_well(
+    welded: tuple[DemoResult, dict[str, Any]],
+) -> None:
     result, truth = welded
     assert result.state == "done", result.run.reason
     assert (truth["state"], truth["collisions"]) == ("done", 0)
@@ -133,6 +174,9 @@ def test_the_job_is_done_and_the_truth_file_says_how_well(welded: tuple[DemoResu
     assert 0.95 * SEAM_MM <= truth["welded_mm"] <= SEAM_MM + 8.0
     assert truth["arc_on_s"] == pytest.approx(truth["welded_mm"] / 8.0, abs=0.5)
     assert np.array(truth["X_BC"])[:3, 3] == pytest.approx([0.65, 0.0, 0.95])
+    files = {file.name for file in result.folder.iterdir()}
+    assert {"report.html", "weld.csv", "weld.json", "summary.json"} <= files
+    assert UNFINISHED not in files
 
 
 def test_the_cell_knows_nothing_of_the_truth(welded: tuple[DemoResult, dict[str, Any]]) -> None:
@@ -229,7 +273,7 @@ def test_pictures_that_stop_end_the_job_by_name(
     assert "finger camera" in reason
     state = played.ask(ask="state")
     stops_by = state["timestamp"] + 0.3  # by the controller's clock, which a busy computer slows
-    while np.abs(state["qd"]).max() >= 1e-3 and state["timestamp"] < stops_by:
+    while (state["program"] or np.abs(state["qd"]).max() >= 1e-3) and state["timestamp"] < stops_by:
         time.sleep(0.02)
         state = played.ask(ask="state")
     assert np.abs(state["qd"]).max() < 1e-3

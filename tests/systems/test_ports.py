@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import inspect
 import pkgutil
 import textwrap
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -17,7 +19,7 @@ from pydrake.geometry import FramePoseVector, GeometryId, Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import InputPort, LeafSystem, OutputPort, PortDataType
+from pydrake.systems.framework import InputPort, OutputPort, PortDataType
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 import weldcal.systems
@@ -79,6 +81,7 @@ from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig, Ite
 from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobPlan, JobSequencer, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import (
     CalibrationStatus,
     FlangeEstimate,
@@ -496,7 +499,7 @@ def test_every_system_of_this_room_is_tested_here() -> None:
     for module in pkgutil.walk_packages(weldcal.systems.__path__, "weldcal.systems."):
         members = inspect.getmembers(importlib.import_module(module.name), inspect.isclass)
         found |= {c for _, c in members if issubclass(c, LeafSystem) and c.__module__.startswith("weldcal.")}
-    found.discard(BackgroundSystem)  # the base class has no ports of its own
+    found -= {LeafSystem, BackgroundSystem}  # the base classes have no ports of their own
     assert found == set(MAKERS) == set(KINDS)
 
 
@@ -508,6 +511,12 @@ def test_the_docstring_shows_the_ports_in_their_order(kind: type[LeafSystem]) ->
     assert block.get("input_ports", []) == [port.get_name() for port in inputs(system)]
     shown = [name for name in block.get("output_ports", []) if name not in private]
     assert shown == [port.get_name() for port in outputs(system) if port.get_name() not in private]
+
+
+def test_no_system_keeps_itself_in_memory() -> None:
+    made = [weakref.ref(make()) for make in MAKERS.values()]
+    gc.collect()
+    assert [type(found).__name__ for one in made if (found := one()) is not None] == []
 
 
 @every_system

@@ -8,7 +8,12 @@ import typer
 from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outcome, command, option
 
 
-@command("verify", short_help="Verify a calibration on scans that it did not use.")
+@command(
+    "verify",
+    options=("browser", "share"),
+    defaults={"browser": False},
+    short_help="Verify a calibration on scans that it did not use.",
+)
 def verify(
     call: Call,
     result: Annotated[Path, typer.Argument(help="A result folder, or its calibration.yaml.")],
@@ -104,7 +109,7 @@ def _touched_live(call: Call, result: Path, scenario: str, robot: str, points: i
     from weldcal.tools.outcomes.options import RunOptions
 
     options = RunOptions(
-        scenario=scenario, out=call.folder("verify", scenario), seed=call.seed, robot=robot, browser=False
+        scenario=scenario, out=call.folder("verify", scenario), seed=call.seed, robot=robot, **call.live
     )
     found = run_touches(touching(scenario, result, points), options, call.progress)
     report, problem = found.report, ""

@@ -47,7 +47,8 @@ def write_mounting(report: MountingReport, finished: JobRun) -> None:
         provenance = Provenance("scenario.yaml", sha256(scenario.encode()).hexdigest())
         export_hand_eye(report.result, report.mounting, folder, provenance)
     write_atomic(folder / "sightings.csv", _observations(report))
-    write_atomic(folder / "summary.txt", report.text() + "\n")
+    poses = [f"{name}: {text}" for pose in report.first.poses for name, text in pose.rows().items()]
+    write_atomic(folder / "summary.txt", "\n".join([report.text(), "", *poses, ""]))
     picture = station_picture(report)
     if picture is not None:
         write_atomic(folder / "station.png", picture)

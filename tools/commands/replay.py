@@ -119,6 +119,7 @@ def _run(
     simulator.Initialize()
     simulator.AdvanceTo(end_s)
     simulator.AdvancePendingEvents()
+    simulator.clear_monitor()
     root = simulator.get_context()
     if look is not None:
         look(cell, root)

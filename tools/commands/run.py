@@ -19,6 +19,7 @@ from weldcal.systems.person import Person, person_at
 from weldcal.systems.runner import Progress, Run, run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.viewer.kept import free_unused
 from weldcal.systems.viewer.live import LiveView
 from weldcal.tools import console
 from weldcal.tools.commands.record import RunRecorder
@@ -73,6 +74,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
         chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot,
         person_at() as person,
     ):
+        free_unused()
         if options.recording or options.browser:
             meshcat = Meshcat(
                 MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}", show_stats_plot=False)

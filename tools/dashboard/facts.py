@@ -18,6 +18,9 @@ from weldcal.systems.jobs.mounting.job import AddedMounting
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.procedure import PLANS
 from weldcal.systems.jobs.tablet.job import AddedVisit
+from weldcal.systems.jobs.touch.config import TouchConfig
+from weldcal.systems.jobs.touch.job import AddedTouches
+from weldcal.systems.jobs.touch.procedure import Felt
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
@@ -27,6 +30,7 @@ from weldcal.systems.phase_words import (
     PROFILER_STEPS,
     STEPS,
     TABLET_STEPS,
+    TOUCH_STEPS,
     WATCH_STEPS,
 )
 from weldcal.welding.servo.guards import ArmGuardConfig
@@ -43,7 +47,8 @@ class Facts:
     `band_mm`: least and largest deflection of the tip with which the seam is followed. `gain` computes the expected error after
     the next pose from the present status. `settable_pace`: a simulation, whose pace may be chosen. `seconds`: about how long each
     step takes, and SCAN, the scan of a pose with the way to it; empty: the time left follows from the completed share of the run.
-    `work_B` (3,) m: where the calibration's error is shown.
+    `work_B` (3,) m: where the calibration's error is shown. `press_mm`: deflection of the tip at which it has touched. `height` computes how
+    far (m) a touched face lies above the scanned one.
     """
 
     title: str = ""
@@ -61,6 +66,8 @@ class Facts:
     sigma_stop: float = ArmGuardConfig().sigma_stop
     gain: Callable[[CalibrationStatus, int], float] | None = field(default=None, repr=False)
     work_B: Array | None = field(default=None, repr=False)
+    press_mm: float = math.nan
+    height: Callable[[Felt], float] | None = field(default=None, repr=False)
 
 
 def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
@@ -106,6 +113,12 @@ def _other_facts(cell: Cell[Any], title: str, robot: str, settable: bool) -> Fac
         return Facts(title, robot, settable, steps, maximum_scans=job.frames)
     if isinstance(job, AddedVisit):
         return Facts(title, robot, settable, TABLET_STEPS, maximum_scans=len(job.plan.q_above))
+    if isinstance(job, AddedTouches):
+        touch = cell.scenario.part(TouchConfig)
+        press_mm = math.nan if touch is None else touch.press_mm
+        return Facts(
+            title, robot, settable, TOUCH_STEPS, maximum_scans=job.points, press_mm=press_mm, height=job.height_m
+        )
     if isinstance(job, AddedProfilerJob):
         keys = ["start", *(step for stage in job.job.stages for step in PLANS[stage]), "home"]
         return Facts(title, robot, settable, tuple((PROFILER_STEPS[key], (key,)) for key in keys))

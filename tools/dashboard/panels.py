@@ -13,6 +13,7 @@ from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.jobs.tablet.procedure import TabletState
+from weldcal.systems.jobs.touch.procedure import TouchState
 from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.viewer.live import Moment
 from weldcal.tools.dashboard.facts import Facts
@@ -33,7 +34,7 @@ def stage_of(moment: Moment) -> str:
         return "start" if state.visit < 0 else "verify" if state.purpose == "calibrate" else "home"
     if isinstance(state, ProfilerState):
         return state.step or "start"
-    if isinstance(state, TabletState | MotionState):
+    if isinstance(state, TabletState | TouchState | MotionState):
         return state.phase
     return moment.command.phase
 
@@ -49,6 +50,8 @@ def panel(facts: Facts, moment: Moment) -> dict[str, Any] | None:
         return _drift(drift) if isinstance(drift, DriftStatus) else _motion(facts, moment)
     if isinstance(state, TabletState):
         return _tablet(facts, state)
+    if isinstance(state, TouchState):
+        return _touch(facts, state)
     return _profiler(state) if isinstance(state, ProfilerState) else None
 
 
@@ -152,6 +155,44 @@ def _tablet(facts: Facts, state: TabletState) -> dict[str, Any]:
     plot["now"] = f"{len(points)} of {facts.maximum_scans}"
     plot["line"] = False
     return {"heading": "Touches", "note": plot["now"], "plots": [plot], "lines": lines}
+
+
+def _touch(facts: Facts, state: TouchState) -> dict[str, Any]:
+    heights = [] if facts.height is None else [1e3 * facts.height(felt) for felt in state.felt]
+    points = [(float(k + 1), y) for k, y in enumerate(heights)]
+    reach = _high([0.1, *(abs(y) for y in heights)])
+    across = (0.0, facts.maximum_scans + 1.0)
+    plots = [_plot("Touched face above the scanned one", "mm", [("touch", PLAIN, points)], across, (-reach, reach), "touches", dots=True)]  # fmt: skip
+    plots[0]["line"] = False
+    if state.zero is not None and state.frames and state.phase in ("descend", "press"):
+        given = 1e3 * np.array([frame[2] - state.zero[2] for frame in state.frames[-_NEWEST_FRAMES:]])
+        n = np.arange(float(len(given)))
+        high = max(1.5 * facts.press_mm, float(given.max()))
+        plots.append(
+            _plot(
+                f"Tip gives way at place {state.index + 1}",
+                "mm",
+                [("tip", PLAIN, [(float(a), float(b)) for a, b in np.column_stack([n, given])])],
+                (0.0, max(float(len(given)), 1.0)),
+                (min(-0.1, float(given.min())), high),
+                "frames",
+                (facts.press_mm, "touched"),
+            )
+        )
+    last = "none yet"
+    if heights:
+        side = "above" if heights[-1] >= 0.0 else "below"
+        last = f"place {len(heights)}: the face is {abs(heights[-1]):.3f} mm {side} the scanned one"
+    lines = [("Last touch", last)]
+    if state.places and state.phase in ("to_above", "zero", "descend"):
+        lines.append(("Next", f"place {state.index + 1} of {len(state.places)}"))
+    return {
+        "heading": "Touches",
+        "note": f"{len(state.felt)} of {facts.maximum_scans}",
+        "warning": state.reason,
+        "plots": plots,
+        "lines": lines,
+    }
 
 
 def _profiler(state: ProfilerState) -> dict[str, Any]:

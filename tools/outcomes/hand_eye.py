@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
@@ -93,37 +92,21 @@ class HandEyeReport:
         }
 
     def text(self) -> str:
-        """The printed result: directions, sketch, numbers with their uncertainty, comparison, next pose."""
+        """What is printed between the poses' diversity and the first screen: directions, sketch, uncertainty, comparison.
+
+        The first screen has the poses themselves, the warnings and the next pose.
+        """
         r, m = self.result, self.mounting
         lines = [f"{m.name}: {m.words}   {m.equation}   ({m.source})", "", *m.sketch.splitlines(), ""]
-        lines += [f"poses        {r.diversity.sentence()}"]
-        for k, X in r.poses.items():
-            u = m.unknowns[k]
+        for k in r.poses:
             sigma = np.sqrt(np.diag(r.covariance[k]))
-            p, rpy = 1e3 * X.translation(), np.degrees(X.rotation().ToRollPitchYaw().vector())
-            lines += [
-                "",
-                u.sentence,
-                "  position     "
-                + "  ".join(f"{v:+.3f}" for v in p)
-                + "  mm   +- "
-                + _sigmas(1e3 * sigma[3:], 1e3 * r.extent),
-                "  roll pitch yaw "
-                + "  ".join(f"{v:+.4f}" for v in rpy)
-                + "  deg  +- "
-                + _sigmas(np.degrees(sigma[:3]), 57.3),
-                "  quaternion wxyz " + "  ".join(f"{v:+.7f}" for v in X.rotation().ToQuaternion().wxyz()),
-                f"  UR pose      {export_ur_pose(X).strip()}",
-                *("  4 x 4, m     " + " ".join(f"{v:+.6f}" for v in row) for row in X.GetAsMatrix4()),
-            ]
-        lines += ["", f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
+            mm, deg = _sigmas(1e3 * sigma[3:], 1e3 * r.extent), _sigmas(np.degrees(sigma[:3]), 57.3)
+            lines.append(f"one sigma    {m.unknowns[k].symbol}  {mm} mm   {deg} deg")
+        lines += [f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
         if not r.inliers.all():
             kept = HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
             lines += [f"             {_held_out(kept, 'without outliers, ')}"]
         lines += [f"weighting    {r.method}"]
-        lines += [f"unobservable {s}" for s in r.unobservable] + [f"warning      {s}" for s in r.warnings]
-        if self.streams is not None:
-            lines += [f"clocks       {self.streams.sentence}"]
         if self.corners:
             lines += ["", self.corners]
         if self.comparison:
@@ -136,8 +119,6 @@ class HandEyeReport:
                 lines += [
                     f"{c.method:<12}  {'no answer':>12}" if failed else f"{c.method:<12}  {c.deg:12.4f}  {c.mm:12.3f}"
                 ]
-        if self.advice:
-            lines += ["", f"next pose    {self.advice}"]
         return "\n".join(lines)
 
 

@@ -185,6 +185,7 @@ class MountingReport:
         if self.result is None:
             return f"{self.mounting.name}: {self.state}. {self.reason}"
         lines = [HandEyeReport(self.result, self.mounting, (), None, (), self.seconds).text(), ""]
+        lines.append(f"poses        {self.result.diversity.sentence()}")
         lines += [f"given        {sentence}" for sentence in self.given()]
         aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.held_out)
         if aside:
@@ -198,6 +199,4 @@ class MountingReport:
                 f"covariance {e.nees:.1f}, 99.7 % of the time below {e.bound:.1f})"
             )
         lines += [f"refused      {id}: {why}" for id, why in status.refused]
-        if status.next_best is not None:
-            lines += ["", f"next best pose: {status.next_best.sentence()}"]
         return "\n".join(lines)

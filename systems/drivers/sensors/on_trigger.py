@@ -5,10 +5,11 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from weldcal.systems.drivers.sensors.acquisition import Acquisition
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 
 Shown = TypeVar("Shown", bound=Message)

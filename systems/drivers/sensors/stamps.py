@@ -26,6 +26,11 @@ class Stamp:
     late_s: float = 0.0
 
 
+def unix_now() -> float:
+    """The host's clock, Unix time in s."""
+    return time.time()
+
+
 class UnixClock:
     """Maps Unix time to the host's monotonic time, also while somebody sets the host's clock.
 
@@ -33,7 +38,7 @@ class UnixClock:
     that makes the frame the least late is right, because no frame comes before its time.
     """
 
-    def __init__(self, unix: Callable[[], float] = time.time, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, unix: Callable[[], float] = unix_now, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._unix, self._monotonic = unix, monotonic
         self._offset = self._read()[1]
         self._before: float | None = None

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from weldcal.models.errors import InputError
 from weldcal.models.tool import FingerCamera
@@ -19,6 +19,7 @@ from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Ru
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Image
 
 Picture = NDArray[np.uint8]

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
@@ -17,6 +17,7 @@ from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Scan, ScanStream, StreamedScan
 
 Cloud = NDArray[np.float32]

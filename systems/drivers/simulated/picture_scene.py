@@ -17,8 +17,9 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder
 
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 from scipy.special import ndtri
 
 from weldcal.models.tool import FingerCamera
@@ -17,6 +17,7 @@ from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.simulated.tag_view import Pixels, TagView
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Image, Message
 
 COVERED_GREY = 25  # of a lens under spatter

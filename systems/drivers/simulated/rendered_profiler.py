@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -18,6 +18,7 @@ from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, To
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.profiler.config import pose_of
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import ProfileScan, TorchTouch
 
 FORCE_N = 0.02  # contact force above which a touch is reported

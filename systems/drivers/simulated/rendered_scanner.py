@@ -21,7 +21,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from weldcal.calibration.geometry.se3 import exp_rotation
@@ -31,6 +31,7 @@ from weldcal.systems.drivers.config import ScannerConfig
 from weldcal.systems.drivers.simulated.picture_scene import add_stand
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message, Scan
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import ClippingRange, ColorRenderCamera, DepthRange, DepthRenderCamera, RenderCameraCore
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from weldcal.systems.drivers.config import DriverConfig
@@ -16,6 +16,7 @@ from weldcal.systems.drivers.simulated.picture_scene import add_picture_scene
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.tablet.messages import TabletTruth, WristPicture
+from weldcal.systems.leaf_system import LeafSystem
 
 RENDERER = "wrist"
 _NEAR_M, _FAR_M = 0.05, 2.0

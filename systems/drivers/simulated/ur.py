@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from weldcal.models.arms.compiled_kinematics import tick_flange_pose
 from weldcal.models.arms.kinematics import ArmModel, jacobian
@@ -17,6 +17,7 @@ from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import UrStatus
 
 _LARGEST_MM = 1.0  # a larger error is a defect, not repeatability

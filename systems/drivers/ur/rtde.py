@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus
 
 from weldcal.models.arms.compiled_kinematics import tick_flange_pose
 from weldcal.models.arms.kinematics import ArmModel
@@ -19,6 +19,7 @@ from weldcal.systems.drivers.ur.link import UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.supervisor import FOLLOWING_PATIENCE_S, Limits
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.wall_clock import WallClock
 
 FULL_PACE = 1.0

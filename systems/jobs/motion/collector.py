@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 
 from weldcal.calibration.data.motion_dataset import FrameTime
 from weldcal.systems.jobs.motion.messages import MotionRecord, MotionState
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import FlangeEstimate
 
 _BLOCK = 512  # samples that are joined to one array: copies of short tuples are cheap

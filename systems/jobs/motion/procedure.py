@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord, MotionState
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, UrStatus
 
 ENDS = ("done", "held")

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, EventStatus
 
 from weldcal.calibration.data.clouds import save_cloud
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream, save_motion_dataset
 from weldcal.models.scanners import ScannerPreset
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import ScanStream
 
 

@@ -2,15 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, UrStatus
 from weldcal.systems.motion.goals import stands_at
 
@@ -67,7 +69,7 @@ class MountingProcedure(LeafSystem):
         ticket = {self.abstract_state_ticket(self._state)}
         for arm, name in enumerate(("job", "job_2")):
             self.DeclareAbstractOutputPort(
-                name, lambda: AbstractValue.Make(JobCommand()), lambda c, o, arm=arm: self._job(c, o, arm), ticket
+                name, lambda: AbstractValue.Make(JobCommand()), partial(self._job, arm=arm), ticket
             )
         self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
         self.DeclareStateOutputPort("state", self._state)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arms.kinematics import jacobian
 from weldcal.models.arrays import Array
@@ -16,6 +16,7 @@ from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.jobs.profiler.planning_context import PlanningContext
 from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.jobs.profiler.steps import next_step
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 

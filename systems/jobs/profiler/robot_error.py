@@ -2,9 +2,10 @@
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
 from weldcal.models.arms.kinematics import ArmModel, jacobian
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand
 
 

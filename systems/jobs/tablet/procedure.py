@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arms.kinematics import ArmModel, jacobian
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, Message, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 

@@ -16,14 +16,18 @@ from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.touch.config import TouchConfig, check_touch
 from weldcal.systems.jobs.touch.planner import TouchPlanner, TouchPlanning
-from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
+from weldcal.systems.jobs.touch.procedure import Felt, TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, JobPorts, Spine
+from weldcal.systems.phase_words import TOUCH_STEPS, phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
+
+TOUCHING = dict(TOUCH_STEPS)["Touch"]
+"""Phases at a place."""
 
 
 @dataclass(eq=False)
@@ -40,30 +44,33 @@ class AddedTouches(AddedJob):
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
         state: TouchState = self.state(root)
-        return state.phase.replace("_", " "), 0.95 if state.finished else 0.1 + 0.8 * len(state.felt) / self.points
+        at = f"place {state.index + 1} of {self.points}" if state.phase in TOUCHING else ""
+        return phase_words(state.phase, at), 0.95 if state.finished else 0.1 + 0.8 * len(state.felt) / self.points
 
     def touches(self, root: Context) -> tuple[Touch, ...]:
         """The touches so far: the tip where it was pressed to, its ball less by what it gave way, and the plane of the scan there."""
-        tool, arm = self.station.tool, self.station.arm
+        return tuple(self._touch(f"touch{k + 1:02d}", felt) for k, felt in enumerate(self.state(root).felt))
+
+    def height_m(self, felt: Felt) -> float:
+        """How far (m) the touched face lies above the scanned one, with the calibration that is judged."""
+        touch = self._touch("", felt)
+        return float((touch.p_BT - felt.place.p_B) @ felt.place.n_B) - touch.radius
+
+    def _touch(self, name: str, felt: Felt) -> Touch:
+        tool = self.station.tool
         assert tool is not None
-        found = []
-        for k, felt in enumerate(self.state(root).felt):
-            X_FT = tool.X_FT
-            force = tool.axial_stiffness_N_per_m * max(float(felt.deflection_T[2]), 0.0)
-            found.append(
-                Touch(
-                    f"touch{k + 1:02d}",
-                    PLANE,
-                    forward_kinematics(arm, felt.q),
-                    np.asarray(X_FT.multiply(felt.deflection_T)),
-                    tool.tip_radius_m - tool.indentation(force),
-                    felt.place.p_C,
-                    felt.place.n_C,
-                    sigma_scan=max(felt.place.sigma_m, 2.5e-5),
-                    q=felt.q,
-                )
-            )
-        return tuple(found)
+        force = tool.axial_stiffness_N_per_m * max(float(felt.deflection_T[2]), 0.0)
+        return Touch(
+            name,
+            PLANE,
+            forward_kinematics(self.station.arm, felt.q),
+            np.asarray(tool.X_FT.multiply(felt.deflection_T)),
+            tool.tip_radius_m - tool.indentation(force),
+            felt.place.p_C,
+            felt.place.n_C,
+            sigma_scan=max(felt.place.sigma_m, 2.5e-5),
+            q=felt.q,
+        )
 
 
 class TouchJob(Job[TouchPlanning]):
@@ -125,7 +132,8 @@ class TouchJob(Job[TouchPlanning]):
         )
         wiring.feed("scanner.trigger", procedure.GetOutputPort("trigger"))
         wiring.feed("finger_camera.streaming", procedure.GetOutputPort("streaming"))
-        ports = JobPorts((command,), procedure.GetOutputPort("state"), procedure.GetOutputPort("descent"))
+        shown = {"scan": wiring.out("scanner.scan")}
+        ports = JobPorts((command,), procedure.GetOutputPort("state"), procedure.GetOutputPort("descent"), shown=shown)
         result = load_result(Path(config.result))
         return AddedTouches(result, station, config.points, procedure, ports, motion.maximum_time_s)
 

@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.touch.planner import Place, PlannedTouches
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, Message, UrStatus
 
 MOVES = ("to_home", "to_above", "lift", "go_home")

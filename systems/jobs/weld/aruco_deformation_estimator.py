@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import FingerCamera, WeldingTool
 from weldcal.systems.background import Answer, Background, Inline, import_module
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, Image, Message, believed_arm
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.servo.deformation import TagModel, deflection_from_tag, detect_tag

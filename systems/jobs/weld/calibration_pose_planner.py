@@ -5,9 +5,10 @@ import dataclasses as dc
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, State
 
 from weldcal.calibration.planning.calibration_poses import PlannedPose
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, Message
 
 

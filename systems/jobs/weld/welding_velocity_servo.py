@@ -6,12 +6,13 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arms.compiled_kinematics import tick_flange_pose
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, believed_arm
 from weldcal.welding.servo.interruption import Interruption, interruptible_step
 from weldcal.welding.servo.settings import ServoConfig

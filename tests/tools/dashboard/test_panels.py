@@ -19,6 +19,8 @@ from weldcal.systems.jobs.mounting.messages import HeldOut, MountingState, Mount
 from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.jobs.tablet.procedure import TabletState, Touched
+from weldcal.systems.jobs.touch.planner import Place
+from weldcal.systems.jobs.touch.procedure import Felt, TouchState
 from weldcal.systems.messages import FlangeEstimate, JobCommand, Scan
 from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.person import Person
@@ -27,6 +29,7 @@ from weldcal.systems.phase_words import (
     MOUNTING_STEPS,
     PROFILER_STEPS,
     TABLET_STEPS,
+    TOUCH_STEPS,
     WATCH_STEPS,
 )
 from weldcal.systems.viewer.live import LiveView, Moment
@@ -50,6 +53,7 @@ def drifted(moved: bool) -> DriftStatus:
 
 PROFILE = np.column_stack([np.linspace(-0.02, 0.02, 50), 0.08 + 0.001 * np.cos(np.arange(50))])
 BEST = NextBest(np.zeros(6), None, RigidTransform(), 2e-4, 1e-4)
+PLACE = Place(np.zeros(6), np.zeros(3), np.zeros(3), 0.0, np.zeros(3), np.zeros(3))
 PROFILER = tuple((name, (key,)) for key, name in PROFILER_STEPS.items())
 JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
     "mounting": (
@@ -85,6 +89,17 @@ JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
         },
         "Touch",
         "landmark 2 at 120.0, 3.5 px",
+    ),
+    "touch": (
+        Facts("touch", steps=TOUCH_STEPS, maximum_scans=8, press_mm=1.0, height=lambda felt: 1e-3 * felt.q[0]),
+        {
+            "state": TouchState(
+                "descend", places=(PLACE,) * 8, index=2, zero=np.zeros(3), frames=tuple(np.array([0.0, 0.0, 1e-4 * k]) for k in range(9)),
+                felt=tuple(Felt(PLACE, np.full(6, height), np.zeros(3)) for height in (0.05, -0.12)),
+            ),
+        },
+        "Touch",
+        "place 2: the face is 0.120 mm below the scanned one",
     ),
     "profiler": (
         Facts("profiler_edge", steps=PROFILER),

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import socket
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -131,8 +130,3 @@ def _still_there(world: Connection) -> None:
     """Raise EOFError where the world has ended."""
     if world.poll(0.0):
         world.recv()
-
-
-def unix_now() -> float:
-    """The host's clock, Unix time in s."""
-    return time.time()

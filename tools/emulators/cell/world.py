@@ -17,6 +17,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import loopback_address
 from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
+from weldcal.systems.drivers.sensors.stamps import unix_now
 from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamera
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
@@ -28,7 +29,7 @@ from weldcal.tools.emulators.cell.arc import Arc
 from weldcal.tools.emulators.cell.finger_process import FingerSetup, run_finger_camera
 from weldcal.tools.emulators.cell.input_wire import InputWire
 from weldcal.tools.emulators.cell.physics import STEP_S, Physics
-from weldcal.tools.emulators.cell.scanner_process import ScannerSetup, run_scanner, unix_now
+from weldcal.tools.emulators.cell.scanner_process import ScannerSetup, run_scanner
 from weldcal.tools.emulators.cell.score import score
 from weldcal.tools.emulators.ur.addresses import take_address
 from weldcal.tools.emulators.ur.controller.core import Controller

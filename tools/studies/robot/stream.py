@@ -193,6 +193,7 @@ def run_stream(tap: Tap, arm: ArmModel, seconds: float, progress: Progress = no_
         simulator.Initialize()
         simulator.set_monitor(watch)
         simulator.AdvanceTo(seconds)
+    simulator.clear_monitor()
     final = tap.link.state()
     return StreamReport(simulator.get_context().get_time(), tap, final, clock, final.status.fault or "")
 

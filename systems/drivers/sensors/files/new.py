@@ -2,10 +2,14 @@
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from weldcal.systems.drivers.sensors.stamps import unix_now
+
 Signature = tuple[int, int, int]  # inode, size, time of the last change (ns)
+SET_S = 0.5  # by which the computer's clock is set and not only disciplined
 UNFINISHED = (".tmp", ".part", ".partial", ".crdownload")
 
 
@@ -21,12 +25,16 @@ class NewFiles:
     """Files of some suffixes that appear in a folder, or change, after `start`.
 
     A file is complete when its size and time of change have been the same for `settle_s`; one that was renamed into the folder
-    and last changed before that is complete at once. Names that begin with a dot or end as unfinished downloads do are never
+    and last changed before that is complete at once, unless the computer's clock was set since `start`.
+    Names that begin with a dot or end as unfinished downloads do are never
     looked at. The folder is polled: network folders do not report changes.
     """
 
-    def __init__(self, folder: Path, suffixes: tuple[str, ...], settle_s: float) -> None:
-        self._folder, self._suffixes, self._settle_s = folder, suffixes, settle_s
+    def __init__(
+        self, folder: Path, suffixes: tuple[str, ...], settle_s: float, unix: Callable[[], float] = unix_now
+    ) -> None:
+        self._folder, self._suffixes, self._settle_s, self._unix = folder, suffixes, settle_s, unix
+        self._offset = unix() - time.monotonic()
         self._known: dict[str, Signature] = {}
         self._growing: dict[str, _Growing] = {}
 
@@ -34,10 +42,12 @@ class NewFiles:
         """Take what is there now as old. Raises OSError where the folder cannot be read."""
         self._known = self._listed()
         self._growing = {}
+        self._offset = self._unix() - time.monotonic()
 
     def complete(self) -> list[Path]:
         """New complete files, oldest change first, each of them once. Raises OSError where the folder cannot be read."""
-        now, age_of = time.monotonic(), time.time_ns()
+        now, unix = time.monotonic(), self._unix()
+        clock_was_set = abs(unix - now - self._offset) > SET_S
         listed = self._listed()
         self._known = {name: s for name, s in self._known.items() if name in listed}
         self._growing = {name: g for name, g in self._growing.items() if name in listed}
@@ -48,7 +58,9 @@ class NewFiles:
             growing = self._growing.get(name)
             if growing is None or growing.signature != signature:
                 growing = self._growing[name] = _Growing(signature, now)
-            unchanged_s = max(now - growing.since, 1e-9 * (age_of - signature[2]))
+            unchanged_s = now - growing.since
+            if not clock_was_set:
+                unchanged_s = max(unchanged_s, unix - 1e-9 * signature[2])
             if unchanged_s >= self._settle_s:
                 ready.append((signature[2], name))
                 self._known[name] = signature

@@ -13,6 +13,7 @@ from weldcal.models.files import read_text
 from weldcal.systems.drivers.sensors.acquisition import Delivery, DeviceLost, Garbage, Source
 from weldcal.systems.drivers.sensors.files.new import NewFiles
 from weldcal.systems.drivers.sensors.files.triggers import Trigger, trigger_of
+from weldcal.systems.drivers.sensors.stamps import UnixClock
 
 Datum = TypeVar("Datum")
 POLL_S = 0.01
@@ -46,7 +47,8 @@ class FolderSource(Source[Datum]):
         self._trigger: Trigger = trigger_of(trigger)
         self._doubtful: dict[Path, float] = {}
         self._request = 0
-        self._asked_at = 0.0  # Unix time, s
+        self._asked_at = 0.0  # s, monotonic
+        self._unix = UnixClock()
         self._waiting: list[Path] = []
 
     def open(self) -> None:
@@ -63,7 +65,7 @@ class FolderSource(Source[Datum]):
         if self._triggered:
             self._start()  # what came before the trigger does not answer it
         self._waiting.clear()
-        self._request, self._asked_at = request, time.time()
+        self._request, self._asked_at = request, time.monotonic()
         self._trigger.send(request)
 
     def next(self, timeout_s: float) -> Delivery[Datum] | None:
@@ -108,9 +110,10 @@ class FolderSource(Source[Datum]):
         captured, request, where = self._sidecar(path)
         if request not in (None, self._request):
             raise Garbage(f"{path.name} answers the trigger {request}, and the newest is {self._request}")
-        if captured is not None and self._request and captured < self._asked_at - BEFORE_S:
-            raise Garbage(f"{path.name} was captured before it was asked for")
         arrived = time.monotonic()
+        earliest = self._asked_at - BEFORE_S if self._request else float("-inf")
+        if captured is not None and self._unix.to_monotonic(captured, arrived) < earliest:
+            raise Garbage(f"{path.name} was captured before it was asked for")
         if self._remove_read:
             with suppress(OSError):
                 path.unlink()

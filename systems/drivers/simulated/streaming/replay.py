@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
 from weldcal.models.arrays import Array
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import ScanStream, StreamedScan
 
 _SHOWN = 4  # newest frames on the port

@@ -1,13 +1,14 @@
 """Simulated streaming scanner: frames at its own rate that arrive later with stamps of its own clock, and single scans at rest."""
 
 import dataclasses as dc
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, State
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from weldcal.models.errors import InputError
@@ -23,6 +24,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import (
 )
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message, ScanStream, StreamedScan
 
 _KEPT = 8  # arrived frames on the port
@@ -117,9 +119,7 @@ class DepthStream(LeafSystem):
         captured = self.DeclareDiscreteState(2)
         self.DeclareVectorOutputPort("newest_capture", 2, self._newest_capture, {self.discrete_state_ticket(captured)})
         for k in range(n):
-            self.DeclarePeriodicUnrestrictedUpdateEvent(
-                period, (k + 1) * spacing * step, lambda c, s, k=k: self._instant(c, s, k)
-            )
+            self.DeclarePeriodicUnrestrictedUpdateEvent(period, (k + 1) * spacing * step, partial(self._instant, k=k))
 
     def _instant(self, context: Context, state: State, k: int) -> None:
         old: _Streaming = context.get_abstract_state(self._state).get_value()

@@ -167,6 +167,44 @@ def test_a_scan_of_another_time_is_refused(start: Start, tmp_path: Path, beside:
     assert scanner.answer(1) is None
 
 
+@pytest.mark.parametrize("jump_s", [3600.0, -3600.0])
+@pytest.mark.parametrize("at", ["before its capture", "after its capture"])
+def test_a_clock_that_is_set_while_a_scan_is_taken_refuses_no_scan(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump_s: float, at: str
+) -> None:
+    def set_clock(unix: Callable[[], float] = time.time) -> None:
+        monkeypatch.setattr(time, "time", lambda: unix() + jump_s)
+
+    scanner = start()
+    scanner.request(1)
+    time.sleep(0.05)
+    if at == "before its capture":
+        set_clock()
+    taken, taken_unix = time.monotonic(), time.time()
+    if at == "after its capture":
+        set_clock()
+    drop(tmp_path, "a.npz", cloud(1), capture_time=taken_unix, request=1)
+    assert number_of(answer(scanner, 1)) == 1
+    assert abs(scanner.frames()[-1].stamp.captured - taken) < 0.005
+    assert scanner.counts.garbled == 0
+
+
+def test_a_file_that_still_grows_is_not_old_because_the_clock_was_set(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scanner = start(settle_s=0.3)
+    scanner.request(1)
+    time.sleep(0.05)
+    unix = time.time
+    monkeypatch.setattr(time, "time", lambda: unix() + 3600.0)
+    (tmp_path / "slow.xyz").write_text(
+        "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in cloud(3).reshape(-1, 3)[:96])
+    )
+    time.sleep(0.1)
+    assert scanner.counts.received == 0
+    assert answer(scanner, 1).shape == (96, 3)
+
+
 def test_points_in_another_unit_are_refused_and_read_with_the_right_one(start: Start, tmp_path: Path) -> None:
     scanner = start()
     scanner.request(1)
