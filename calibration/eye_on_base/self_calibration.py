@@ -103,7 +103,7 @@ def self_calibrate(
     both = f"{asked}, the flange's hole circle for {_percent(holes)}"
     difference = motion.values - holes.values
     spread = motion.covariance + holes.covariance + np.diag(CIRCLE_OWN**2)
-    if chi2_below(difference @ np.linalg.solve(spread, difference), 3) > _CONTRADICT:
+    if chi2_below(float(difference @ np.linalg.solve(spread, difference)), 3) > _CONTRADICT:
         return refused(f"No scanner correction: {both}; they contradict each other.", True)
     together = from_motion(observations, patterns, seed=seed, usual=True)
     if together.certainty < _EVIDENT:
