@@ -18,7 +18,6 @@ def no_long_garbage_collections() -> Iterator[None]:
     A full collection visits every object of every imported library and stops the Diagram for 0.1 s and more. Frozen objects
     are not visited. Objects that the run creates are collected as usual, so memory does not grow.
     """
-    gc.collect()
     gc.freeze()
     try:
         yield

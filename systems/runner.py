@@ -173,9 +173,8 @@ def run_cell(
 
     simulator.set_monitor(watch)
     try:
-        with ExitStack() as around:
+        with no_long_garbage_collections(), ExitStack() as around:
             if run.clock is not None:
-                around.enter_context(no_long_garbage_collections())
                 _first_pictures(cell, run.root)
                 station.background.settle()
                 run.host = measure_host()

@@ -237,6 +237,7 @@ def _make_station(
             profiler=furnishing.profiler,
             time_step_s=furnishing.time_step_s,
             surroundings=surroundings,
+            contacts_read=furnishing.contacts_read,
         )
         build.parts = (world, *furnishing.parts)
     X_LC = None

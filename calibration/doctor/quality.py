@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from weldcal.calibration.doctor.case import Case
 from weldcal.calibration.doctor.fit import NU, Fit, fit
 from weldcal.calibration.doctor.models import Explained
+from weldcal.calibration.geometry.quantiles import f_tail
 from weldcal.calibration.geometry.se3 import log_rotation
 from weldcal.models.arrays import Array
 
@@ -60,7 +60,7 @@ def outliers(case: Case, null: Fit) -> Explained | None:
 def sure_outliers(case: Case, null: Fit) -> Finding | None:
     """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the residuals."""
     r = np.linalg.norm(null.e, axis=1)
-    chance = f_distribution.sf((r / null.sigma_m) ** 2 / 3.0, 3, NU)
+    chance = f_tail((r / null.sigma_m) ** 2 / 3.0, 3, NU)
     bad = (chance * case.n < _ODD) & (r > _GROSS_M)
     m = int(bad.sum())
     if m == 0 or m > _MOST * case.n or case.n - m < 5:
@@ -104,7 +104,7 @@ def noise_growth(case: Case) -> Finding | None:
     inside = float(left @ left)
     total = float(((y - y.mean()) ** 2).sum())
     value = (total - inside) / 2.0 / max(inside / free, 1e-12)
-    chance = float(f_distribution.sf(value, 2, free))
+    chance = float(f_tail(value, 2, free))
     model = y - left
     order = np.argsort(model)
     third = max(len(x) // 3, 2)

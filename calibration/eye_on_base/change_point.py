@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.stats import f as f_distribution
 
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.quantiles import f_tail
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -83,7 +83,7 @@ def find_change(observations: Sequence[Observation]) -> ChangePoint | None:
     at_split = _fit(b, c, split.X_before, k, order, split.sigma)
     free = 3 * n - 12 - TERMS[order]
     ratio = max(single.loss - at_split.loss, 0.0) / 6.0 / max(at_split.loss / free, 1e-12)
-    probability = min(1.0, float(f_distribution.sf(ratio, 6, free)) * (n - 2 * LEAST_PART + 1))
+    probability = min(1.0, float(f_tail(ratio, 6, free)) * (n - 2 * LEAST_PART + 1))
     moved = (at_split.X_after @ at_split.X_before.inverse()).multiply(b.T).T - b
     shift = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
     if probability > FALSE_ALARM or shift < _LARGER_THAN * at_split.sigma:

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.geometry.quantiles import chi2_quantile, f_quantile
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
 
@@ -82,4 +81,4 @@ def with_scanner(
 
 def few_residuals(redundancy: float) -> float:
     """Factor by which a 95 % region widens because its scale was estimated with that redundancy (F to chi-square)."""
-    return float(6.0 * f_distribution.ppf(0.95, 6, redundancy) / chi2.ppf(0.95, 6))
+    return 6.0 * f_quantile(0.95, 6, redundancy) / chi2_quantile(0.95, 6)

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from pydrake.math import RigidTransform
-from scipy.stats import t as student
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.observations import corrected_observation
@@ -13,6 +12,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.quantiles import t_quantile
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -70,7 +70,7 @@ def mean_interval(errors: Array, level: float = 0.95) -> tuple[float, float] | N
     n = len(e)
     if n < 4 or not e.mean() > 0.0:
         return None
-    spread = float(np.std(e, ddof=1) / e.mean() * np.sqrt(2.0 / n) * student.ppf(0.5 + 0.5 * level, n - 1))
+    spread = float(np.std(e, ddof=1) / e.mean() * np.sqrt(2.0 / n) * t_quantile(0.5 + 0.5 * level, n - 1))
     return float(e.mean() * np.exp(-spread)), float(e.mean() * np.exp(spread))
 
 

@@ -5,18 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.stats import chi2
 
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.geometry.compiled_rotation import cross_rows, rotation_of
+from weldcal.calibration.geometry.quantiles import chi2_share
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
 
 LEAST_PATTERNS = 6
 STARTS = 30  # random starts of an estimate: these observations are cleared of gross outliers
+_LARGEST = 0.05  # a scale farther from 1 is no property of a scanner that measures
 _MARGIN_M = 0.03  # a face reaches so far about its centre: there, too, a bend was seen
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2])  # what scanners are off in scale and gradient (1/m)
 _USUAL_SPREAD_M = 1e-4
@@ -59,7 +62,7 @@ class CorrectionEstimate:
     def certainty(self) -> float:
         """Probability that the correction is not zero by chance."""
         v = self.values - np.eye(len(self.values))[0]
-        return float(chi2.cdf(v @ np.linalg.solve(self.covariance, v), len(v)))
+        return chi2_share(v @ np.linalg.solve(self.covariance, v), len(v))
 
 
 def from_motion(
@@ -103,51 +106,20 @@ def from_motion(
     own_noise = np.array(
         [0.0 if o.center_covariance is None else np.trace(o.center_covariance) / 3.0 for o in observations]
     )
-    vague = np.sqrt(1.0 + own_noise / _USUAL_SPREAD_M**2)[:, None]
+    vague = np.sqrt(1.0 + own_noise / _USUAL_SPREAD_M**2)
     sigma_r = _ratio_sigma(rows[:, :3], ratio)
     size = 6 + terms + (3 if len(ratio) else 0)  # with circles: three for what is their own, see CIRCLE_OWN
     prior = np.zeros(size)
     prior[6 : 6 + terms] = 1.0 / _expected(terms, float(np.median(c[:, 2])), usual)
     prior[6 + terms :] = 1.0 / CIRCLE_OWN[: size - 6 - terms]
-    R, p = start.rotation().matrix(), np.asarray(start.translation())
+    found = _gauss_newton(
+        *(c, b, vague, shape.terms(c)),  # a correction is linear in its factors
+        *(c[has], m, z, shape.terms(c[has]), shape.slopes(c[has])),
+        *(rows, ratio, prior, start.rotation().matrix().copy(), np.array(start.translation())),
+        *(sigma_p, sigma_n, sigma_r),
+    )
+    R, p, change, information, redundancy, sigma_p, sigma_n = found
     pivot = b.mean(axis=0)
-    change = np.zeros(size - 6)  # of the factors, then the circles' own
-    basis, slopes = shape.terms(c), shape.slopes(c[has])  # a correction is linear in its factors
-    redundancy = 1.0
-    information = np.eye(size)
-    for k in range(40):
-        values = correction_of(change[:terms], field).values
-        q = (c * (basis @ values)[:, None]) @ R.T + p
-        e_p = (q - b) / vague
-        J_p = np.zeros((len(b), 3, size))
-        J_p[:, :, :3], J_p[:, :, 3:6] = -skew(q - pivot), np.eye(3)
-        J_p[:, :, 6 : 6 + terms] = (c @ R.T)[:, :, None] * basis[:, None]
-        J_p /= vague[:, :, None]
-        e_n, J_n = _normal_rows(basis[has] @ values, slopes, values, c[has], m, z, R, size)
-        own = change[terms:] if len(ratio) else np.zeros(3)
-        e_r = ratio * (rows @ values) - 1.0 - rows[:, :3] @ own
-        J_r = np.zeros((len(ratio), size))
-        J_r[:, 6 : 6 + terms] = ratio[:, None] * rows
-        J_r[:, 6 + terms :] = -rows[:, : size - 6 - terms]
-        J = np.vstack([J_p.reshape(-1, size) / sigma_p, J_n.reshape(-1, size) / sigma_n, J_r / sigma_r])
-        e = np.concatenate([e_p.ravel() / sigma_p, e_n.ravel() / sigma_n, e_r / sigma_r])
-        w = 1.0 / np.sqrt(1.0 + (e / 2.0) ** 2)
-        information = J.T @ (w[:, None] * J) + np.diag(prior**2)
-        unknown = np.concatenate([np.zeros(6), change])
-        step = -np.linalg.solve(information, J.T @ (w * e) + prior**2 * unknown)
-        dR = exp_rotation(step[:3])
-        R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:6]
-        change = change + step[6:]
-        if k in (2, 4, 6, 8):  # robust spreads of what the unknowns leave, each kind by its own redundancy
-            taken = np.einsum("ij,jk,ik->i", J, np.linalg.inv(information), J) * w
-            n_p, n_n = 3 * len(b), 2 * len(m)
-            redundancy = max(n_p - float(taken[:n_p].sum()), 1.0)
-            sigma_p = max(_spread(e_p.ravel(), n_p) * np.sqrt(n_p / redundancy), 1e-6)
-            if n_n:
-                left = max(n_n - float(taken[n_p : n_p + 3 * len(m)].sum()), 1.0)
-                sigma_n = max(_spread(e_n.ravel(), n_n) * np.sqrt(n_n / left), 1e-6)
-        if k > 9 and float(np.linalg.norm(step)) < 1e-9:
-            break
     inverse = np.linalg.inv(information)[: 6 + terms, : 6 + terms]
     T = np.eye(6 + terms)
     T[3:6, :3] = -skew(p - pivot)
@@ -172,7 +144,7 @@ def from_holes(observations: Sequence[Observation], patterns: Mapping[str, HoleP
 
 def correction_of(change: Array, field: tuple[float, float, float, float] | None = None) -> ScannerCorrection:
     """The correction whose factors (K,) differ by ``change`` from those of a perfect scanner."""
-    limited = np.clip(change[0], -0.05, 0.05)
+    limited = np.clip(change[0], -_LARGEST, _LARGEST)
     bend = tuple(float(v) for v in change[3:])
     return ScannerCorrection(1.0 + float(limited), (float(change[1]), float(change[2])), bend, field if bend else None)
 
@@ -184,28 +156,117 @@ def _expected(terms: int, depth: float, usual: bool) -> Array:
     return np.concatenate([_USUAL if usual else _LOOSE, bends])[:terms]
 
 
-def _normal_rows(
-    factor: Array, slopes: Array, values: Array, c: Array, m: Array, z: Array, R: Array, size: int
-) -> tuple[Array, Array]:
-    """Tilts (n, 3) of seen against stated normals, and their derivative (n, 3, size) by rotation and correction.
+@compiled()
+def _gauss_newton(
+    c: Array,
+    b: Array,
+    vague: Array,
+    basis: Array,
+    c_n: Array,
+    m: Array,
+    z: Array,
+    basis_n: Array,
+    slopes: Array,
+    rows: Array,
+    ratio: Array,
+    prior: Array,
+    R: Array,
+    p: Array,
+    sigma_p: float,
+    sigma_n: float,
+    sigma_r: float,
+) -> tuple[Array, Array, Array, Array, float, float, float]:
+    """The loop of from_motion: pose, change of the unknowns after it, information, redundancy of positions, both sigmas.
 
-    The correction has these ``values`` (K,), ``factor`` (n,) and ``slopes`` (n, K, 2) of its terms at the centres c (n, 3).
-
-    A normal turns by the inverse transpose of the correction's derivative; the linear part of that, at the identity, is what a
-    small change of a factor does.
+    Centres c, b (n, 3) with ``vague`` (n,) and the correction's terms (n, K); of those with a normal m (h, 3), z (h, 3) in the base,
+    their centres, terms and ``slopes`` (h, K, 2); of k hole circles rows (k, K) and ratio (k,). ``prior`` (6 + K or 9 + K,) are
+    inverse sigmas. A normal turns by the inverse transpose of the correction's derivative f 1 + c s'; its linear part at the identity
+    is what a small change of a factor does.
     """
-    jacobian = factor[:, None, None] * np.eye(3)
-    jacobian[:, :, :2] += c[:, :, None] * np.einsum("nki,k->ni", slopes, values)[:, None]
-    turned_back = np.linalg.solve(np.swapaxes(jacobian, -1, -2), m[..., None])[..., 0]
-    seen = turned_back / np.linalg.norm(turned_back, axis=-1, keepdims=True) @ R.T
-    across = np.eye(3) - z[:, :, None] * z[:, None]
-    J = np.zeros((len(z), 3, size))
-    J[:, :, :3] = -skew(seen)
-    lean = (c * m).sum(axis=1)
-    turned = np.zeros((len(z), slopes.shape[1], 3))
-    turned[:, :, :2] = -lean[:, None, None] * slopes
-    J[:, :, 6 : 6 + slopes.shape[1]] = np.swapaxes(turned @ R.T, 1, 2)
-    return np.einsum("nij,nj->ni", across, seen - z), np.einsum("nij,njk->nik", across, J)
+    n, h, k, terms, size = len(b), len(z), len(ratio), basis.shape[1], len(prior)
+    own = size - 6 - terms
+    pivot = np.array([b[:, 0].mean(), b[:, 1].mean(), b[:, 2].mean()])
+    change = np.zeros(size - 6)
+    redundancy = 1.0
+    information = np.eye(size)
+    J = np.zeros((3 * n + 3 * h + k, size))
+    e = np.zeros(len(J))
+    e_p, e_n, tilt, turn = np.zeros(3 * n), np.zeros(3 * h), np.zeros((3, size)), np.zeros(3)
+    s, seen = np.zeros(3), np.zeros(3)
+    for count in range(40):
+        values = change[:terms].copy()
+        values[0] = 1.0 + min(max(change[0], -_LARGEST), _LARGEST)
+        for i in range(n):
+            factor = basis[i] @ values
+            q = R @ (factor * c[i]) + p
+            a = q - pivot
+            along = R @ c[i]
+            weight = 1.0 / (vague[i] * sigma_p)
+            for x in range(3):
+                row = 3 * i + x
+                e_p[row] = (q[x] - b[i, x]) / vague[i]
+                e[row] = e_p[row] / sigma_p
+                J[row, 3 + x] = weight
+                for t in range(terms):
+                    J[row, 6 + t] = along[x] * basis[i, t] * weight
+            cross_rows(J[3 * i : 3 * i + 3], a, weight)
+        for i in range(h):
+            factor = basis_n[i] @ values
+            s[:] = 0.0
+            for t in range(terms):
+                s[0] += slopes[i, t, 0] * values[t]
+                s[1] += slopes[i, t, 1] * values[t]
+            lean = c_n[i] @ m[i]
+            seen[:] = m[i] - s * (lean / (factor + c_n[i] @ s))  # Sherman-Morrison; its length does not count
+            seen[:] = R @ (seen / np.sqrt(seen @ seen))
+            cross_rows(tilt, seen, 1.0)
+            for t in range(terms):
+                turn[0], turn[1] = -lean * slopes[i, t, 0], -lean * slopes[i, t, 1]
+                tilt[:, 6 + t] = R @ turn
+            off = seen - z[i]
+            off -= (off @ z[i]) * z[i]
+            for x in range(3):
+                e_n[3 * i + x] = off[x]
+                e[3 * (n + i) + x] = off[x] / sigma_n
+            for y in range(6 + terms):
+                lengthwise = z[i] @ np.ascontiguousarray(tilt[:, y])
+                for x in range(3):
+                    J[3 * (n + i) + x, y] = (tilt[x, y] - lengthwise * z[i, x]) / sigma_n
+        for i in range(k):
+            row = 3 * (n + h) + i
+            off_size = ratio[i] * (rows[i] @ values) - 1.0
+            for t in range(terms):
+                J[row, 6 + t] = ratio[i] * rows[i, t] / sigma_r
+            for t in range(own):
+                J[row, 6 + terms + t] = -rows[i, t] / sigma_r
+                off_size -= rows[i, t] * change[terms + t]
+            e[row] = off_size / sigma_r
+        w = 1.0 / np.sqrt(1.0 + (e / 2.0) ** 2)
+        weighted = J * w.reshape(-1, 1)
+        information = J.T @ weighted + np.diag(prior**2)
+        gradient = weighted.T @ e
+        gradient[6:] += prior[6:] ** 2 * change
+        step = -np.linalg.solve(information, gradient)
+        dR = rotation_of(step[:3])
+        R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:6]
+        change = change + step[6:]
+        if count in (2, 4, 6, 8):  # robust spreads of what the unknowns leave, each kind by its own redundancy
+            taken = ((J @ np.linalg.inv(information)) * weighted).sum(axis=1)
+            redundancy = max(3.0 * n - taken[: 3 * n].sum(), 1.0)
+            sigma_p = max(_spread(e_p, 3 * n) * np.sqrt(3 * n / redundancy), 1e-6)
+            if h:
+                left = max(2.0 * h - taken[3 * n : 3 * (n + h)].sum(), 1.0)
+                sigma_n = max(_spread(e_n, 2 * h) * np.sqrt(2 * h / left), 1e-6)
+        if count > 9 and np.sqrt(step @ step) < 1e-9:
+            break
+    return R, p, change, information, redundancy, sigma_p, sigma_n
+
+
+@compiled()
+def _spread(e: Array, count: int) -> float:
+    """Standard deviation of residuals, half of it from their middle: a few wild ones do not set it."""
+    limit = 4.0 * 1.4826 * np.median(np.abs(e))
+    return np.sqrt((np.minimum(np.abs(e), limit) ** 2).sum() / count)  # type: ignore[no-any-return]
 
 
 def _circles(patterns: Sequence[HolePattern], shape: ScannerCorrection) -> tuple[Array, Array]:
@@ -228,11 +289,3 @@ def _ratio_sigma(rows: Array, ratio: Array) -> float:
         left = 1.0 / ratio - rows @ np.linalg.lstsq(rows, 1.0 / ratio, rcond=1e-6)[0]
         square, dof = float((left**2).sum()), len(ratio) - 3
     return float(np.sqrt((square + _RATIO_DOF * _RATIO_SIGMA**2) / (dof + _RATIO_DOF)))
-
-
-def _spread(e: Array, count: int) -> float:
-    """Standard deviation of residuals, half of it from their middle: a few wild ones do not set it."""
-    if count == 0:
-        return 1.0
-    limit = 4.0 * 1.4826 * float(np.median(np.abs(e)))
-    return float(np.sqrt((np.minimum(np.abs(e), limit) ** 2).sum() / count))

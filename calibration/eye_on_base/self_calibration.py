@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform
-from scipy.stats import chi2
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.observations import corrected_observation
@@ -18,6 +17,7 @@ from weldcal.calibration.eye_on_base.scanner_fit import (
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.quantiles import chi2_share
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -103,7 +103,7 @@ def self_calibrate(
     both = f"{asked}, the flange's hole circle for {_percent(holes)}"
     difference = motion.values - holes.values
     spread = motion.covariance + holes.covariance + np.diag(CIRCLE_OWN**2)
-    if float(chi2.cdf(difference @ np.linalg.solve(spread, difference), 3)) > _CONTRADICT:
+    if chi2_share(difference @ np.linalg.solve(spread, difference), 3) > _CONTRADICT:
         return refused(f"No scanner correction: {both}; they contradict each other.", True)
     together = from_motion(observations, patterns, seed=seed, usual=True)
     if together.certainty < _EVIDENT:

@@ -7,9 +7,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.stats import f as f_distribution
 
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.quantiles import f_tail
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arrays import Array
@@ -112,7 +112,7 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
         return None
     variance = max(full.square / free, 1e-12)
     value = (bare.square - full.square) / gained / variance
-    probability = float(f_distribution.sf(value, gained, free))
+    probability = float(f_tail(value, gained, free))
     found = TcpOffset(
         full.offset,
         np.sqrt(variance) * full.offset_factor,

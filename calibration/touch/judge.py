@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as fisher
 
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
@@ -21,6 +20,7 @@ from weldcal.calibration.eye_on_base.stated_error import (
     scatter_elsewhere,
 )
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.quantiles import f_quantile
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.refinement.kinematics_fit import FactoryPrior
 from weldcal.calibration.refinement.local_field import field_from_document
@@ -258,7 +258,7 @@ def _marginal(
         size[k] = e[0] if m == 1 else np.linalg.norm(e)
         along = np.array([1.0]) if m == 1 else e / max(float(np.linalg.norm(e)), 1e-12)
         inverse = np.linalg.pinv(S)
-        bound = m * float(fisher.ppf(LEVEL, m, free))
+        bound = m * f_quantile(LEVEL, m, free)
         limit[k] = np.sqrt(bound / max(float(along @ inverse @ along), 1e-300))
         inside[k] = abs(size[k]) <= limit[k]
     return size, limit, inside
@@ -292,5 +292,5 @@ def _most_outside(C: Array, owner: NDArray[np.int64], n: int, free: float) -> in
         rows = np.flatnonzero(owner == k)
         S = np.linalg.pinv(C[np.ix_(rows, rows)])
         square = np.einsum("di,ij,dj->d", drawn[:, rows], S, drawn[:, rows])
-        outside += square > len(rows) * float(fisher.ppf(LEVEL, len(rows), free))
+        outside += square > len(rows) * f_quantile(LEVEL, len(rows), free)
     return int(np.quantile(outside, 1.0 - FALSE_ALARM, method="higher"))

@@ -59,7 +59,7 @@ def read_surface(path: Path, unit_m: float) -> TriMesh:
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (N,3) in the file's unit and triangles (M,3), by Open3D."""
-    import open3d as o3d
+    from weldcal.models.open3d_core import o3d
 
     quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
     try:

@@ -29,7 +29,7 @@ class CommandArbiter(LeafSystem):
         self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
         self._mover = self.DeclareVectorInputPort("mover_velocity", 6)
         self._servo = self.DeclareVectorInputPort("servo_velocity", 6)
-        self.DeclareVectorOutputPort("velocity_wanted", 6, self._choose)
+        self.DeclareVectorOutputPort("velocity_wanted", 6, self._choose, {self.all_input_ports_ticket()})
 
     def _choose(self, context: Context, output: BasicVector) -> None:
         job: JobCommand = self._job.Eval(context)

@@ -1,12 +1,11 @@
 """FlangeMover: moves the arm to a joint goal on a quintic synchronised path, as a stream of joint velocities."""
 
 import dataclasses as dc
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, State
+from pydrake.systems.framework import Context, State
 
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, Message
@@ -72,17 +71,16 @@ class FlangeMover(LeafSystem):
         self._position = self.DeclareVectorInputPort("position_measured", 6)
         self._velocity = self.DeclareVectorInputPort("velocity_measured", 6)
         self._move = self.DeclareAbstractState(AbstractValue.Make(_Move()))
-        out = self.DeclareDiscreteState(np.zeros(7))
-        ticket = {self.discrete_state_ticket(out)}
-        self.DeclareVectorOutputPort("velocity", 6, self._velocity_out, ticket)
-        self.DeclareVectorOutputPort("settled_goal", 1, self._settled_out, ticket)
+        self._commanded = self.DeclareDiscreteState(np.zeros(6))
+        self._settled = self.DeclareDiscreteState(1)
+        self.DeclareStateOutputPort("velocity", self._commanded)
+        self.DeclareStateOutputPort("settled_goal", self._settled)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
         job: JobCommand = self._job.Eval(context)
         move: _Move = context.get_abstract_state(self._move).get_value()
-        old = context.get_discrete_state_vector().value()
-        velocity, settled = np.zeros(6), old[6]
+        out, velocity = state.get_mutable_discrete_state(), np.zeros(6)
         if job.mode == "move" and job.q_goal is not None:
             now, q = context.get_time(), self._position.Eval(context)
             if job.goal_id != move.goal_id:
@@ -94,11 +92,5 @@ class FlangeMover(LeafSystem):
             velocity = v_path + FEEDBACK_PER_S * (q_path - q)
             at_rest = np.max(np.abs(self._velocity.Eval(context))) < SETTLED_RAD_S
             if u >= 1.0 and at_rest and np.max(np.abs(q - move.q_goal)) < SETTLED_RAD:
-                settled = float(move.goal_id)
-        state.get_mutable_discrete_state().set_value(np.append(velocity, settled))
-
-    def _velocity_out(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[:6])
-
-    def _settled_out(self, context: Context, output: BasicVector) -> Any:
-        output.SetAtIndex(0, context.get_discrete_state_vector().value()[6])
+                out.set_value(self._settled, [move.goal_id])
+        out.set_value(self._commanded, velocity)

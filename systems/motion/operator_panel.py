@@ -1,7 +1,7 @@
 """OperatorPanel: reads what a person asks for, at the terminal, on the dashboard or in Meshcat, into the Diagram."""
 
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues
+from pydrake.systems.framework import Context, DiscreteValues
 
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.person import FASTEST, Person
@@ -10,7 +10,6 @@ from weldcal.systems.viewer.kept import keep
 HOLD_BUTTON = "Hold the job"
 PACE_SLIDER = "Pace (1 = real time, 0 = as fast as it goes)"
 PERIOD_S = 0.008
-_HOLD, _END, _PACE, _CLICKS, _ASKED = range(5)
 
 
 class OperatorPanel(LeafSystem):
@@ -36,34 +35,31 @@ class OperatorPanel(LeafSystem):
         if meshcat is not None:
             meshcat.AddButton(HOLD_BUTTON, "Escape")
             meshcat.AddSlider(PACE_SLIDER, 0.0, FASTEST, 0.1, pace)
-        state = self.DeclareDiscreteState([0.0, 0.0, pace, 0.0, pace])
-        ticket = {self.discrete_state_ticket(state)}
-        self.DeclareVectorOutputPort("hold", 1, self._hold, ticket)
-        self.DeclareVectorOutputPort("end", 1, self._end, ticket)
-        self.DeclareVectorOutputPort("pace", 1, self._pace, ticket)
+        self._hold, self._end = self.DeclareDiscreteState(1), self.DeclareDiscreteState(1)
+        self._pace = self.DeclareDiscreteState([pace])
+        self._seen = self.DeclareDiscreteState([0.0, pace])  # clicks, and the pace that was asked for
+        self.DeclareStateOutputPort("hold", self._hold)
+        self.DeclareStateOutputPort("end", self._end)
+        self.DeclareStateOutputPort("pace", self._pace)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._read)
 
     def _read(self, context: Context, discrete: DiscreteValues) -> None:
-        old = context.get_discrete_state_vector().value()
-        person, pace, clicks = self._person, old[_PACE], old[_CLICKS]
-        asked = old[_ASKED] if person.pace is None else person.pace
+        clicks, before = discrete.value(self._seen)
+        pace = float(discrete.value(self._pace)[0])
+        person = self._person
+        asked = before if person.pace is None else person.pace
         if self._meshcat is not None:
-            if asked != old[_ASKED]:
+            if asked != before:
                 self._meshcat.SetSliderValue(PACE_SLIDER, asked)
             slider = self._meshcat.GetSliderValue(PACE_SLIDER)
             pace = slider if 0.0 <= slider <= FASTEST else pace
             if (now := float(self._meshcat.GetButtonClicks(HOLD_BUTTON))) > clicks:
                 person.hold("the 3D view")
             clicks = now
-        elif asked != old[_ASKED]:
+        elif asked != before:
             pace = asked
-        discrete.set_value([float(person.holds), max(old[_END], float(person.ends)), pace, clicks, asked])
-
-    def _hold(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_discrete_state_vector().value()[_HOLD])
-
-    def _end(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_discrete_state_vector().value()[_END])
-
-    def _pace(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_discrete_state_vector().value()[_PACE])
+        discrete.set_value(self._hold, [float(person.holds)])
+        discrete.set_value(self._pace, [pace])
+        discrete.set_value(self._seen, [clicks, asked])
+        if person.ends:  # for good
+            discrete.set_value(self._end, [1.0])

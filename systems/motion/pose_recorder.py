@@ -8,7 +8,8 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, State
 
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arms.compiled_kinematics import tick_flange_pose
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 
@@ -34,7 +35,7 @@ class PoseHistory(Message):
     def pose_at(self, arm: ArmModel, time: float) -> RigidTransform | None:
         """Flange pose X_BF at `time` s; None as in joints_at."""
         q = self.joints_at(time)
-        return None if q is None else forward_kinematics(arm, q)
+        return None if q is None else tick_flange_pose(arm, q)
 
 
 class PoseRecorder(LeafSystem):
@@ -64,6 +65,8 @@ class PoseRecorder(LeafSystem):
         time = float(self._time.Eval(context)[0])
         if old.times.size and time <= old.times[-1]:
             return
-        times = np.append(old.times[-self._length :], time)
-        positions = np.vstack([old.positions[-self._length :], self._position.Eval(context)])
+        n = min(old.times.size, self._length)
+        times, positions = np.empty(n + 1), np.empty((n + 1, 6))
+        times[:n], positions[:n] = old.times[old.times.size - n :], old.positions[old.times.size - n :]
+        times[n], positions[n] = time, self._position.Eval(context)
         state.get_mutable_abstract_state(self._state).set_value(PoseHistory(times, positions))

@@ -38,9 +38,11 @@ class ProcessSwitch(LeafSystem):
         self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
         self._margin = self.DeclareVectorInputPort("margin", 2)
         self._hold = self.DeclareVectorInputPort("hold", 1)
-        state = self.DeclareDiscreteState([0.0, 0.0])  # turned off for this weld; by the guard
-        self.DeclareVectorOutputPort("process_on", 1, self._process)
-        self.DeclareVectorOutputPort("arm_stopped", 1, self._arm_stopped, {self.discrete_state_ticket(state)})
+        self._off = self.DeclareDiscreteState(1)  # turned off for this weld
+        self._stopped_by_guard = self.DeclareDiscreteState(1)
+        ticket = {self.all_input_ports_ticket(), self.discrete_state_ticket(self._off)}
+        self.DeclareVectorOutputPort("process_on", 1, self._process, ticket)
+        self.DeclareStateOutputPort("arm_stopped", self._stopped_by_guard)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._latch)
 
     def _stopped(self, context: Context) -> bool:
@@ -51,19 +53,17 @@ class ProcessSwitch(LeafSystem):
         return bool(self._status.Eval(context).ready and not self._stopped(context))
 
     def _latch(self, context: Context, discrete: DiscreteValues) -> None:
-        off, stopped = context.get_discrete_state_vector().value()
         if self._job.Eval(context).mode != "weld":
-            off = stopped = 0.0
+            discrete.set_value(self._off, [0.0])
+            discrete.set_value(self._stopped_by_guard, [0.0])
         elif self._wanted.Eval(context)[0] > 0.5 and not self._free(context):
-            off, stopped = 1.0, max(stopped, float(self._stopped(context)))
-        discrete.set_value([off, stopped])
+            discrete.set_value(self._off, [1.0])
+            if self._stopped(context):
+                discrete.set_value(self._stopped_by_guard, [1.0])
 
     def _process(self, context: Context, output: BasicVector) -> None:
         job: JobCommand = self._job.Eval(context)
-        off = context.get_discrete_state_vector().value()[0] > 0.5
+        off = context.get_discrete_state(self._off).value()[0] > 0.5
         consent = job.process_on and not job.held and self._wanted.Eval(context)[0] > 0.5
         held = self._hold.Eval(context)[0] > 0.5
         output.SetAtIndex(0, float(consent and not off and not held and self._free(context)))
-
-    def _arm_stopped(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_discrete_state_vector().value()[1])

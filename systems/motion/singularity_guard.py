@@ -4,7 +4,8 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context
 
-from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.models.arms.compiled_kinematics import tick_jacobian
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.welding.servo.guards import ArmGuardConfig, guarded_joint_velocity
 
@@ -35,8 +36,7 @@ class SingularityGuard(LeafSystem):
         self._arm, self._p_FT = arm, np.array(X_FT.translation())
         self._config, self._limit = config or ArmGuardConfig(), speed_share * arm.velocity_limit
         # the first call loads machine code, which no tick has time for
-        _, _, J = kinematics_and_jacobian(arm, np.zeros(6), self._p_FT)
-        guarded_joint_velocity(J, np.zeros(6), self._limit, self._config)
+        guarded_joint_velocity(np.eye(6), np.zeros(6), self._limit, self._config)
         self._V = self.DeclareVectorInputPort("V_BT", 6)
         self._q = self.DeclareVectorInputPort("position_measured", 6)
         ticket = {self._V.ticket(), self._q.ticket()}
@@ -45,9 +45,8 @@ class SingularityGuard(LeafSystem):
         self.DeclareVectorOutputPort("margin", 2, self._margin, ticket)
 
     def _calculate(self, context: Context, output: BasicVector) -> None:
-        V = self._V.Eval(context)
-        _, _, J = kinematics_and_jacobian(self._arm, self._q.Eval(context), self._p_FT)
-        guarded = guarded_joint_velocity(J, V, self._limit, self._config)
+        J = tick_jacobian(self._arm, self._q.Eval(context), self._p_FT)
+        guarded = guarded_joint_velocity(J, self._V.Eval(context), self._limit, self._config)
         output.SetFromVector(np.concatenate([guarded.q_dot, [guarded.sigma_min, float(guarded.stopped)]]))
 
     def _velocity(self, context: Context, output: BasicVector) -> None:

@@ -13,6 +13,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms import kinematics as module
+from weldcal.models.arms.compiled_kinematics import tick_flange_pose, tick_jacobian
 from weldcal.models.arms.kinematics import (
     LINKS,
     forward_kinematics,
@@ -180,6 +181,13 @@ def test_jacobian_is_the_derivative_of_the_kinematics() -> None:
             v = (X_plus @ p_FP - X_minus @ p_FP) / (2 * h)
             dR = (X_plus.rotation().matrix() - X_minus.rotation().matrix()) / (2 * h) @ R.T
             np.testing.assert_allclose(J[:, i], [dR[2, 1], dR[0, 2], dR[1, 0], *v], rtol=0, atol=1e-9)
+
+
+def test_a_control_ticks_kinematics_are_the_same() -> None:
+    arm, p_FP = load_arm(), np.array([0.01, -0.02, 0.3])
+    for q in np.random.default_rng(3).uniform(-np.pi, np.pi, (20, 6)):
+        assert tick_flange_pose(arm, q).IsNearlyEqualTo(forward_kinematics(arm, q), 1e-14)
+        assert tick_jacobian(arm, q, p_FP) == pytest.approx(jacobian(arm, q, p_FP), abs=1e-14)
 
 
 def test_sigma_min_vanishes_where_the_arm_is_singular_and_only_there() -> None:

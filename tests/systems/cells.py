@@ -107,5 +107,10 @@ class Drive:
             world.plant.SetPositions(self.plant, world.tool, np.zeros(3) if deflection_T is None else deflection_T)
             world.plant.SetVelocities(self.plant, world.tool, np.zeros(3))
         servo = self.station.diagram.GetSubsystemByName("arm_servo")
-        memory = servo.GetMyMutableContextFromRoot(self.context).get_mutable_discrete_state_vector()
-        memory.SetFromVector(np.concatenate([q, np.zeros(6), q, np.zeros(6), [self.time, 0.0]]))
+        place_servo(servo.GetMyMutableContextFromRoot(self.context), q, self.time)
+
+
+def place_servo(context: Context, q: np.ndarray, time: float = 0.0, fault: float = 0.0) -> None:
+    """Set the state of a SpeedJointServo: its reference and what it measured at rest at q, at that time, and its fault."""
+    for group, value in enumerate((np.concatenate([q, np.zeros(6)]), q, np.zeros(6), [time], [fault])):
+        context.SetDiscreteState(group, value)

@@ -284,6 +284,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     SpeedJointServo: {
         "velocity_command": 6,
         "arm_state": 12,
+        "arm_acceleration": 6,
         "desired_state": 12,
         "position_measured": 6,
         "velocity_measured": 6,

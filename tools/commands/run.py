@@ -69,11 +69,8 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
         scenario.job.speed_factor = options.speed_factor
         check_scenario(scenario)
     meshcat = None
-    from threadpoolctl import threadpool_limits
-
     with (
-        # The products of a tick are small: a second thread waits busily for the next one and takes a core from the robot's peer.
-        threadpool_limits(1, user_api="blas"),
+        _one_thread(),
         chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot,
         person_at() as person,
     ):
@@ -110,6 +107,25 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
                 if recorder is not None:
                     recorder.close(run)
     return JobRun(run, meshcat, robot.title, live)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let NumPy and OpenCV use one thread for the duration of the block.
+
+    The products of a tick and the finger camera's pictures are small: a second thread waits busily for the next one and takes a
+    core from the robot's peer.
+    """
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 @contextmanager

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import kendalltau
 
 from weldcal.tools.outcomes.calibration import CARE, DO_NOT
 
@@ -186,6 +185,8 @@ def _grows(errors_mm: Sequence[float | None]) -> bool:
     seen = [mm for mm in errors_mm if mm is not None]
     if len(seen) < 7:
         return False
+    from scipy.stats import kendalltau  # slow to import
+
     found = kendalltau(np.arange(len(seen)), seen, alternative="greater")
     return bool(found.pvalue < FALSE_ALARM)
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.stats import chi2
 
+from weldcal.calibration.geometry.quantiles import chi2_quantile, chi2_share
 from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.estimates import pose_sigmas
@@ -28,7 +28,7 @@ from weldcal.tools.outcomes.profiler_file import WORDS
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 
-JOINT_3_SIGMA = float(chi2.ppf(chi2.cdf(9.0, 1), 6))  # 20.06
+JOINT_3_SIGMA = chi2_quantile(chi2_share(9.0, 1), 6)  # 20.06
 
 
 @dataclass(frozen=True, eq=False)

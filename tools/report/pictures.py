@@ -1,7 +1,10 @@
 """Plots that several reports share: errors as bars, errors as arrows across the scanner's field of view."""
 
+from __future__ import annotations
+
 import io
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import matplotlib
 
@@ -13,11 +16,14 @@ from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arrays import Array
+
+if TYPE_CHECKING:
+    from weldcal.calibration.flange.observation import Observation
 
 OURS, THEIRS, TRUTH, GREY = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab"
 PLANNED, TORCH, ROBOT = GREY, "#d9700f", "#5b7d4e"
+_MOST_BARS = 400
 _GROSS = 10.0  # times the median: a gross outlier
 _PLATE = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.0}  # keeps a label readable on a bar
 
@@ -41,7 +47,11 @@ def error_bars(
         axes.text(0.5, 0.5, "too few scans for cross-validation", transform=axes.transAxes, ha="center", color="#555")
         axes.set_axis_off()
         return svg(figure, axes)
-    axes.bar(x, error, color=[OURS if k else GREY for k in keep], width=0.7)
+    if len(error) <= _MOST_BARS:
+        axes.bar(x, error, color=[OURS if k else GREY for k in keep], width=0.7)
+    else:  # thousands of bars are a picture of many megabytes, each thinner than a pixel
+        for of, colour in ((keep, OURS), (~keep, GREY)):
+            axes.fill_between(x, 0.0, np.where(of, error, np.nan), step="mid", color=colour, linewidth=0.5)
     median = float(np.median(error[keep])) if keep.any() else float(np.nanmedian(error))
     # gross outliers would flatten every other bar
     usual = np.isfinite(error) & (

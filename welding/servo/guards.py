@@ -99,13 +99,13 @@ def guarded_joint_velocity(
     # copies: the code is compiled anew for each kind of view
     jacobian, velocity = np.array(J, dtype=float), np.array(V, dtype=float)
     bound, rest = np.full(6, q_dot_limit, dtype=float), np.zeros(6)
-    if not (np.isfinite(jacobian).all() and np.isfinite(velocity).all() and np.isfinite(bound).all()):
-        return GuardedVelocity(rest, 0.0, 0.0, True, "The arm was stopped: the commanded velocity is not finite.")
     sigma_min, scale, slowed = _guarded(
         jacobian, velocity, bound, limits.row_scale, limits.sigma_stop, limits.sigma_slow, rest
     )
     reason: str | None = None
-    if scale == 0.0:
+    if slowed < 0.0:
+        reason = "The arm was stopped: the commanded velocity is not finite."
+    elif scale == 0.0:
         reason = f"The arm was stopped {sigma_min:.3f} from a singularity; start from another arm configuration."
     elif slowed < 1.0:
         reason = f"Near a singularity: the arm moves at {slowed:.0%}."
@@ -119,7 +119,9 @@ def _guarded(
     J: Array, V: Array, bound: Array, row_scale: Array, stop: float, slow: float, q_dot: Array
 ) -> tuple[float, float, float]:
     """Fill q_dot (6,), which is zero; returns sigma_min, the share of the wanted velocity that is left (0: stopped), and that
-    near a singularity."""
+    near a singularity (below 0: an input is not finite)."""
+    if not (np.isfinite(J).all() and np.isfinite(V).all() and np.isfinite(bound).all()):
+        return 0.0, 0.0, -1.0
     scaled, wanted = J * row_scale.reshape(6, 1), V * row_scale
     U, sigma, Vt = np.linalg.svd(scaled)
     sigma_min = sigma[5]

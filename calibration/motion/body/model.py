@@ -2,15 +2,16 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import open3d as o3d
 from pydrake.math import RigidTransform
 from scipy.spatial import cKDTree
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
+from weldcal.models.open3d_core import o3d
 
 _SAMPLES_PER_M2 = 6e5  # one in 1.3 mm
 _INSIDE_M = 1e-4
@@ -105,7 +106,7 @@ def fused_model(frames: Iterable[tuple[Array, RigidTransform]], middle: Array, r
     return BodyModel(points[near], normals[near])
 
 
-def _scene(mesh: TriMesh) -> o3d.t.geometry.RaycastingScene:
+def _scene(mesh: TriMesh) -> Any:
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
         o3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32)),

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from scipy.stats import chi2
 
+from weldcal.calibration.geometry.quantiles import chi2_threshold
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.motion.drift.hypotheses import RAMP, RAMP_S, STEP, DriftFilter, FilterConfig
 from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
@@ -102,7 +102,7 @@ class DriftTest:
         tests = 3600.0 * frame_rate_hz * len(self.filter.kind)
         level = min(self.config.false_alarms_per_hour / tests / 4.0, 0.3)
         # of a move with six unknowns, and of a pure translation or rotation
-        self.threshold, self.threshold_alone = float(chi2.isf(level, 6)), float(chi2.isf(level, 3))
+        self.threshold, self.threshold_alone = chi2_threshold(level, 6), chi2_threshold(level, 3)
         turned = np.vstack(
             [np.eye(3), -skew(self._lever)]
         )  # about the scanner's origin: it moves the pivot by rotation x lever
@@ -110,7 +110,7 @@ class DriftTest:
         # a turn about the line of sight shifts the feature least of all: alone, it has one unknown
         about_view = turned @ (self._lever / max(float(np.linalg.norm(self._lever)), 1e-9))[:, None]
         self._alone = tuple(
-            (E, self.threshold / float(chi2.isf(level, E.shape[1]))) for E in (*self._simple, about_view)
+            (E, self.threshold / chi2_threshold(level, E.shape[1])) for E in (*self._simple, about_view)
         )
 
     @property
@@ -297,7 +297,7 @@ class DriftTest:
         c = self.config
         S = cov + np.diag(np.repeat([c.floor_rad**2, c.floor_m**2], 3))
         W = np.linalg.inv(S)
-        limit = float(chi2.isf(_PARSIMONY, 3))
+        limit = chi2_threshold(_PARSIMONY, 3)
         best: tuple[float, str, Array, Array] | None = None
         for name, E in zip(("translation", "rotation"), self._simple, strict=True):
             N = np.linalg.inv(E.T @ W @ E)

@@ -69,7 +69,7 @@ def fit_frustum(points: ArrayLike) -> Frustum:
 
 def _normals(p: Floats) -> Floats:
     """Unit normal (n, 3) at each point from its neighbours, by Open3D."""
-    import open3d as o3d
+    from weldcal.models.open3d_core import o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))

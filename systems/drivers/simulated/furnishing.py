@@ -11,7 +11,10 @@ from weldcal.systems.drivers.simulated.world import Fittings
 
 @dataclass(frozen=True, eq=False)
 class Furnishing:
-    """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild)."""
+    """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
+
+    `contacts_read`: a device reads the plant's contact results.
+    """
 
     fittings: Sequence[Fittings] = ()
     second: PlacedArm | None = None
@@ -19,3 +22,4 @@ class Furnishing:
     profiler: ProfilerFixture | None = None
     time_step_s: float = 0.002  # of the plant: as fine as what is touched asks for
     parts: Sequence[object] = ()
+    contacts_read: bool = False

@@ -6,9 +6,10 @@ from typing import Any, ClassVar
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues
+from pydrake.systems.framework import Context, DiscreteValues
 
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
+from weldcal.models.arms.compiled_kinematics import tick_flange_pose
+from weldcal.models.arms.kinematics import ArmModel, jacobian
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
 from weldcal.models.errors import InputError
@@ -54,6 +55,7 @@ class SpeedJointServo(LeafSystem):
         input_ports:
         - velocity_command
         - arm_state
+        - arm_acceleration
         output_ports:
         - desired_state
         - position_measured
@@ -62,50 +64,77 @@ class SpeedJointServo(LeafSystem):
         - sample_time
         - status
 
-    Inputs: velocity (6) rad/s, arm state (12) rad, rad/s. Outputs depend on the discrete state only: no feedthrough, one tick
-    of latency. Speeds and accelerations above the arm's limits are clamped as by the controller. A reference that differs
+    Inputs: velocity (6) rad/s, arm state (12) rad, rad/s, its acceleration (6) rad/s^2. What is measured is the arm at the end of the
+    plant's step at this tick, so that a sample is not a tick old: the state after one semi-implicit step of ``plant_period_s``. An open
+    `arm_acceleration` says that `arm_state` has made that step already. Outputs depend on the discrete state only: no feedthrough, one
+    tick of latency. Speeds and accelerations above the arm's limits are clamped as by the controller. A reference that differs
     from the arm by more than the following error latches a fault and freezes the reference. With a repeatability above zero
     the measured joints differ from the true ones by a small offset. It is constant while the arm is at rest and is drawn
     anew, from ``seed`` and the number of the stop, when the arm starts to move.
     """
 
-    def __init__(self, arm: ArmModel, config: SimulatedUr, q_start: np.ndarray, seed: int = 0) -> None:
+    def __init__(
+        self,
+        arm: ArmModel,
+        config: SimulatedUr,
+        q_start: np.ndarray,
+        seed: int = 0,
+        plant_period_s: float = 0.002,
+    ) -> None:
         super().__init__()
         self._arm = arm
         self._config = config
         self._seed = seed
+        self._plant_period_s = plant_period_s
         rows = (arm.velocity_limit, arm.acceleration_limit, arm.position_lower, arm.position_upper)
         self._limits = np.array([*rows, np.full(6, config.following_error_rad)])
         offset = self._offset(q_start, 0)
-        own = [*offset, 0.0] if config.repeatability_mm else []
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._arm_state = self.DeclareVectorInputPort("arm_state", 12)
-        # q_ref, v_ref, q, v, sample time, fault; with a repeatability above zero: joint offset of this stop, its number
-        state = self.DeclareDiscreteState(
-            np.concatenate([q_start, np.zeros(6), q_start - offset, np.zeros(6), [0.0, 0.0], own])
-        )
-        ticket = {self.discrete_state_ticket(state)}
-        self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
-        self.DeclareVectorOutputPort("position_measured", 6, self._position, ticket)
-        self.DeclareVectorOutputPort("velocity_measured", 6, self._velocity, ticket)
-        self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, ticket)
-        self.DeclareVectorOutputPort("sample_time", 1, self._time, ticket)
-        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(UrStatus()), self._status, ticket)
+        self._acceleration = self.DeclareVectorInputPort("arm_acceleration", 6)
+        # one group for each port, which Drake then fills without Python
+        self._reference = self.DeclareDiscreteState(np.concatenate([q_start, np.zeros(6)]))
+        self._position = self.DeclareDiscreteState(q_start - offset)
+        self._velocity = self.DeclareDiscreteState(np.zeros(6))
+        self._sampled = self.DeclareDiscreteState(1)
+        self._fault = self.DeclareDiscreteState(1)
+        self._stop = self.DeclareDiscreteState(np.append(offset, 0.0))  # joint offset of this stop, its number
+        self.DeclareStateOutputPort("desired_state", self._reference)
+        self.DeclareStateOutputPort("position_measured", self._position)
+        self.DeclareStateOutputPort("velocity_measured", self._velocity)
+        position, fault = ({self.discrete_state_ticket(group)} for group in (self._position, self._fault))
+        self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, position)
+        self.DeclareStateOutputPort("sample_time", self._sampled)
+        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(UrStatus()), self._status, fault)
         self.DeclarePeriodicDiscreteUpdateEvent(config.control_period_s, 0.0, self._sample)
 
     def _sample(self, context: Context, discrete: DiscreteValues) -> None:
-        new = np.array(context.get_discrete_state_vector().value())
+        now = context.get_time()
         measured = np.array(self._arm_state.Eval(context))
+        if self._acceleration.HasValue(context) and self._plant_steps_at(now):
+            step = self._plant_period_s
+            measured[6:] += step * self._acceleration.Eval(context)
+            measured[:6] += step * measured[6:]
         command = np.array(self._command.Eval(context))
-        starts = _follow(new, measured, command, self._limits, self._config.control_period_s)
-        own = new[26:]
-        if own.size:
+        reference, fault = np.array(discrete.value(self._reference)), np.array(discrete.value(self._fault))
+        starts = _follow(reference, fault, measured, command, self._limits, self._config.control_period_s)
+        discrete.set_value(self._reference, reference)
+        discrete.set_value(self._fault, fault)
+        if self._config.repeatability_mm:
+            stop = np.array(discrete.value(self._stop))
             if starts:
-                own[6] += 1.0
-                own[:6] = self._offset(measured[:6], int(own[6]))
-            measured[:6] -= own[:6]
-        new[12:24], new[24] = measured, context.get_time()
-        discrete.set_value(new)
+                stop[6] += 1.0
+                stop[:6] = self._offset(measured[:6], int(stop[6]))
+                discrete.set_value(self._stop, stop)
+            measured[:6] -= stop[:6]
+        discrete.set_value(self._position, measured[:6])
+        discrete.set_value(self._velocity, measured[6:])
+        discrete.set_value(self._sampled, [now])
+
+    def _plant_steps_at(self, time: float) -> bool:
+        """Whether the plant makes a step at this tick."""
+        steps = time / self._plant_period_s
+        return abs(steps - round(steps)) < 1e-6
 
     def _offset(self, q: np.ndarray, stop: int) -> np.ndarray:
         """Joint offsets (6,) rad that displace the flange by the repeatability (rms) at any arm pose."""
@@ -115,23 +144,11 @@ class SpeedJointServo(LeafSystem):
         sigma = 1e-3 * self._config.repeatability_mm / lever
         return np.asarray(sigma * np.random.default_rng([self._seed, stop]).standard_normal(6))
 
-    def _desired(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[:12])
-
-    def _position(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[12:18])
-
-    def _velocity(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[18:24])
-
     def _pose(self, context: Context, output: Any) -> None:
-        output.set_value(forward_kinematics(self._arm, context.get_discrete_state_vector().value()[12:18]))
-
-    def _time(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[24:25])
+        output.set_value(tick_flange_pose(self._arm, context.get_discrete_state(self._position).value()))
 
     def _status(self, context: Context, output: Any) -> None:
-        fault = bool(context.get_discrete_state_vector().value()[25])
+        fault = bool(context.get_discrete_state(self._fault).value()[0])
         text = (
             "The simulated arm stopped: it did not follow its command, or the command was not finite."
             if fault
@@ -141,23 +158,22 @@ class SpeedJointServo(LeafSystem):
 
 
 @compiled()
-def _follow(state: Array, measured: Array, command: Array, limits: Array, dt: float) -> bool:
-    """Advance reference (6,), its velocity (6,) and the fault at index 25 of the servo's state, in place; whether the arm starts
-    to move.
+def _follow(reference: Array, fault: Array, measured: Array, command: Array, limits: Array, dt: float) -> bool:
+    """Advance the servo's reference (12,), position and velocity, and its fault (1,), in place; whether the arm starts to move.
 
     ``limits`` (5, 6): velocity, acceleration, lower and upper position, following error; rad and s.
     """
     moved, moves = False, False
     for k in range(6):
-        moved = moved or state[6 + k] != 0.0
-        if not np.isfinite(command[k]) or abs(state[k] - measured[k]) > limits[4, k]:
-            state[25] = 1.0
+        moved = moved or reference[6 + k] != 0.0
+        if not np.isfinite(command[k]) or abs(reference[k] - measured[k]) > limits[4, k]:
+            fault[0] = 1.0
     for k in range(6):
-        wanted = 0.0 if state[25] else min(max(command[k], -limits[0, k]), limits[0, k])
+        wanted = 0.0 if fault[0] else min(max(command[k], -limits[0, k]), limits[0, k])
         step = limits[1, k] * dt
-        state[6 + k] += min(max(wanted - state[6 + k], -step), step)
-        state[k] = min(max(state[k] + dt * state[6 + k], limits[2, k]), limits[3, k])
-        moves = moves or state[6 + k] != 0.0
+        reference[6 + k] += min(max(wanted - reference[6 + k], -step), step)
+        reference[k] = min(max(reference[k] + dt * reference[6 + k], limits[2, k]), limits[3, k])
+        moves = moves or reference[6 + k] != 0.0
     return moves and not moved
 
 
@@ -170,9 +186,12 @@ def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
     world = build.require(SimulatedWorld)
     # no draw where it is not needed: the other devices' random numbers stay the same
     seed = int(build.rng.integers(2**32)) if config.repeatability_mm else 0
-    servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start, seed))
+    servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start, seed, world.plant.time_step()))
     servo.set_name("arm_servo")
     build.builder.Connect(world.plant.get_state_output_port(world.arm), servo.GetInputPort("arm_state"))
+    if not world.plant.has_sampled_output_ports():
+        acceleration = world.plant.get_generalized_acceleration_output_port(world.arm)
+        build.builder.Connect(acceleration, servo.GetInputPort("arm_acceleration"))
     build.builder.Connect(servo.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
     build.inputs["arm.velocity_command"] = servo.GetInputPort("velocity_command")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):

@@ -105,18 +105,22 @@ def build_world(
     second: PlacedArm | None = None,
     foot: BaseCircle | None = None,
     surroundings: Surroundings | None = None,
+    contacts_read: bool = False,
 ) -> SimulatedWorld:
     """Build the plant of the station, with the arm at `q_start`, held by implicit joint servos.
 
     Gravity pulls against the arm's `up`. `table` is the pose in B of the table's top, z up.
     A robot driver sets the servos' reference: the simulated controller, or a real arm that the simulated one follows.
     Frame: the world is the robot base B. `workpiece` is the true part (it may differ from its CAD), placed at X_BP.
+    `contacts_read`: a device reads the plant's contact results, which are then those of its last step.
     `second` is another arm; `foot` is the ring of the base mounting, with a mesh finer than a scan resolves.
     """
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
             time_step=time_step_s,
             contact_model="hydroelastic" if profiler is None else "point",
+            # A plant with sampled ports steps in an unrestricted update: at each step Drake would copy the state of the whole Diagram.
+            use_sampled_output_ports=contacts_read,
             discrete_contact_approximation="lagged",  # with `sap` the tip's rest position would depend on the sliding speed
         ),
         builder,

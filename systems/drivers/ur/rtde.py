@@ -6,9 +6,10 @@ from typing import Any, ClassVar
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus
 
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arms.compiled_kinematics import tick_flange_pose
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import controller_address, is_loopback
 from weldcal.systems.drivers.config import DriverConfig
@@ -106,32 +107,40 @@ class UrRtdeArm(LeafSystem):
         found = link.state()
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._process = self.DeclareVectorInputPort("process_on", 1)
-        # q, qd, sample time, desired q, desired qd, arc, codes of the status: numbers only, because an update of abstract state
-        # would make Drake copy and compute everything anew, 500 times a second
-        start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6), [0.0], found.codes])
-        vector = self.DeclareDiscreteState(start)
-        ticket = {self.discrete_state_ticket(vector)}
-        self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
-        self.DeclareVectorOutputPort("position_measured", 6, self._position, ticket)
-        self.DeclareVectorOutputPort("velocity_measured", 6, self._velocity, ticket)
-        self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, ticket)
-        self.DeclareVectorOutputPort("sample_time", 1, self._time, ticket)
-        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(found.status), self._status, ticket)
-        self.DeclareVectorOutputPort("arc_established", 1, self._arc, ticket)
+        # Numbers only, because an update of abstract state would make Drake copy and compute everything anew, 500 times a second.
+        # One group for each port, which Drake then fills without Python.
+        self._desired = self.DeclareDiscreteState(np.concatenate([found.q, np.zeros(6)]))
+        self._position = self.DeclareDiscreteState(found.q)
+        self._velocity = self.DeclareDiscreteState(6)
+        self._sampled = self.DeclareDiscreteState(1)
+        self._arc = self.DeclareDiscreteState(1)
+        self._codes = self.DeclareDiscreteState(found.codes)  # of the status
+        position, codes = ({self.discrete_state_ticket(group)} for group in (self._position, self._codes))
+        self.DeclareStateOutputPort("desired_state", self._desired)
+        self.DeclareStateOutputPort("position_measured", self._position)
+        self.DeclareStateOutputPort("velocity_measured", self._velocity)
+        self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, position)
+        self.DeclareStateOutputPort("sample_time", self._sampled)
+        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(found.status), self._status, codes)
+        self.DeclareStateOutputPort("arc_established", self._arc)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._read)
         self.DeclarePeriodicPublishEvent(send_s, 0.0, self._send)
 
     def _read(self, context: Context, discrete: DiscreteValues) -> None:
         found = self._link.state()
-        old = context.get_discrete_state_vector().value()
         rate = self._clock.rate
         age_s = 0.0 if self._clock.follows else self._clock.pace * rate * found.age_s
-        sampled = max(context.get_time() - age_s, float(old[12]))
+        sampled = max(context.get_time() - age_s, float(discrete.value(self._sampled)[0]))
         qd = found.qd / rate
         ahead = min(context.get_time() + self._period_s - sampled, 0.05)
         desired = np.clip(found.q + ahead * qd, self._arm.position_lower, self._arm.position_upper)
         arc = float(found.arc is None or found.arc)
-        discrete.set_value(np.concatenate([found.q, qd, [sampled], desired, qd, [arc], found.codes]))
+        discrete.set_value(self._desired, np.concatenate([desired, qd]))
+        discrete.set_value(self._position, found.q)
+        discrete.set_value(self._velocity, qd)
+        discrete.set_value(self._sampled, [sampled])
+        discrete.set_value(self._arc, [arc])
+        discrete.set_value(self._codes, found.codes)
 
     def _send(self, context: Context) -> EventStatus:
         wanted = np.array(self._command.Eval(context))
@@ -144,26 +153,11 @@ class UrRtdeArm(LeafSystem):
         self._link.command(self._clock.rate * wanted if moving else np.zeros(6), process)
         return EventStatus.Succeeded()
 
-    def _desired(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[13:25])
-
-    def _position(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[:6])
-
-    def _velocity(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[6:12])
-
     def _pose(self, context: Context, output: Any) -> None:
-        output.set_value(forward_kinematics(self._arm, context.get_discrete_state_vector().value()[:6]))
+        output.set_value(tick_flange_pose(self._arm, context.get_discrete_state(self._position).value()))
 
     def _status(self, context: Context, output: Any) -> None:
-        output.set_value(status_of(tuple(context.get_discrete_state_vector().value()[26:])))
-
-    def _arc(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_discrete_state_vector()[25])
-
-    def _time(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[12:13])
+        output.set_value(status_of(tuple(context.get_discrete_state(self._codes).value())))
 
 
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:

@@ -70,7 +70,12 @@ class Profiler(Job[PlanningContext]):
         error = 1e-3 * p.mounting_translation_mm, float(np.deg2rad(p.mounting_rotation_deg))
         table_z_m = scenario.calibration.table_z_m
         fixture = draw_fixture(drawn_pose(p), *error, job, rng, table_z_m, part, X_BP)
-        return Furnishing(profiler=fixture, time_step_s=fixture.time_step_s, parts=(fixture, fixture.truth))
+        return Furnishing(
+            profiler=fixture,
+            time_step_s=fixture.time_step_s,
+            parts=(fixture, fixture.truth),
+            contacts_read=True,
+        )
 
     def position_error(self, scenario: Scenario, arm: ArmModel, seed: int) -> LeafSystem | None:
         """See Job: adds position errors to a simulated arm; a real arm has its own errors."""

@@ -78,7 +78,7 @@ class Tablet(Job[TabletPlan]):
     ) -> Furnishing:
         """See Job: camera, pen and tablet at their true poses."""
         visit = tablet_fittings(tablet_of(scenario), scenario.wrist_camera, scenario.digitizer, rng)
-        return Furnishing(fittings=(visit,), parts=(visit.tablet, visit.truth))
+        return Furnishing(fittings=(visit,), parts=(visit.tablet, visit.truth), contacts_read=True)
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> TabletPlan:
         """See Job."""

@@ -8,7 +8,8 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, State
 
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arms.compiled_kinematics import tick_flange_pose
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.leaf_system import LeafSystem
@@ -110,7 +111,7 @@ class WeldingVelocityServo(LeafSystem):
                 state.get_mutable_abstract_state(self._state).set_value(report)
             return
         arm = believed_arm(self._calibration, context, self._arm)
-        X_BT = forward_kinematics(arm, self._q.Eval(context)) @ self._tool.X_FT
+        X_BT = tick_flange_pose(arm, self._q.Eval(context)) @ self._tool.X_FT
         arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else WeldingState()

@@ -52,14 +52,18 @@ def new_errors(status: CalibrationStatus, world: Station) -> Array:
 
 
 def test_the_arm_s_errors_are_found_and_its_new_poses_agree_with_new_scans() -> None:
-    world = station(7, scans=16, links=False)
-    before = status_of(world)
-    after = refined_status(before, "joints", load_arm("ur10e"), True)
-    assert after.refinement is not None
-    assert after.refinement.accepted, after.refinement.sentence
-    assert after.refinement.document["kind"] == "joints"
+    """Over three worlds: what one world gains depends on which errors its arm happens to have."""
     floor = 3.0 * (2e-5**2 + 2e-5**2)  # of the world's repeatability and fits, which no calibration takes away
-    plain, refined = (float(np.mean(new_errors(status, world) ** 2)) - floor for status in (before, after))
+    left = np.zeros(2)
+    for seed in (7, 8, 9):
+        world = station(seed, scans=16, links=False)
+        before = status_of(world)
+        after = refined_status(before, "joints", load_arm("ur10e"), True)
+        assert after.refinement is not None
+        assert after.refinement.accepted, after.refinement.sentence
+        assert after.refinement.document["kind"] == "joints"
+        left += [np.mean(new_errors(status, world) ** 2) - floor for status in (before, after)]
+    plain, refined = left
     assert refined < 0.5 * plain
     assert refined_status(before, "none", load_arm("ur10e"), True) is before
 

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from tests.systems.cells import Q_HOME, weld_only_cell
+from tests.systems.cells import Q_HOME, place_servo, weld_only_cell
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.sequencer import JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
@@ -48,11 +48,10 @@ class Welding:
     def arm(self, q: np.ndarray, fault: float = 0.0) -> None:
         station = self.diagram.GetSubsystemByName("station")
         servo = station.GetSubsystemByName("arm_servo").GetMyMutableContextFromRoot(self.root)
-        memory = np.concatenate([q, np.zeros(6), q, np.zeros(6), [0.0, fault]])
-        servo.get_mutable_discrete_state_vector().SetFromVector(memory)
+        place_servo(servo, q, fault=fault)
 
     def person_holds(self) -> None:
-        self.context("operator_panel").get_mutable_discrete_state_vector().SetAtIndex(0, 1.0)
+        self.context("operator_panel").SetDiscreteState(0, [1.0])
 
     @property
     def process_on(self) -> bool:

@@ -46,14 +46,14 @@ def locate_part(
 
 def _about_seam(points: Floats, eye: Floats, seam: DrawnSeam) -> tuple[Floats, Floats]:
     """All of the scan's points (N,3) in the box about the seam, with normals (N,3) towards the eye (3,)."""
-    import open3d
+    from weldcal.models.open3d_core import o3d
 
     reach = REACH_M + 2.0 * MOST_M
     low, high = seam.points_P.min(axis=0) - reach, seam.points_P.max(axis=0) + reach
     points = points[((points > low) & (points < high)).all(axis=1)]
     if len(points) < 20:
         return points, points
-    cloud: Any = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))
+    cloud: Any = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
     normals = np.asarray(cloud.normals)
     return points, normals * np.where(np.sum(normals * (eye - points), axis=1) < 0.0, -1.0, 1.0)[:, None]

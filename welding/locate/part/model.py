@@ -43,12 +43,12 @@ class PartModel:
     """A mesh in frame P, m, prepared for registration."""
 
     def __init__(self, mesh: TriMesh, seed: int = 0) -> None:
-        import open3d
+        from weldcal.models.open3d_core import o3d
 
         self.mesh = mesh
-        tensor: Any = open3d.core.Tensor
+        tensor: Any = o3d.core.Tensor
         self._tensor = tensor
-        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
         self.points, self.normals = mesh.sample(SAMPLES, np.random.default_rng(seed))
         corners, area = mesh.vertices[mesh.triangles], np.linalg.norm(mesh.area_vectors, axis=1)

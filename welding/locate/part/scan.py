@@ -73,7 +73,7 @@ def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) 
     Raises:
         PartNotFound: fewer than `least` points.
     """
-    import open3d
+    from weldcal.models.open3d_core import o3d
 
     if len(points) < least:
         raise PartNotFound(f"The scan has only {len(points)} points: move the part into view.")
@@ -81,10 +81,10 @@ def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) 
     pitch, measured = _pitch(points, rng), points
     if len(points) > FINE_POINTS:
         points = points[np.sort(rng.choice(len(points), FINE_POINTS, replace=False))]
-    cloud: Any = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(14))
+    cloud: Any = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(14))
     few = cloud.voxel_down_sample(COARSE_CELL_M)
-    few.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))
+    few.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
     found = _planes(np.asarray(few.points), np.asarray(few.normals), rng)
     middle = np.median(np.asarray(few.points), axis=0)
     if eye_B is None:

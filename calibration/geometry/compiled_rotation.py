@@ -1,0 +1,24 @@
+"""Rotations and cross products for loops that Numba compiles; se3.py has them for arrays."""
+
+import numpy as np
+
+from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
+
+
+@compiled()
+def cross_rows(J: Array, v: Array, weight: float) -> None:
+    """Set the first three columns of J (3, columns) to -skew(v), v (3,), times the weight: how v turns; the diagonal stays."""
+    J[0, 1], J[0, 2], J[1, 2] = weight * v[2], -weight * v[1], weight * v[0]
+    J[1, 0], J[2, 0], J[2, 1] = -weight * v[2], weight * v[1], -weight * v[0]
+
+
+@compiled()
+def rotation_of(w: Array) -> Array:
+    """Rotation (3, 3) of a rotation vector (3,) rad (Rodrigues)."""
+    angle = np.sqrt(w @ w)
+    S = np.zeros((3, 3))
+    cross_rows(S, w, -1.0)
+    if angle < 1e-4:
+        return np.eye(3) + (1.0 - angle**2 / 6.0) * S + (0.5 - angle**2 / 24.0) * (S @ S)
+    return np.eye(3) + np.sin(angle) / angle * S + (1.0 - np.cos(angle)) / angle**2 * (S @ S)
