@@ -23,6 +23,7 @@ from weldcal.models.arms import ur10e
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.mesh import extrude
+from weldcal.models.scanners import get_scanner
 from weldcal.models.tools.loading import WELDING
 from weldcal.tools.scenarios.new_cell import write_cell
 from weldcal.tools.studies.touch.world import touch_world
@@ -70,6 +71,13 @@ def _bracket(path: Path) -> None:
     from weldcal.tools.studies.part_welds.step_parts import PARTS, write_step
 
     write_step(PARTS["bracket"]().shape, path)
+
+
+def _bracket_scan(path: Path) -> None:
+    from weldcal.tools.studies.parts.scenes import scan_scene, subject
+
+    scene = scan_scene(subject("bracket").mesh, get_scanner("phoxi_m", width=412, height=308), 0)
+    np.savez(path, points_B=scene.cloud_B, eye_B=scene.eye_B)
 
 
 def _scanner(path: Path) -> None:
@@ -154,6 +162,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "fixed_camera.npz": lambda path: _hand_eye(path, "eye_on_base"),
     "two_robots.npz": _two_robots,
     "bracket.step": _bracket,
+    "bracket_scan.npz": _bracket_scan,
     "my_arm.urdf": lambda path: path.write_text(arm_urdf(load_arm("ur10e")), encoding="utf-8"),
     "clamp.stl": lambda path: path.write_text(stl(), encoding="utf-8"),
     "my_tool.yaml": lambda path: shutil.copy(WELDING, path),
