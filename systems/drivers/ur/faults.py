@@ -32,6 +32,7 @@ class Fault(IntEnum):
     PROGRAM_STOPPED = 26
     PROGRAM_PAUSED = 27
     ARC_FAULT = 28
+    ARC_INPUT = 29
     GUARD_REFUSED = 30
     UPLOAD_REFUSED = 31
     CONTROL_REFUSED = 32
@@ -70,6 +71,8 @@ SENTENCES = {
     Fault.PROGRAM_STOPPED: "PROGRAM STOPPED: the program on the controller was stopped; start again.",
     Fault.PROGRAM_PAUSED: "PROGRAM PAUSED: the program on the controller was paused; press Stop, not Play, on the pendant, and start again.",
     Fault.ARC_FAULT: "ARC: the power source reports a fault; look for its message (gas, wire, cooling, no contact), clear it and start again.",
+    Fault.ARC_INPUT: "ARC INPUT: the power source's input reports an arc although the torch is off; look whether somebody else burns it, "
+    "and at the input's wire (robot.arc_input), then start again.",
     Fault.GUARD_REFUSED: "An old command in the controller's registers could not be cleared: close the program that writes them and start again.",
     Fault.UPLOAD_REFUSED: "The controller did not start the guard script: switch it to Remote Control (top right of the pendant), or see its Log tab for an error.",
     Fault.CONTROL_REFUSED: "The controller refused the connection: its registers may be in use by EtherNet/IP or another client; run `weldcal check-robot`.",

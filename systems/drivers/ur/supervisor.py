@@ -24,6 +24,8 @@ GUARD_SILENT_S = 0.08
 OUTPUT_ON_S = 0.020
 # The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after 25.
 OUTPUT_OFF_S = 0.050
+# An arc that is reported while nothing asks for the torch: its input may follow the torch's end by ARC_ENDS_S.
+ARC_ENDS_S, ARC_ON_S = 1.0, 0.010
 PATIENCE_S, HELD_S = 5.0, 0.010  # in lockstep: of the host's time, of the controller's
 FOLLOWING_PATIENCE_S = 30.0  # where the cell waits for the controller too: no time of the host decides
 
@@ -43,6 +45,7 @@ ACTIONS = {
     **{fault: Action.BRAKE for fault in Fault if Fault.COMMAND_LATE <= fault < Fault.PROTECTIVE_STOP},
     **{fault: Action.STOP for fault in Fault if fault >= Fault.PROTECTIVE_STOP},
     Fault.ARC_FAULT: Action.BRAKE,
+    Fault.ARC_INPUT: Action.BRAKE,
 }
 
 
@@ -163,6 +166,7 @@ class Supervisor:
         self._slow_since: float | None = None
         self._asked, self._asked_at = False, -np.inf
         self._off_since: float | None = None
+        self._arc_ends_at, self._arc_since = -np.inf, np.inf
         self.latched = Decision(Action.SEND)
 
     def step(self, now: float, robot: RobotSample, command: Command) -> Decision:
@@ -191,6 +195,8 @@ class Supervisor:
                 return look
         if robot.arc_fault and (command.process or robot.process_asked):
             return Fault.ARC_FAULT, 0.0
+        if self._arc_unasked(robot):
+            return Fault.ARC_INPUT, 0.0
         return self._motion(now, robot, command)
 
     def _link(self, now: float, robot: RobotSample) -> tuple[Fault, float]:
@@ -250,6 +256,19 @@ class Supervisor:
             if robot.robot_time - self._off_since > OUTPUT_OFF_S:
                 return Fault.PROCESS_OUTPUT, 0.0
         return Fault.NONE, 0.0
+
+    def _arc_unasked(self, robot: RobotSample) -> bool:
+        """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the torch."""
+        if robot.arc is None or robot.process_on is None:
+            return False
+        if robot.process_asked or robot.process_on:
+            self._arc_since, self._arc_ends_at = np.inf, robot.robot_time + ARC_ENDS_S
+            return False
+        if not robot.arc:
+            self._arc_since, self._arc_ends_at = np.inf, -np.inf  # it has ended, and does not come back by itself
+            return False
+        self._arc_since = min(self._arc_since, robot.robot_time)
+        return robot.robot_time > self._arc_ends_at and robot.robot_time - self._arc_since >= ARC_ON_S
 
     def _motion(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
         limits = self._limits

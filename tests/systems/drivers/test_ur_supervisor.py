@@ -352,6 +352,33 @@ def test_a_power_sources_fault_ends_the_weld_and_says_nothing_while_no_torch_is_
     assert rig.one().fault is Fault.ARC_FAULT, "latched"
 
 
+def test_an_arc_that_nothing_asks_for_is_a_fault_once_the_last_one_has_had_time_to_end() -> None:
+    def readings(arc: list[bool], torch: list[bool]) -> list[bool]:
+        """Whether each pass of 4 ms is sent, for an input and a torch of these levels."""
+        rig = Rig(process=True)
+        found = []
+        for lit, on in zip(arc, torch, strict=True):
+            rig.command = replace(rig.command, process=on)
+            decision = rig.one(arc=lit, process_on=on, process_asked=on)
+            assert decision.fault in (Fault.NONE, Fault.ARC_INPUT)
+            found.append(decision.action is Action.SEND)
+        return found
+
+    def passes(seconds: float) -> int:
+        return round(seconds / PERIOD_S)
+
+    off, burns = [False] * passes(0.2), [True] * passes(0.2)
+    assert all(readings([False, True, True] * 50, [False] * 150)), "a glitch of 8 ms"
+    assert readings([*off, *burns], [False] * 2 * len(off)).count(False) == len(burns) - 3, "10 ms later"
+    ends = [True] * passes(0.9) + [False] * passes(0.5)
+    assert all(readings([*off, *burns, *ends], [*off, *burns, *[False] * len(ends)])), "an arc may end later than its torch"
+    sticks = [True] * passes(1.2)
+    found = readings([*burns, *sticks], [*burns, *[False] * len(sticks)])
+    assert found.index(False) == pytest.approx(len(burns) + passes(1.0), abs=2)
+    comes_back = [False] * 5 + [True] * 10
+    assert not all(readings([*burns, *comes_back], [*burns, *[False] * 15])), "it does not come back by itself"
+
+
 def test_a_slow_controller_has_longer_deadlines_by_its_own_clock() -> None:
     rig = Rig(LIMITS.slowed(0.25))
     assert rig.passes(2.0) == Decision(Action.SEND)
@@ -364,7 +391,7 @@ def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
     assert all(sentence(fault, 1.0).endswith(".") for fault in SENTENCES)
     seen = {fault for _, fault in OF_THE_SAMPLE} | {fault for _, fault in COMMANDS}
     seen |= {Fault.LINK_STALE, Fault.COMMAND_LATE, Fault.SPEED_SLIDER, Fault.JOINT_LIMIT, Fault.TRACKING}
-    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT}
+    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT, Fault.ARC_INPUT}
     of_the_start = {fault for fault in Fault if fault >= Fault.GUARD_REFUSED}
     assert seen == set(Fault) - of_the_start - {Fault.NONE, Fault.WORKER_DIED}, "every fault is tested here"
     assert seen <= set(ACTIONS)

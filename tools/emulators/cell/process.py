@@ -38,6 +38,15 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 """
 
 
+SOON = (  # what a bridged cell allows its devices, where a played one waits for a slow computer
+    ("  follow: true\n", "  follow: true\n  patience_s: 1.5\n"),
+    ("scan_timeout_s: 60.0", "scan_timeout_s: 2.0"),
+    ("silent_s: 10.0", "silent_s: 1.0"),
+    ("frozen_s: 10.0", "frozen_s: 1.0"),
+    ("late_s: 10.0", "late_s: 1.0"),
+)
+
+
 class NoWorld(WeldcalError):
     """The process that plays the world has not begun."""
 
@@ -76,7 +85,8 @@ class WiredWorld:
 
 @contextmanager
 def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: bool = False) -> Iterator[WiredWorld]:
-    """Play the world at a loopback address for the duration of the block; `bridged`: scanner and camera through bridges.
+    """Play the world at a loopback address for the duration of the block; `bridged`: scanner and camera
+    through bridges, with the short times of SOON after which a device is at fault.
 
     Raises:
         NoWorld: it has not begun.
@@ -92,6 +102,8 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
         passed.mkdir(exist_ok=True)
         for port in (TRIGGER_PORT, STREAM_PORT):
             text = text.replace(f"{host}:{port}", f"{host}:{port + BRIDGED}")
+        for played, soon in SOON:
+            text = text.replace(played, soon)
     paths["cell.yaml"].write_text(text.replace(PLAYED_SCANS, str(passed if bridged else scans)), encoding="utf-8")
     paths["world.yaml"].write_text(WORLD, encoding="utf-8")
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(paths["world.yaml"])]
