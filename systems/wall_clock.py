@@ -15,7 +15,7 @@ SLOWEST = 0.1
 # The servo needs pictures and detections: where this computer makes them late the path is slowed too.
 PICTURE_LATE_S, PICTURE_SPAN_S = 0.025, 0.100
 # A robot that waits for this computer's next velocity does not move its time: go on after this time of the wall clock.
-ROBOT_STANDS_S, ROBOT_LOOK_S = 0.020, 0.0005
+ROBOT_STANDS_S, ROBOT_LOOK_S = 0.100, 0.0005
 STOPPED = 0.02  # the rate at which a held path stands: at 1 rad/s the arm stops within a step of the slew limit
 
 
@@ -93,6 +93,10 @@ class WallClock:
         found = cls(1.0, robot_time, wait)
         found.follows = True
         return found
+
+    def now(self) -> float:
+        """Time of the clock that is waited for: the host's, or the robot's that is followed."""
+        return self._clock()
 
     @property
     def stands(self) -> bool:

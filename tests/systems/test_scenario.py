@@ -314,7 +314,6 @@ robot: !UrRtde
   pace: 0.5
   lockstep: true
   follow: true
-  patience_s: 2.0
   velocity_share: 0.3
   upper_registers: false
   payload_kg: 2.0

@@ -13,6 +13,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Frame, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.cell_time import cell_time
 from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
 from weldcal.systems.drivers.sensors.watch import watch
@@ -155,6 +156,7 @@ def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild
         DeviceFault: the scanner does not answer.
     """
     acquisition = acquire(config, source)
+    acquisition.time = cell_time(build)
     acquisition.start(start_s, first_frame=config.streams)
     watch(build, acquisition, "scanner")
     if config.streams:

@@ -17,7 +17,7 @@ from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
-from weldcal.systems.drivers.ur.supervisor import FOLLOWING_PATIENCE_S, HELD_S, PATIENCE_S, Limits
+from weldcal.systems.drivers.ur.supervisor import Limits
 from weldcal.systems.wall_clock import WallClock
 
 FULL_PACE = 1.0
@@ -37,8 +37,6 @@ class UrRtde(DriverConfig):
     lockstep: bool = False  # only for the emulator: its time waits for this computer
     # only for an emulator in lockstep: the cell's time waits for it too, as for a world of its own
     follow: bool = False
-    # only for an emulator in lockstep: for so long (s of this computer) it may say nothing; null: 5, and 30 with follow
-    patience_s: float | None = None
     velocity_share: float = 0.6  # of the arm's limits; a faster command is refused
     upper_registers: bool | None = None  # from 24 on (fieldbuses use those from 0 on); null: true
     payload_kg: float = 1.4  # of the welding tool
@@ -61,8 +59,7 @@ class UrRtde(DriverConfig):
         ).slowed(self.pace)
         if not self.lockstep:
             return limits
-        patience_s = self.patience_s or (FOLLOWING_PATIENCE_S if self.follow else PATIENCE_S)
-        return limits.in_lockstep(patience_s, held_s=0.0 if self.follow else HELD_S)
+        return limits.following() if self.follow else limits.in_lockstep()
 
     def torch_delay_s(self) -> float:
         """The time of gas before the torch, where a valve is wired."""
@@ -184,10 +181,6 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     if config.follow and not config.lockstep:
         raise InputError(
             "robot.follow needs robot.lockstep: only an emulator that waits for this computer may be waited for."
-        )
-    if config.patience_s is not None and not (config.lockstep and 0.1 <= config.patience_s <= 60.0):
-        raise InputError(
-            f"robot.patience_s must be from 0.1 to 60 and needs robot.lockstep; it is {config.patience_s:g}: remove it for a robot."
         )
     if config.process_output is not None and not 0 <= config.process_output < N_OUTPUTS:
         raise InputError(

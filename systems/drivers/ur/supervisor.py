@@ -28,6 +28,7 @@ OUTPUT_OFF_S = 0.050
 ARC_ENDS_S, ARC_ON_S = 1.0, 0.010
 PATIENCE_S, HELD_S = 5.0, 0.010  # in lockstep: of the host's time, of the controller's
 FOLLOWING_PATIENCE_S = 30.0  # where the cell waits for the controller too: no time of the host decides
+COMMAND_S, BLIND_COMMANDS = 0.004, 25  # period of the cell's commands, of its time; 0.1 s without a state
 
 
 class Action(IntEnum):
@@ -69,6 +70,8 @@ class Limits:
     position_margin: float = 0.02
     # a moving command that is older is not sent again; in lockstep the controller waits for the next
     hold_s: float = np.inf
+    # commands that may be given while the robot's time stands still, where the cell follows it
+    blind_commands: float = np.inf
 
     @property
     def waits(self) -> bool:
@@ -99,6 +102,16 @@ class Limits:
             jump_s=max(self.jump_s, patience_s),
             hold_s=held_s / self.pace,
         )
+
+
+    def following(self) -> Limits:
+        """The limits for an emulated controller in lockstep that the cell follows: no time of the host decides."""
+        return replace(self.in_lockstep(FOLLOWING_PATIENCE_S, held_s=0.0), blind_commands=BLIND_COMMANDS)
+
+    @property
+    def follows(self) -> bool:
+        """Whether the cell follows the controller's time."""
+        return bool(np.isfinite(self.blind_commands))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,17 +180,20 @@ class Supervisor:
         self._asked, self._asked_at = False, -np.inf
         self._off_since: float | None = None
         self._arc_ends_at, self._arc_since = -np.inf, np.inf
+        self._seen_time, self._seen_number = -np.inf, 0
         self.latched = Decision(Action.SEND)
 
     def step(self, now: float, robot: RobotSample, command: Command) -> Decision:
         """Compute the decision of this pass. `now` is host time, s."""
+        if robot.robot_time != self._seen_time:
+            self._seen_time, self._seen_number = robot.robot_time, command.number
         if self.latched.fault is Fault.NONE:
             fault, detail = self._look(now, robot, command)
             if fault is not Fault.NONE:
                 self.latched = Decision(ACTIONS[fault], fault, detail)
         elif self.latched.action is not Action.LEAVE:
             # a link failure during braking overrides the latched fault
-            fault, detail = self._link(now, robot)
+            fault, detail = self._link(now, robot, command)
             if fault is not Fault.NONE:
                 self.latched = Decision(Action.LEAVE, self.latched.fault, self.latched.detail)
         self._last, self._command, self._stepped_at = robot, command, now
@@ -190,7 +206,7 @@ class Supervisor:
         self._reference = None
 
     def _look(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
-        for look in (self._link(now, robot), self._safety(robot), self._program(robot), self._output(robot)):
+        for look in (self._link(now, robot, command), self._safety(robot), self._program(robot), self._output(robot)):
             if look[0] is not Fault.NONE:
                 return look
         if robot.arc_fault and (command.process or robot.process_asked):
@@ -199,12 +215,14 @@ class Supervisor:
             return Fault.ARC_INPUT, 0.0
         return self._motion(now, robot, command)
 
-    def _link(self, now: float, robot: RobotSample) -> tuple[Fault, float]:
+    def _link(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
         limits, last = self._limits, self._last
         if not robot.connected:
             return Fault.LINK_CLOSED, 0.0
         if now - robot.fresh_at > (limits.stale_process_s if self._command.process else limits.stale_s):
             return Fault.LINK_STALE, 1e3 * (now - robot.fresh_at)
+        if (blind := command.number - self._seen_number) > limits.blind_commands:
+            return Fault.LINK_STALE, 1e3 * COMMAND_S * blind
         if last is not None and robot.robot_time != last.robot_time:
             passed = robot.robot_time - last.robot_time
             expected = limits.pace * (robot.fresh_at - last.fresh_at)

@@ -30,6 +30,7 @@ ACCELERATION = 40.0  # rad/s^2 of speedj: the cell ramps the stream, the control
 LATE_PASS_S = 0.020
 REST_RAD_S = 1e-3
 STOP_LIMIT_S = 2.0
+RESTS_S = 5.0  # for which an arm at rest waits for a cell that computes
 LEFT = 3  # exit code of a worker that exited because of the link
 
 
@@ -152,7 +153,9 @@ class Worker:
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
             old = command.number == self._driven and now - command.given_at > self._config.limits.hold_s
-            if command.qd.any() and old:
+            # a cell that follows the controller is waited for at rest too, so that its devices' time is its own
+            waited_for = self._config.limits.follows and now - command.given_at < RESTS_S
+            if old and (command.qd.any() or waited_for):
                 return  # the controller waits for the cell's next command
             self._driven = command.number
             # while the cell computes without a limit the arm may stay at rest, but the process is not enabled

@@ -10,6 +10,8 @@ import pytest
 from weldcal.systems.drivers.ur.faults import SENTENCES, Fault, sentence
 from weldcal.systems.drivers.ur.supervisor import (
     ACTIONS,
+    BLIND_COMMANDS,
+    COMMAND_S,
     NORMAL,
     OBEYING,
     PAUSED,
@@ -371,7 +373,9 @@ def test_an_arc_that_nothing_asks_for_is_a_fault_once_the_last_one_has_had_time_
     assert all(readings([False, True, True] * 50, [False] * 150)), "a glitch of 8 ms"
     assert readings([*off, *burns], [False] * 2 * len(off)).count(False) == len(burns) - 3, "10 ms later"
     ends = [True] * passes(0.9) + [False] * passes(0.5)
-    assert all(readings([*off, *burns, *ends], [*off, *burns, *[False] * len(ends)])), "an arc may end later than its torch"
+    assert all(readings([*off, *burns, *ends], [*off, *burns, *[False] * len(ends)])), (
+        "an arc may end later than its torch"
+    )
     sticks = [True] * passes(1.2)
     found = readings([*burns, *sticks], [*burns, *[False] * len(sticks)])
     assert found.index(False) == pytest.approx(len(burns) + passes(1.0), abs=2)
@@ -384,6 +388,17 @@ def test_a_slow_controller_has_longer_deadlines_by_its_own_clock() -> None:
     assert rig.passes(2.0) == Decision(Action.SEND)
     assert rig.passes(0.31, state=False, commands=False) == Decision(Action.SEND)
     assert rig.passes(0.02, state=False, commands=False).fault is Fault.LINK_STALE
+
+
+def test_a_followed_controller_is_judged_by_the_commands_that_it_lets_pass_and_not_by_the_host() -> None:
+    slow = Rig(LIMITS.following())
+    assert slow.passes(20.0, state=False, commands=False) == Decision(Action.SEND), "neither goes on"
+    rig = Rig(LIMITS.following())
+    assert rig.passes(1.0) == Decision(Action.SEND)
+    found = [rig.one(state=False) for _ in range(60)]
+    named = [decision.fault for decision in found]
+    assert named.index(Fault.LINK_STALE) == pytest.approx(2 * BLIND_COMMANDS, abs=2), "a command in every second pass"
+    assert found[-1].detail == pytest.approx(1e3 * COMMAND_S * (BLIND_COMMANDS + 1))
 
 
 def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:

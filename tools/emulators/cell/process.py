@@ -27,7 +27,7 @@ WORLD = """\
 description: A straight groove whose scanner stands where the drawing has it.
 robot: !SimulatedUr {}
 scanner: !RenderedScanner
-  {preset: ideal, width: 824, height: 616, mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0}
+  {preset: ideal, mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0, width: 824, height: 616}
 finger_camera: !RenderedFingerCamera {}
 workpiece:
   shape: straight
@@ -38,9 +38,10 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 """
 
 
-SOON = (  # what a bridged cell allows its devices, where a played one waits for a slow computer
-    ("  follow: true\n", "  follow: true\n  patience_s: 1.5\n"),
+PLAYED_PIXELS, SMALL_PIXELS = (824, 616), (412, 308)
+SOON = (  # what a bridged cell allows its devices
     ("scan_timeout_s: 60.0", "scan_timeout_s: 2.0"),
+    ("width: 824\n  height: 616", "width: 412\n  height: 308"),
     ("silent_s: 10.0", "silent_s: 1.0"),
     ("frozen_s: 10.0", "frozen_s: 1.0"),
     ("late_s: 10.0", "late_s: 1.0"),
@@ -66,11 +67,8 @@ class WiredWorld:
     @contextmanager
     def control(self) -> Iterator[Emulator]:
         """A connection to the controller's control channel, for one thread."""
-        emulator = Emulator(self.process, self.host, CONTROL_PORT)
-        try:
+        with _controller(self.process, self.host) as emulator:
             yield emulator
-        finally:
-            emulator.leave()
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """One request to the controller's control channel."""
@@ -105,7 +103,8 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
         for played, soon in SOON:
             text = text.replace(played, soon)
     paths["cell.yaml"].write_text(text.replace(PLAYED_SCANS, str(passed if bridged else scans)), encoding="utf-8")
-    paths["world.yaml"].write_text(WORLD, encoding="utf-8")
+    small = WORLD.replace(*(f"width: {w}, height: {h}" for w, h in (PLAYED_PIXELS, SMALL_PIXELS)))
+    paths["world.yaml"].write_text(small if bridged else WORLD, encoding="utf-8")
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(paths["world.yaml"])]
     command += ["--cell", str(paths["wires.yaml"]), "--seed", str(seed), "--truth", str(paths["truth.json"])]
     command += ["--parent", str(os.getpid())]
@@ -122,11 +121,22 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
         bridges: dict[str, Bridge] = {}
         if bridged:
             trigger, stream = (host, TRIGGER_PORT), (host, STREAM_PORT)
-            bridges["scanner"] = ScannerBridge((host, TRIGGER_PORT + BRIDGED), trigger, scans, passed)
-            bridges["finger camera"] = PictureBridge((host, STREAM_PORT + BRIDGED), stream)
+            clocks = [stack.enter_context(_controller(process, host)) for _ in range(2)]  # one for each thread
+            trigger_clock, stream_clock = (lambda clock=clock: float(clock.ask(ask="time")["timestamp"]) for clock in clocks)  # type: ignore[misc]  # fmt: skip
+            bridges["scanner"] = ScannerBridge((host, TRIGGER_PORT + BRIDGED), trigger, scans, passed, trigger_clock)
+            bridges["finger camera"] = PictureBridge((host, STREAM_PORT + BRIDGED), stream, stream_clock)
             for bridge in bridges.values():
                 stack.callback(bridge.close)
         yield WiredWorld(process, host, paths["cell.yaml"], paths["truth.json"], children[0], children[-1], bridges)
+
+
+@contextmanager
+def _controller(process: subprocess.Popen[str], host: str) -> Iterator[Emulator]:
+    emulator = Emulator(process, host, CONTROL_PORT)
+    try:
+        yield emulator
+    finally:
+        emulator.leave()
 
 
 def _end(process: subprocess.Popen[str], children: list[int]) -> None:

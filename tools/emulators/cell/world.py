@@ -40,7 +40,7 @@ START_LIMIT_S = 120.0
 WAITS_S = 30.0  # for a cell that is late, of the host
 REST_RAD_S = 1e-3
 RESTS_S = 0.2
-CAMERA_LIMIT_S = 1.0  # of the host: a camera that does not answer is not waited for longer
+CAMERA_LIMIT_S = 10.0  # of the host: a camera that does not answer is not waited for longer
 Truth = dict[str, object]
 
 

@@ -37,10 +37,10 @@ NAMES = {
 CALIBRATES = (
     "job: {calibrate: true, weld: false}\ncalibration: {minimum_scans: 4, maximum_scans: 6, required_error_mm: 1.0}\n"
 )
-OF_THE_LINK: dict[str, tuple[str, dict[str, float]]] = {
+OF_THE_LINK: dict[str, tuple[str, dict[str, object]]] = {
     "killed": ("close_tcp", {}),
     "frozen": ("half_open", {}),
-    "delayed": ("delay", {"seconds": 2.0}),
+    "delayed": ("delay", {"seconds": 2.0, "clock": "controller"}),
     "garbage": ("corrupt", {"n": 50}),
 }
 ESTABLISHED_S = 0.3  # for which the arc is established before a fault of the phase "weld"
@@ -127,6 +127,7 @@ def run_job(
         "fault": "" if happening is None else happening.fault,
         "phase": "" if happening is None else happening.phase,
         "job": "calibrate" if calibrates else "weld",
+        "thrown": thrown[0] > 0.0,
         "state": result.state,
         "reason": reason,
         "rest_after_s": measured.get("rest_after_s"),

@@ -165,6 +165,8 @@ class ControlServer(Server):
                 "overruns": self._world.overruns,
                 "lockstep": self._lockstep.state(),
             }
+        if request.get("ask") == "time":
+            return {"timestamp": self._controller.timestamp}
         if request.get("ask") == "log":
             return {"log": list(self._controller.log)}
         if request.get("ask") == "program":
@@ -196,6 +198,7 @@ class ControlServer(Server):
             delay_s=_number(request, "seconds"),
             jitter_s=_number(request, "jitter", 0.0),
             delay_until=now + _number(request, "for", math.inf),
+            delay_clock=(lambda: self._controller.timestamp) if request.get("clock") == "controller" else None,
         )
 
     def _freeze(self, request: Request, now: float) -> None:
