@@ -52,6 +52,12 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 """
 
 
+ARC_INPUTS = "  arc_fault_input: 1\n"
+SET_POINTS = """  wire_feed: {output: 0, unit: V, at_zero: 1.0, at_full: 22.0, value: 8.0}
+  arc_voltage: {output: 1, unit: mA, at_zero: 10.0, at_full: 40.0, value: 21.5}
+"""
+
+
 @dataclass
 class Played:
     """A world that plays a cell's devices: its process, those of its devices, the cell's scenario and the truth file."""
@@ -94,6 +100,8 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
     cell, world, truth = folder / "cell.yaml", folder / "world.yaml", folder / "truth.json"
     text = (SCENARIO_FOLDER / "wired_straight_groove.yaml").read_text()
     text = text.replace("127.30.0.1", host).replace("/tmp/weldcal-cell/scans", str(folder / "scans"))
+    assert ARC_INPUTS in text
+    text = text.replace(ARC_INPUTS, ARC_INPUTS + SET_POINTS)
     cell.write_text(text.replace("pace: 0.5", "pace: 1.0") + WELD_ONLY + "\n")
     world.write_text(WORLD)
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(world)]
@@ -133,6 +141,8 @@ def test_the_job_is_done_and_the_truth_file_says_how_well(welded: tuple[DemoResu
     assert 0.95 * SEAM_MM <= truth["welded_mm"] <= SEAM_MM + 8.0
     assert truth["arc_on_s"] == pytest.approx(truth["welded_mm"] / 8.0, abs=0.5)
     assert np.array(truth["X_BC"])[:3, 3] == pytest.approx([0.65, 0.0, 0.95])
+    # what the power source made of the analog outputs while its arc burned: without them there is no arc
+    assert truth["set_points"] == pytest.approx({"wire_feed": 8.0, "arc_voltage": 21.5})
 
 
 def test_the_cell_knows_nothing_of_the_truth(welded: tuple[DemoResult, dict[str, Any]]) -> None:

@@ -18,6 +18,7 @@ from weldcal.systems.drivers.ur.link import UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.supervisor import Limits
+from weldcal.systems.drivers.ur.torch.set_points import SETTLES_S, AnalogSetPoint, levels_of
 from weldcal.systems.wall_clock import WallClock
 
 FULL_PACE = 1.0
@@ -51,6 +52,10 @@ class UrRtde(DriverConfig):
     gas_output: int | None = None
     gas_before_s: float = 0.5
     gas_after_s: float = 1.0
+    # the power source's wire feed at an analog output of the controller; null: not wired. A set point needs process_output and
+    # arc_input, and is given after the gas and before the torch
+    wire_feed: AnalogSetPoint | None = None
+    arc_voltage: AnalogSetPoint | None = None  # the same for its voltage
 
     def limits(self, arm: ArmModel) -> Limits:
         """The limits against which the worker checks commands."""
@@ -62,8 +67,9 @@ class UrRtde(DriverConfig):
         return limits.following() if self.follow else limits.in_lockstep()
 
     def torch_delay_s(self) -> float:
-        """The time of gas before the torch, where a valve is wired."""
-        return 0.0 if self.gas_output is None else self.gas_before_s
+        """The time of gas before the torch, where a valve is wired, and of the set points, where there are some."""
+        points_s = 0.0 if self.wire_feed is None and self.arc_voltage is None else SETTLES_S
+        return points_s + (0.0 if self.gas_output is None else self.gas_before_s)
 
     def load(self, owner: str = "the scenario") -> ExpectedLoad:
         """The payload with which the pre-flight compares the controller's."""
@@ -198,6 +204,9 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
             raise InputError("robot.gas_output and robot.process_output must be two outputs.")
         if not (0.0 <= config.gas_before_s <= 10.0 and 0.0 <= config.gas_after_s <= 10.0):
             raise InputError("robot.gas_before_s and robot.gas_after_s must be from 0 to 10.")
+    levels = levels_of(config.wire_feed, config.arc_voltage)
+    if levels and (config.process_output is None or config.arc_input is None):
+        raise InputError("robot.wire_feed and robot.arc_voltage need process_output and arc_input.")
     report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load())
     require_ready(report)
     arm = report.arm
@@ -218,6 +227,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         gas_output=config.gas_output,
         gas_before_s=config.gas_before_s,
         gas_after_s=config.gas_after_s,
+        levels=levels,
     )
     clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
     return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)

@@ -9,6 +9,7 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.torch.set_points import apart
 
 NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
 SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7
@@ -24,6 +25,8 @@ GUARD_SILENT_S = 0.08
 OUTPUT_ON_S = 0.020
 # The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after 25.
 OUTPUT_OFF_S = 0.050
+# The guard writes the analog outputs in every frame, too.
+SET_POINT_S = 0.050
 # An arc that is reported while nothing asks for the torch: its input may follow the torch's end by ARC_ENDS_S.
 ARC_ENDS_S, ARC_ON_S = 1.0, 0.010
 PATIENCE_S, HELD_S = 5.0, 0.010  # in lockstep: of the host's time, of the controller's
@@ -47,6 +50,7 @@ ACTIONS = {
     **{fault: Action.STOP for fault in Fault if fault >= Fault.PROTECTIVE_STOP},
     Fault.ARC_FAULT: Action.BRAKE,
     Fault.ARC_INPUT: Action.BRAKE,
+    Fault.SET_POINT: Action.BRAKE,
 }
 
 
@@ -103,7 +107,6 @@ class Limits:
             hold_s=held_s / self.pace,
         )
 
-
     def following(self) -> Limits:
         """The limits for an emulated controller in lockstep that the cell follows: no time of the host decides."""
         return replace(self.in_lockstep(FOLLOWING_PATIENCE_S, held_s=0.0), blind_commands=BLIND_COMMANDS)
@@ -136,6 +139,8 @@ class RobotSample:
     process_asked: bool = False  # whether the newest number that the guard script has read asks for it
     arc: bool | None = None  # established; None where the input is not wired
     arc_fault: bool = False  # the power source reports a fault
+    # of each set point: what the guard script gives its analog output, and what the output shows
+    set_points: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +153,7 @@ class Command:
     stop: bool = False
     orphaned: bool = False  # the cell's process has ended
     process: bool = False  # the process output is enabled
+    armed: bool = False  # the set points of the power source are given
     scale: float = 1.0  # of the velocity while the command is late
 
     @property
@@ -179,6 +185,7 @@ class Supervisor:
         self._slow_since: float | None = None
         self._asked, self._asked_at = False, -np.inf
         self._off_since: float | None = None
+        self._apart_since: float | None = None
         self._arc_ends_at, self._arc_since = -np.inf, np.inf
         self._seen_time, self._seen_number = -np.inf, 0
         self.latched = Decision(Action.SEND)
@@ -209,6 +216,8 @@ class Supervisor:
         for look in (self._link(now, robot, command), self._safety(robot), self._program(robot), self._output(robot)):
             if look[0] is not Fault.NONE:
                 return look
+        if (found := self._set_points(robot)) is not None:
+            return Fault.SET_POINT, found
         if robot.arc_fault and (command.process or robot.process_asked):
             return Fault.ARC_FAULT, 0.0
         if self._arc_unasked(robot):
@@ -274,6 +283,15 @@ class Supervisor:
             if robot.robot_time - self._off_since > OUTPUT_OFF_S:
                 return Fault.PROCESS_OUTPUT, 0.0
         return Fault.NONE, 0.0
+
+    def _set_points(self, robot: RobotSample) -> float | None:
+        """The share (%) that an analog output shows in place of what the guard gives it, of one package; None: as it should."""
+        wrong = [shown for asked, shown in robot.set_points if apart(asked, shown)]
+        if not wrong:
+            self._apart_since = None
+            return None
+        self._apart_since = robot.robot_time if self._apart_since is None else self._apart_since
+        return 100.0 * wrong[0] if robot.robot_time - self._apart_since > SET_POINT_S else None
 
     def _arc_unasked(self, robot: RobotSample) -> bool:
         """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the torch."""

@@ -354,6 +354,19 @@ def test_a_power_sources_fault_ends_the_weld_and_says_nothing_while_no_torch_is_
     assert rig.one().fault is Fault.ARC_FAULT, "latched"
 
 
+def test_a_set_point_that_its_output_does_not_show_is_a_fault_and_a_late_output_is_none() -> None:
+    rig = Rig(process=True)
+    right, wrong = {"set_points": ((0.4, 0.405), (0.0, 0.0))}, {"set_points": ((0.4, 0.4), (0.0, 0.5))}
+    assert rig.one(**right) == Decision(Action.SEND)
+    assert all(rig.one(**wrong) == Decision(Action.SEND) for _ in range(13))
+    assert rig.one(**right) == Decision(Action.SEND)
+    found = [rig.one(**wrong) for _ in range(14)]
+    assert {decision.action for decision in found[:-1]} == {Action.SEND}
+    assert (found[-1].action, found[-1].fault, found[-1].detail) == (Action.BRAKE, Fault.SET_POINT, 50.0)
+    changed = Rig()
+    assert [changed.one(set_points=((0.0, np.nan),)) for _ in range(14)][-1].fault is Fault.SET_POINT, "another range"
+
+
 def test_an_arc_that_nothing_asks_for_is_a_fault_once_the_last_one_has_had_time_to_end() -> None:
     def readings(arc: list[bool], torch: list[bool]) -> list[bool]:
         """Whether each pass of 4 ms is sent, for an input and a torch of these levels."""
@@ -406,7 +419,7 @@ def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
     assert all(sentence(fault, 1.0).endswith(".") for fault in SENTENCES)
     seen = {fault for _, fault in OF_THE_SAMPLE} | {fault for _, fault in COMMANDS}
     seen |= {Fault.LINK_STALE, Fault.COMMAND_LATE, Fault.SPEED_SLIDER, Fault.JOINT_LIMIT, Fault.TRACKING}
-    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT, Fault.ARC_INPUT}
+    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT, Fault.ARC_INPUT, Fault.SET_POINT}
     of_the_start = {fault for fault in Fault if fault >= Fault.GUARD_REFUSED}
     assert seen == set(Fault) - of_the_start - {Fault.NONE, Fault.WORKER_DIED}, "every fault is tested here"
     assert seen <= set(ACTIONS)

@@ -39,12 +39,9 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 
 
 PLAYED_PIXELS, SMALL_PIXELS = (824, 616), (412, 308)
-SOON = (  # what a bridged cell allows its devices
+SOON = (  # small scans, and what a bridged cell allows for one, s of the world
     ("scan_timeout_s: 60.0", "scan_timeout_s: 2.0"),
     ("width: 824\n  height: 616", "width: 412\n  height: 308"),
-    ("silent_s: 10.0", "silent_s: 1.0"),
-    ("frozen_s: 10.0", "frozen_s: 1.0"),
-    ("late_s: 10.0", "late_s: 1.0"),
 )
 
 
@@ -84,7 +81,7 @@ class WiredWorld:
 @contextmanager
 def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: bool = False) -> Iterator[WiredWorld]:
     """Play the world at a loopback address for the duration of the block; `bridged`: scanner and camera
-    through bridges, with the short times of SOON after which a device is at fault.
+    through bridges, with small scans and a short limit for each.
 
     Raises:
         NoWorld: it has not begun.

@@ -21,6 +21,7 @@ from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamer
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
 from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -41,6 +42,7 @@ WAITS_S = 30.0  # for a cell that is late, of the host
 REST_RAD_S = 1e-3
 RESTS_S = 0.2
 CAMERA_LIMIT_S = 10.0  # of the host: a camera that does not answer is not waited for longer
+SET_POINTS = ("wire_feed", "arc_voltage")  # keys of the cell's robot
 Truth = dict[str, object]
 
 
@@ -58,6 +60,7 @@ class Wires:
     folder: Path
     trigger: tuple[str, int]
     stream: tuple[str, int]
+    set_points: Mapping[str, AnalogSetPoint]
 
 
 def wires_of(cell: Scenario) -> Wires:
@@ -90,6 +93,7 @@ def wires_of(cell: Scenario) -> Wires:
         Path(scanner.folder),
         (loopback_address(trigger.hostname or ""), trigger.port or 0),
         (loopback_address(stream.hostname or ""), stream.port or 0),
+        {name: point for name in SET_POINTS if (point := getattr(robot, name)) is not None},
     )
 
 
@@ -117,21 +121,27 @@ class _World:
         self._pictures: deque[tuple[float, tuple[float, Array]]] = deque()
         self._programs = controller.script_count
         self._rests_s, self._dirty = 0.0, True
+        self._given: dict[str, float] = {}
 
     def step(self, now: float) -> None:
         """One frame of the world, after the controller's."""
         c, physics, wires = self._controller, self._physics, self._wires
         enabled = wires.process_output is not None and bool(c.terminals.digital_outputs >> wires.process_output & 1)
         burned = self._arc.burns
-        self._arc.step(enabled, STEP_S)
+        shares = {name: c.terminals.analog_outputs[point.output] for name, point in wires.set_points.items()}
+        self._arc.step(enabled, STEP_S, all(share > 0.0 for share in shares.values()))
         burns, fault = self._wire.step(physics.time_s, self._arc.burns, self._arc.fault)
         self._set_input(wires.arc_input, burns)
         self._set_input(wires.fault_input, fault)
         if c.script_count != self._programs:
             if not c.terminals.digital_outputs and c.program is not None and c.program.kind != "sec":
                 physics.forget()
+                self._given = {}
             self._programs = c.script_count
         physics.step(c.arm.q, c.arm.qd, self._arc)
+        if self._arc.burns and shares:
+            points = wires.set_points
+            self._given = {n: p.at_zero + shares[n] * (p.at_full - p.at_zero) for n, p in points.items()}
         self._expose()
         self.answer_scanner()
         rests = float(np.abs(c.arm.qd).max()) < REST_RAD_S
@@ -151,7 +161,8 @@ class _World:
         """Write the truth as it is now."""
         self._dirty = False
         rests = float(np.abs(self._controller.arm.qd).max()) < REST_RAD_S
-        self._write(score(self._physics, self._wanted_m, arc_burns=self._arc.burns, at_rest=rests))
+        found = score(self._physics, self._wanted_m, arc_burns=self._arc.burns, at_rest=rests)
+        self._write(found | ({"set_points": self._given} if self._wires.set_points else {}))
 
     def _set_input(self, n: int | None, on: bool) -> None:
         if n is not None:
