@@ -1,6 +1,7 @@
 """Acquisition: a worker thread that opens a device, takes its frames, reconnects, and knows at any time what is wrong."""
 
 import threading
+import time
 import weakref
 import zlib
 from collections.abc import Callable
@@ -153,7 +154,7 @@ class Acquisition(Generic[Datum]):
         self._seen = _Seen()
         self._read = self._wanted = self._number = 0
         self._wanted_at = 0.0
-        self._excused = 0.0
+        self._excused, self._excused_at = 0.0, float("-inf")
         self._print: int | None = None
         self._device_number: int | None = None
         self.time: CellTime = HostTime()  # before `start`: another one
@@ -230,8 +231,9 @@ class Acquisition(Generic[Datum]):
         return found
 
     def excuse(self, seconds: float) -> None:
-        """Do not count this time, in which nobody could read, as the device's silence."""
+        """Do not count this time, in which nobody could read, as the device's silence, nor its frames as late."""
         self._excused += seconds
+        self._excused_at, self._seen.late_s = time.monotonic(), 0.0
 
     def fault(self, now: float) -> str | None:
         """What is wrong with the device at `now` (s, of `time`), as a sentence; None where nothing is. Never waits."""
@@ -350,7 +352,7 @@ class Acquisition(Generic[Datum]):
             found = _print_of(d.datum)
             seen.same_since = (seen.same_since or seen.good_at) if found == self._print else None
             self._print = found
-        seen.late_s = stamp.late_s
+        seen.late_s = 0.0 if stamp.captured < self._excused_at else stamp.late_s
         if stamp.clock != "arrival":
             seen.latency = (*seen.latency[-99:], d.arrived - stamp.captured)
         seen.trouble = ""

@@ -24,7 +24,7 @@ class Watched(Protocol):
         """What is wrong at `now` (s, of `time`), as a sentence; None where nothing is. Never waits."""
 
     def excuse(self, seconds: float) -> None:
-        """Do not count this time, in which nobody could read, as the device's silence."""
+        """Do not count this time, in which nobody could read, as the device's silence, nor its frames as late."""
 
     def close(self) -> None:
         """Disconnect; a second call has no effect."""
