@@ -73,6 +73,7 @@ class WallClock:
         self.lost_s = 0.0
         self.lateness = Lateness()
         self.held = False
+        self.behind_s = 0.0  # how late the newest tick was, where the clock follows a robot
         self.waiting_s = 0.0  # wall seconds for which the oldest picture or detection has been waited for
 
     @classmethod
@@ -117,6 +118,7 @@ class WallClock:
         self._at = diagram_time
         late = (now - self._due) * self.pace
         self._set_rate(step, late, moving)
+        self.behind_s = late if self.follows else 0.0
         if late <= 0.0:
             self._sleep(self._due - now)
             return
@@ -128,6 +130,10 @@ class WallClock:
             self._due = now
             self.reanchored += int(moving)
             self.lost_s += late if moving else 0.0
+
+    def diagram_time(self, clock_s: float, now: float) -> float:
+        """The Diagram's time (s) at a time of the clock that it waits for; `now` before it has waited."""
+        return now if self._at is None else self._at + (clock_s - self._due) * self.pace * self.rate
 
     def velocity_leaves(self, diagram_time: float, moving: bool) -> None:
         """Count how late a velocity of this time of the Diagram leaves it; one at rest is not counted."""

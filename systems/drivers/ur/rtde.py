@@ -23,6 +23,7 @@ from weldcal.systems.wall_clock import WallClock
 
 FULL_PACE = 1.0
 STILL_RAD_S = 1e-9
+CATCHES_UP_S = 0.004
 N_OUTPUTS = 8
 
 
@@ -95,7 +96,8 @@ class UrRtdeArm(LeafSystem):
         - arc_established
 
     Units as in the simulated arm. `sample_time` is the time of the robot's sample on the Diagram's clock: the time of the
-    update less the sample's age, computed from robot time mapped to host time. `desired_state` (12) rad, rad/s is the
+    update less the sample's age, computed from robot time mapped to host time; of a robot that the Diagram follows, its own time.
+    `desired_state` (12) rad, rad/s is the
     predicted state of the arm at the next tick, which the simulated arm follows. Outputs depend on the state only: no
     feedthrough.
     On a computer that is late the clock's `rate` is below 1: velocities are sent, and read, in proportion to it.
@@ -130,8 +132,10 @@ class UrRtdeArm(LeafSystem):
         found = self._link.state()
         old = context.get_discrete_state_vector().value()
         rate = self._clock.rate
-        age_s = 0.0 if self._clock.follows else self._clock.pace * rate * found.age_s
-        sampled = max(context.get_time() - age_s, float(old[12]))
+        if self._clock.follows:
+            sampled = max(self._clock.diagram_time(found.robot_time, context.get_time()), float(old[12]))
+        else:
+            sampled = max(context.get_time() - self._clock.pace * rate * found.age_s, float(old[12]))
         qd = found.qd / rate
         ahead = min(context.get_time() + self._period_s - sampled, 0.05)
         desired = np.clip(found.q + ahead * qd, self._arm.position_lower, self._arm.position_upper)
@@ -139,6 +143,8 @@ class UrRtdeArm(LeafSystem):
         discrete.set_value(np.concatenate([found.q, qd, [sampled], desired, qd, [arc], found.codes]))
 
     def _send(self, context: Context) -> EventStatus:
+        if self._clock.behind_s > CATCHES_UP_S:
+            return EventStatus.DidNothing()  # the robot that is followed waits until the Diagram has caught up with it
         wanted = np.array(self._command.Eval(context))
         # at rest exactly zero is sent: only then may the cell compute without a time limit
         process = self._process.HasValue(context) and bool(self._process.Eval(context)[0] > 0.5)
