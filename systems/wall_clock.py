@@ -15,7 +15,7 @@ SLOWEST = 0.1
 # The servo needs pictures and detections: where this computer makes them late the path is slowed too.
 PICTURE_LATE_S, PICTURE_SPAN_S = 0.025, 0.100
 # A robot that waits for this computer's next velocity does not move its time: go on after this time of the wall clock.
-ROBOT_STANDS_S, ROBOT_LOOK_S = 0.020, 0.0005
+ROBOT_STANDS_S, ROBOT_LOOK_S = 0.100, 0.0005
 STOPPED = 0.02  # the rate at which a held path stands: at 1 rad/s the arm stops within a step of the slew limit
 
 
@@ -73,6 +73,7 @@ class WallClock:
         self.lost_s = 0.0
         self.lateness = Lateness()
         self.held = False
+        self.behind_s = 0.0  # how late the newest tick was, where the clock follows a robot
         self.waiting_s = 0.0  # wall seconds for which the oldest picture or detection has been waited for
 
     @classmethod
@@ -94,6 +95,10 @@ class WallClock:
         found.follows = True
         return found
 
+    def now(self) -> float:
+        """Time of the clock that is waited for: the host's, or the robot's that is followed."""
+        return self._clock()
+
     @property
     def stands(self) -> bool:
         """Whether a held path has come to rest."""
@@ -113,6 +118,7 @@ class WallClock:
         self._at = diagram_time
         late = (now - self._due) * self.pace
         self._set_rate(step, late, moving)
+        self.behind_s = late if self.follows else 0.0
         if late <= 0.0:
             self._sleep(self._due - now)
             return
@@ -124,6 +130,10 @@ class WallClock:
             self._due = now
             self.reanchored += int(moving)
             self.lost_s += late if moving else 0.0
+
+    def diagram_time(self, clock_s: float, now: float) -> float:
+        """The Diagram's time (s) at a time of the clock that it waits for; `now` before it has waited."""
+        return now if self._at is None else self._at + (clock_s - self._due) * self.pace * self.rate
 
     def velocity_leaves(self, diagram_time: float, moving: bool) -> None:
         """Count how late a velocity of this time of the Diagram leaves it; one at rest is not counted."""

@@ -11,6 +11,7 @@ import pytest
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.robot import guard_script, same_payload
+from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.main import HOME
@@ -104,9 +105,13 @@ def test_the_guard_calls_only_what_its_documentation_lists() -> None:
     section = text.partition("## What the guard script needs")[2].partition("\nThere are no threads")[0]
     rows = [row.split("|")[1] for row in section.splitlines() if row.startswith("| `")]
     listed = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
-    outputs = {name for name in listed if "digital" in name}
-    assert called(guard_script(True, 3)) == called(guard_script(False, 3)) == listed
-    assert called(guard_script(True)) == listed - outputs
+    digital, analog = ({name for name in listed if kind in name} for kind in ("digital", "analog"))
+    levels = [Level(0, True, 0.4), Level(1, False, 0.5)]
+    assert called(guard_script(True, 3, levels=levels)) == called(guard_script(False, 3, levels=levels)) == listed
+    assert called(guard_script(True, 3)) == listed - analog
+    assert called(guard_script(True)) == listed - digital - analog
+    assert "global domain0 = 1" in guard_script(True, 3, levels=levels)
+    assert "global domain1 = 0" in guard_script(True, 3, levels=levels)
     assert not {"thread", "run", "kill", "enter_critical"} & set(re.findall(r"\w+", code_of(guard_script(True, 3))))
 
 

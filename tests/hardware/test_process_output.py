@@ -20,6 +20,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.drivers.ur.torch.off_switch import MASK, VALUE
+from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.station import make_station
 from weldcal.systems.wall_clock import WallClock
@@ -32,6 +33,10 @@ from weldcal.tools.studies.robot.bench import Bench
 from weldcal.tools.studies.robot.faults import recover
 
 OUTPUT, VALVE = 3, 4
+FEED, VOLTAGE = Level(0, True, 0.4), Level(1, False, 0.75)
+SHOWN = [4.0, 0.016]  # V and A
+ZERO = [0.0, 0.004]
+ARC, ARC_FAULT = 5, 6
 TURNING = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
 BASE = 24
 SILENT = 3
@@ -41,12 +46,14 @@ SPEED_J, SPEED_STOP, END = 9, 15, 255
 class Guarded:
     """The guard in a controller, frame by frame; a negative number asks for the process."""
 
-    def __init__(self, output: int | None = OUTPUT, gas: int | None = None) -> None:
+    def __init__(self, output: int | None = OUTPUT, gas: int | None = None, levels: Sequence[Level] = ()) -> None:
         self.controller = Controller(load_arm(), np.array(HOME), parse_version("5.21"))
         self.controller.terminals.digital_outputs = 0xFF  # somebody left them on
-        self.controller.submit(guard_script(True, output, gas))
+        self.controller.terminals.analog_outputs = [0.9, 0.9]
+        self.controller.submit(guard_script(True, output, gas, levels))
         self.number = 0.0
         self.history: list[tuple[bool, float]] = []
+        self.levels: list[list[float]] = []
         self.frames(5)
 
     def frames(self, count: int, *, fed: bool = True) -> None:
@@ -55,17 +62,23 @@ class Guarded:
                 self.controller.written((f"input_int_register_{BASE}",))
             self.controller.step()
             self.history.append((self.on, float(np.abs(self.controller.arm.qd).max())))
+            self.levels.append(self.analog)
 
     def write(self, command: int, values: Sequence[float] = ()) -> None:
         self.controller.inputs.integers[BASE] = command
         for i, value in enumerate(values):
             self.controller.inputs.doubles[BASE + i] = value
 
-    def speed(self, qd: Sequence[float], frames: int, process: bool) -> None:
+    def speed(self, qd: Sequence[float], frames: int, process: bool, shares: Sequence[float] = ()) -> None:
         for _ in range(frames):
             self.number += 1.0
-            self.write(SPEED_J, [*qd, 40.0, -self.number if process else self.number])
+            self.write(SPEED_J, [*qd, 40.0, -self.number if process else self.number, *shares])
             self.frames(1)
+
+    @property
+    def analog(self) -> list[float]:
+        """V or A at the analog outputs."""
+        return [self.controller.terminals.analog_output(n) for n in range(2)]
 
     @property
     def on(self) -> bool:
@@ -100,6 +113,23 @@ def test_the_gas_valve_closes_when_the_guard_ends_whoever_opened_it() -> None:
     guarded.frames(120, fed=False)  # nobody is there any more
     assert not guarded.controller.terminals.digital_outputs & 1 << VALVE
     assert guarded.controller.terminals.digital_outputs == 0xFF & ~(1 << VALVE) & ~(1 << OUTPUT)
+
+
+def test_set_points_are_there_before_the_torch_and_the_others_outputs_are_not_touched() -> None:
+    guarded = Guarded(levels=[FEED])
+    assert guarded.analog == pytest.approx([0.0, 0.004 + 0.9 * 0.016])
+    guarded.speed([0.0] * 6, 2, process=False, shares=[0.4, 0.0])
+    assert (guarded.on, guarded.analog[0]) == (False, pytest.approx(4.0))
+    guarded.speed([0.0] * 6, 2, process=True, shares=[0.4, 0.0])
+    assert (guarded.on, guarded.analog[0]) == (True, pytest.approx(4.0))
+    guarded.controller.terminals.analog_foreign[0] = (1.0, guarded.controller.frame + 1)
+    guarded.speed([0.0] * 6, 2, process=True, shares=[0.4, 0.0])
+    assert guarded.analog[0] == pytest.approx(4.0), "written in every frame"
+    guarded.speed([0.0] * 6, 1, process=False, shares=[0.0, 0.0])
+    assert (guarded.on, guarded.analog[0]) == (False, 0.0)
+    guarded.speed([0.0] * 6, 2, process=False, shares=[0.4, 0.0])
+    guarded.frames(21)
+    assert guarded.analog[0] == 0.0, "numbers that stay away, before there was a torch"
 
 
 def test_a_guard_without_an_output_touches_none() -> None:
@@ -147,12 +177,16 @@ def program_stopped(guarded: Guarded) -> None:
     "stop", [silence, stale_number, too_fast, told_to_stop, told_to_end, watchdog, program_stopped]
 )
 def test_whatever_brakes_the_arm_turns_the_process_off_first(stop: Callable[[Guarded], None]) -> None:
-    guarded = Guarded()
-    guarded.speed(TURNING, 50, process=True)
+    guarded = Guarded(levels=[FEED, VOLTAGE])
+    guarded.speed(TURNING, 50, process=True, shares=[FEED.share, VOLTAGE.share])
     assert guarded.on
+    assert guarded.analog == pytest.approx(SHOWN)
     stop(guarded)
     assert not guarded.on
     assert guarded.off_before_slower()
+    dark = next(k for k in range(50, len(guarded.history)) if not guarded.history[k][0])
+    assert guarded.levels[dark] == pytest.approx(ZERO), "in the frame in which the torch goes out"
+    assert guarded.analog == pytest.approx(ZERO)
 
 
 @pytest.mark.parametrize("qd", [TURNING, [0.0] * 6], ids=["moving", "at rest"])
@@ -183,21 +217,29 @@ def test_the_output_is_written_in_every_frame() -> None:
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
-    """One controller for all that happens over the wire, and a link whose torch is wired."""
+    """One controller for all that happens over the wire, and a link with a torch, its set points and the inputs of its arc."""
+    torch = {"arc_input": ARC, "arc_fault_input": ARC_FAULT, "levels": (FEED, VOLTAGE)}
     with emulator_process(lockstep=LOCKSTEP_S) as emulator:
-        yield Bench(emulator, OUTPUT)
+        yield Bench(emulator, OUTPUT, torch)
 
 
 @pytest.fixture
 def burning(bench: Bench) -> Iterator[Bench]:
-    """The arm at full speed, the torch on."""
+    """The arm at full speed, the torch on, with an arc."""
     bench.start()
+    assert bench.stream.state.arc is False
     bench.stream.process = True
     bench.cruise()
     until = time.monotonic() + 2.0
     while not bench.stream.state.process_on and time.monotonic() < until:
         time.sleep(0.002)
-    assert bench.emulator.state()["digital_outputs"] >> OUTPUT & 1
+    state = bench.emulator.state()
+    assert state["digital_outputs"] >> OUTPUT & 1
+    assert state["analog_outputs"] == pytest.approx(SHOWN)
+    bench.emulator.do("set_digital_in", n=ARC)
+    while bench.stream.state.arc is not True and time.monotonic() < until:
+        time.sleep(0.002)
+    assert bench.stream.state.arc
     yield bench
     bench.end(kill=True)
     recover(bench)
@@ -231,6 +273,7 @@ def test_the_torch_goes_out_before_the_arm_stops(burning: Bench, name: str) -> N
     off = answer["off_after_s"]
     assert isinstance(off, float)
     assert off < limit_s, answer
+    assert burning.emulator.state()["analog_outputs"] == pytest.approx(ZERO)
     if name in ("numbers 60 ms late", "the cell falls silent", "connection reset", "worker killed", "program stopped"):
         frames = answer["frames_before_braking"]
         assert isinstance(frames, int)
@@ -243,6 +286,39 @@ def test_numbers_30_ms_late_leave_the_torch_on_and_the_arm_at_its_speed(burning:
     assert answer["off_after_s"] is None, answer
     assert answer["slows_after_s"] is None or answer["slows_after_s"] > 0.06, answer
     assert burning.stream.state.fault is Fault.NONE
+
+
+POWER_SOURCE: dict[str, tuple[Callable[[Bench], float], Fault, str]] = {
+    "its fault": (lambda b: b.emulator.do("set_digital_in", n=ARC_FAULT), Fault.ARC_FAULT, "power source"),
+    "its wire feed, by somebody else": (
+        lambda b: b.emulator.fault("set_analog_out", n=0, share=0.6, seconds=0.2), Fault.SET_POINT, "60 % of its range"),
+    "its voltage, by somebody else": (
+        lambda b: b.emulator.fault("set_analog_out", n=1, share=0.0, seconds=0.2), Fault.SET_POINT, "0 % of its range"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", POWER_SOURCE)
+def test_what_the_power_source_says_or_is_told_by_others_turns_the_torch_off_by_name(burning: Bench, name: str) -> None:
+    happen, fault, word = POWER_SOURCE[name]
+    answer = answer_of(burning, happen(burning))
+    assert answer["ok"], answer
+    assert burning.stream.state.fault is fault
+    assert word in str(burning.stream.state.status.fault)
+    assert answer["off_after_s"] < 0.12, answer  # type: ignore[operator]
+    assert answer["frames_before_braking"] >= 0, answer  # type: ignore[operator]
+    until = time.monotonic() + 5.0  # zero again as soon as nobody else holds them
+    while burning.emulator.state()["analog_outputs"] != pytest.approx(ZERO) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert burning.emulator.state()["analog_outputs"] == pytest.approx(ZERO)
+
+
+def test_an_arc_that_outlives_its_torch_is_named(burning: Bench) -> None:
+    burning.stream.process = False  # the input stays as it is
+    until = time.monotonic() + 10.0
+    while burning.stream.state.fault is Fault.NONE and time.monotonic() < until:
+        time.sleep(0.01)
+    assert burning.stream.state.fault is Fault.ARC_INPUT
+    assert "arc_input" in str(burning.stream.state.status.fault)
 
 
 @NEEDS_UR_RTDE

@@ -62,6 +62,10 @@ true_time = time.time
 time.time = lambda: true_time() + float(Path({file!r}).read_text())
 """
 HOUR_S = 3600.0
+ARC_INPUTS = "  arc_fault_input: 1\n"
+SET_POINTS = """  wire_feed: {output: 0, unit: V, at_zero: 1.0, at_full: 22.0, value: 8.0}
+  arc_voltage: {output: 1, unit: mA, at_zero: 10.0, at_full: 40.0, value: 21.5}
+"""
 
 
 @dataclass
@@ -107,6 +111,8 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
     cell, world, truth = folder / "cell.yaml", folder / "world.yaml", folder / "truth.json"
     text = (SCENARIO_FOLDER / "wired_straight_groove.yaml").read_text()
     text = text.replace("127.30.0.1", host).replace("/tmp/weldcal-cell/scans", str(folder / "scans"))
+    assert ARC_INPUTS in text
+    text = text.replace(ARC_INPUTS, ARC_INPUTS + SET_POINTS)
     cell.write_text(text.replace("pace: 0.5", "pace: 1.0") + WELD_ONLY + "\n")
     world.write_text(WORLD)
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(world)]
@@ -177,6 +183,8 @@ def test_the_job_is_done_though_the_clock_is_set_and_the_truth_file_says_how_wel
     files = {file.name for file in result.folder.iterdir()}
     assert {"report.html", "weld.csv", "weld.json", "summary.json"} <= files
     assert UNFINISHED not in files
+    # what the power source made of the analog outputs while its arc burned: without them there is no arc
+    assert truth["set_points"] == pytest.approx({"wire_feed": 8.0, "arc_voltage": 21.5})
 
 
 def test_the_cell_knows_nothing_of_the_truth(welded: tuple[DemoResult, dict[str, Any]]) -> None:

@@ -324,6 +324,8 @@ robot: !UrRtde
   gas_output: 4
   gas_before_s: 0.2
   gas_after_s: 2.0
+  wire_feed: {output: 1, unit: mA, at_zero: 1.0, at_full: 22.0, value: 8.0}
+  arc_voltage: {output: 1, unit: mA, at_zero: 10.0, at_full: 40.0, value: 21.5}
 """
 
 

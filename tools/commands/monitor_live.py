@@ -16,7 +16,6 @@ from weldcal.calibration.motion.drift.watch import Watched, watch
 from weldcal.calibration.motion.frames import observed_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
 from weldcal.systems.jobs.motion.calibrator import posed_stream
 from weldcal.systems.jobs.motion.config import MotionJob
 from weldcal.systems.jobs.motion.job import AddedMotion
@@ -102,7 +101,8 @@ def monitored_scenario(name: str, calibration: Path, frames: int | None, false_a
     """
     rate_checked(false_alarms_per_hour)
     scenario = load_scenario(name)
-    if not isinstance(scenario.scanner, StreamingScanner):
+    scanner = scenario.scanner_config()
+    if scanner is None or scanner.stream_delay_s() is None:
         raise InputError(
             f"The scanner of '{name}' does not stream, so that nothing can be watched: write scanner: !StreamingScanner {{}} in the scenario, "
             "or give a recording."

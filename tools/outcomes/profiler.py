@@ -96,7 +96,9 @@ def pose_outcome(estimate: ProfilerEstimate, X_FS: RigidTransform) -> PoseOutcom
 
 
 def true_torch(run: Run[AddedProfilerJob]) -> Array:
-    """True torch positions (n, 3) m during its pass along the seam."""
+    """True torch positions (n, 3) m during its pass along the seam; none where no simulation knows them."""
+    if "torch" not in run.cell.logs:
+        return np.empty((0, 3))
     state: ProfilerState = run.cell.job.state(run.root)
     log = run.cell.logs["torch"].FindLog(run.root)
     t = log.sample_times()
@@ -104,12 +106,12 @@ def true_torch(run: Run[AddedProfilerJob]) -> Array:
 
 
 def live_outcome(run: Run[AddedProfilerJob]) -> LiveOutcome:
-    """Compare the run with the ground truth of its station."""
+    """Compare the run with the ground truth of its station; nothing is known of one whose devices are all real."""
     cell, s = run.cell, run.cell.job.state(run.root)
     truth, torch_B = cell.station.truth, true_torch(run)
     profiler = truth.profiler
     if profiler is None:
-        raise RuntimeError("this station has no profiler")
+        return LiveOutcome(None, None, None, None, None, None, None)
     touched = s.sphere if s.sphere is not None and s.sphere.estimate.tip is not None else None
     tip = center = None
     if touched is not None and touched.estimate.tip is not None:
@@ -220,16 +222,18 @@ class ProfilerLive:
         found |= {"seed": self.options.seed, "robot": self.robot}
         if not done:
             found["reason"] = self.run.reason
-        if s.edge is not None and o.edge is not None:
+        if s.edge is not None:
             found["edge"] = _pose(o.edge) | {
+                "X_FS": _matrix(s.edge.estimate),
                 "scans": len(s.edge_scans),
                 "without_feature": s.edge.lost,
                 "outliers": int((~s.edge.estimate.inliers).sum()),
                 "reduced_chi2": s.edge.estimate.reduced_chi2,
                 "held_out_mm": float(s.edge.held_out_mm.mean()) if s.edge.held_out_mm.size else None,
             }
-        if s.sphere is not None and o.sphere is not None:
+        if s.sphere is not None:
             found["sphere"] = _pose(o.sphere) | {
+                "X_FS": _matrix(s.sphere.estimate),
                 "scans": len(s.sphere_scans),
                 "without_feature": s.sphere.lost,
                 "touches": len(s.touches),
@@ -252,15 +256,25 @@ class ProfilerLive:
         return found | self.run.timing()
 
 
-def _pose(p: PoseOutcome) -> dict[str, object]:
-    return {
-        "error_mm": p.error_mm,
-        "error_deg": p.error_deg,
-        "sigma_mm": p.sigma_mm,
-        "sigma_deg": p.sigma_deg,
-        "sigmas": [float(v) for v in p.parts],
-        "nees": p.nees,
-    }
+def _matrix(e: ProfilerEstimate) -> list[list[float]]:
+    X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(e.rotation), e.translation)
+    found: list[list[float]] = X.GetAsMatrix4().tolist()
+    return found
+
+
+def _pose(p: PoseOutcome | None) -> dict[str, object]:
+    return (
+        {}
+        if p is None
+        else {
+            "error_mm": p.error_mm,
+            "error_deg": p.error_deg,
+            "sigma_mm": p.sigma_mm,
+            "sigma_deg": p.sigma_deg,
+            "sigmas": [float(v) for v in p.parts],
+            "nees": p.nees,
+        }
+    )
 
 
 def _path(name: str, p: PathOutcome) -> dict[str, object]:

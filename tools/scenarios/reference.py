@@ -52,7 +52,19 @@ def _device(key: Key) -> str:
         if key.name == "robot_2":
             continue  # as those of robot
         text += f"\n### `{key.name}: !{driver.__name__}`\n\n{_sentence(driver)}\n\n{_table(keys_of(driver), {})}"
+        text += "".join(_parts_of(driver, key.name))
     return text
+
+
+def _parts_of(driver: type, device: str) -> Iterator[str]:
+    """The keys of the parts that a driver's keys hold, each kind of part once."""
+    named: dict[type, list[str]] = {}
+    for key in keys_of(driver):
+        for part in key.parts:
+            if part.__name__ != "PoseConfig":
+                named.setdefault(part, []).append(f"`{device}.{key.name}`")
+    for part, names in named.items():
+        yield f"\n#### {', '.join(names)}\n\n{_sentence(part)}\n\n{_table(keys_of(part), {})}"
 
 
 def _sentence(config: type) -> str:

@@ -12,6 +12,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
+from weldcal.systems.drivers.sensors.cell_time import CellTime, HostTime
 from weldcal.systems.drivers.sensors.stamps import DeviceClock, Stamp, UnixClock
 
 Datum = TypeVar("Datum")
@@ -133,7 +134,7 @@ class _Seen:
 class Acquisition(Generic[Datum]):
     """Takes a source's frames in a thread of its own; the newest `kept` of them can be read at any time without waiting.
 
-    `prepare` is applied to each frame in that thread.
+    `prepare` is applied to each frame in that thread. Whether the device is silent or late is judged by `time`.
     """
 
     def __init__(
@@ -153,9 +154,10 @@ class Acquisition(Generic[Datum]):
         self._seen = _Seen()
         self._read = self._wanted = self._number = 0
         self._wanted_at = 0.0
-        self._excused = 0.0
+        self._excused, self._excused_at = 0.0, float("-inf")
         self._print: int | None = None
         self._device_number: int | None = None
+        self.time: CellTime = HostTime()  # before `start`: another one
         self._stop = threading.Event()
         self._news = threading.Condition()
         self._thread: threading.Thread | None = None
@@ -181,7 +183,7 @@ class Acquisition(Generic[Datum]):
         Raises:
             DeviceFault: it is not within `wait_s`; the thread has ended.
         """
-        self._seen = _Seen(lost_since=time.monotonic(), good_at=time.monotonic())
+        self._seen = _Seen(lost_since=self.time.now(), good_at=self.time.now())
         # the thread must not keep its own object alive: a station that nobody closed ends its threads when it is forgotten
         self._thread = threading.Thread(target=_work, args=(weakref.ref(self), self._stop), daemon=True)
         self._thread.start()
@@ -203,7 +205,7 @@ class Acquisition(Generic[Datum]):
     def request(self, number: int) -> None:
         """Ask the device for a frame, once for each number; its frame carries this number. Never waits."""
         if number > self._wanted:
-            self._wanted_at = time.monotonic()
+            self._wanted_at = self.time.now()
             self._wanted = number
 
     def frames(self) -> tuple[Frame[Datum], ...]:
@@ -223,17 +225,18 @@ class Acquisition(Generic[Datum]):
 
     def wait_for_answer(self, number: int) -> Frame[Datum] | None:
         """The frame that answers a request, waited for until the device is at fault: only where the Diagram may wait."""
-        while (found := self.answer(number)) is None and self.fault(time.monotonic()) is None:
+        while (found := self.answer(number)) is None and self.fault(self.time.now()) is None:
             with self._news:
                 self._news.wait(0.05)
         return found
 
     def excuse(self, seconds: float) -> None:
-        """Do not count this time, in which nobody could read, as the device's silence."""
+        """Do not count this time, in which nobody could read, as the device's silence, nor its frames as late."""
         self._excused += seconds
+        self._excused_at, self._seen.late_s = time.monotonic(), 0.0
 
     def fault(self, now: float) -> str | None:
-        """What is wrong with the device at `now` (s, monotonic), as a sentence; None where nothing is. Never waits."""
+        """What is wrong with the device at `now` (s, of `time`), as a sentence; None where nothing is. Never waits."""
         seen, rules, excused = self._seen, self.rules, self._excused
         trouble = f": {seen.trouble.rstrip('.')}" if seen.trouble else ""
         silent = rules.silent_s is not None and now - seen.good_at - excused > rules.silent_s
@@ -284,10 +287,11 @@ class Acquisition(Generic[Datum]):
         Returns the seconds to pause before the next pass.
         """
         seen = self._seen
+        self.time.look()
         try:
             if not seen.connected:
                 self.source.open()
-                seen.connected, seen.refused, seen.opened_at = True, 0, time.monotonic()
+                seen.connected, seen.refused, seen.opened_at = True, 0, self.time.now()
                 self.clock = DeviceClock(self._latency_s, self.rules.late_s)
                 self._device_number = None
                 seen.asked = min(seen.asked, max(self._wanted - 1, 0))  # an unanswered request is repeated
@@ -318,7 +322,7 @@ class Acquisition(Generic[Datum]):
         return 0.0
 
     def _lose(self, reason: str) -> None:
-        seen, now = self._seen, time.monotonic()
+        seen, now = self._seen, self.time.now()
         seen.trouble = reason
         with suppress(Exception):  # whatever state its library is in
             self.source.close()
@@ -348,11 +352,11 @@ class Acquisition(Generic[Datum]):
             found = _print_of(d.datum)
             seen.same_since = (seen.same_since or seen.good_at) if found == self._print else None
             self._print = found
-        seen.late_s = stamp.late_s
+        seen.late_s = 0.0 if stamp.captured < self._excused_at else stamp.late_s
         if stamp.clock != "arrival":
             seen.latency = (*seen.latency[-99:], d.arrived - stamp.captured)
         seen.trouble = ""
-        seen.good_at, self._excused = d.arrived, 0.0
+        seen.good_at, self._excused = self.time.at(d.arrived), 0.0
         self._frames = (*self._frames[len(pushed) :], frame)
         seen.counts = replace(c, received=c.received + 1, lost=c.lost + gap, dropped=c.dropped + dropped)
         self._tell()
@@ -360,7 +364,7 @@ class Acquisition(Generic[Datum]):
     def _stamp(self, d: Delivery[Datum]) -> Stamp:
         if d.unix_time is not None:
             captured = self._unix.to_monotonic(d.unix_time, d.arrived)
-            late = d.arrived - captured - self._latency_s
+            late = self.time.at(d.arrived) - self.time.at(captured) - self._latency_s
             return Stamp(min(captured, d.arrived), "host", max(late, 0.0))
         if d.device_time is not None:
             return self.clock.stamp(d.device_time, d.arrived)

@@ -1,13 +1,13 @@
 """DeviceWatch: a device's fault becomes the robot's: the arm stops, the process goes off, and the fault stays until the run ends."""
 
 import dataclasses as dc
-import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues
 
+from weldcal.systems.drivers.sensors.cell_time import CellTime
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import UrStatus
@@ -17,13 +17,15 @@ STOOD_S = 0.1  # a longer time between two looks: the Diagram computed, with the
 
 
 class Watched(Protocol):
-    """A device that knows what is wrong with it."""
+    """A device that knows what is wrong with it, by a clock of its own."""
+
+    time: CellTime
 
     def fault(self, now: float) -> str | None:
-        """What is wrong at `now` (s, monotonic), as a sentence; None where nothing is. Never waits."""
+        """What is wrong at `now` (s, of `time`), as a sentence; None where nothing is. Never waits."""
 
     def excuse(self, seconds: float) -> None:
-        """Do not count this time, in which nobody could read, as the device's silence."""
+        """Do not count this time, in which nobody could read, as the device's silence, nor its frames as late."""
 
     def close(self) -> None:
         """Disconnect; a second call has no effect."""
@@ -44,10 +46,10 @@ class DeviceWatch(LeafSystem):
     sentence. A device that works again changes nothing before the next run.
     """
 
-    def __init__(self, device: Watched, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, device: Watched, clock: Callable[[], float] | None = None) -> None:
         super().__init__()
-        self._device, self._clock = device, clock
-        self._looked = clock()
+        self._device, self._clock = device, clock or device.time.now
+        self._looked = self._clock()
         self.sentence = ""
         self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
         self.DeclareDiscreteState([0.0])

@@ -16,6 +16,7 @@ from weldcal.models.tool import FingerCamera
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.cell_time import cell_time
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
@@ -150,6 +151,7 @@ def add_camera(config: WiredFingerCamera, source: Source[Picture], build: Statio
         DeviceFault: the camera sends no picture.
     """
     acquisition = acquire_pictures(config, source)
+    acquisition.time = cell_time(build)
     acquisition.start(start_s, first_frame=True)
     watch(build, acquisition, "finger_camera")
     camera = build.builder.AddSystem(WiredPictures(acquisition))

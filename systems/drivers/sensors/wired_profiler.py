@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.cell_time import cell_time
 from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
@@ -62,6 +63,7 @@ def add_profiler(config: WiredProfiler, source: Source[Profile], build: StationB
         DeviceFault: the profiler does not answer.
     """
     acquisition = acquire_profiles(config, source)
+    acquisition.time = cell_time(build)
     acquisition.start(start_s, first_frame=False)
     watch(build, acquisition, "profiler")
     system = build.builder.AddSystem(OnTrigger(acquisition, "profile", ProfileScan, PERIOD_S, build.may_wait))

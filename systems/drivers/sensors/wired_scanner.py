@@ -13,6 +13,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Frame, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.cell_time import cell_time
 from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
 from weldcal.systems.drivers.sensors.watch import watch
@@ -42,6 +43,8 @@ class WiredScanner(ScannerConfig):
     scan_timeout_s: float = 6.0  # from the trigger to the scan
     latency_s: float = 0.0  # from the middle of the exposure to the arrival of the earliest frames
     streams: bool = False  # the scanner runs freely: a scanner of a motion job
+    silent_s: float = 1.0  # of a stream without a usable frame, or with identical ones: a fault
+    late_s: float = 1.0  # that a frame of a stream comes late: a fault
 
     def scanner(self) -> ScannerPreset:
         """The preset with the configured resolution and field of view."""
@@ -70,7 +73,10 @@ class WiredScanner(ScannerConfig):
                 f"scanner.scan_timeout_s must be from {low:g} to {high:g}, and it is {self.scan_timeout_s:g}."
             )
         if self.streams:
-            return Rules(silent_s=1.0, frozen_s=1.0, late_s=1.0)
+            for name in ("silent_s", "late_s"):
+                if not 0.1 <= getattr(self, name) <= high:
+                    raise InputError(f"scanner.{name} must be from 0.1 to {high:g}, and it is {getattr(self, name):g}.")
+            return Rules(silent_s=self.silent_s, frozen_s=self.silent_s, late_s=self.late_s)
         return Rules(late_s=float("inf"), answer_s=self.scan_timeout_s)
 
 
@@ -156,6 +162,7 @@ def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild
         DeviceFault: the scanner does not answer.
     """
     acquisition = acquire(config, source)
+    acquisition.time = cell_time(build)
     acquisition.start(start_s, first_frame=config.streams)
     watch(build, acquisition, "scanner")
     if config.streams:

@@ -13,6 +13,7 @@ class Fault(IntEnum):
     CONTROLLER_DEAF = 4
     CLOCK_JUMPED = 5
     STATE_IMPLAUSIBLE = 6
+    SET_POINT = 9
     COMMAND_LATE = 10
     COMMAND_NOT_FINITE = 11
     COMMAND_TOO_FAST = 12
@@ -32,6 +33,7 @@ class Fault(IntEnum):
     PROGRAM_STOPPED = 26
     PROGRAM_PAUSED = 27
     ARC_FAULT = 28
+    ARC_INPUT = 29
     GUARD_REFUSED = 30
     UPLOAD_REFUSED = 31
     CONTROL_REFUSED = 32
@@ -61,6 +63,8 @@ SENTENCES = {
     Fault.GUARD_LATCHED: "GUARD: the script on the controller stopped the arm, {reason}; check the cable and the load of this computer, then start again.",
     Fault.PROCESS_OUTPUT: "PROCESS OUTPUT: the torch's output {reason}; find what else writes it "
     "(a program, a PLC, Modbus, an action in Installation > I/O), stop that and start again.",
+    Fault.SET_POINT: "SET POINT: an analog output of the power source is at {detail:.0f} % of its range and not at its set point; find what else "
+    "writes it (a program, a PLC, Modbus, the I/O tab) or changed its range, stop that and start again.",
     Fault.PROTECTIVE_STOP: "PROTECTIVE STOP: look for the cause, press Enable Robot on the pendant after 5 s, and start again.",
     Fault.SAFEGUARD_STOP: "SAFEGUARD STOP: close the safeguard, press its reset, and start again.",
     Fault.EMERGENCY_STOP: "EMERGENCY STOP: release the button, switch the arm on and release its brakes on the pendant, and start again.",
@@ -70,12 +74,14 @@ SENTENCES = {
     Fault.PROGRAM_STOPPED: "PROGRAM STOPPED: the program on the controller was stopped; start again.",
     Fault.PROGRAM_PAUSED: "PROGRAM PAUSED: the program on the controller was paused; press Stop, not Play, on the pendant, and start again.",
     Fault.ARC_FAULT: "ARC: the power source reports a fault; look for its message (gas, wire, cooling, no contact), clear it and start again.",
+    Fault.ARC_INPUT: "ARC INPUT: the power source's input reports an arc although the torch is off; look whether somebody else burns it, "
+    "and at the input's wire (robot.arc_input), then start again.",
     Fault.GUARD_REFUSED: "An old command in the controller's registers could not be cleared: close the program that writes them and start again.",
     Fault.UPLOAD_REFUSED: "The controller did not start the guard script: switch it to Remote Control (top right of the pendant), or see its Log tab for an error.",
     Fault.CONTROL_REFUSED: "The controller refused the connection: its registers may be in use by EtherNet/IP or another client; run `weldcal check-robot`.",
     Fault.TCP_NOT_ZERO: "The TCP could not be set to zero: set it to zero in Installation > General > TCP on the pendant and start again.",
     Fault.PAYLOAD_NOT_SET: "The controller did not take the payload: set it in Installation > General > Payload on the pendant and start again.",
-    Fault.OUTPUT_IN_USE: "The digital output of the process (robot.process_output) is taken: close the other RTDE client or fieldbus that writes the outputs.",
+    Fault.OUTPUT_IN_USE: "An output of the torch (robot.process_output, or a set point) is taken: close the other RTDE client or fieldbus that writes the outputs.",
     Fault.START_FAILED: "The worker process of the robot link could not start; run `weldcal check-robot` and try again.",
 }
 

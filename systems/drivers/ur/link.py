@@ -23,6 +23,7 @@ from weldcal.systems.drivers.ur.faults import Fault, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
 from weldcal.systems.drivers.ur.shared import STATE, Memory, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
+from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.wire.dashboard import stop_program
 from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
 from weldcal.systems.messages import UrStatus
@@ -133,6 +134,7 @@ class UrLink:
         gas_output: int | None = None,
         gas_before_s: float = 0.0,
         gas_after_s: float = 0.0,
+        levels: tuple[Level, ...] = (),
     ) -> UrLink:
         """Start the worker, upload the guard, and wait until it is active. The arm does not move, `process_output` is off.
 
@@ -154,6 +156,7 @@ class UrLink:
             gas_output,
             gas_before_s,
             gas_after_s,
+            levels,
         )
         link = cls(config)
         until = time.monotonic() + START_LIMIT_S / limits.pace

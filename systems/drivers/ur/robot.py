@@ -13,10 +13,12 @@ from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.clock import ClockMap
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, UPPER_OFFSET, register_names
+from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, SET_POINTS, UPPER_OFFSET, register_names
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
 from weldcal.systems.drivers.ur.torch.arc_inputs import ArcInputs
 from weldcal.systems.drivers.ur.torch.off_switch import OffSwitch
+from weldcal.systems.drivers.ur.torch.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
+from weldcal.systems.drivers.ur.torch.set_points import Level, apart
 from weldcal.systems.drivers.ur.wire.dashboard import SCRIPT_PORT
 from weldcal.systems.drivers.ur.wire.line import Line
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe, Value
@@ -33,6 +35,8 @@ ANSWER_LIMIT_S = 2.0
 START_LIMIT_S = 8.0
 EXCUSED_S = 0.5
 ONLY_WITH_OUTPUT, ONLY_WITH_VALVE = "# only with an output", "# only with a gas valve"
+ONLY_WITH_ANALOG = "# only with analog output {}"
+ANALOG_TYPES = "analog_io_types"
 READ_BACK = ("tcp_offset", "payload", "payload_cog")
 READ_BACK_LIMIT_S = 1.0
 SCALINGS = ("speed_scaling", "target_speed_fraction")
@@ -55,21 +59,30 @@ class Refused(Exception):
         self.fault = fault
 
 
-def guard_script(upper_registers: bool, output: int | None = None, gas: int | None = None) -> str:
+def guard_script(
+    upper_registers: bool, output: int | None = None, gas: int | None = None, levels: Sequence[Level] = ()
+) -> str:
     """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share; `output` and
-    `gas`: the standard digital outputs of the process and of the gas valve, None where none is wired.
+    `gas`: the standard digital outputs of the process and of the gas valve, None where none is wired; `levels`: set points.
     """
+    analog = {level.output: int(level.volts) for level in levels}
     text = files("weldcal.systems.drivers.ur").joinpath("guard.script").read_text(encoding="utf-8")
+    for n in OUTPUTS_OF_SET_POINTS:
+        text = text.replace(f"global domain{n} = 1", f"global domain{n} = {analog.get(n, 1)}")
+        if n not in analog:
+            text = _without(text, ONLY_WITH_ANALOG.format(n))
     for number, name, mark in ((output, "output", ONLY_WITH_OUTPUT), (gas, "valve", ONLY_WITH_VALVE)):
-        if number is None:
-            # a controller may refuse a program for the name of a function that it never calls
-            text = "".join(line for line in text.splitlines(keepends=True) if mark not in line)
-        else:
-            text = text.replace(f"global {name} = -1", f"global {name} = {number}")
+        known = text.replace(f"global {name} = -1", f"global {name} = {number}")
+        text = _without(text, mark) if number is None else known
     if upper_registers:
         return text
     changed = text.replace("global base = 24", "global base = 0").replace("global word = 36", "global word = 12")
     return changed.replace("input_int_register_24", "input_int_register_0")
+
+
+def _without(text: str, mark: str) -> str:
+    """The script without the lines of a mark: a controller may refuse a program for the name of a function that it never calls."""
+    return "".join(line for line in text.splitlines(keepends=True) if mark not in line)
 
 
 class Robot:
@@ -85,11 +98,13 @@ class Robot:
         output: int | None = None,
         arc_inputs: ArcInputs | None = None,
         gas: int | None = None,
+        levels: Sequence[Level] = (),
     ) -> None:
-        self._host = host
+        self._host, self._levels = host, tuple(levels)
         base = UPPER_OFFSET if upper else 0
         self._output, self._arm, self._pace = output, arm, pace
-        self._script = guard_script(upper, output, gas)
+        self._script = guard_script(upper, output, gas, levels)
+        self._doubles = DOUBLES + (SET_POINTS if levels else 0)
         self._arc_inputs = arc_inputs or ArcInputs()
         self.clock = ClockMap(pace)
         self._answer, self._latch = f"output_int_register_{base}", f"output_int_register_{base + 12}"
@@ -98,8 +113,14 @@ class Robot:
         names = [*ALWAYS, "actual_TCP_pose", self._answer, self._latch, *self._told]
         names += [] if output is None else [OUTPUTS]
         names += [INPUTS] if self._arc_inputs.wired else []
+        # of each set point: what the guard gives its output, and what the output shows
+        self._points = [
+            (f"output_double_register_{base + 15 + level.output}", f"standard_analog_output{level.output}")
+            for level in levels
+        ]
+        names += [ANALOG_TYPES, *(name for pair in self._points for name in pair)] if levels else []
         try:
-            self._stream = RtdeStream(host, names, register_names(base))
+            self._stream = RtdeStream(host, names, register_names(base, self._doubles))
             self._stream.first(FIRST_LIMIT_S)
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
@@ -115,7 +136,7 @@ class Robot:
 
     def _off_switch(self, host: str, output: int, gas: int | None) -> OffSwitch:
         try:
-            return OffSwitch(host, output, gas)
+            return OffSwitch(host, output, gas, self._levels)
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.OUTPUT_IN_USE) from error
@@ -173,8 +194,12 @@ class Robot:
                 return True
         return False
 
-    def _write(self, command: int, *arguments: float) -> None:
-        self._stream.send(command, *arguments, *[0.0] * (DOUBLES - len(arguments)))
+    def _write(self, command: int, *arguments: float, armed: bool = False) -> None:
+        """Write a command; `armed`: with the set points of the power source."""
+        numbers = [*arguments, *[0.0] * (self._doubles - len(arguments))]
+        for level in self._levels if armed else ():
+            numbers[DOUBLES + level.output] = level.share
+        self._stream.send(command, *numbers)
 
     def _read_back(self, found: dict[str, Value], mass_kg: float, cog_m: list[float]) -> None:
         """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the guard
@@ -226,6 +251,17 @@ class Robot:
             echo < 0.0,
             self._arc_inputs.arc(inputs),
             self._arc_inputs.fault(inputs),
+            self._shown(),
+        )
+
+    def _shown(self) -> tuple[tuple[float, float], ...]:
+        """Of each set point the share that the guard gives its analog output, and the share that the output shows."""
+        if not self._levels:
+            return ()
+        domains = int(self._stream.number(ANALOG_TYPES))
+        return tuple(
+            (self._stream.number(asked), level.shown(self._stream.number(shown), domains))
+            for level, (asked, shown) in zip(self._levels, self._points, strict=True)
         )
 
     def excuse(self, seconds: float) -> None:
@@ -245,9 +281,9 @@ class Robot:
             self._sent = {number: t for number, t in self._sent.items() if t > self._sent[echo]}
             self._first_unheard = min(self._sent.values(), default=now)
 
-    def send(self, qd: np.ndarray, acceleration: float, process: bool = False) -> bool:
-        """Send one velocity, numbered for the guard's watchdog; a negative number enables the process. Returns False where the
-        program does not run.
+    def send(self, qd: np.ndarray, acceleration: float, process: bool = False, armed: bool = False) -> bool:
+        """Send one velocity, numbered for the guard's watchdog; a negative number enables the process, `armed` the set points.
+        Returns False where the program does not run.
         """
         self._number = (abs(self._number) % 1_000_000.0 + 1.0) * (-1.0 if process else 1.0)
         now = time.monotonic()
@@ -257,7 +293,7 @@ class Robot:
         if not self._playing:
             self.forget()
             return False
-        self._write(VELOCITY, *qd.tolist(), acceleration, self._number)
+        self._write(VELOCITY, *qd.tolist(), acceleration, self._number, armed=armed)
         return True
 
     def torch_off(self) -> None:
@@ -274,6 +310,11 @@ class Robot:
     def process_on(self) -> bool:
         """The state of the process output as reported by the controller."""
         return self._output is not None and bool(int(self._stream.number(OUTPUTS)) >> self._output & 1)
+
+    @property
+    def powered(self) -> bool:
+        """Whether the process output is on, or a set point is not at zero, as the controller reports them."""
+        return self.process_on or any(apart(0.0, shown) for _, shown in self._shown())
 
     @property
     def numbers(self) -> tuple[float, float, float]:

@@ -18,12 +18,14 @@ from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
-from weldcal.systems.drivers.ur.supervisor import FOLLOWING_PATIENCE_S, Limits
+from weldcal.systems.drivers.ur.supervisor import Limits
+from weldcal.systems.drivers.ur.torch.set_points import SETTLES_S, AnalogSetPoint, levels_of
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.wall_clock import WallClock
 
 FULL_PACE = 1.0
 STILL_RAD_S = 1e-9
+CATCHES_UP_S = 0.004
 N_OUTPUTS = 8
 
 
@@ -53,19 +55,24 @@ class UrRtde(DriverConfig):
     gas_output: int | None = None
     gas_before_s: float = 0.5
     gas_after_s: float = 1.0
+    # the power source's wire feed at an analog output of the controller; null: not wired. A set point needs process_output and
+    # arc_input, and is given after the gas and before the torch
+    wire_feed: AnalogSetPoint | None = None
+    arc_voltage: AnalogSetPoint | None = None  # the same for its voltage
 
     def limits(self, arm: ArmModel) -> Limits:
         """The limits against which the worker checks commands."""
         limits = Limits(
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
-        if self.follow:
-            return limits.in_lockstep(FOLLOWING_PATIENCE_S, held_s=0.0)
-        return limits.in_lockstep() if self.lockstep else limits
+        if not self.lockstep:
+            return limits
+        return limits.following() if self.follow else limits.in_lockstep()
 
     def torch_delay_s(self) -> float:
-        """The time of gas before the torch, where a valve is wired."""
-        return 0.0 if self.gas_output is None else self.gas_before_s
+        """The time of gas before the torch, where a valve is wired, and of the set points, where there are some."""
+        points_s = 0.0 if self.wire_feed is None and self.arc_voltage is None else SETTLES_S
+        return points_s + (0.0 if self.gas_output is None else self.gas_before_s)
 
     def load(self, owner: str = "the scenario") -> ExpectedLoad:
         """The payload with which the pre-flight compares the controller's."""
@@ -91,7 +98,8 @@ class UrRtdeArm(LeafSystem):
         - arc_established
 
     Units as in the simulated arm. `sample_time` is the time of the robot's sample on the Diagram's clock: the time of the
-    update less the sample's age, computed from robot time mapped to host time. `desired_state` (12) rad, rad/s is the
+    update less the sample's age, computed from robot time mapped to host time; of a robot that the Diagram follows, its own time.
+    `desired_state` (12) rad, rad/s is the
     predicted state of the arm at the next tick, which the simulated arm follows. Outputs depend on the state only: no
     feedthrough.
     On a computer that is late the clock's `rate` is below 1: velocities are sent, and read, in proportion to it.
@@ -129,8 +137,11 @@ class UrRtdeArm(LeafSystem):
     def _read(self, context: Context, discrete: DiscreteValues) -> None:
         found = self._link.state()
         rate = self._clock.rate
-        age_s = 0.0 if self._clock.follows else self._clock.pace * rate * found.age_s
-        sampled = max(context.get_time() - age_s, float(discrete.value(self._sampled)[0]))
+        before = float(discrete.value(self._sampled)[0])
+        if self._clock.follows:
+            sampled = max(self._clock.diagram_time(found.robot_time, context.get_time()), before)
+        else:
+            sampled = max(context.get_time() - self._clock.pace * rate * found.age_s, before)
         qd = found.qd / rate
         ahead = min(context.get_time() + self._period_s - sampled, 0.05)
         desired = np.clip(found.q + ahead * qd, self._arm.position_lower, self._arm.position_upper)
@@ -143,6 +154,8 @@ class UrRtdeArm(LeafSystem):
         discrete.set_value(self._codes, found.codes)
 
     def _send(self, context: Context) -> EventStatus:
+        if self._clock.behind_s > CATCHES_UP_S:
+            return EventStatus.DidNothing()  # the robot that is followed waits until the Diagram has caught up with it
         wanted = np.array(self._command.Eval(context))
         # at rest exactly zero is sent: only then may the cell compute without a time limit
         process = self._process.HasValue(context) and bool(self._process.Eval(context)[0] > 0.5)
@@ -193,6 +206,9 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
             raise InputError("robot.gas_output and robot.process_output must be two outputs.")
         if not (0.0 <= config.gas_before_s <= 10.0 and 0.0 <= config.gas_after_s <= 10.0):
             raise InputError("robot.gas_before_s and robot.gas_after_s must be from 0 to 10.")
+    levels = levels_of(config.wire_feed, config.arc_voltage)
+    if levels and (config.process_output is None or config.arc_input is None):
+        raise InputError("robot.wire_feed and robot.arc_voltage need process_output and arc_input.")
     report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load())
     require_ready(report)
     arm = report.arm
@@ -213,6 +229,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         gas_output=config.gas_output,
         gas_before_s=config.gas_before_s,
         gas_after_s=config.gas_after_s,
+        levels=levels,
     )
     clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
     return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)

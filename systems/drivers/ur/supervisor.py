@@ -9,6 +9,7 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.torch.set_points import apart
 
 NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
 SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7
@@ -24,8 +25,13 @@ GUARD_SILENT_S = 0.08
 OUTPUT_ON_S = 0.020
 # The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after 25.
 OUTPUT_OFF_S = 0.050
+# The guard writes the analog outputs in every frame, too.
+SET_POINT_S = 0.050
+# An arc that is reported while nothing asks for the torch: its input may follow the torch's end by ARC_ENDS_S.
+ARC_ENDS_S, ARC_ON_S = 1.0, 0.010
 PATIENCE_S, HELD_S = 5.0, 0.010  # in lockstep: of the host's time, of the controller's
 FOLLOWING_PATIENCE_S = 30.0  # where the cell waits for the controller too: no time of the host decides
+COMMAND_S, BLIND_COMMANDS = 0.004, 25  # period of the cell's commands, of its time; 0.1 s without a state
 
 
 class Action(IntEnum):
@@ -43,6 +49,8 @@ ACTIONS = {
     **{fault: Action.BRAKE for fault in Fault if Fault.COMMAND_LATE <= fault < Fault.PROTECTIVE_STOP},
     **{fault: Action.STOP for fault in Fault if fault >= Fault.PROTECTIVE_STOP},
     Fault.ARC_FAULT: Action.BRAKE,
+    Fault.ARC_INPUT: Action.BRAKE,
+    Fault.SET_POINT: Action.BRAKE,
 }
 
 
@@ -66,6 +74,8 @@ class Limits:
     position_margin: float = 0.02
     # a moving command that is older is not sent again; in lockstep the controller waits for the next
     hold_s: float = np.inf
+    # commands that may be given while the robot's time stands still, where the cell follows it
+    blind_commands: float = np.inf
 
     @property
     def waits(self) -> bool:
@@ -97,6 +107,15 @@ class Limits:
             hold_s=held_s / self.pace,
         )
 
+    def following(self) -> Limits:
+        """The limits for an emulated controller in lockstep that the cell follows: no time of the host decides."""
+        return replace(self.in_lockstep(FOLLOWING_PATIENCE_S, held_s=0.0), blind_commands=BLIND_COMMANDS)
+
+    @property
+    def follows(self) -> bool:
+        """Whether the cell follows the controller's time."""
+        return bool(np.isfinite(self.blind_commands))
+
 
 @dataclass(frozen=True, eq=False)
 class RobotSample:
@@ -120,6 +139,8 @@ class RobotSample:
     process_asked: bool = False  # whether the newest number that the guard script has read asks for it
     arc: bool | None = None  # established; None where the input is not wired
     arc_fault: bool = False  # the power source reports a fault
+    # of each set point: what the guard script gives its analog output, and what the output shows
+    set_points: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +153,7 @@ class Command:
     stop: bool = False
     orphaned: bool = False  # the cell's process has ended
     process: bool = False  # the process output is enabled
+    armed: bool = False  # the set points of the power source are given
     scale: float = 1.0  # of the velocity while the command is late
 
     @property
@@ -163,17 +185,22 @@ class Supervisor:
         self._slow_since: float | None = None
         self._asked, self._asked_at = False, -np.inf
         self._off_since: float | None = None
+        self._apart_since: float | None = None
+        self._arc_ends_at, self._arc_since = -np.inf, np.inf
+        self._seen_time, self._seen_number = -np.inf, 0
         self.latched = Decision(Action.SEND)
 
     def step(self, now: float, robot: RobotSample, command: Command) -> Decision:
         """Compute the decision of this pass. `now` is host time, s."""
+        if robot.robot_time != self._seen_time:
+            self._seen_time, self._seen_number = robot.robot_time, command.number
         if self.latched.fault is Fault.NONE:
             fault, detail = self._look(now, robot, command)
             if fault is not Fault.NONE:
                 self.latched = Decision(ACTIONS[fault], fault, detail)
         elif self.latched.action is not Action.LEAVE:
             # a link failure during braking overrides the latched fault
-            fault, detail = self._link(now, robot)
+            fault, detail = self._link(now, robot, command)
             if fault is not Fault.NONE:
                 self.latched = Decision(Action.LEAVE, self.latched.fault, self.latched.detail)
         self._last, self._command, self._stepped_at = robot, command, now
@@ -186,19 +213,25 @@ class Supervisor:
         self._reference = None
 
     def _look(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
-        for look in (self._link(now, robot), self._safety(robot), self._program(robot), self._output(robot)):
+        for look in (self._link(now, robot, command), self._safety(robot), self._program(robot), self._output(robot)):
             if look[0] is not Fault.NONE:
                 return look
+        if (found := self._set_points(robot)) is not None:
+            return Fault.SET_POINT, found
         if robot.arc_fault and (command.process or robot.process_asked):
             return Fault.ARC_FAULT, 0.0
+        if self._arc_unasked(robot):
+            return Fault.ARC_INPUT, 0.0
         return self._motion(now, robot, command)
 
-    def _link(self, now: float, robot: RobotSample) -> tuple[Fault, float]:
+    def _link(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
         limits, last = self._limits, self._last
         if not robot.connected:
             return Fault.LINK_CLOSED, 0.0
         if now - robot.fresh_at > (limits.stale_process_s if self._command.process else limits.stale_s):
             return Fault.LINK_STALE, 1e3 * (now - robot.fresh_at)
+        if (blind := command.number - self._seen_number) > limits.blind_commands:
+            return Fault.LINK_STALE, 1e3 * COMMAND_S * blind
         if last is not None and robot.robot_time != last.robot_time:
             passed = robot.robot_time - last.robot_time
             expected = limits.pace * (robot.fresh_at - last.fresh_at)
@@ -250,6 +283,28 @@ class Supervisor:
             if robot.robot_time - self._off_since > OUTPUT_OFF_S:
                 return Fault.PROCESS_OUTPUT, 0.0
         return Fault.NONE, 0.0
+
+    def _set_points(self, robot: RobotSample) -> float | None:
+        """The share (%) that an analog output shows in place of what the guard gives it, of one package; None: as it should."""
+        wrong = [shown for asked, shown in robot.set_points if apart(asked, shown)]
+        if not wrong:
+            self._apart_since = None
+            return None
+        self._apart_since = robot.robot_time if self._apart_since is None else self._apart_since
+        return 100.0 * wrong[0] if robot.robot_time - self._apart_since > SET_POINT_S else None
+
+    def _arc_unasked(self, robot: RobotSample) -> bool:
+        """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the torch."""
+        if robot.arc is None or robot.process_on is None:
+            return False
+        if robot.process_asked or robot.process_on:
+            self._arc_since, self._arc_ends_at = np.inf, robot.robot_time + ARC_ENDS_S
+            return False
+        if not robot.arc:
+            self._arc_since, self._arc_ends_at = np.inf, -np.inf  # it has ended, and does not come back by itself
+            return False
+        self._arc_since = min(self._arc_since, robot.robot_time)
+        return robot.robot_time > self._arc_ends_at and robot.robot_time - self._arc_since >= ARC_ON_S
 
     def _motion(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
         limits = self._limits

@@ -25,11 +25,13 @@ from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Lim
 from weldcal.systems.drivers.ur.time_scale import TimeScale
 from weldcal.systems.drivers.ur.torch.arc_inputs import ArcInputs
 from weldcal.systems.drivers.ur.torch.gas import Gas
+from weldcal.systems.drivers.ur.torch.set_points import Level, SetPoints, apart
 
 ACCELERATION = 40.0  # rad/s^2 of speedj: the cell ramps the stream, the controller only follows
 LATE_PASS_S = 0.020
 REST_RAD_S = 1e-3
 STOP_LIMIT_S = 2.0
+RESTS_S = 5.0  # for which an arm at rest waits for a cell that computes
 LEFT = 3  # exit code of a worker that exited because of the link
 
 
@@ -60,6 +62,7 @@ class WorkerConfig:
     gas_output: int | None = None
     gas_before_s: float = 0.0
     gas_after_s: float = 0.0
+    levels: tuple[Level, ...] = ()
 
 
 class Worker:
@@ -77,6 +80,7 @@ class Worker:
         self._driven = 0  # number of the newest command that was sent
         self._gas = Gas(config.gas_before_s, config.gas_after_s)
         self._gas_on = False
+        self._points = SetPoints()
         self._ringed = -1.0
         self._newest: tuple[float, ...] | None = None
         self._rest_since: float | None = None
@@ -100,11 +104,11 @@ class Worker:
                 self._supervisor.excuse()
             last, deadline = now, max(deadline + period, now)
             sample = robot.sample(now)
-            command = self._with_gas(self._scaled(self._command(), now, sample), robot, sample)
+            command = self._with_torch(self._scaled(self._command(), now, sample), robot, sample)
             decision = self._supervisor.step(now, sample, command)
             if decision.fault is not Fault.NONE and self._fault_time == 0.0:
                 self._fault_time = now
-            if decision.action is not Action.SEND and (robot.process_on or not self._put_out):
+            if decision.action is not Action.SEND and (robot.powered or not self._put_out):
                 robot.torch_off()
                 self._put_out = True
                 self._valve(robot, False)
@@ -130,13 +134,17 @@ class Worker:
         number, given_at, stop, process, *qd = found
         return Command(int(number), given_at, np.array(qd), bool(stop), orphaned, bool(process))
 
-    def _with_gas(self, command: Command, robot: Robot, sample: RobotSample) -> Command:
-        """The command whose torch waits for the gas, where a valve is wired."""
-        if self._config.gas_output is None:
-            return command
-        flows, torch = self._gas.step(sample.robot_time, command.process)
-        self._valve(robot, flows and not self._put_out)
-        return replace(command, process=torch)
+    def _with_torch(self, command: Command, robot: Robot, sample: RobotSample) -> Command:
+        """The command whose torch waits for the gas and then for the set points, where they are wired."""
+        torch, armed = command.process, False
+        if self._config.gas_output is not None:
+            flows, torch = self._gas.step(sample.robot_time, torch)
+            self._valve(robot, flows and not self._put_out)
+        if self._config.levels:
+            shown = zip(self._config.levels, sample.set_points, strict=True)
+            right = not any(apart(level.share, share) for level, (_, share) in shown)
+            armed, torch = self._points.step(sample.robot_time, torch, right)
+        return replace(command, process=torch, armed=armed)
 
     def _valve(self, robot: Robot, on: bool) -> None:
         if on != self._gas_on:
@@ -152,12 +160,14 @@ class Worker:
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
             old = command.number == self._driven and now - command.given_at > self._config.limits.hold_s
-            if command.qd.any() and old:
+            # a cell that follows the controller is waited for at rest too, so that its devices' time is its own
+            waited_for = self._config.limits.follows and now - command.given_at < RESTS_S
+            if old and (command.qd.any() or waited_for):
                 return  # the controller waits for the cell's next command
             self._driven = command.number
             # while the cell computes without a limit the arm may stay at rest, but the process is not enabled
-            process = command.process and now - command.given_at <= self._config.limits.late_s
-            if not robot.send(command.scaled_qd, ACCELERATION, process):
+            in_time = now - command.given_at <= self._config.limits.late_s
+            if not robot.send(command.scaled_qd, ACCELERATION, command.process and in_time, command.armed and in_time):
                 self._phase = Phase.STOPPED  # the next sample shows the cause
         elif decision.action is Action.STOP:
             robot.forget()
@@ -213,6 +223,7 @@ def main() -> None:
             output=config.process_output,
             arc_inputs=ArcInputs(config.arc_input, config.arc_fault_input),
             gas=config.gas_output,
+            levels=config.levels,
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))

@@ -85,6 +85,11 @@ class Profiler(Job[PlanningContext]):
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> PlanningContext:
         """See Job: the nominal data with which the procedure starts."""
+        job = scenario.part(ProfilerJob)
+        if job is not None and "sphere" in job.stages and not station.diagram.HasOutputPort("torch.touch"):
+            raise InputError(
+                "No driver tells when the torch touches the sphere in this cell: write profiler_job: {stages: [edge]}."
+            )
         return planning_context(scenario, station)
 
     def add(self, wiring: Wiring, spine: Spine, plan: PlanningContext) -> AddedProfilerJob:
@@ -101,15 +106,17 @@ class Profiler(Job[PlanningContext]):
             settled_goal=spine.arm.settled_goal,
             robot_status=spine.arm.status,
             profile=wiring.out("profiler.profile"),
-            touch=wiring.out("torch.touch"),
             hold=spine.end,
         )
+        known = wiring.station.diagram.HasOutputPort
+        if known("torch.touch"):
+            wiring.connect(procedure, touch=wiring.out("torch.touch"))
         wiring.feed("profiler.trigger", procedure.GetOutputPort("trigger"))
         ports = JobPorts(
             (procedure.GetOutputPort("job"),),
             procedure.GetOutputPort("state"),
             velocity=procedure.GetOutputPort("creep"),
-            logged={"torch": wiring.out("cheat.torch")},
+            logged={"torch": wiring.out("cheat.torch")} if known("cheat.torch") else {},
         )
         return AddedProfilerJob(plan.job, procedure, ports, plan.job.maximum_time_s)
 

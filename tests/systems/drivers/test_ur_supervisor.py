@@ -10,6 +10,8 @@ import pytest
 from weldcal.systems.drivers.ur.faults import SENTENCES, Fault, sentence
 from weldcal.systems.drivers.ur.supervisor import (
     ACTIONS,
+    BLIND_COMMANDS,
+    COMMAND_S,
     NORMAL,
     OBEYING,
     PAUSED,
@@ -352,6 +354,48 @@ def test_a_power_sources_fault_ends_the_weld_and_says_nothing_while_no_torch_is_
     assert rig.one().fault is Fault.ARC_FAULT, "latched"
 
 
+def test_a_set_point_that_its_output_does_not_show_is_a_fault_and_a_late_output_is_none() -> None:
+    rig = Rig(process=True)
+    right, wrong = {"set_points": ((0.4, 0.405), (0.0, 0.0))}, {"set_points": ((0.4, 0.4), (0.0, 0.5))}
+    assert rig.one(**right) == Decision(Action.SEND)
+    assert all(rig.one(**wrong) == Decision(Action.SEND) for _ in range(13))
+    assert rig.one(**right) == Decision(Action.SEND)
+    found = [rig.one(**wrong) for _ in range(14)]
+    assert {decision.action for decision in found[:-1]} == {Action.SEND}
+    assert (found[-1].action, found[-1].fault, found[-1].detail) == (Action.BRAKE, Fault.SET_POINT, 50.0)
+    changed = Rig()
+    assert [changed.one(set_points=((0.0, np.nan),)) for _ in range(14)][-1].fault is Fault.SET_POINT, "another range"
+
+
+def test_an_arc_that_nothing_asks_for_is_a_fault_once_the_last_one_has_had_time_to_end() -> None:
+    def readings(arc: list[bool], torch: list[bool]) -> list[bool]:
+        """Whether each pass of 4 ms is sent, for an input and a torch of these levels."""
+        rig = Rig(process=True)
+        found = []
+        for lit, on in zip(arc, torch, strict=True):
+            rig.command = replace(rig.command, process=on)
+            decision = rig.one(arc=lit, process_on=on, process_asked=on)
+            assert decision.fault in (Fault.NONE, Fault.ARC_INPUT)
+            found.append(decision.action is Action.SEND)
+        return found
+
+    def passes(seconds: float) -> int:
+        return round(seconds / PERIOD_S)
+
+    off, burns = [False] * passes(0.2), [True] * passes(0.2)
+    assert all(readings([False, True, True] * 50, [False] * 150)), "a glitch of 8 ms"
+    assert readings([*off, *burns], [False] * 2 * len(off)).count(False) == len(burns) - 3, "10 ms later"
+    ends = [True] * passes(0.9) + [False] * passes(0.5)
+    assert all(readings([*off, *burns, *ends], [*off, *burns, *[False] * len(ends)])), (
+        "an arc may end later than its torch"
+    )
+    sticks = [True] * passes(1.2)
+    found = readings([*burns, *sticks], [*burns, *[False] * len(sticks)])
+    assert found.index(False) == pytest.approx(len(burns) + passes(1.0), abs=2)
+    comes_back = [False] * 5 + [True] * 10
+    assert not all(readings([*burns, *comes_back], [*burns, *[False] * 15])), "it does not come back by itself"
+
+
 def test_a_slow_controller_has_longer_deadlines_by_its_own_clock() -> None:
     rig = Rig(LIMITS.slowed(0.25))
     assert rig.passes(2.0) == Decision(Action.SEND)
@@ -359,12 +403,23 @@ def test_a_slow_controller_has_longer_deadlines_by_its_own_clock() -> None:
     assert rig.passes(0.02, state=False, commands=False).fault is Fault.LINK_STALE
 
 
+def test_a_followed_controller_is_judged_by_the_commands_that_it_lets_pass_and_not_by_the_host() -> None:
+    slow = Rig(LIMITS.following())
+    assert slow.passes(20.0, state=False, commands=False) == Decision(Action.SEND), "neither goes on"
+    rig = Rig(LIMITS.following())
+    assert rig.passes(1.0) == Decision(Action.SEND)
+    found = [rig.one(state=False) for _ in range(60)]
+    named = [decision.fault for decision in found]
+    assert named.index(Fault.LINK_STALE) == pytest.approx(2 * BLIND_COMMANDS, abs=2), "a command in every second pass"
+    assert found[-1].detail == pytest.approx(1e3 * COMMAND_S * (BLIND_COMMANDS + 1))
+
+
 def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
     assert set(SENTENCES) == set(Fault) - {Fault.NONE}
     assert all(sentence(fault, 1.0).endswith(".") for fault in SENTENCES)
     seen = {fault for _, fault in OF_THE_SAMPLE} | {fault for _, fault in COMMANDS}
     seen |= {Fault.LINK_STALE, Fault.COMMAND_LATE, Fault.SPEED_SLIDER, Fault.JOINT_LIMIT, Fault.TRACKING}
-    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT}
+    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT, Fault.ARC_INPUT, Fault.SET_POINT}
     of_the_start = {fault for fault in Fault if fault >= Fault.GUARD_REFUSED}
     assert seen == set(Fault) - of_the_start - {Fault.NONE, Fault.WORKER_DIED}, "every fault is tested here"
     assert seen <= set(ACTIONS)

@@ -1,7 +1,7 @@
 """Bridges between a cell and two devices of its world, the scanner and the finger camera, on which a test does what wires and devices do.
 
 Each is a thread in the tester's process: it passes on what the device says, or is killed (refuses and closes), frozen (says nothing),
-delayed by 2 s, or sends garbage. `how` may change at any time; "" is right again.
+delayed by 2 s of the world's time, or sends garbage. `how` may change at any time; "" is right again.
 """
 
 import contextlib
@@ -11,9 +11,12 @@ import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+from weldcal.models.errors import InputError
 
 DELAY_S = 2.0
 LOOK_S = 0.02
@@ -24,8 +27,10 @@ SEED = 12
 class Bridge:
     """A port that a cell connects to, and the device's own port behind it; one client at a time."""
 
-    def __init__(self, listen: tuple[str, int], device: tuple[str, int]) -> None:
-        self.how = ""
+    def __init__(
+        self, listen: tuple[str, int], device: tuple[str, int], now: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.how, self._now = "", now
         self._listen, self._device = listen, device
         self._server: socket.socket | None = None
         self._hear()
@@ -46,7 +51,9 @@ class Bridge:
                 self._be_deaf()
                 self._ends.wait(LOOK_S)
                 continue
-            with contextlib.suppress(OSError):  # also what either side does to its connection
+            with contextlib.suppress(
+                OSError, InputError
+            ):  # what either side does to its connection, or a world that ends
                 client, _ = self._hear().accept()
                 with client, socket.create_connection(self._device, 5.0) as device:
                     self._pass_on(client, device)
@@ -70,9 +77,9 @@ class Bridge:
                 data = side.recv(BLOCK)
                 if not data:
                     return
-                wait = DELAY_S if self.how == "delayed" and side is device else 0.0
-                kept.append((time.monotonic() + wait, side is device, data))
-            while kept and kept[0][0] <= time.monotonic() and self.how != "frozen":
+                delayed = self.how == "delayed" and side is device
+                kept.append((self._now() + DELAY_S if delayed else 0.0, side is device, data))
+            while kept and self.how != "frozen" and (kept[0][0] == 0.0 or kept[0][0] <= self._now()):
                 _, up, data = kept.popleft()
                 if up:
                     self._up(client, data)
@@ -90,9 +97,16 @@ class PictureBridge(Bridge):
 class ScannerBridge(Bridge):
     """Of a scanner's trigger and of the folder into which it writes: garbage is a cloud of random bytes."""
 
-    def __init__(self, listen: tuple[str, int], device: tuple[str, int], written: Path, read: Path) -> None:
+    def __init__(
+        self,
+        listen: tuple[str, int],
+        device: tuple[str, int],
+        written: Path,
+        read: Path,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._written, self._read = written, read
-        super().__init__(listen, device)
+        super().__init__(listen, device, now)
 
     def _up(self, client: socket.socket, data: bytes) -> None:
         for suffix in (".json", ".npz"):  # the note first, as the scanner does

@@ -3,6 +3,7 @@
 import dataclasses as dc
 
 import numpy as np
+from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
@@ -10,6 +11,7 @@ from weldcal.calibration.planning.clearance import lowest_point, self_distance
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.tool import WeldingTool
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot
@@ -29,12 +31,16 @@ def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
     """The simulated station of a scenario whose arm stands where its controller has moved it; all else follows from `seed`.
 
     Raises:
-        InputError: the scenario has no simulated scanner, no workpiece or no finger camera.
+        InputError: the scenario has no simulated scanner or profiler, or a tool and no workpiece or no finger camera.
     """
     scenario = dc.replace(scenario, robot=WorldArm())
-    if not (scenario.scanner.SIMULATED and scenario.finger_camera.SIMULATED) or scenario.workpiece is None:
+    feels = scenario.welds
+    if not (scenario.scanner.SIMULATED or scenario.profiler.SIMULATED) or (
+        feels and (not scenario.finger_camera.SIMULATED or scenario.workpiece is None)
+    ):
         raise InputError(
-            "The world needs a scenario with a simulated scanner, a simulated finger camera and a workpiece, such as s_groove."
+            "The world needs a scenario with a simulated scanner or profiler, and a simulated finger camera and a workpiece or tool: none, "
+            "such as s_groove, motion or profiler_edge."
         )
     if not isinstance(scenario.robot_2, NoDevice):
         raise InputError("The world has one arm: remove robot_2 from its scenario.")
@@ -53,12 +59,11 @@ def still(station: Station, q: Array) -> tuple[Simulator, Context]:
 
 
 class Physics:
-    """The plant of the world, advanced by the controller's frames."""
+    """The plant of the world, advanced by the controller's frames; without a tool nothing touches, and the arm is where it should be."""
 
     def __init__(self, scenario: Scenario, arm: ArmModel, seed: int, repeatability_mm: float) -> None:
         self.station = true_station(scenario, arm, seed)
         assert self.station.world is not None
-        assert self.station.tool is not None
         self.world: SimulatedWorld = self.station.world
         self._table_z_m = scenario.table_height_m()
         self._joints = Repeatability(arm, repeatability_mm, seed)
@@ -68,15 +73,11 @@ class Physics:
         self._simulator.Initialize()
         diagram, plant = self.station.diagram, self.world.plant
         self._desired = diagram.GetInputPort("arm.desired_state")
-        self._torch_port = diagram.GetOutputPort("cheat.torch")
         self._plant_context = plant.GetMyContextFromRoot(self._context)
         self._poses = plant.get_body_poses_output_port()
-        tool = self.station.tool
-        assert self.world.tool is not None
-        self._plate, self._tip = (
-            int(plant.GetBodyByName(name, self.world.tool).index()) for name in ("tool_plate", "tip_z")
-        )
-        self._X_TM = tool.X_FT.InvertAndCompose(tool.X_FM_rest)
+        self._torch_port = diagram.GetOutputPort("cheat.torch") if self.station.tool is not None else None
+        self._tag = None if self.station.tool is None else _tag_on(self.world, self.station.tool)
+        self._true_q = np.array(self.station.q_start)
         self._frame = 0
         self.time_s = 0.0
         self.arc_on_s = 0.0
@@ -88,12 +89,13 @@ class Physics:
         """Advance by one frame with the controller's joints (6,) rad, rad/s; `arc` tells whether the arc burns."""
         self._frame += 1
         self.time_s = STEP_S * self._frame
-        true_q = self._joints.true_joints(q, qd)
-        self._desired.FixValue(self._context, np.concatenate([true_q, qd]))
-        self._simulator.AdvanceTo(self.time_s)
+        true_q = self._true_q = self._joints.true_joints(q, qd)
+        if self._torch_port is not None:
+            self._desired.FixValue(self._context, np.concatenate([true_q, qd]))
+            self._simulator.AdvanceTo(self.time_s)
         if arc.burns:
             self.arc_on_s += STEP_S
-            if self._frame % LOG_EVERY == 0:
+            if self._frame % LOG_EVERY == 0 and self._torch_port is not None:
                 self.torch.append(np.array(self._torch_port.Eval(self._context)))
         if self._frame % COLLISION_EVERY == 0:
             frames = link_frames(self._arm, true_q)
@@ -111,10 +113,22 @@ class Physics:
 
     def positions(self) -> Array:
         """All positions of the plant, as the scanner's process poses its copy of it."""
-        return np.array(self.world.plant.GetPositions(self._plant_context))
+        found = np.array(self.world.plant.GetPositions(self._plant_context))
+        if self._torch_port is None:
+            found[:6] = self._true_q
+        return found
 
     def tag(self) -> Array:
         """The tag's pose in the flange frame, X_FM (4, 4), with the soft tip as it is bent now."""
+        assert self._tag is not None
+        plate, tip, X_TM = self._tag
         poses = self._poses.Eval(self._plant_context)
-        found = poses[self._plate].InvertAndCompose(poses[self._tip]) @ self._X_TM
+        found = poses[plate].InvertAndCompose(poses[tip]) @ X_TM
         return np.asarray(found.GetAsMatrix4())
+
+
+def _tag_on(world: SimulatedWorld, tool: WeldingTool) -> tuple[int, int, RigidTransform]:
+    """Indices of the bodies of the tool's plate and of its tip, and the tag's pose on the tip, X_TM."""
+    assert world.tool is not None
+    plate, tip = (int(world.plant.GetBodyByName(name, world.tool).index()) for name in ("tool_plate", "tip_z"))
+    return plate, tip, tool.X_FT.InvertAndCompose(tool.X_FM_rest)

@@ -27,7 +27,7 @@ WORLD = """\
 description: A straight groove whose scanner stands where the drawing has it.
 robot: !SimulatedUr {}
 scanner: !RenderedScanner
-  {preset: ideal, width: 824, height: 616, mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0}
+  {preset: ideal, mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0, width: 824, height: 616}
 finger_camera: !RenderedFingerCamera {}
 workpiece:
   shape: straight
@@ -36,6 +36,13 @@ workpiece:
   groove_error: {translation_mm: 1.0, rotation_deg: 0.2}
 home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 """
+
+
+PLAYED_PIXELS, SMALL_PIXELS = "width: 824, height: 616", "width: 412, height: 308"
+SOON = (  # small scans, and what a bridged cell allows for one, s of the world
+    ("scan_timeout_s: 60.0", "scan_timeout_s: 2.0"),
+    ("width: 824\n  height: 616", "width: 412\n  height: 308"),
+)
 
 
 class NoWorld(WeldcalError):
@@ -57,11 +64,8 @@ class WiredWorld:
     @contextmanager
     def control(self) -> Iterator[Emulator]:
         """A connection to the controller's control channel, for one thread."""
-        emulator = Emulator(self.process, self.host, CONTROL_PORT)
-        try:
+        with _controller(self.process, self.host) as emulator:
             yield emulator
-        finally:
-            emulator.leave()
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """One request to the controller's control channel."""
@@ -74,26 +78,31 @@ class WiredWorld:
         return found
 
 
+@dataclass(frozen=True)
+class Played:
+    """`weldcal emulate-cell` in a process of its own: that process, those of its devices, and the file of its truth."""
+
+    process: subprocess.Popen[str]
+    children: list[int]
+    truth_file: Path
+
+    def truth(self) -> dict[str, Any]:
+        """The contents of the truth file."""
+        found: dict[str, Any] = json.loads(self.truth_file.read_text(encoding="utf-8"))
+        return found
+
+
 @contextmanager
-def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: bool = False) -> Iterator[WiredWorld]:
-    """Play the world at a loopback address for the duration of the block; `bridged`: scanner and camera through bridges.
+def played_world(folder: Path, world: str, wires: str, seed: int) -> Iterator[Played]:
+    """Play a world, the text of a scenario, behind the wires of a cell's scenario for the duration of the block.
 
     Raises:
         NoWorld: it has not begun.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = {name: folder / name for name in ("cell.yaml", "wires.yaml", "world.yaml", "truth.json", "log")}
-    scans, passed = folder / "scans", folder / "passed"
-    text = (SCENARIO_FOLDER / f"{CELL}.yaml").read_text(encoding="utf-8")
-    text = text.replace("pace: 0.5", "pace: 1.0") + WELD_ONLY.format(X_BC=X_BC, seam_mm=seam_mm)
-    text = text.replace(PLAYED_HOST, host)
-    paths["wires.yaml"].write_text(text.replace(PLAYED_SCANS, str(scans)), encoding="utf-8")
-    if bridged:
-        passed.mkdir(exist_ok=True)
-        for port in (TRIGGER_PORT, STREAM_PORT):
-            text = text.replace(f"{host}:{port}", f"{host}:{port + BRIDGED}")
-    paths["cell.yaml"].write_text(text.replace(PLAYED_SCANS, str(passed if bridged else scans)), encoding="utf-8")
-    paths["world.yaml"].write_text(WORLD, encoding="utf-8")
+    paths = {name: folder / name for name in ("wires.yaml", "world.yaml", "truth.json", "log")}
+    paths["wires.yaml"].write_text(wires, encoding="utf-8")
+    paths["world.yaml"].write_text(world, encoding="utf-8")
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(paths["world.yaml"])]
     command += ["--cell", str(paths["wires.yaml"]), "--seed", str(seed), "--truth", str(paths["truth.json"])]
     command += ["--parent", str(os.getpid())]
@@ -104,17 +113,57 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
         stack.callback(_end, process, children)
         line = process.stdout.readline() if process.stdout is not None else ""
         children += [int(pid) for pid in re.findall(r"process (\d+)", line)]
-        if len(children) < 2:
+        if not children:
             words = line + paths["log"].read_text(encoding="utf-8")
-            raise NoWorld(f"The world at {host} has not begun: {words.strip() or 'it ended without a word'}")
+            raise NoWorld(f"The world in '{folder}' has not begun: {words.strip() or 'it ended without a word'}")
+        yield Played(process, children, paths["truth.json"])
+
+
+@contextmanager
+def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: bool = False) -> Iterator[WiredWorld]:
+    """Play the world at a loopback address for the duration of the block; `bridged`: scanner and camera
+    through bridges, with small scans and a short limit for each.
+
+    Raises:
+        NoWorld: it has not begun.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    cell = folder / "cell.yaml"
+    scans, passed = folder / "scans", folder / "passed"
+    text = (SCENARIO_FOLDER / f"{CELL}.yaml").read_text(encoding="utf-8")
+    text = text.replace("pace: 0.5", "pace: 1.0") + WELD_ONLY.format(X_BC=X_BC, seam_mm=seam_mm)
+    text = text.replace(PLAYED_HOST, host)
+    wires = text.replace(PLAYED_SCANS, str(scans))
+    if bridged:
+        passed.mkdir(exist_ok=True)
+        for port in (TRIGGER_PORT, STREAM_PORT):
+            text = text.replace(f"{host}:{port}", f"{host}:{port + BRIDGED}")
+        for usual, soon in SOON:
+            text = text.replace(usual, soon)
+    cell.write_text(text.replace(PLAYED_SCANS, str(passed if bridged else scans)), encoding="utf-8")
+    small = WORLD.replace(PLAYED_PIXELS, SMALL_PIXELS)
+    with contextlib.ExitStack() as stack:
+        played = stack.enter_context(played_world(folder, small if bridged else WORLD, wires, seed))
+        process, children = played.process, played.children
         bridges: dict[str, Bridge] = {}
         if bridged:
             trigger, stream = (host, TRIGGER_PORT), (host, STREAM_PORT)
-            bridges["scanner"] = ScannerBridge((host, TRIGGER_PORT + BRIDGED), trigger, scans, passed)
-            bridges["finger camera"] = PictureBridge((host, STREAM_PORT + BRIDGED), stream)
+            clocks = [stack.enter_context(_controller(process, host)) for _ in range(2)]  # one for each thread
+            trigger_clock, stream_clock = (lambda clock=clock: float(clock.ask(ask="time")["timestamp"]) for clock in clocks)  # fmt: skip
+            bridges["scanner"] = ScannerBridge((host, TRIGGER_PORT + BRIDGED), trigger, scans, passed, trigger_clock)
+            bridges["finger camera"] = PictureBridge((host, STREAM_PORT + BRIDGED), stream, stream_clock)
             for bridge in bridges.values():
                 stack.callback(bridge.close)
-        yield WiredWorld(process, host, paths["cell.yaml"], paths["truth.json"], children[0], children[-1], bridges)
+        yield WiredWorld(process, host, cell, played.truth_file, children[0], children[-1], bridges)
+
+
+@contextmanager
+def _controller(process: subprocess.Popen[str], host: str) -> Iterator[Emulator]:
+    emulator = Emulator(process, host, CONTROL_PORT)
+    try:
+        yield emulator
+    finally:
+        emulator.leave()
 
 
 def _end(process: subprocess.Popen[str], children: list[int]) -> None:

@@ -1,24 +1,29 @@
-"""Process of the world's 3D scanner: a line over TCP triggers it, and it drops a cloud into a folder."""
+"""Process of the world's 3D scanner or laser profiler: a line over TCP triggers it, and it drops a file into a folder."""
 
 import contextlib
 import json
 import os
 import signal
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
-from weldcal.systems.messages import Scan
+from weldcal.systems.messages import ProfileScan, Scan
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.emulators.cell.physics import still, true_station
 
 EXPOSED_S = 0.3  # of the copy's time: a little longer than the scanner's exposure
+PROFILED_S = 0.03  # of the copy's time, for a profiler
+SCANNER, PROFILER = "scanner", "profiler"
+CLOUD = 3  # columns of a cloud; a profile has two
 POSE_LIMIT_S = 30.0
 LONGEST_LINE = 4096
 
@@ -33,42 +38,50 @@ class ScannerSetup:
     host: str
     port: int
     folder: Path
+    device: str = SCANNER  # or PROFILER
 
 
 class Renderer:
     """A copy of the world that is posed as the world is when the scanner is triggered."""
 
     def __init__(self, setup: ScannerSetup) -> None:
+        self._device = setup.device
         self._station = true_station(load_scenario(setup.scenario), setup.arm, setup.seed)
         assert self._station.world is not None
         self._world = self._station.world
         self._scans = 0
 
     def scan(self, positions: Array) -> Array:
-        """The organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest."""
+        """The organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest; a profile is (n, 2) m."""
         self._scans += 1
         plant = self._world.plant
         simulator, context = still(self._station, positions[:6])
         plant.SetPositions(plant.GetMyContextFromRoot(context), positions)
         diagram = self._station.diagram
         diagram.GetInputPort("arm.desired_state").FixValue(context, np.concatenate([positions[:6], np.zeros(6)]))
-        diagram.GetInputPort("scanner.trigger").FixValue(context, float(self._scans))
-        simulator.AdvanceTo(EXPOSED_S)
+        diagram.GetInputPort(f"{self._device}.trigger").FixValue(context, float(self._scans))
+        simulator.AdvanceTo(EXPOSED_S if self._device == SCANNER else PROFILED_S)
+        if self._device == PROFILER:
+            profile: ProfileScan = diagram.GetOutputPort("profiler.profile").Eval(context)
+            return np.asarray(profile.points)
         found: Scan = diagram.GetOutputPort("scanner.scan").Eval(context)
         if not found.sequence:
             raise RuntimeError("the scanner made no scan within its exposure")
         return np.asarray(found.points_C, dtype=np.float32)
 
 
-def drop(folder: Path, number: int, points: Array, capture_time: float, request: int) -> Path:
+def drop(folder: Path, number: int, points: NDArray[Any], note: Mapping[str, float]) -> Path:
     """Write a cloud as a program of a real scanner should: the note first, then the cloud under another name, then its name."""
-    name = f"scan_{number:04d}"
+    name, suffix = f"scan_{number:04d}", ".npz" if points.shape[-1] == CLOUD else ".npy"
     hidden, path = folder / f".{name}.json.tmp", folder / f"{name}.json"
-    hidden.write_text(json.dumps({"capture_time": capture_time, "request": request}), encoding="ascii")
+    hidden.write_text(json.dumps(note), encoding="ascii")
     os.replace(hidden, path)
-    hidden, path = folder / f".{name}.npz.tmp", folder / f"{name}.npz"
+    hidden, path = folder / f".{name}{suffix}.tmp", folder / f"{name}{suffix}"
     with hidden.open("wb") as file:
-        np.savez(file, points=points)
+        if points.shape[-1] == CLOUD:
+            np.savez(file, points=points)
+        else:
+            np.save(file, points)
     os.replace(hidden, path)
     return path
 
@@ -122,7 +135,7 @@ def _answer(line: str, renderer: Renderer, folder: Path, world: Connection, numb
     if not world.poll(POSE_LIMIT_S):
         return "error the world stands still"
     taken, positions = world.recv()
-    drop(folder, number, renderer.scan(positions), taken, int(request))
+    drop(folder, number, renderer.scan(positions), {"capture_time": taken, "request": int(request)})
     return f"ok {request}"
 
 

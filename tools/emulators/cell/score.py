@@ -17,10 +17,14 @@ def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest:
     seam's length is welded and nothing collided), or stopped.
     """
     truth = physics.station.truth
+    found: dict[str, object] = {}
+    if truth.X_BC is not None:
+        found["X_BC"] = truth.X_BC.GetAsMatrix4().tolist()
+    if truth.profiler is not None:
+        found["X_FS"] = truth.profiler.X_FS.GetAsMatrix4().tolist()
     seam = true_seam(truth)
-    assert truth.X_BC is not None
-    assert seam is not None
-    found: dict[str, object] = {"X_BC": truth.X_BC.GetAsMatrix4().tolist()}
+    if seam is None:  # a world without a workpiece
+        return found | {"collisions": physics.collisions, "time_s": physics.time_s}
     welded_m = 0.0
     if len(physics.torch) >= FEWEST:
         error = path_error(np.array(physics.torch), seam)

@@ -16,12 +16,16 @@ import numpy as np
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import loopback_address
+from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.sensors.folder_profiler import FolderProfiler
 from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.systems.drivers.sensors.stamps import unix_now
 from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamera
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
+from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
 from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -29,8 +33,11 @@ from weldcal.tools.emulators.cell.arc import Arc
 from weldcal.tools.emulators.cell.finger_process import FingerSetup, run_finger_camera
 from weldcal.tools.emulators.cell.input_wire import InputWire
 from weldcal.tools.emulators.cell.physics import STEP_S, Physics
-from weldcal.tools.emulators.cell.scanner_process import ScannerSetup, run_scanner
+from weldcal.tools.emulators.cell.scanner_process import PROFILER, SCANNER, ScannerSetup, run_scanner
 from weldcal.tools.emulators.cell.score import score
+from weldcal.tools.emulators.cell.stream_process import StreamSetup, run_stream
+from weldcal.tools.emulators.cell.streamer import Streamer
+from weldcal.tools.emulators.cell.waiter import Waiter
 from weldcal.tools.emulators.ur.addresses import take_address
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.main import FASTEST, SLOWEST, Emulation
@@ -41,7 +48,7 @@ START_LIMIT_S = 120.0
 WAITS_S = 30.0  # for a cell that is late, of the host
 REST_RAD_S = 1e-3
 RESTS_S = 0.2
-CAMERA_LIMIT_S = 1.0  # of the host: a camera that does not answer is not waited for longer
+SET_POINTS = ("wire_feed", "arc_voltage")  # keys of the cell's robot
 Truth = dict[str, object]
 
 
@@ -57,8 +64,9 @@ class Wires:
     arc_input: int | None
     fault_input: int | None
     folder: Path
-    trigger: tuple[str, int]
-    stream: tuple[str, int]
+    trigger: tuple[str, int] | None  # None: the scanner streams
+    stream: tuple[str, int] | None  # None: there is no finger camera
+    set_points: Mapping[str, AnalogSetPoint]
 
 
 def wires_of(cell: Scenario) -> Wires:
@@ -67,17 +75,25 @@ def wires_of(cell: Scenario) -> Wires:
     Raises:
         InputError: a device of the scenario is not by wire, or not on loopback.
     """
-    robot, scanner, camera = cell.robot, cell.scanner, cell.finger_camera
-    if not (isinstance(robot, UrRtde) and isinstance(scanner, FolderScanner) and isinstance(camera, VideoFingerCamera)):
+    robot, camera = cell.robot, cell.finger_camera
+    scanner = cell.profiler if isinstance(cell.scanner, NoDevice) else cell.scanner
+    if not (isinstance(robot, UrRtde) and isinstance(scanner, FolderScanner | FolderProfiler)) or not isinstance(
+        camera, VideoFingerCamera | NoDevice
+    ):
         raise InputError(
-            "The cell's scenario must have a robot !UrRtde, a scanner !FolderScanner and a finger_camera !VideoFingerCamera, "
-            "such as wired_s_groove."
+            "The cell's scenario must have a robot !UrRtde, a scanner !FolderScanner or a profiler !FolderProfiler, and a finger_camera "
+            "!VideoFingerCamera or !NoDevice, such as wired_s_groove, wired_motion or wired_profiler_edge."
         )
-    trigger, stream = urlsplit(scanner.trigger), urlsplit(camera.source)
-    if trigger.scheme != "tcp" or stream.scheme != "http" or not scanner.folder:
+    streams = isinstance(scanner, FolderScanner) and scanner.streams
+    trigger, stream = urlsplit(scanner.trigger), urlsplit("" if isinstance(camera, NoDevice) else camera.source)
+    if (
+        trigger.scheme != ("" if streams else "tcp")
+        or (isinstance(camera, VideoFingerCamera) and stream.scheme != "http")
+        or not scanner.folder
+    ):
         raise InputError(
-            "The world needs scanner.folder, scanner.trigger: tcp://HOST:PORT and finger_camera.source: http://HOST:PORT/PATH in "
-            "the cell's scenario."
+            "The world needs folder and trigger: tcp://HOST:PORT of scanner or profiler (or streams: true without a trigger) and "
+            "finger_camera.source: http://HOST:PORT/PATH in the cell's scenario."
         )
     x, y, z = robot.payload_cog_m
     return Wires(
@@ -89,8 +105,9 @@ def wires_of(cell: Scenario) -> Wires:
         robot.arc_input,
         robot.arc_fault_input,
         Path(scanner.folder),
-        (loopback_address(trigger.hostname or ""), trigger.port or 0),
-        (loopback_address(stream.hostname or ""), stream.port or 0),
+        None if streams else (loopback_address(trigger.hostname or ""), trigger.port or 0),
+        (loopback_address(stream.hostname or ""), stream.port or 0) if stream.scheme else None,
+        {name: point for name in SET_POINTS if (point := getattr(robot, name)) is not None},
     )
 
 
@@ -102,39 +119,48 @@ class _World:
         controller: Controller,
         physics: Physics,
         wires: Wires,
-        camera: RenderedFingerCamera,
         scanner: Connection,
-        finger: Connection,
+        finger: tuple[RenderedFingerCamera, Connection] | None,
+        streamer: Streamer | None,
         wanted_m: float | None,
         write: Callable[[Truth], None],
     ) -> None:
         self._controller, self._physics, self._wires = controller, physics, wires
-        self._scanner, self._finger, self._wanted_m, self._write = scanner, finger, wanted_m, write
+        self._scanner, self._streamer, self._wanted_m, self._write = scanner, streamer, wanted_m, write
         self._arc, self._wire = Arc(), InputWire()
-        self._every = 1.0 / camera.rate_hz
-        self._latency_s = camera.latency_s
+        self._every, self._latency_s = (
+            (np.inf, 0.0) if finger is None else (1.0 / finger[0].rate_hz, finger[0].latency_s)
+        )
         self._next_picture = 0.0
-        self._unshown = False
+        self._waiter = None if finger is None else Waiter(finger[1])
         self._pictures: deque[tuple[float, tuple[float, Array]]] = deque()
         self._programs = controller.script_count
         self._rests_s, self._dirty = 0.0, True
+        self._given: dict[str, float] = {}
 
     def step(self, now: float) -> None:
         """One frame of the world, after the controller's."""
         c, physics, wires = self._controller, self._physics, self._wires
         enabled = wires.process_output is not None and bool(c.terminals.digital_outputs >> wires.process_output & 1)
         burned = self._arc.burns
-        self._arc.step(enabled, STEP_S)
+        shares = {name: c.terminals.analog_outputs[point.output] for name, point in wires.set_points.items()}
+        self._arc.step(enabled, STEP_S, all(share > 0.0 for share in shares.values()))
         burns, fault = self._wire.step(physics.time_s, self._arc.burns, self._arc.fault)
         self._set_input(wires.arc_input, burns)
         self._set_input(wires.fault_input, fault)
         if c.script_count != self._programs:
             if not c.terminals.digital_outputs and c.program is not None and c.program.kind != "sec":
                 physics.forget()
+                self._given = {}
             self._programs = c.script_count
         physics.step(c.arm.q, c.arm.qd, self._arc)
+        if self._arc.burns and shares:
+            points = wires.set_points
+            self._given = {n: p.at_zero + shares[n] * (p.at_full - p.at_zero) for n, p in points.items()}
         self._expose()
         self.answer_scanner()
+        if self._streamer is not None:
+            self._streamer.step(c.frame, physics.positions, c.program is not None)
         rests = float(np.abs(c.arm.qd).max()) < REST_RAD_S
         self._rests_s = self._rests_s + STEP_S if rests else 0.0
         self._dirty |= burned != self._arc.burns or not rests
@@ -146,13 +172,24 @@ class _World:
         return {
             "arc_inputs": lambda r, now: setattr(self._wire, "how", str(r.get("how", ""))),
             "arc_fails": lambda r, now: setattr(self._arc, "fails", bool(r.get("on", True))),
+            "knock": lambda r, now: self._knock(),
         }
+
+    def _knock(self) -> None:
+        if self._streamer is None:
+            raise InputError("Only the stand of a scanner that streams is knocked.")
+        self._streamer.knock(self._physics.time_s)
+        self.write()
 
     def write(self) -> None:
         """Write the truth as it is now."""
         self._dirty = False
         rests = float(np.abs(self._controller.arm.qd).max()) < REST_RAD_S
-        self._write(score(self._physics, self._wanted_m, arc_burns=self._arc.burns, at_rest=rests))
+        found = score(self._physics, self._wanted_m, arc_burns=self._arc.burns, at_rest=rests)
+        found |= {"set_points": self._given} if self._wires.set_points else {}
+        found |= {} if self._streamer is None else self._streamer.truth()
+        found["robot_time_at_0_s"] = self._controller.timestamp - self._physics.time_s
+        self._write(found)
 
     def _set_input(self, n: int | None, on: bool) -> None:
         if n is not None:
@@ -162,22 +199,19 @@ class _World:
     def _expose(self) -> None:
         """Take a picture where one is due, and send those whose latency is over."""
         t = self._physics.time_s
+        if self._waiter is None:
+            return
         if t >= self._next_picture - 1e-9:
             self._next_picture += self._every
             self._pictures.append((t + self._latency_s, (unix_now(), self._physics.tag())))
         while self._pictures and t >= self._pictures[0][0]:
-            picture = self._pictures.popleft()[1]
-            with contextlib.suppress(OSError, EOFError):
-                # the world waits for its camera: no picture is late by more than this computer
-                if self._unshown and self._finger.poll(CAMERA_LIMIT_S):
-                    self._finger.recv()
-                    self._unshown = False
-                if not self._unshown:
-                    self._finger.send(picture)
-                    self._unshown = True
+            # the world waits for its camera: no picture is late by more than this computer
+            self._waiter.send(self._pictures.popleft()[1])
 
     def answer_scanner(self) -> None:
         """Tell the scanner how the world stands, where it has asked."""
+        if self._streamer is not None:
+            return
         with contextlib.suppress(OSError, EOFError):
             if self._scanner.poll(0.0):
                 self._scanner.recv()
@@ -215,25 +249,36 @@ def run_world(
     fastest = wires.pace if pace is None else pace
     if not SLOWEST <= fastest <= FASTEST:
         raise InputError(f"The pace must be from {SLOWEST} to {FASTEST:.0f}, not {fastest:g}.")
-    camera, device = world.finger_camera, world.robot
-    if not isinstance(camera, RenderedFingerCamera):
+    camera, nominal = world.finger_camera, world.robot
+    if wires.stream is not None and not isinstance(camera, RenderedFingerCamera):
         raise InputError("The world's finger camera is !RenderedFingerCamera.")
+    if wires.trigger is None and not isinstance(world.scanner, StreamingScanner):
+        raise InputError("A cell whose scanner streams needs a world with scanner: !StreamingScanner {}.")
     wires.folder.mkdir(parents=True, exist_ok=True)
     arm = nominal_arm(world)
     q_home = np.deg2rad(world.home_deg)
-    millimetres = device.repeatability_mm if isinstance(device, SimulatedUr) else 0.0
+    millimetres = nominal.repeatability_mm if isinstance(nominal, SimulatedUr) else 0.0
     context = get_context("spawn")
     with take_address(wires.host, 10.0), contextlib.ExitStack() as stack:
-        setup = ScannerSetup(world_name, arm, seed, *wires.trigger, wires.folder)
-        scanner = _start(context, stack, run_scanner, setup)
+        devices = [f"robot {wires.host}", f"scans in {wires.folder}"]
+        if wires.trigger is None:
+            scanner = _start(context, stack, run_stream, StreamSetup(world_name, arm, seed, wires.folder))
+            devices.append(f"as they stream (process {scanner.pid})")
+        else:
+            device = SCANNER if isinstance(cell.scanner, FolderScanner) else PROFILER
+            setup = ScannerSetup(world_name, arm, seed, *wires.trigger, wires.folder, device)
+            scanner = _start(context, stack, run_scanner, setup)
+            devices.append(f"trigger {setup.host}:{setup.port} (process {scanner.pid})")
         physics = Physics(world, arm, seed, millimetres)
-        assert physics.station.tool is not None
-        finger = _start(
-            context,
-            stack,
-            run_finger_camera,
-            FingerSetup(physics.station.tool, camera.camera(), seed, *wires.stream),
-        )
+        streamer = None
+        if isinstance(world.scanner, StreamingScanner) and wires.trigger is None:
+            streamer = Streamer(world.scanner, seed, scanner.pipe, unix_now)
+        finger = None
+        if wires.stream is not None and isinstance(camera, RenderedFingerCamera):
+            tool = physics.station.tool
+            assert tool is not None
+            finger = _start(context, stack, run_finger_camera, FingerSetup(tool, camera.camera(), seed, *wires.stream))
+            devices.append(f"pictures http://{wires.stream[0]}:{wires.stream[1]}/ (process {finger.pid})")
         controller = Controller(arm, q_home, parse_version("5.21"))
         controller.payload.mass, controller.payload.center = wires.payload_kg, list(wires.payload_cog_m)
         length = cell.welding.seam_length_mm
@@ -241,9 +286,9 @@ def run_world(
             controller,
             physics,
             wires,
-            camera,
             scanner.pipe,
-            finger.pipe,
+            (camera, finger.pipe) if finger is not None and isinstance(camera, RenderedFingerCamera) else None,
+            streamer,
             None if length is None else 1e-3 * length,
             write,
         )
@@ -260,12 +305,9 @@ def run_world(
         )
         stack.callback(inside.write)
         for child in (scanner, finger):
-            child.wait_until_ready()
-        sentence = (
-            f"The cell's world answers: robot {wires.host}, scans in {wires.folder}, trigger {setup.host}:{setup.port} (process "
-            f"{scanner.pid}), pictures http://{wires.stream[0]}:{wires.stream[1]}/ (process {finger.pid}), faults at port "
-            f"{control_port}."
-        )
+            if child is not None:
+                child.wait_until_ready()
+        sentence = f"The cell's world answers: {', '.join(devices)}, faults at port {control_port}."
         inside.write()
         emulation.run(parent, lambda _: ready(sentence))
 

@@ -7,8 +7,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -112,9 +113,10 @@ class Stream(threading.Thread):
 class Bench:
     """One emulated controller and, between `start` and `end`, an arm that moves over a link to it."""
 
-    def __init__(self, emulator: Emulator, output: int | None = None) -> None:
+    def __init__(self, emulator: Emulator, output: int | None = None, torch: Mapping[str, Any] | None = None) -> None:
+        """`torch`: what else of it is wired, as UrLink.start takes it."""
         self.emulator = emulator
-        self.output = output
+        self.output, self._torch = output, torch or {}
         self.host = emulator.host
         self.arm = load_arm()
         self.home = np.array(HOME)
@@ -146,7 +148,13 @@ class Bench:
         output = OUTPUT if wired or process else self.output
         x, y, z = config.payload_cog_m
         self.link = UrLink.start(
-            self.host, self.arm, limits, payload_kg=config.payload_kg, payload_cog_m=(x, y, z), process_output=output
+            self.host,
+            self.arm,
+            limits,
+            payload_kg=config.payload_kg,
+            payload_cog_m=(x, y, z),
+            process_output=output,
+            **self._torch,
         )
         self._stream = Stream(self.link, self.arm, self.home)
         self._stream.process = process

@@ -32,15 +32,15 @@ NAMES = {
     "scanner": "scanner",
     "finger camera": "finger camera",
     "controller": "LINK|GUARD|CONTROLLER|STOP|PROGRAM",
-    "digital inputs": "arc|power source",
+    "digital inputs": "arc|ARC|power source",
 }
 CALIBRATES = (
     "job: {calibrate: true, weld: false}\ncalibration: {minimum_scans: 4, maximum_scans: 6, required_error_mm: 1.0}\n"
 )
-OF_THE_LINK: dict[str, tuple[str, dict[str, float]]] = {
+OF_THE_LINK: dict[str, tuple[str, dict[str, object]]] = {
     "killed": ("close_tcp", {}),
     "frozen": ("half_open", {}),
-    "delayed": ("delay", {"seconds": 2.0}),
+    "delayed": ("delay", {"seconds": 2.0, "clock": "controller"}),
     "garbage": ("corrupt", {"n": 50}),
 }
 ESTABLISHED_S = 0.3  # for which the arc is established before a fault of the phase "weld"
@@ -58,18 +58,15 @@ class Happening:
     phase: str
 
     @property
-    def unseen(self) -> bool:
-        """Whether the job may be done in spite of it, because nothing is read from the device that would show it.
+    def silent(self) -> bool:
+        """Whether no signal of the device differs from that of a sound one until the job ends, so that the job must be done, and right.
 
-        The scanner is not asked again after the scan of the workpiece, and a scan that is 2 s late is still right. The pictures and
-        the power source are not read while only the scanner is calibrated. An input that stands still or is slow while the arc burns
-        says what it should.
+        A scanner that is not asked says nothing, and nothing is asked of it after the scan of the workpiece; only its connection can
+        end. The inputs of a power source whose torch is never lit are off whether their wires are cut, stuck or slow.
         """
         if self.device == "scanner":
-            return self.fault == "delayed" or (self.fault != "killed" and self.phase in ("approach", "feel", "weld"))
-        if self.device == "digital inputs" and self.phase == "weld":
-            return self.fault in ("frozen", "delayed")
-        return self.phase == "calibrate" and self.device in ("finger camera", "digital inputs")
+            return self.fault != "killed" and self.phase in ("approach", "feel", "weld")
+        return self.device == "digital inputs" and self.fault != "garbage" and self.phase == "calibrate"
 
 
 def run_job(
@@ -77,14 +74,16 @@ def run_job(
 ) -> dict[str, object]:
     """Run one job, throw the fault in, repair it after the end, and judge by the world's record.
 
-    `problems` is empty where the job was held by the fault's name (or done, where that is right), and neither arm nor torch
+    `problems` is empty where the job was held by the fault's name (or done, where the fault is silent), and neither arm nor torch
     moved or burned without a command.
     """
     scenario = load_scenario(str(world.cell), CALIBRATES if calibrates else "")
-    stage, thrown = [""], [0.0]
+    stage, thrown, named = [""], [0.0], [0.0]
 
     def watch(phase: str, _: float) -> None:
         stage[0] = phase
+        if phase.startswith(phase_words("held")):
+            named[0] = named[0] or time.monotonic()
 
     with world.control() as controller:
         before = controller.ask(check="summary")
@@ -128,10 +127,12 @@ def run_job(
         "fault": "" if happening is None else happening.fault,
         "phase": "" if happening is None else happening.phase,
         "job": "calibrate" if calibrates else "weld",
+        "thrown": thrown[0] > 0.0,
         "state": result.state,
         "reason": reason,
         "rest_after_s": measured.get("rest_after_s"),
         "torch_off_after_s": burned.get("last_on_s"),
+        "named_after_s": named[0] - thrown[0] if thrown[0] and named[0] else None,
         "wall_s": result.run.wall_seconds,
         "moved": counts["moves_without_a_command"] + counts["moves_after_a_fault"],
         "arc_s": torch["on_s"],
@@ -140,7 +141,7 @@ def run_job(
 
 
 def _of_a_job_that_is_done(world: WiredWorld, happening: Happening | None, *, calibrates: bool) -> list[str]:
-    if happening is not None and not happening.unseen:
+    if happening is not None and not happening.silent:
         return ["done in spite of the fault"]
     if calibrates:
         return []

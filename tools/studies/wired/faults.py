@@ -1,11 +1,12 @@
 """Every device by wire killed, frozen, delayed by 2 s and sending garbage, in every phase of the job."""
 
+import dataclasses as dc
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from weldcal.models.errors import InputError
-from weldcal.tools.emulators.cell.process import wired_world
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import csv_text
@@ -15,25 +16,24 @@ from weldcal.tools.studies.wired.fault_run import DEVICES, FAULTS, PHASES, Happe
 
 SEAM_MM = 20.0
 COLUMNS = (
-    "device", "fault", "phase", "state", "reason", "rest_after_s", "torch_off_after_s", "moved", "arc_s", "wall_s", "problems",
+    "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s", "named_after_s", "moved", "arc_s", "wall_s", "problems",
 )  # fmt: skip
+TIMES = ("torch_off_after_s", "rest_after_s", "named_after_s")
 
 
 def one_world(device: str, phase: str, seed: int, folder: str) -> Mapping[str, object]:
     """Every fault of a device in a phase, one job each, in one world: rows of COLUMNS."""
     host = f"127.{40 + DEVICES.index(device)}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
     with wired_world(Path(folder) / "world", host, seed, SEAM_MM, bridged=True) as world:
-        rows = [
-            run_job(
-                world,
-                Path(folder) / fault,
-                seed,
-                calibrates=phase == "calibrate",
-                happening=Happening(device, fault, phase),
-            )
-            for fault in FAULTS
-        ]
-    return {"rows": rows}
+        return {"rows": [_row(world, Path(folder), seed, Happening(device, fault, phase)) for fault in FAULTS]}
+
+
+def _row(world: WiredWorld, folder: Path, seed: int, happening: Happening) -> dict[str, object]:
+    calibrates = happening.phase == "calibrate"
+    try:
+        return run_job(world, folder / happening.fault, seed, calibrates=calibrates, happening=happening)
+    except WeldcalError as problem:  # the job did not begin: what the fault before it has left
+        return dict.fromkeys(COLUMNS, "") | dc.asdict(happening) | {"state": "failed", "problems": [str(problem)]}
 
 
 def run_wired_faults(
@@ -69,12 +69,17 @@ def run_wired_faults(
     wrong += [f"{name}: {result['reason']}" for name, result in found.items() if "rows" not in result]
     summary: dict[str, object] = {
         "state": "failed" if wrong else "done", "faults": len(rows), "held_by_name": sum(r["state"] == "held" for r in rows),
-        "done_unseen": sum(r["state"] == "done" for r in rows), "wrong": wrong, "rows": rows,
+        "done_while_silent": sum(r["state"] == "done" for r in rows), "wrong": wrong, "rows": rows,
         **({"reason": wrong[0]} if wrong else {}),
     }  # fmt: skip
-    cells = [(str(r["device"]), str(r["fault"]), str(r["phase"]), str(r["state"]), "; ".join(r["problems"]) or "as required",
-              str(r["reason"])) for r in rows]  # fmt: skip
-    return summary, markdown_table(("device", "fault", "phase", "job", "verdict", "reason"), cells)
+    cells = [(str(r["device"]), str(r["fault"]), str(r["phase"]), str(r["state"]), *(_seconds(r[name]) for name in TIMES),
+              "; ".join(r["problems"]) or "as required", str(r["reason"])) for r in rows]  # fmt: skip
+    titles = ("device", "fault", "phase", "job", "torch off s", "arm at rest s", "named s", "verdict", "reason")
+    return summary, markdown_table(titles, cells)
+
+
+def _seconds(value: object) -> str:
+    return "" if value in (None, "") else f"{float(str(value)):.2f}"
 
 
 def _rows(found: dict[str, Result]) -> list[Result]:

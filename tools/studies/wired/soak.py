@@ -24,7 +24,7 @@ WARM_UP = 2  # cycles that do not count for the memory: what is loaded and compi
 FLAT_MB_H = 10.0  # memory is flat where growth above this is not shown at 95 %
 FEWEST = 5  # cycles for a slope
 COLUMNS = (
-    "cycle", "at_s", "job", "device", "fault", "phase", "state", "reason", "rest_after_s", "torch_off_after_s", "wall_s", "moved",
+    "cycle", "at_s", "job", "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s", "named_after_s", "wall_s", "moved",
     "arc_s", "problems", "stuck", "cell_mb", "world_mb", "scanner_mb", "finger_mb",
 )  # fmt: skip
 PROCESSES = ("cell", "world", "scanner", "finger")

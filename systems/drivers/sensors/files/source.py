@@ -107,7 +107,7 @@ class FolderSource(Source[Datum]):
             del self._doubtful[path]
             raise Garbage(str(error)) from error
         self._doubtful.pop(path, None)
-        captured, request, where = self._sidecar(path)
+        captured, request, device, where = self._sidecar(path)
         if request not in (None, self._request):
             raise Garbage(f"{path.name} answers the trigger {request}, and the newest is {self._request}")
         arrived = time.monotonic()
@@ -118,22 +118,21 @@ class FolderSource(Source[Datum]):
             with suppress(OSError):
                 path.unlink()
                 path.with_suffix(SIDECAR).unlink(missing_ok=True)
-        return Delivery(
-            datum, arrived, unix_time=captured, request=self._request, note=f"{path.name}, time from {where}"
-        )
+        return Delivery(datum, arrived, device, captured, request=self._request, note=f"{path.name}, time from {where}")
 
-    def _sidecar(self, path: Path) -> tuple[float | None, int | None, str]:
-        """Capture time (Unix, s), request's number, and where the time is from."""
+    def _sidecar(self, path: Path) -> tuple[float | None, int | None, float | None, str]:
+        """Capture time (Unix, s), request's number, the time of the scanner's own clock (s), and where the time is from."""
         beside = path.with_suffix(SIDECAR)
         if not beside.is_file():
-            return None, None, "its arrival"
+            return None, None, None, "its arrival"
         try:
             said = json.loads(read_text(beside))
-            captured, request = said.get("capture_time"), said.get("request")
-            captured = None if captured is None else float(captured)
-            request = None if request is None else int(request)
-            if captured is not None and not math.isfinite(captured):
-                raise ValueError(captured)
+            captured, device = (
+                None if said.get(key) is None else float(said[key]) for key in ("capture_time", "device_time")
+            )
+            request = None if said.get("request") is None else int(said["request"])
+            if not all(math.isfinite(time) for time in (captured, device) if time is not None):
+                raise ValueError(said)
         except (InputError, ValueError, TypeError, AttributeError, OverflowError) as error:
-            raise Garbage(f"{beside.name} is not a JSON object with capture_time and request") from error
-        return captured, request, "its arrival" if captured is None else beside.name
+            raise Garbage(f"{beside.name} is not a JSON object with capture_time, device_time and request") from error
+        return captured, request, device, "its arrival" if captured is None and device is None else beside.name

@@ -1,6 +1,7 @@
 """Simulated streaming scanner: frames at its own rate that arrive later with stamps of its own clock, and single scans at rest."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -78,6 +79,19 @@ class _Streaming(Message):
     frames: tuple[StreamedScan, ...] = ()
 
 
+def exposed_cloud(
+    preset: ScannerPreset,
+    instants: Sequence[NDArray[np.float32]],
+    dark: NDArray[np.float32] | None,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """The organised cloud (H, W, 3) m of the depth pictures (H, W) of one exposure, with the scanner's noise."""
+    p, noise = preset, preset.noise
+    depth = mixed_exposure(np.stack(list(instants)), noise.edge_step_m, noise.flying, rng)
+    noisy = apply_noise(depth, p, rng, dark)
+    return np.asarray(depth_to_points(noisy, p.fx, p.fy, p.cx, p.cy).astype(np.float32))
+
+
 class DepthStream(LeafSystem):
     """Takes a frame per period while streaming is on; it is on the port from its arrival on.
 
@@ -140,14 +154,11 @@ class DepthStream(LeafSystem):
     def _exposed(self, s: _Streaming, capture: float) -> _Streaming:
         """The frame of the completed exposure joins those under way; no frame overtakes another one."""
         rng = np.random.default_rng([self._seed, s.count])
-        p, noise = self._preset, self._preset.noise
-        depth = mixed_exposure(np.stack(s.instants), noise.edge_step_m, noise.flying, rng)
-        noisy = apply_noise(depth, p, rng, s.dark)
+        points = exposed_cloud(self._preset, s.instants, s.dark, rng)
         arrival = capture + self._timing.delay(rng)
         if s.frames:
             arrival = max(arrival, s.frames[-1].arrival_time)
         stamp = self._timing.device_time(capture, rng) if self._config.device_clock else None
-        points = depth_to_points(noisy, p.fx, p.fy, p.cx, p.cy).astype(np.float32)
         frame = StreamedScan(s.count + 1, points_C=points, arrival_time=arrival, device_time=stamp)
         lost = rng.random() < self._timing.loss
         frames = s.frames if lost else (*s.frames[-_KEPT - 8 :], frame)

@@ -1,13 +1,14 @@
 """Names of the input registers that the driver claims, and their ranges as text."""
 
 # The command and its numbers, from register 0 or (upper registers) 24 on.
-INTEGERS, DOUBLES, UPPER_OFFSET = 1, 8, 24
+# Two more numbers are the set points of the power source, where they are wired.
+INTEGERS, DOUBLES, SET_POINTS, UPPER_OFFSET = 1, 8, 2, 24
 
 
-def register_names(offset: int) -> list[str]:
+def register_names(offset: int, doubles: int = DOUBLES) -> list[str]:
     """The names, from a register on."""
     integers = [f"input_int_register_{i}" for i in range(offset, offset + INTEGERS)]
-    return integers + [f"input_double_register_{i}" for i in range(offset, offset + DOUBLES)]
+    return integers + [f"input_double_register_{i}" for i in range(offset, offset + doubles)]
 
 
 def ranges(names: list[str]) -> str:

@@ -146,6 +146,17 @@ def test_late_frames_are_a_fault(started: Acquisition[Any], device: Scripted) ->
     assert wait_until(lambda: "is late: a frame came 2.0 s after its time" in (started.fault(time.monotonic()) or ""))
 
 
+def test_frames_of_a_time_in_which_nobody_could_read_are_not_late(started: Acquisition[Any], device: Scripted) -> None:
+    before = time.time()
+    time.sleep(0.4)
+    started.excuse(0.4)
+    device.script.append(Delivery(picture(2), time.monotonic(), unix_time=before))
+    assert wait_until(lambda: started.counts.received == 2)
+    assert "late" not in (started.fault(time.monotonic()) or "")
+    device.script.append(Delivery(picture(3), time.monotonic() + 2.0, unix_time=time.time() + 0.01))
+    assert wait_until(lambda: "is late" in (started.fault(time.monotonic()) or ""))
+
+
 def test_a_request_is_sent_once_and_its_answer_found(device: Scripted) -> None:
     acquisition = Acquisition(device, Rules(answer_s=0.2, late_s=float("inf")))
     device.script.clear()

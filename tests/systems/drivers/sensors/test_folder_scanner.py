@@ -155,7 +155,7 @@ def test_the_time_of_the_scan_is_its_sidecars_or_that_of_its_arrival(start: Star
     [
         ({"capture_time": 0.0}, "was captured before it was asked for"),
         ({"request": 8}, "answers the trigger 8, and the newest is 1"),
-        ({"capture_time": "noon"}, "is not a JSON object with capture_time and request"),
+        ({"capture_time": "noon"}, "is not a JSON object with capture_time, device_time and request"),
     ],
 )
 def test_a_scan_of_another_time_is_refused(start: Start, tmp_path: Path, beside: dict[str, object], said: str) -> None:
@@ -203,6 +203,20 @@ def test_a_file_that_still_grows_is_not_old_because_the_clock_was_set(
     time.sleep(0.1)
     assert scanner.counts.received == 0
     assert answer(scanner, 1).shape == (96, 3)
+
+
+def test_a_stream_keeps_the_time_of_the_scanners_own_clock_beside_that_of_the_host(
+    start: Start, tmp_path: Path
+) -> None:
+    scanner = start(streams=True, settle_s=0.0, remove_read=True)
+    for number in (1, 2, 3):
+        taken = time.time()
+        drop(tmp_path, f"f{number}.npz", cloud(number), capture_time=taken, device_time=48000.0 + number)
+        assert wait_until(lambda: number in [number_of(f.datum) for f in scanner.frames()])  # noqa: B023
+    assert [f.device_time for f in scanner.frames()] == [48001.0, 48002.0, 48003.0]
+    assert {f.stamp.clock for f in scanner.frames()} == {"host"}
+    assert scanner.fault(time.monotonic()) is None
+    assert wait_until(lambda: "sent nothing usable for 1 s" in (scanner.fault(time.monotonic()) or ""))
 
 
 def test_points_in_another_unit_are_refused_and_read_with_the_right_one(start: Start, tmp_path: Path) -> None:

@@ -126,8 +126,11 @@ class Controller(ControllerState):
         self.sidekicks.clear()
         self.inputs, self.outputs = Registers(), Registers()
         self.terminals.digital_outputs = 0
-        self.terminals.runstate.clear()
+        self.terminals.analog_outputs = [0.0, 0.0]
+        for kept in (self.terminals.runstate, self.terminals.analog_runstate):
+            kept.clear()
         self.terminals.foreign.clear()
+        self.terminals.analog_foreign.clear()
         self.robot_mode, self.safety_mode = RobotMode.POWER_OFF, SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.timestamp = 0.0
@@ -217,6 +220,7 @@ class Controller(ControllerState):
             "answer": self.outputs.integers[0],
             "digital_outputs": self.terminals.digital_outputs,
             "digital_inputs": self.terminals.digital_inputs,
+            "analog_outputs": [self.terminals.analog_output(n) for n in range(2)],
             "script_line": self.program.line if self.program else 0,
             "watchdogs": sorted(self.watchdogs),
         }

@@ -54,8 +54,10 @@ class Terminals:
         self.runstate: dict[int, int] = {}
         # outputs that somebody else than the program writes in every frame (Modbus, a PLC): level, and until which frame
         self.foreign: dict[int, tuple[bool, int]] = {}
-        self.analog_outputs = [0.0, 0.0]
-        self.analog_output_types = 0
+        self.analog_outputs = [0.0, 0.0]  # shares of their ranges
+        self.analog_output_types = 0  # a bit for each: 0 is 4 to 20 mA, 1 is 0 to 10 V
+        self.analog_runstate: dict[int, int] = {}
+        self.analog_foreign: dict[int, tuple[float, int]] = {}
         self.tool_voltage = 0
         self.speed_slider = 1.0
         self.limiter = 1.0  # of the trajectory: what RTDE calls speed_scaling
@@ -64,12 +66,25 @@ class Terminals:
         """Sets the outputs that `mask` names, counted from `first` (0 standard, 8 configurable, 16 tool)."""
         self.digital_outputs = self.digital_outputs & ~(mask << first) | (value & mask) << first
 
+    def set_analog(self, n: int, share: float) -> None:
+        """Set an analog output to a share of its range."""
+        self.analog_outputs[n] = min(1.0, max(0.0, share))
+
+    def analog_output(self, n: int) -> float:
+        """What an analog output shows, V or A."""
+        share = self.analog_outputs[n]
+        return 10.0 * share if self.analog_output_types >> n & 1 else 0.004 + 0.016 * share
+
     def write_foreign(self, frame: int) -> None:
         """What that somebody does in this frame, after the programs."""
         for n, (on, until) in list(self.foreign.items()):
             self.set_digital(0, 1 << n, int(on) << n)
             if frame >= until:
                 del self.foreign[n]
+        for n, (share, until) in list(self.analog_foreign.items()):
+            self.set_analog(n, share)
+            if frame >= until:
+                del self.analog_foreign[n]
 
     def program_ended(self) -> None:
         """Outputs that follow the program's state take their level for a program that does not run."""
@@ -78,6 +93,11 @@ class Terminals:
                 self.digital_outputs &= ~(1 << n)
             elif choice == 2:
                 self.digital_outputs |= 1 << n
+        for n, choice in self.analog_runstate.items():
+            if choice in (1, 3):
+                self.analog_outputs[n] = 0.0
+            elif choice == 2:
+                self.analog_outputs[n] = 1.0
 
 
 def register_index(index: object, count: int) -> int:

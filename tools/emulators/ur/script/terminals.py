@@ -41,6 +41,9 @@ class TerminalFunctions(Answers):
     def set_runstate_standard_digital_output_to_value(self, outputId: int, state: int) -> None:
         self._controller.terminals.runstate[register_index(outputId, 8)] = register_index(state, 8)
 
+    def set_runstate_standard_analog_output_to_value(self, outputId: int, state: int) -> None:
+        self._controller.terminals.analog_runstate[register_index(outputId, 2)] = register_index(state, 8)
+
     def get_standard_digital_in(self, n: int) -> bool:
         return self._get(self._controller.terminals.digital_inputs, STANDARD, register_index(n, 8))
 
@@ -54,7 +57,7 @@ class TerminalFunctions(Answers):
         return self._get(self._controller.terminals.digital_inputs, TOOL, register_index(n, 2))
 
     def set_standard_analog_out(self, n: int, f: float) -> None:
-        self._controller.terminals.analog_outputs[register_index(n, 2)] = min(1.0, max(0.0, float(f)))
+        self._controller.terminals.set_analog(register_index(n, 2), float(f))
 
     def set_analog_out(self, n: int, f: float) -> None:
         self.set_standard_analog_out(n, f)

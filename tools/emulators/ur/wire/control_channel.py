@@ -80,6 +80,7 @@ class ControlServer(Server):
             "registers_in_use": lambda r, now: rtde.claim_elsewhere([str(n) for n in r.get("names", ())]),
             "speed_scaling": self._slider,
             "set_digital_out": self._foreign_output,
+            "set_analog_out": self._foreign_analog,
             "limiter": lambda r, now: setattr(c.terminals, "limiter", _number(r, "value")),
             "timestamp_jump": lambda r, now: setattr(c, "timestamp", max(0.0, c.timestamp + _number(r, "seconds"))),
             "clock_skew": lambda r, now: setattr(c, "clock_rate", 1.0 + _number(r, "ppm") * 1e-6),
@@ -107,6 +108,7 @@ class ControlServer(Server):
             "set_tcp": lambda r, now: c.set_tcp(_six(r, "pose")),
             "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
             "set_payload": self._payload,
+            "set_digital_in": self._digital_input,
             "set_gravity": lambda r, now: setattr(c, "gravity", _several(r, "gravity", 3)),
             "clear_links": self._clear_links,
             "recover": self._recover,
@@ -165,6 +167,8 @@ class ControlServer(Server):
                 "overruns": self._world.overruns,
                 "lockstep": self._lockstep.state(),
             }
+        if request.get("ask") == "time":
+            return {"timestamp": self._controller.timestamp}
         if request.get("ask") == "log":
             return {"log": list(self._controller.log)}
         if request.get("ask") == "program":
@@ -196,6 +200,7 @@ class ControlServer(Server):
             delay_s=_number(request, "seconds"),
             jitter_s=_number(request, "jitter", 0.0),
             delay_until=now + _number(request, "for", math.inf),
+            delay_clock=(lambda: self._controller.timestamp) if request.get("clock") == "controller" else None,
         )
 
     def _freeze(self, request: Request, now: float) -> None:
@@ -222,6 +227,8 @@ class ControlServer(Server):
         c.terminals.speed_slider, c.terminals.limiter, c.arm.lag_s = 1.0, 1.0, 0.0
         c.set_tcp([0.0] * 6)
         c.terminals.foreign.clear()
+        c.terminals.analog_foreign.clear()
+        c.terminals.digital_inputs = 0
         c.surroundings, c.sensor = Surroundings(), ForceSensor()
 
     def _close(self, request: Request, *, reset: bool) -> None:
@@ -265,6 +272,20 @@ class ControlServer(Server):
         frames = max(1, round(_number(request, "seconds", 0.0) / STEP_S))
         until = self._controller.frame + frames
         self._controller.terminals.foreign[int(_number(request, "n"))] = (bool(request.get("on", True)), until)
+
+    def _digital_input(self, request: Request, now: float) -> None:
+        """The level of a standard input, by whoever is wired there."""
+        n, terminals = int(_number(request, "n")), self._controller.terminals
+        if not 0 <= n < 8:
+            raise InputError("Give a number from 0 to 7 as 'n'.")
+        terminals.digital_inputs = terminals.digital_inputs & ~(1 << n) | int(bool(request.get("on", True))) << n
+
+    def _foreign_analog(self, request: Request, now: float) -> None:
+        until = self._controller.frame + max(1, round(_number(request, "seconds", 0.0) / STEP_S))
+        n = int(_number(request, "n"))
+        if n not in (0, 1):
+            raise InputError("Give 0 or 1 as 'n'.")
+        self._controller.terminals.analog_foreign[n] = (_number(request, "share"), until)
 
     def _reboot(self, request: Request, now: float) -> None:
         self._network.unplug(self)

@@ -26,6 +26,7 @@ class LinkFaults:
     delay_s: float = 0.0
     jitter_s: float = 0.0
     delay_until: float = 0.0
+    delay_clock: Callable[[], float] | None = None  # of the delay; None: the host's
     freeze_until: float = 0.0
     deaf_until: float = 0.0
     corrupt: int = 0
@@ -68,10 +69,10 @@ class Connection:
         if faults.wrong_size > 0 and len(package) > 3:
             faults.wrong_size -= 1
             package = struct.pack(">H", len(package) + 5) + package[2:]
-        due = now
+        due = clock = now if faults.delay_clock is None else faults.delay_clock()
         if now < faults.delay_until:
-            due = now + faults.delay_s + (self._rng.uniform(0.0, faults.jitter_s) if faults.jitter_s else 0.0)
-        if self._waiting or due > now:
+            due = clock + faults.delay_s + (self._rng.uniform(0.0, faults.jitter_s) if faults.jitter_s else 0.0)
+        if self._waiting or due > clock:
             # packages keep their order, whatever the jitter
             self._waiting.append((max(due, self._waiting[-1][0]) if self._waiting else due, package))
         else:
@@ -84,7 +85,8 @@ class Connection:
 
     def flush(self, now: float) -> None:
         """Writes what is due and what fits."""
-        while self._waiting and self._waiting[0][0] <= now:
+        clock = now if self.faults.delay_clock is None else self.faults.delay_clock()
+        while self._waiting and self._waiting[0][0] <= clock:
             self._outbox += self._waiting.popleft()[1]
         if not self._outbox or self.closed or self.faults.half_open or now < self.faults.freeze_until:
             return

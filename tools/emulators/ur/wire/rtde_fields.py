@@ -111,8 +111,8 @@ _SCALARS: dict[str, dict[str, Getter]] = {
         "target_speed_fraction": lambda c: c.terminals.speed_slider,
         "actual_robot_voltage": lambda c: 48.0 if c.robot_mode > RobotMode.POWER_OFF else 0.0,
         "actual_robot_current": lambda c: 0.8 if c.robot_mode > RobotMode.POWER_OFF else 0.0,
-        "standard_analog_output0": lambda c: c.terminals.analog_outputs[0],
-        "standard_analog_output1": lambda c: c.terminals.analog_outputs[1],
+        "standard_analog_output0": lambda c: c.terminals.analog_output(0),
+        "standard_analog_output1": lambda c: c.terminals.analog_output(1),
         "payload": lambda c: c.payload.mass,
         "tcp_force_scalar": lambda c: math.hypot(*c.tcp_force()[:3]),
         "actual_execution_time": _constant(0.4),
@@ -226,7 +226,7 @@ def apply_masked(c: Controller, values: dict[str, Any]) -> None:
         c.terminals.analog_output_types = c.terminals.analog_output_types & ~mask | types & mask
         for i in range(2):
             if mask >> i & 1:
-                c.terminals.analog_outputs[i] = float(values.get(f"standard_analog_output_{i}", 0.0))
+                c.terminals.set_analog(i, float(values.get(f"standard_analog_output_{i}", 0.0)))
 
 
 def _set_wrench(c: Controller, value: Any) -> None:

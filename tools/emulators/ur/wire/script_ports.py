@@ -145,7 +145,8 @@ class PrimaryServer(ScriptServer):
         return struct.pack(
             ">2I2B2d2b2d4f3BI3B",
             *(t.digital_inputs, t.digital_outputs, 0, 0, 0.0, 0.0),
-            *(t.analog_output_types & 1, t.analog_output_types >> 1 & 1, *t.analog_outputs, 30.0, 48.0, 0.8, 0.0),
+            *(t.analog_output_types & 1, t.analog_output_types >> 1 & 1, t.analog_output(0), t.analog_output(1)),
+            *(30.0, 48.0, 0.8, 0.0),
             *(int(c.safety_mode), c.safety_mode == SafetyMode.REDUCED, 0, 0),  # no Euromap interface
             *(OPERATIONAL_MODES.index(c.operational_mode), 0, 0),
         )
