@@ -134,8 +134,9 @@ def test_a_profile_taken_in_motion_meets_the_pose_of_its_own_time() -> None:
     qd = np.linalg.solve(jacobian(station.arm, q), [0.0, 0.0, 0.0, 0.0, 0.0, -0.04])
     plant.SetPositions(plant.GetMyMutableContextFromRoot(root), station.world.arm, q - 0.3 * qd)
     servo = station.diagram.GetSubsystemByName("arm_servo")
-    state = np.concatenate([q - 0.3 * qd, np.zeros(6), q - 0.3 * qd, np.zeros(6), [0.0, 0.0]])
-    servo.GetMyMutableContextFromRoot(root).SetDiscreteState(state)
+    begun = servo.GetMyMutableContextFromRoot(root)
+    begun.SetDiscreteState(0, np.append(q - 0.3 * qd, np.zeros(6)))  # the reference
+    begun.SetDiscreteState(1, q - 0.3 * qd)  # what is measured
     command, trigger = (station.diagram.GetInputPort(n) for n in ("arm.velocity_command", "profiler.trigger"))
     command.FixValue(root, qd)
     trigger.FixValue(root, [0.0])
