@@ -41,7 +41,8 @@ def said_twice(printed: str) -> list[str]:
     """Poses, and lines of words, that a terminal shows more than once."""
     poses = re.findall(r"p\[.*?\]", printed)
     lines = [text for line in printed.splitlines() if len(text := re.sub(r"^ *(\S.*?)?  +|^- ", "", line).strip()) > 30]
-    lines = [text for text in lines if re.search(r"[a-z]{3}", text)]  # the last rows of two matrices are the same
+    # rows of two matrices are alike, and so are those of two joints
+    lines = [text for text in lines if re.search(r"[a-z]{3}", text) and not re.match(r"[-+]?\d", text)]
     return [text for found in (poses, lines) for text, count in Counter(found).items() if count > 1]
 
 

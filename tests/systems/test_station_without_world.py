@@ -47,7 +47,7 @@ def test_the_job_is_done_and_its_report_gives_no_true_error(finished: DemoResult
     # 0.03 mm of noise along each ray, five scans: the camera's origin, 0.7 m away, is known to some 0.1 mm
     assert np.linalg.norm(X_BC.translation() - true.translation()) < 2e-4
     page = (finished.folder / "report.html").read_text()
-    assert "Error at the work point, 95 %" in page
+    assert "Error at the work point, 95\u00a0%" in page
     assert "known in simulation only" not in page
     assert "Robot: KinematicArm, seed 0." in page
     assert {"calibration.yaml", "scans"} <= {path.name for path in finished.folder.iterdir()}

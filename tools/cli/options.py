@@ -287,7 +287,10 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     elif outcome.text is not None:
         console.emit_text(outcome.text)
     else:
-        rows = console.rows(summary if outcome.values is None else outcome.values) | dict(outcome.rows)
+        values = dict(summary if outcome.values is None else outcome.values)
+        if outcome.first is not None and isinstance(warnings := values.get("warnings"), list):
+            values["warnings"] = [text for text in warnings if text not in outcome.first.concerns]  # said there
+        rows = console.rows(values) | dict(outcome.rows)
         if outcome.first is None:
             rows |= {} if call.written is None else {"written to": str(call.written)}
         console.emit_summary(f"{title}: {state}", rows)
