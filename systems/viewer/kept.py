@@ -1,5 +1,7 @@
 """Keeps each Meshcat until the thread that made it frees it: Drake aborts the process where another thread does."""
 
+import atexit
+import ctypes
 import gc
 import sys
 import threading
@@ -23,3 +25,11 @@ def free_unused() -> None:
     for key in list(_KEPT):
         if _KEPT[key][1] == here and sys.getrefcount(_KEPT[key][0]) <= _HERE_ONLY:
             del _KEPT[key]
+
+
+@atexit.register
+def _never_free_of_other_threads() -> None:
+    """The end of the program is in the main thread: what other threads made is left to the operating system."""
+    for meshcat, maker in _KEPT.values():
+        if maker != threading.main_thread().ident:
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(meshcat))
