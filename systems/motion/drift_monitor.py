@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
+from weldcal.calibration.data.scanner_clock import ScannerClock
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.motion.drift.residuals import CLOCK, TrackedFrame, tracked_rows
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
@@ -20,10 +20,10 @@ from weldcal.models.arrays import Array
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, believed_arm
 from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.run_clock import RunClock, Seen, followed, with_frame
 
 _HALF_S = 0.01  # about a capture: its velocity
 _RECENT = 400  # frames that the view shows
-_CLOCKS_APART_S = 0.5  # a device time that is this far from the arrival is one of a clock that was set anew
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -96,18 +96,6 @@ class DriftStatus(Message):
         return ""
 
 
-@dc.dataclass(frozen=True)
-class _Anchor:
-    """A time of the device's clock and what it is taken for on the robot's clock, s."""
-
-    device_s: float
-    robot_s: float
-
-    def time(self, device_s: float) -> float:
-        """A device time on the robot's clock, s."""
-        return self.robot_s + device_s - self.device_s
-
-
 @dc.dataclass(frozen=True, eq=False)
 class _Watch(Message):
     """The status and the test behind it, which is copied before it is changed."""
@@ -117,7 +105,7 @@ class _Watch(Message):
     watched: MonitoredCalibration | None = None
     pivot: Array | None = None
     asked: bool = False
-    anchor: _Anchor | None = None
+    clock: RunClock | None = None
 
 
 class DriftMonitor(LeafSystem):
@@ -197,25 +185,41 @@ def _begun(calibration: MonitoredCalibration | None) -> _Watch:
 def watched_frame(
     watch: _Watch, estimate: FlangeEstimate, history: PoseHistory, arm: ArmModel, X_FR: RigidTransform, config: DriftConfig | None
 ) -> _Watch:  # fmt: skip
-    """The watch after one more estimate; a frame without a fit, a time or a pose of the arm is counted as dropped."""
-    status = dc.replace(watch.status, sequence=estimate.sequence)
-    if watch.watched is not None:
-        watch = dc.replace(watch, anchor=_anchored(watch.anchor, estimate, watch.watched.delay_s))
-    frame = _tracked(watch.watched, estimate, history, arm, X_FR, watch.anchor)
-    if frame is None or watch.watched is None:
+    """The watch after one more estimate; a frame without a fit, a time or a pose of the arm is counted as dropped.
+
+    Frames in motion with a device time wait until they show the scanner's clock in this run.
+    """
+    c, status = watch.watched, dc.replace(watch.status, sequence=estimate.sequence)
+    if c is None or estimate.fit is None:
         return dc.replace(watch, status=dc.replace(status, dropped=status.dropped + 1))
-    pivot = frame.p_BR if watch.pivot is None else watch.pivot
-    c = watch.watched
+    clock, done = followed(watch.clock, estimate, c.delay_s, c.clock), 1
+    usable: tuple[FlangeEstimate, ...] = (estimate,)
+    if clock is not None:
+        waited = len(clock.waiting)
+        clock, usable = with_frame(clock, estimate, Seen(c.X_BC, c.correction, arm, X_FR, history))
+        done = waited + 1 - len(clock.waiting)
+    tracked = [_tracked(c, f, history, arm, X_FR, clock) for f in usable]
+    frames = [f for f in tracked if f is not None]
+    dropped = status.dropped + done - len(frames)
+    watch = dc.replace(watch, clock=clock, status=dc.replace(status, dropped=dropped))
+    return _tested(watch, c, frames, config) if frames else watch
+
+
+def _tested(watch: _Watch, c: MonitoredCalibration, frames: list[TrackedFrame], config: DriftConfig | None) -> _Watch:
+    """The watch after these frames' test."""
+    pivot = frames[0].p_BR if watch.pivot is None else watch.pivot
     test = (
         DriftTest(c.X_BC, c.covariance, pivot, c.config or config) if watch.test is None else copy.deepcopy(watch.test)
     )
-    rows = tracked_rows(c.X_BC, pivot, [frame])
+    rows = tracked_rows(c.X_BC, pivot, frames)
     events = test.update(rows)
     X, covariance = test.current()
-    error = rows.residuals[0, :3] - test.clock_s * rows.derivatives[0, :3, CLOCK]
-    row = np.array([frame.time, *error, test.clock_s, test.statistic])
+    errors = rows.residuals[:, :3] - test.clock_s * rows.derivatives[:, :3, CLOCK]
+    n = len(frames)
+    recent = np.column_stack([rows.times, errors, np.full(n, test.clock_s), np.full(n, test.statistic)])
+    status = watch.status
     status = dc.replace(
-        status, frames=status.frames + 1, recent=np.vstack([status.recent[1 - _RECENT :], row]), statistic=test.statistic,
+        status, frames=status.frames + n, recent=np.vstack([status.recent, recent])[-_RECENT:], statistic=test.statistic,
         threshold=test.threshold, alarmed=test.alarmed, events=(*status.events, *events), X_BC=X, covariance=covariance,
     )  # fmt: skip
     return dc.replace(watch, status=status, test=test, pivot=pivot)
@@ -232,21 +236,18 @@ def recalibrated(watch: _Watch) -> _Watch:
 
 
 def _tracked(
-    c: MonitoredCalibration | None,
+    c: MonitoredCalibration,
     estimate: FlangeEstimate,
     history: PoseHistory,
     arm: ArmModel,
     X_FR: RigidTransform,
-    anchor: _Anchor | None,
+    clock: RunClock | None,
 ) -> TrackedFrame | None:
     """A frame with the feature's pose and rates at its capture; None where one of them is missing."""
     fit = estimate.fit
-    if fit is None or c is None:
+    if fit is None:
         return None
-    time: float | None = estimate.capture_time
-    if np.isfinite(estimate.arrival_time):  # streamed: when it was captured is not known
-        time = _captured(c, estimate, anchor)
-    assert time is not None
+    time = _captured(c, estimate, clock)
     X = [history.pose_at(arm, t) for t in (time - _HALF_S, time, time + _HALF_S)]
     before, now, after = (None if x is None else (x @ X_FR).GetAsMatrix4() for x in X)
     if now is None or before is None or after is None:
@@ -259,22 +260,11 @@ def _tracked(
     )  # fmt: skip
 
 
-def _anchored(anchor: _Anchor | None, estimate: FlangeEstimate, delay_s: float) -> _Anchor | None:
-    """The device's clock as its first frame shows it; one that was set anew begins again. None where a frame has no device time."""
-    if estimate.device_time is None or not np.isfinite(estimate.arrival_time):
-        return None
-    usual = estimate.arrival_time - delay_s
-    if anchor is not None and abs(anchor.time(estimate.device_time) - usual) < _CLOCKS_APART_S:
-        return anchor
-    return _Anchor(estimate.device_time, usual)
-
-
-def _captured(c: MonitoredCalibration, estimate: FlangeEstimate, anchor: _Anchor | None) -> float:
-    """When a streamed frame was captured (s), by the calibration's clock. Where that is not known, or was set anew since, by the
-    device's clock from its first frame on: what that is wrong by is the same for all frames, and the test estimates it."""
-    usual = estimate.arrival_time - c.delay_s
-    if c.clock is not None:
-        time = c.clock.capture(estimate.arrival_time, estimate.device_time)
-        if time is not None and (c.clock.kind != DEVICE or abs(time - usual) < _CLOCKS_APART_S):
-            return time
-    return usual if anchor is None or estimate.device_time is None else anchor.time(estimate.device_time)
+def _captured(c: MonitoredCalibration, estimate: FlangeEstimate, clock: RunClock | None) -> float:
+    """When a frame was captured (s): as its scan was ordered, by the scanner's clock in this run, or by its arrival."""
+    if not np.isfinite(estimate.arrival_time):
+        return estimate.capture_time
+    if clock is not None and estimate.device_time is not None:
+        return clock.time(estimate.device_time)
+    known = None if c.clock is None else c.clock.capture(estimate.arrival_time, estimate.device_time)
+    return estimate.arrival_time - c.delay_s if known is None else known

@@ -84,7 +84,9 @@ def test_the_monitor_finds_the_stand_that_the_world_knocks(
     assert found.finished.run.reason is None
     assert ticks is not None
     knocked = ticks.diagram_time(truth["knocked_at_s"] + truth["robot_time_at_0_s"], np.nan)
-    # All frames together show the clock. What is found live goes by arrivals, because the Diagram's time began anew.
+    live = [event.found_s - knocked for event in found.found_live]
+    assert len(live) == 1, live
+    assert 0.0 < live[0] < 3.0, live
     assert found.report is not None
     moves = [(event.time_s - knocked, 1e3 * event.translation_m) for event in found.report.moves]
     assert len(moves) == 1, moves

@@ -20,6 +20,7 @@ from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Scan, ScanStream, StreamedScan
+from weldcal.systems.wall_clock import WallClock
 
 Cloud = NDArray[np.float32]
 PERIOD_S, STREAM_PERIOD_S = 0.02, 0.004
@@ -117,12 +118,13 @@ class WiredScanStream(LeafSystem):
         output_ports:
         - stream
 
-    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's own.
+    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's own. Where the
+    cell follows an emulated robot's time (``followed``), a host that is late does not make a frame late.
     """
 
-    def __init__(self, acquisition: Acquisition[Cloud]) -> None:
+    def __init__(self, acquisition: Acquisition[Cloud], followed: WallClock | None = None) -> None:
         super().__init__()
-        self.acquisition = acquisition
+        self.acquisition, self._followed = acquisition, followed
         self._times = DiagramTime()
         self._shown: tuple[StreamedScan, ...] = ()
         self._streaming = self.DeclareVectorInputPort("streaming", 1)
@@ -137,13 +139,20 @@ class WiredScanStream(LeafSystem):
         if self._streaming.Eval(context)[0] > 0.5:
             new = [f for f in self.acquisition.frames() if f.number > newest]
             if new:
-                self._shown = (*self._shown, *(self._streamed(f) for f in new))[-SHOWN:]
+                self._shown = (*self._shown, *(self._streamed(f, context.get_time()) for f in new))[-SHOWN:]
                 newest = new[-1].number
         discrete.set_value([float(newest)])
 
-    def _streamed(self, frame: Frame[Cloud]) -> StreamedScan:
-        arrived = self._times.at(frame.arrived)
-        return StreamedScan(frame.number, points_C=frame.datum, arrival_time=arrived, device_time=frame.device_time)
+    def _streamed(self, frame: Frame[Cloud], now: float) -> StreamedScan:
+        return StreamedScan(
+            frame.number, points_C=frame.datum, arrival_time=self._arrival(frame.arrived, now), device_time=frame.device_time
+        )  # fmt: skip
+
+    def _arrival(self, host_s: float, now: float) -> float:
+        """The Diagram's time at a time of the host."""
+        if self._followed is None:
+            return self._times.at(host_s)
+        return self._followed.diagram_time(self.acquisition.time.at(host_s), now)
 
     def _output(self, context: Context, output: Any) -> None:
         output.set_value(ScanStream(self._shown))
@@ -166,7 +175,9 @@ def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild
     acquisition.start(start_s, first_frame=config.streams)
     watch(build, acquisition, "scanner")
     if config.streams:
-        stream = build.builder.AddSystem(WiredScanStream(acquisition))
+        clock = None if build.robot is None else build.robot.clock
+        followed = clock if clock is not None and clock.follows else None
+        stream = build.builder.AddSystem(WiredScanStream(acquisition, followed))
         build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
         build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
         stream.set_name("scanner")

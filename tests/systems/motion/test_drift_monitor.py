@@ -1,10 +1,14 @@
-"""DriftMonitor: a knock raises `moved`, is measured, and the recalibrated pose is the new one; all state is in the Context."""
+"""DriftMonitor: a knock raises `moved`, is measured, and the recalibrated pose is the new one; all state is in the Context.
+The scanner's clock is learnt where the calibration's is of another run."""
+
+import dataclasses as dc
 
 import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.data.scanner_clock import ARRIVAL, DEVICE, ScannerClock
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
@@ -97,3 +101,67 @@ def test_a_recalibration_takes_the_new_pose(run: tuple[list[DriftStatus], list[f
     assert not after.moved
     assert after.X_BC is not None
     assert after.X_BC.translation() - X_BC.translation() == pytest.approx(SHIFT, abs=8e-5)
+
+
+def watched(clock: ScannerClock | None, at_0_s: float, late_s: Array) -> DriftStatus:
+    """The status at 14 s of a scanner whose clock reads `at_0_s` at 0, and whose frames came `late_s` (n,) later than usual."""
+    rng = np.random.default_rng(2)
+    calibration = MonitoredCalibration(X_BC, np.diag([1e-9] * 6), clock=clock, delay_s=DELAY_S)
+    monitor = DriftMonitor(ARM, RigidTransform(), calibration)
+    context = monitor.CreateDefaultContext()
+    state = context.get_mutable_state()
+    for k, t in enumerate(np.arange(0.5, 14.0, 0.1)):
+        late = late_s[k % len(late_s)]
+        arrival = float(t) + DELAY_S + late
+        times = np.arange(max(0.0, arrival - 10.0), arrival, 0.008)
+        monitor.GetInputPort("history").FixValue(context, AbstractValue.Make(PoseHistory(times, joints(times))))
+        seen = dc.replace(estimate(k + 1, float(t), rng), arrival_time=arrival, device_time=at_0_s + float(t))
+        monitor.GetInputPort("flange_estimate").FixValue(context, AbstractValue.Make(seen))
+        monitor._update(context, state)
+    return monitor.status(context)
+
+
+@pytest.mark.parametrize(
+    "late_s", [[0.15, 0.0, 0.01, 0.05], [0.0, 0.02, 0.2, 0.01, 0.03]], ids=["first late", "others late"]
+)
+@pytest.mark.parametrize(
+    "clock",
+    [
+        None,
+        ScannerClock(DEVICE, -1000.12, 1e-4, 3e-4, 1000.0),
+        ScannerClock(DEVICE, 55.0, 1e-4, 3e-4, 1000.0),
+        ScannerClock(DEVICE, -1000.0, 1e-4, 3e-4, 1000.0),
+        ScannerClock(ARRIVAL, DELAY_S + 0.02, 1e-2, 0.015, 0.0),
+    ],
+    ids=["unknown", "another start", "another day", "this run", "arrivals"],
+)
+def test_one_knock_is_found_whatever_the_calibration_says_of_the_clock(
+    clock: ScannerClock | None, late_s: list[float]
+) -> None:
+    """The scanner's clock reads 1000 s at 0; the calibration's offset is that of the start of its own run."""
+    status = watched(clock, 1000.0, np.array(late_s))
+    assert len(status.events) == 1
+    event = status.events[0]
+    assert abs(event.time_s - KNOCK_S) < 0.3
+    assert event.found_s - KNOCK_S < 2.0
+    assert event.translation_m == pytest.approx(SHIFT, abs=1e-4)
+    assert status.dropped == 0
+
+
+def test_a_scanner_that_counts_anew_is_learnt_again() -> None:
+    """Nothing moves: what the second half shows is another start of the device's clock."""
+    calibration = MonitoredCalibration(X_BC, np.diag([1e-9] * 6), delay_s=DELAY_S)
+    monitor = DriftMonitor(ARM, RigidTransform(), calibration)
+    context, rng = monitor.CreateDefaultContext(), np.random.default_rng(3)
+    times = np.arange(0.0, 9.0, 0.008)
+    monitor.GetInputPort("history").FixValue(context, AbstractValue.Make(PoseHistory(times, joints(times))))
+    for k, t in enumerate(np.arange(0.5, 7.5, 0.05)):
+        device = 70.0 + float(t) if t < 4.0 else float(t) - 4.0
+        arrival = float(t) + DELAY_S + 0.1 * (k % 7 == 0)
+        seen = dc.replace(estimate(k + 1, float(t), rng), arrival_time=arrival, device_time=device)
+        monitor.GetInputPort("flange_estimate").FixValue(context, AbstractValue.Make(seen))
+        monitor._update(context, context.get_mutable_state())
+    status = monitor.status(context)
+    assert status.events == ()
+    assert not status.moved
+    assert status.frames > 120
