@@ -7,7 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from scipy.stats import ncx2
 
+from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter
 from weldcal.calibration.motion.drift.residuals import CLOCK
 from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arrays import Array
@@ -22,14 +25,15 @@ WITHIN_S = 2.0
 CREEP_M_S, CREEP_MOST_M = 2e-5 / 60.0, 2e-4
 _KNOCK_S, _AFTER_S = (25.0, 35.0), 10.0
 _CREEP_START_S = 60.0
-_CHUNK = 200  # frames handed over at a time
+_TOLD_EVERY = 200  # frames
 
 
 @dataclass(frozen=True)
 class Trial:
     """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was measured.
     ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of the first WITHIN_S
-    say of it to a test that knows the noise and all other errors exactly, in units of the test's threshold."""
+    say of it to a test that knows the noise and all other errors exactly, in units of the test's threshold; ``told`` what they say to one
+    that knows of these errors what the monitor knows, and is told when the change was, in the same units."""
 
     kind: str
     seed: int
@@ -41,6 +45,7 @@ class Trial:
     named: str
     false_alarms: int
     shown: float
+    told: float
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,7 @@ def run_drift_study(
     for k in range(size.creeps):
         tell("creeps", 0.3 + 0.1 * k / size.creeps)
         trials.append(creep_trial(world, seed + 5000 + k))
-    alarms, largest, threshold = quiet_hours(
+    alarmed, largest, threshold = quiet_hours(
         world, size.hours, seed + 9000, lambda f: tell("quiet hours", 0.4 + 0.6 * f)
     )
     knocks = [t for t in trials if t.kind != "creep"]
@@ -75,7 +80,7 @@ def run_drift_study(
     early = sum(t.false_alarms for t in trials)
     targets = [
         Target(f"knocks found within {WITHIN_S:g} s", "%", _percent(found <= WITHIN_S), 100.0, "≥"),
-        Target(f"false alarms in {size.hours:g} quiet hours", "", float(alarms), 0.0),
+        Target(f"false alarms in {size.hours:g} quiet hours", "", float(len(alarmed)), 0.0),
         Target("false alarms before a change", "", float(early), 0.0),
         Target("creep when found", "mm", float(reached.max(initial=0.0)), 1e3 * CREEP_MOST_M, over="worst"),
     ]
@@ -90,11 +95,24 @@ def run_drift_study(
         "translation_error_mm": _spread(np.array([t.translation_error_mm for t in knocks if t.kind == "shift"])),
         "rotation_error_deg": _spread(np.array([t.rotation_error_deg for t in knocks if t.kind == "turn"])),
         "named_right": sum(t.named == {"shift": "translation", "turn": "rotation"}[t.kind] for t in knocks),
+        "expected_late": expected_late(knocks),
         "latest": [asdict(t) for t in sorted(knocks, key=lambda t: -np.nan_to_num(t.found_after_s, nan=np.inf))[:5]],
         "turns_by_angle_to_the_view": found_by_angle(knocks),
         "creep_mm_when_found": reached.tolist(),
         "quiet_hours": size.hours,
-        "false_alarms": alarms,
+        "false_alarms": len(alarmed),
+        "alarmed": [
+            {
+                "kind": e.kind,
+                "time_s": e.time_s,
+                "found_s": e.found_s,
+                "statistic": e.statistic,
+                "model": e.model,
+                "translation_mm": (1e3 * e.translation_m).tolist(),
+                "rotation_deg": np.degrees(e.rotation_rad).tolist(),
+            }
+            for e in alarmed
+        ],
         "largest_statistic": largest,
         "threshold": threshold,
         "targets": [{**t._asdict(), "met": t.met} for t in targets],
@@ -113,8 +131,8 @@ def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> Trial:
     at = float(rng.uniform(*_KNOCK_S))
     shift, rotation = (np.zeros(3), TURN_RAD * axis) if turn else (SHIFT_M * axis, np.zeros(3))
     change = Change(at, tuple(shift.tolist()), tuple(rotation.tolist()))
-    events, view, shown = _watched(replace(world, changes=(change,)), at + _AFTER_S, seed, (at, shift, rotation))
-    return _trial("turn" if turn else "shift", seed, events, at, shift, rotation, float(abs(axis @ view)), shown)
+    events, view, *said = _watched(replace(world, changes=(change,)), at + _AFTER_S, seed, (at, shift, rotation))
+    return _trial("turn" if turn else "shift", seed, events, at, shift, rotation, float(abs(axis @ view)), *said)
 
 
 def creep_trial(world: WorldConfig, seed: int) -> Trial:
@@ -126,13 +144,14 @@ def creep_trial(world: WorldConfig, seed: int) -> Trial:
     shift = CREEP_MOST_M * axis
     change = Change(_CREEP_START_S, tuple(shift.tolist()), over_s=over)
     slow = replace(world, frame_s=8.0 * world.frame_s, changes=(change,))
-    events, view, _ = _watched(slow, _CREEP_START_S + over, seed, (0.0, shift, np.zeros(3)))
-    return _trial("creep", seed, events, _CREEP_START_S, shift, np.zeros(3), float(abs(axis @ view)), float("nan"))
+    events, view, _, _ = _watched(slow, _CREEP_START_S + over, seed, (0.0, shift, np.zeros(3)))
+    said = (float("nan"), float("nan"))
+    return _trial("creep", seed, events, _CREEP_START_S, shift, np.zeros(3), float(abs(axis @ view)), *said)
 
 
 def quiet_hours(
     world: WorldConfig, hours: float, seed: int, tell: Callable[[float], None] | None = None
-) -> tuple[int, float, float]:
+) -> tuple[list[DriftEvent], float, float]:
     """False alarms, the largest statistic and the threshold over hours in which nothing happens."""
     w = simulate(world, 3600.0 * hours, seed)
     test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / world.frame_s)
@@ -140,29 +159,56 @@ def quiet_hours(
     for k in range(len(w.rows)):
         test.update(w.rows.part(slice(k, k + 1)))
         largest = max(largest, test.statistic)
-        if tell is not None and k % _CHUNK == 0:
+        if tell is not None and k % _TOLD_EVERY == 0:
             tell(k / len(w.rows))
     test.finish()
-    return len(test.events), largest, test.threshold
+    return test.events, largest, test.threshold
 
 
 def _watched(
     config: WorldConfig, duration_s: float, seed: int, change: tuple[float, Array, Array]
-) -> tuple[list[DriftEvent], Array, float]:
-    """Events of a recording, the line of sight in the base, and what its frames show of a change (time s, shift m, rotation rad)."""
+) -> tuple[list[DriftEvent], Array, float, float]:
+    """Events of a recording, the line of sight in the base, and what its frames show of a change (time s, shift m, rotation rad): to a
+    test that knows everything else, and to one that knows what the monitor does."""
     w = simulate(config, duration_s, seed)
     test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / config.frame_s)
-    for k in range(0, len(w.rows), _CHUNK):
-        test.update(w.rows.part(slice(k, k + _CHUNK)))
+    before: DriftFilter | None = None
+    for k in range(len(w.rows)):
+        if before is None and w.rows.times[k] >= change[0]:
+            before = test.filter.copy()
+        test.update(w.rows.part(slice(k, k + 1)))
     test.finish()
-    return test.events, np.asarray(w.X_BC.rotation().matrix()[:, 2]), _shown(w, test, change)
+    told = float("nan") if before is None else _told(w, test, before, change)
+    return test.events, np.asarray(w.X_BC.rotation().matrix()[:, 2]), _shown(w, test, change), told
+
+
+def expected_late(knocks: Sequence[Trial]) -> float:
+    """How many of the changes a test with three unknowns that is told their times does not find within WITHIN_S, by the noise alone."""
+    threshold = DriftTest(RigidTransform(), np.eye(6), np.ones(3)).threshold_alone
+    return float(sum(ncx2.cdf(threshold, 3, t.told * threshold) for t in knocks if np.isfinite(t.told)))
+
+
+def _moved(w: World, change: tuple[float, Array, Array]) -> Array:
+    """A change [rotation; translation] (6,) about the pivot."""
+    _, shift, rotation = change
+    return np.concatenate([rotation, shift + np.cross(rotation, w.pivot - np.asarray(w.X_BC.translation()))])
+
+
+def _within(w: World, at: float) -> NDArray[np.intp]:
+    """The frames of WITHIN_S after a time."""
+    return np.flatnonzero((w.rows.times >= at) & (w.rows.times <= at + WITHIN_S))
+
+
+def _without_clock(information: Array) -> Array:
+    """Information (6, 6) of a move, where the clock may be other as well."""
+    N, c = information, CLOCK
+    return np.asarray(N[:c, :c] - np.outer(N[:c, c], N[c, :c]) / N[c, c])
 
 
 def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> float:
     """The expected statistic of a pure shift or turn by the frames of WITHIN_S after it, over its threshold, where noise and all other
     errors are known exactly and the clock alone is not."""
-    at, shift, rotation = change
-    chosen = np.flatnonzero((w.rows.times >= at) & (w.rows.times <= at + WITHIN_S))
+    chosen = _within(w, change[0])
     if not len(chosen) or test.noise is None:
         return float("nan")
     H = w.rows.derivatives[chosen][:, :, : CLOCK + 1]
@@ -170,10 +216,25 @@ def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> flo
     noise = test.noise
     R = np.array([noise.covariance(S, u) for S, u in zip(w.rows.covariances[chosen], motion, strict=True)])
     N = np.einsum("nia,nij,njb->ab", H, np.linalg.inv(R), H)
-    known = N[:CLOCK, :CLOCK] - np.outer(N[:CLOCK, CLOCK], N[CLOCK, :CLOCK]) / N[CLOCK, CLOCK]
-    lever = w.pivot - np.asarray(w.X_BC.translation())
-    move = np.concatenate([rotation, shift + np.cross(rotation, lever)])
-    return float(move @ known @ move) / test.threshold_alone
+    move = _moved(w, change)
+    return float(move @ _without_clock(N) @ move) / test.threshold_alone
+
+
+def _told(w: World, test: DriftTest, before: DriftFilter, change: tuple[float, Array, Array]) -> float:
+    """The same, where all other errors are known as by the monitor's filter ``before`` the change, and its time exactly."""
+    chosen = _within(w, change[0])
+    if not len(chosen) or test.noise is None:
+        return float("nan")
+    before.spawn(change[0], (STEP,))
+    (slot,) = np.flatnonzero(before.used)
+    for k in chosen:
+        before.update(w.rows, int(k), test.noise, spawn=False)
+    move, c = _moved(w, change), test.config
+    floor = np.repeat([c.floor_rad**2, c.floor_m**2], 3)
+    known = float(move @ _without_clock(before.information[slot]) @ move)
+    if known <= 0.0:
+        return 0.0
+    return 1.0 / (1.0 / known + 1.0 / float(move @ (move / floor))) / test.threshold_alone
 
 
 def found_by_angle(trials: Sequence[Trial]) -> list[dict[str, float]]:
@@ -194,16 +255,16 @@ def found_by_angle(trials: Sequence[Trial]) -> list[dict[str, float]]:
 
 
 def _trial(
-    kind: str, seed: int, events: list[DriftEvent], at: float, shift: Array, rotation: Array, view: float, shown: float
-) -> Trial:
+    kind: str, seed: int, events: list[DriftEvent], at: float, shift: Array, rotation: Array, view: float, shown: float, told: float
+) -> Trial:  # fmt: skip
     early = sum(e.found_s < at for e in events)
     later = [e for e in events if e.found_s >= at]
     if not later:
-        return Trial(kind, seed, view, *(4 * (float("nan"),)), "", early, shown)
+        return Trial(kind, seed, view, *(4 * (float("nan"),)), "", early, shown, told)
     e = later[0]
     return Trial(
         kind, seed, view, e.found_s - at, e.time_s - at, 1e3 * float(np.linalg.norm(e.translation_m - shift)),
-        float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))), e.model, early, shown,
+        float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))), e.model, early, shown, told,
     )  # fmt: skip
 
 
