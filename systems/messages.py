@@ -222,6 +222,9 @@ class PlannedSeam(Message):
     reason: str | None = None
     sigma_m: float = np.nan  # lateral sigma of the planned root
     summary: str = ""  # the result of the scan, in one sentence
+    # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and torch at one place
+    arm_sigma_m: float = np.nan
+    arm_turn_rad: float = np.nan
 
 
 def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:

@@ -54,12 +54,19 @@ def part_welds(
     seam_mm: Annotated[
         float | None, option("--seam-mm", "MM", "Weld only so much of each seam.", show_default="all of it")
     ] = None,
+    refine: Annotated[
+        str,
+        option("--refine", "KIND", "Calibrate each cell first and refine it: none (not calibrated), joints or links."),
+    ] = "none",
+    arm_mm: Annotated[
+        float, option("--arm-mm", "MM", "How far the true flange is from the reported one (rms).", min=0.0, max=5.0)
+    ] = 0.4,
 ) -> Outcome:
     """Weld twelve parts in four joints in the simulated cell, each from its STEP file, and measure the torch's error."""
     from weldcal.tools.studies.part_welds.study import Trial, run_part_welds
 
+    trial = Trial.of(located_by, seam_mm, refine, arm_mm)
     folder = call.folder("benchmark", "part-welds")
-    trial = Trial.of(located_by, seam_mm)
     summary = run_part_welds(folder, part, range(call.seed, call.seed + runs), trial, call.progress)
     return Outcome(summary)
 

@@ -27,6 +27,8 @@ from weldcal.tools.outcomes.poses import SCANNER, work_point_error
 from weldcal.tools.outcomes.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
 from weldcal.welding.record.process import PathError
 
+ARM_NOTE_M = 1e-4  # the torch's mean error that welds are to keep
+
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
@@ -81,6 +83,7 @@ class DemoResult:
                 against=against,
                 no_tolerance="No scenario key states how far the torch may be off: compare the error below with what your joint allows.",
                 concerns=self.warnings,
+                notes=self.arm_note,
             )
             more["pose"] = (
                 "none was computed: X_BC is the scenario's" if not scenario.job.calibrate else "none was found"
@@ -101,7 +104,7 @@ class DemoResult:
         )  # fmt: skip
         # what is not observable and matters to X_BC is among the warnings
         concerns = (*self.warnings, *estimate.warnings)
-        notes = [*refused_note(status.refused, self.n_scans)]
+        notes = [*refused_note(status.refused, self.n_scans), *self.arm_note]
         if estimate.scanner is not None:
             # as calibration.yaml says to programs that use X_BC
             notes.insert(
@@ -111,6 +114,21 @@ class DemoResult:
         found = Findings(against, tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
         return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())
+
+    @property
+    def arm_note(self) -> tuple[str, ...]:
+        """What errors of the arm may do between tip and torch, where a planned seam is bent enough for that to matter."""
+        plan = self.run.cell.job.planned_seam(self.run.root)
+        if self.weld is None or not plan.arm_sigma_m > ARM_NOTE_M:
+            return ()
+        refinement = self.status.refinement
+        refined = refinement is not None and refinement.arm is not None
+        arm = "What the refinement leaves of the arm's errors" if refined else "Errors of an arm as its maker leaves it"
+        advice = "" if refined else " Calibrate with calibration.refine: links."
+        return (
+            f"Along this seam the tool turns by up to {np.degrees(plan.arm_turn_rad):.0f} deg between the tip and the torch at the same "
+            f"place. {arm} then put the torch {1e3 * plan.arm_sigma_m:.2f} mm (rms) off the seam that the tip felt.{advice}",
+        )
 
     def _lead(self) -> str:
         if self.weld is None or self.weld.speed is None or self.state != "done":
@@ -197,6 +215,9 @@ class DemoResult:
             if np.isfinite(plan.sigma_m):
                 found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
             found["plan_words"] = plan.summary
+            if np.isfinite(plan.arm_sigma_m):
+                found["plan_arm_sigma_mm"] = 1e3 * plan.arm_sigma_m
+                found["plan_arm_turn_deg"] = float(np.degrees(plan.arm_turn_rad))
             found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
         found |= self.run.timing()
         return found

@@ -3,6 +3,8 @@
 import dataclasses as dc
 import itertools
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,7 @@ from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.jobs.weld.levelled import plan_root_anyhow
+from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan
 from weldcal.welding.seam.curve import SeamCurve
@@ -52,6 +55,7 @@ class SeamPlanning:
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
     surroundings: Surroundings = dc.field(default_factory=Surroundings)
     local_field: LocalField | None = None
+    arm_errors: Mapping[str, Any] | None = None  # as the refinement states them, where there is one
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -68,6 +72,10 @@ class SeamPlanning:
         seam = tip_seam(self.workpiece, self.X_BP_guess, self.tool, self.seam_length_m)
         R = touch_start_pose(seam, self.config).rotation() @ self.tool.X_FT.rotation().inverse()
         return self.local_field.at_places(points_B, R.matrix())
+
+    def tip_to_torch(self, seam: SeamCurve, q_start: NDArray[np.float64]) -> TipToTorch:
+        """What errors of the arm do between tip and torch along a seam."""
+        return tip_to_torch(self.arm, self.tool, seam, q_start, self.arm_errors)
 
     def waypoints(
         self, seam: SeamCurve, X_BP: RigidTransform | None
@@ -138,7 +146,12 @@ class SeamPlanner(BackgroundSystem):
         if X_BC is None:
             status: CalibrationStatus = self._status.Eval(context)
             X_BC, correction = status.X_BC, status.correction
-            planning = dc.replace(planning, arm=status.arm_or(planning.arm), local_field=status.local_field)
+            planning = dc.replace(
+                planning,
+                arm=status.arm_or(planning.arm),
+                local_field=status.local_field,
+                arm_errors=None if status.refinement is None else status.refinement.arm_errors,
+            )
         planning = dc.replace(planning, workpiece=numbered(planning.workpiece, job.seam))
         return self.plan(planning, scan, X_BC, correction)
 
@@ -168,6 +181,7 @@ def plan_seam(
         )
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
         q_start, q_above, q_retract = planning.waypoints(seam, found.X_BP)
+        share = planning.tip_to_torch(seam, q_start)
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
     return PlannedSeam(
@@ -182,6 +196,8 @@ def plan_seam(
         points_B,
         sigma_m=found.sigma_m,
         summary=found.summary,
+        arm_sigma_m=share.sigma_m,
+        arm_turn_rad=share.turn_rad,
     )
 
 
@@ -340,6 +356,7 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     try:
         seam = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
         q_start, q_above, q_retract = planning.waypoints(seam, planning.X_BP_guess)
+        share = planning.tip_to_torch(seam, q_start)
     except WeldcalError as error:
         return PlannedSeam(sequence=sequence, reason=str(error))
     points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
@@ -354,4 +371,6 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
         q_retract,
         points_B,
         summary="the pose of the part is from the fixture's drawing; the scan was not used",
+        arm_sigma_m=share.sigma_m,
+        arm_turn_rad=share.turn_rad,
     )

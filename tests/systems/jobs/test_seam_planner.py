@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
@@ -11,7 +13,14 @@ from pydrake.systems.analysis import Simulator
 from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.systems.jobs.weld.seam_planner import SeamOutOfReach, SeamPlanner, SeamPlanning, arm_waypoints, tip_seam
+from weldcal.systems.jobs.weld.seam_planner import (
+    SeamOutOfReach,
+    SeamPlanner,
+    SeamPlanning,
+    arm_waypoints,
+    plan_drawn_seam,
+    tip_seam,
+)
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod
@@ -135,6 +144,17 @@ def test_the_plan_holds_the_arms_way_to_it(plan: PlannedSeam, config: ServoConfi
     assert plan.q_start == pytest.approx(expected[0])
     assert plan.q_above == pytest.approx(expected[1])
     assert plan.q_retract == pytest.approx(expected[2])
+
+
+def test_the_plan_states_what_errors_of_the_arm_do(plan: PlannedSeam, config: ServoConfig) -> None:
+    """The same of a scanned and of a drawn seam; less where a refinement has found the links' errors."""
+    planning = SeamPlanning(the_arm(), TOOL, STRAIGHT, X_BP, config, Q_HOME, CLEARANCE_M, 0.1)
+    drawn = plan_drawn_seam(planning, 1)
+    assert 2e-5 < plan.arm_sigma_m < 2e-4
+    assert drawn.arm_sigma_m == pytest.approx(plan.arm_sigma_m, rel=0.05)
+    assert plan.arm_turn_rad < np.radians(0.5)
+    known = {"which": [13], "covariance": [[0.0]]}  # the elbow's turn
+    assert plan_drawn_seam(replace(planning, arm_errors=known), 1).arm_sigma_m < drawn.arm_sigma_m
 
 
 def test_the_cloud_is_shown_in_the_base(plan: PlannedSeam) -> None:

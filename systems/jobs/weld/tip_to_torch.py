@@ -1,0 +1,135 @@
+"""Predicts how far errors of the arm put the torch off the seam that the tip has felt.
+
+At one place of a bent seam the torch is led by another posture of the arm than the tip was: it comes a chord later, and the tool has turned.
+What the arm's kinematics are off is not the same in both, and the tip cannot feel the difference. Derivation in docs/parts.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.hand_eye.joints import flange_poses
+from weldcal.calibration.refinement.kinematics_fit import FactoryPrior
+from weldcal.models.arms.chain import chain_of
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arrays import Array
+from weldcal.models.tool import WeldingTool
+from weldcal.welding.numerics import pose, unit
+from weldcal.welding.seam.curve import SeamCurve
+
+EVERY_M = 0.01
+_DIFFERENCE = 1e-2  # of the prior's standard deviation: micrometres
+
+
+@dataclass(frozen=True)
+class TipToTorch:
+    """Between tip and torch at the same place of a seam: ``sigma_m``, rms over the seam of the torch's distance from the line that the tip
+    felt, m, for arms of one accuracy; ``turn_rad``, the largest turn of the tool."""
+
+    sigma_m: float
+    turn_rad: float
+
+
+def tip_to_torch(
+    arm: ArmModel,
+    tool: WeldingTool,
+    seam: SeamCurve,
+    q_near: Array,
+    stated: Mapping[str, Any] | None = None,
+    prior: FactoryPrior | None = None,
+) -> TipToTorch:
+    """Predict the error that an arm brings in between tip and torch; NaN where it does not reach the whole seam.
+
+    Args:
+        seam: line of the seated tip in B.
+        q_near: (6,) rad, of the posture in which the arm welds.
+        stated: what a refinement states of the errors that it has found (Refinement.arm_errors); without it the arm is as makers leave it.
+        prior: how makers leave it.
+    """
+    at = _held(arm, tool, seam, q_near)
+    if at is None:
+        return TipToTorch(math.nan, math.nan)
+    s_torch, s_tip, X_BT, q = at
+    by_tip, by_torch = _sensitivities(arm, tool, q, prior or FactoryPrior())
+    here = (s_torch >= 0.0) & (s_torch <= seam.length)
+    felt = np.stack([[np.interp(s_torch[here], s_tip, row) for row in rows] for rows in by_tip.transpose(1, 2, 0)])
+    off = by_torch[here] - felt.transpose(2, 0, 1)
+    t = seam.tangent(s_torch[here])
+    off = off - t[:, :, None] * np.einsum("ni,nik->nk", t, off)[:, None]
+    sigma = np.sqrt(np.einsum("nik,kl,nil->n", off, _covariance(6 * len(arm.stack), stated), off))
+    turns = [_turn(X_BT[k], X_BT[int(np.argmin(np.abs(s_tip - s_torch[k])))]) for k in np.flatnonzero(here)]
+    return TipToTorch(float(np.sqrt(np.mean(sigma**2))), max(turns))
+
+
+def _held(
+    arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array
+) -> tuple[Array, Array, list[RigidTransform], Array] | None:
+    """Arcs (n,) of torch and tip, poses of T and joint angles (n, 6), with the tool as the servo holds it: its left square to the torch's up."""
+    places = np.arange(-tool.chord_m, seam.length + EVERY_M, EVERY_M)
+    tips, poses, joints, q = [], [], [], q_near
+    for s in places:
+        torch = seam.frame(float(s))
+        s_tip = _chord_ahead(seam, float(s), tool.chord_m)
+        tip = seam.frame(s_tip)
+        x = unit(tip.position - torch.position, tip.tangent)
+        y = unit(np.cross(torch.up, x), torch.normal)
+        X_BT = pose(np.column_stack([x, y, np.cross(x, y)]), tip.position)
+        found = nearest_solution(arm, X_BT @ tool.X_FT.inverse(), q)
+        if found is None:
+            return None
+        q = found
+        tips.append(s_tip)
+        poses.append(X_BT)
+        joints.append(found)
+    return places, np.array(tips), poses, np.array(joints)
+
+
+def _chord_ahead(seam: SeamCurve, s: float, chord_m: float) -> float:
+    """Arc length of the first point as far ahead as the chord is long."""
+    start = seam.frame(s).position
+    low, high = s, s + chord_m
+    while float(np.linalg.norm(seam.frame(high).position - start)) < chord_m and high - s < 2.0 * chord_m:
+        low, high = high, high + 0.1 * chord_m
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        short = float(np.linalg.norm(seam.frame(middle).position - start)) < chord_m
+        low, high = (middle, high) if short else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _sensitivities(arm: ArmModel, tool: WeldingTool, q: Array, prior: FactoryPrior) -> tuple[Array, Array]:
+    """Displacement (n, 3, k) m of tip and of torch by each error of the links, of one standard deviation."""
+    chain = chain_of(arm)
+    scale = np.tile([prior.turn_rad, prior.turn_rad, prior.offset_rad, *[prior.length_m] * 3], chain.n)
+    p_FT, p_FW = tool.X_FT.translation(), tool.X_FT @ tool.p_TW
+    columns: tuple[list[Array], list[Array]] = ([], [])
+    for k in range(6 * chain.n):
+        error = np.zeros(6 * chain.n)
+        error[k] = _DIFFERENCE * scale[k]
+        more, less = (flange_poses(chain, q, e.reshape(-1, 6)) for e in (error, -error))
+        change = (more - less) / (2.0 * _DIFFERENCE)
+        for found, p in zip(columns, (p_FT, p_FW), strict=True):
+            found.append(change[:, :3, :3] @ p + change[:, :3, 3])
+    by_tip, by_torch = (np.stack(found, axis=2) for found in columns)
+    return by_tip, by_torch
+
+
+def _covariance(size: int, stated: Mapping[str, Any] | None) -> Array:
+    """Covariance (k, k) of the links' errors in units of the prior: one where nothing was found, else as it is stated."""
+    covariance = np.eye(size)
+    if stated is not None:
+        which = np.array(stated["which"], dtype=int)
+        found = np.array(stated["covariance"], dtype=float)[-len(which) :, -len(which) :]
+        covariance[np.ix_(which, which)] = found
+    return covariance
+
+
+def _turn(a: RigidTransform, b: RigidTransform) -> float:
+    return float((a.rotation().inverse() @ b.rotation()).ToAngleAxis().angle())
