@@ -268,6 +268,14 @@ def test_registers_of_the_lower_range_are_asked_for_where_the_driver_uses_them(r
     assert problem.found == "int 0, double 3 in use"
 
 
+def test_registers_of_the_set_points_are_asked_for_where_they_are_wired(robot: Emulator) -> None:
+    robot.fault("registers_in_use", names=["input_double_register_33"])
+    assert preflight(robot.host).ok
+    problem = preflight(robot.host, set_points=True).first_problem
+    assert problem is not None
+    assert problem.found == "double 33 in use"
+
+
 def test_a_command_that_an_earlier_client_left_behind_is_told_and_left_alone(robot: Emulator) -> None:
     def write(value: int) -> None:
         with socket.create_connection((robot.host, 30004)) as client:

@@ -133,7 +133,9 @@ def _robot(scenario: Scenario, q: Array) -> tuple[list[tuple[str, Check]], Rigid
     config = scenario.robot
     arm = nominal_arm(scenario)
     if isinstance(config, UrRtde):
-        report = preflight(config.host, upper_registers=config.upper_registers, nominal=arm, load=config.load())
+        report = preflight(
+            config.host, upper_registers=config.upper_registers, nominal=arm, load=config.load(), set_points=config.set_points
+        )  # fmt: skip
         X_BF = None if report.arm is None or report.arm_q is None else forward_kinematics(report.arm, report.arm_q)
         return [("robot", check) for check in report.checks], X_BF
     if config.SIMULATED:

@@ -129,8 +129,9 @@ def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
         RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the operator action.
     """
     report = preflight(
-        config.host, upper_registers=config.upper_registers, nominal=nominal_arm(scenario), load=config.load()
-    )
+        config.host, upper_registers=config.upper_registers, nominal=nominal_arm(scenario), load=config.load(),
+        set_points=config.set_points,
+    )  # fmt: skip
     require_ready(report)
     assert report.arm is not None
     assert report.arm_q is not None

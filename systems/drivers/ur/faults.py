@@ -13,6 +13,7 @@ class Fault(IntEnum):
     CONTROLLER_DEAF = 4
     CLOCK_JUMPED = 5
     STATE_IMPLAUSIBLE = 6
+    STATE_DAMAGED = 7
     SET_POINT = 9
     COMMAND_LATE = 10
     COMMAND_NOT_FINITE = 11
@@ -51,6 +52,8 @@ SENTENCES = {
     "check the cable, and that no other program runs or writes its registers; start again.",
     Fault.CLOCK_JUMPED: "LINK: the controller's clock jumped by {detail:.3f} s; if it was restarted, start again when it is ready.",
     Fault.STATE_IMPLAUSIBLE: "LINK: a joint was reported {detail:.3f} rad from where it was 4 ms before; check the network and start again.",
+    Fault.STATE_DAMAGED: "LINK: the controller's mode was reported as {detail:.0f}, which does not exist: its packages arrive damaged; check the "
+    "cable, the switch and the network card, and start again.",
     Fault.COMMAND_LATE: "COMMAND LATE: the cell gave no new velocity for {detail:.0f} ms while the arm moved or the process was on; "
     "close other programs here and start again.",
     Fault.COMMAND_NOT_FINITE: "COMMAND: a velocity that is not a number was refused; this is a mistake of the program, report it.",

@@ -74,6 +74,11 @@ class UrRtde(DriverConfig):
         points_s = 0.0 if self.wire_feed is None and self.arc_voltage is None else SETTLES_S
         return points_s + (0.0 if self.gas_output is None else self.gas_before_s)
 
+    @property
+    def set_points(self) -> bool:
+        """Whether the power source's set points are wired to analog outputs."""
+        return self.wire_feed is not None or self.arc_voltage is not None
+
     def load(self, owner: str = "the scenario") -> ExpectedLoad:
         """The payload with which the pre-flight compares the controller's."""
         return ExpectedLoad(self.payload_kg, tuple(self.payload_cog_m), owner)
@@ -209,7 +214,9 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     levels = levels_of(config.wire_feed, config.arc_voltage)
     if levels and (config.process_output is None or config.arc_input is None):
         raise InputError("robot.wire_feed and robot.arc_voltage need process_output and arc_input.")
-    report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load())
+    report = preflight(
+        config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load(), set_points=config.set_points
+    )  # fmt: skip
     require_ready(report)
     arm = report.arm
     if arm is None:

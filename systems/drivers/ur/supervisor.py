@@ -15,6 +15,8 @@ NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
 SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7
 RUNNING = 7
 PLAYING, PAUSING, PAUSED = 2, 3, 4
+MODES = range(-1, 100)  # of robot, safety and program; PolyScope has some fifteen of each, from -1 on
+POSE_M = 5e-5
 # states that the guard script writes into its output register
 OBEYING, STALE_REGISTER = 1, 2
 MADE_UP_FOR_S = 0.03  # of the cell's time
@@ -46,6 +48,7 @@ class Action(IntEnum):
 ACTIONS = {
     **dict.fromkeys((Fault.LINK_STALE, Fault.LINK_CLOSED, Fault.CONTROLLER_DEAF, Fault.CLOCK_JUMPED), Action.LEAVE),
     Fault.STATE_IMPLAUSIBLE: Action.LEAVE,
+    Fault.STATE_DAMAGED: Action.LEAVE,
     **{fault: Action.BRAKE for fault in Fault if Fault.COMMAND_LATE <= fault < Fault.PROTECTIVE_STOP},
     **{fault: Action.STOP for fault in Fault if fault >= Fault.PROTECTIVE_STOP},
     Fault.ARC_FAULT: Action.BRAKE,
@@ -186,6 +189,7 @@ class Supervisor:
         self._asked, self._asked_at = False, -np.inf
         self._off_since: float | None = None
         self._apart_since: float | None = None
+        self._posed_off_at: float | None = None
         self._arc_ends_at, self._arc_since = -np.inf, np.inf
         self._seen_time, self._seen_number = -np.inf, 0
         self.latched = Decision(Action.SEND)
@@ -232,6 +236,9 @@ class Supervisor:
             return Fault.LINK_STALE, 1e3 * (now - robot.fresh_at)
         if (blind := command.number - self._seen_number) > limits.blind_commands:
             return Fault.LINK_STALE, 1e3 * COMMAND_S * blind
+        for mode in (robot.robot_mode, robot.safety_mode, robot.runtime_state):
+            if mode not in MODES:
+                return Fault.STATE_DAMAGED, float(mode)
         if last is not None and robot.robot_time != last.robot_time:
             passed = robot.robot_time - last.robot_time
             expected = limits.pace * (robot.fresh_at - last.fresh_at)
@@ -317,7 +324,11 @@ class Supervisor:
         self._slow_since = (self._slow_since or now) if slow else None
         if self._slow_since is not None and now - self._slow_since > limits.late_s:
             return Fault.SPEED_SLIDER, 100.0 * robot.speed_scaling
-        if robot.pose_error_m > 5e-5:
+        if robot.pose_error_m <= POSE_M:
+            self._posed_off_at = None
+        elif self._posed_off_at is None:  # one state alone may be a byte that was damaged on the way
+            self._posed_off_at = robot.robot_time
+        elif robot.robot_time != self._posed_off_at:
             return Fault.POSE_MISMATCH, 1e3 * robot.pose_error_m
         if not np.isfinite(command.qd).all():
             return Fault.COMMAND_NOT_FINITE, 0.0

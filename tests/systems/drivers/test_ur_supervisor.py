@@ -123,7 +123,10 @@ OF_THE_SAMPLE = [
     ({"runtime_state": PAUSED}, Fault.PROGRAM_PAUSED),
     ({"guard": 3}, Fault.GUARD_LATCHED),
     ({"guard": 0}, Fault.GUARD_LATCHED),
-    ({"pose_error_m": 6e-5}, Fault.POSE_MISMATCH),
+    ({"robot_mode": 7 ^ 0xFF}, Fault.STATE_DAMAGED),  # a byte with all bits turned
+    ({"robot_mode": -16777209}, Fault.STATE_DAMAGED),
+    ({"safety_mode": 1 ^ 0xFF}, Fault.STATE_DAMAGED),
+    ({"runtime_state": -3}, Fault.STATE_DAMAGED),
 ]
 
 
@@ -132,6 +135,14 @@ def test_a_sample_that_is_not_as_it_must_be_is_a_fault(rig: Rig, changes: dict[s
     decision = rig.one(**changes)  # type: ignore[arg-type]
     assert decision.fault is fault
     assert decision.action is ACTIONS[fault]
+
+
+def test_another_tcp_shows_in_two_states_and_a_damaged_byte_in_one(rig: Rig) -> None:
+    assert rig.one(pose_error_m=6e-5).fault is Fault.NONE
+    assert rig.one(state=False, pose_error_m=6e-5).fault is Fault.NONE, "the same state again"
+    assert rig.one().fault is Fault.NONE
+    assert rig.one(pose_error_m=6e-5).fault is Fault.NONE
+    assert rig.one(pose_error_m=6e-5) == Decision(Action.BRAKE, Fault.POSE_MISMATCH, pytest.approx(0.06))
 
 
 def test_in_lockstep_a_controller_that_waited_has_not_jumped(rig: Rig) -> None:
@@ -419,7 +430,7 @@ def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
     assert all(sentence(fault, 1.0).endswith(".") for fault in SENTENCES)
     seen = {fault for _, fault in OF_THE_SAMPLE} | {fault for _, fault in COMMANDS}
     seen |= {Fault.LINK_STALE, Fault.COMMAND_LATE, Fault.SPEED_SLIDER, Fault.JOINT_LIMIT, Fault.TRACKING}
-    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT, Fault.ARC_INPUT, Fault.SET_POINT}
+    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT, Fault.ARC_INPUT, Fault.SET_POINT, Fault.POSE_MISMATCH}
     of_the_start = {fault for fault in Fault if fault >= Fault.GUARD_REFUSED}
     assert seen == set(Fault) - of_the_start - {Fault.NONE, Fault.WORKER_DIED}, "every fault is tested here"
     assert seen <= set(ACTIONS)

@@ -12,6 +12,10 @@ CONNECT_S = 2.0
 LONGEST_LINE = 4096
 
 
+# s without a word until the other side is asked, s between such questions, and how many without an answer are the end
+KEEP_ALIVE = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
+
+
 class Trigger(Protocol):
     """Tells another program to scan."""
 
@@ -89,6 +93,11 @@ class TcpTrigger:
                 "start the program that scans"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # nothing is sent between scans, so that a pulled cable would show at the next one only
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for option, value in KEEP_ALIVE.items():
+            if hasattr(socket, option):
+                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
         self._unread = b""
 
     def send(self, request: int) -> None:

@@ -33,7 +33,7 @@ from weldcal.systems.drivers.ur.readiness.load import (
     payload_finding,
 )
 from weldcal.systems.drivers.ur.readiness.needs import OUTPUTS, WAITS_FOR
-from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET, ranges, register_names
+from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, SET_POINTS, UPPER_OFFSET, ranges, register_names
 from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported
 from weldcal.systems.drivers.ur.wire.dashboard import ask
 from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
@@ -117,6 +117,7 @@ def preflight(
     timeout_s: float = 2.0,
     nominal: ArmModel | None = None,
     load: ExpectedLoad | None = None,
+    set_points: bool = False,
 ) -> Preflight:
     """Check the robot at `host` without changing anything on it.
 
@@ -126,11 +127,12 @@ def preflight(
         timeout_s: longest time of each request to the controller.
         nominal: the expected arm; a UR10e where None.
         load: the payload that the job needs; shown and not compared where None.
+        set_points: whether the driver will also write those of the power source, for which it needs two more registers.
 
     Raises:
         InputError: the host is empty or not an address. All other problems are failed checks.
     """
-    look = _Look(host, timeout_s, nominal or load_arm("ur10e"), load)
+    look = _Look(host, timeout_s, nominal or load_arm("ur10e"), load, DOUBLES + (SET_POINTS if set_points else 0))
     look.run(upper_registers)
     return look.report()
 
@@ -150,8 +152,10 @@ def require_ready(report: Preflight) -> None:
 class _Look:
     """Performs the checks, one method each; each stores its result in `_done`."""
 
-    def __init__(self, host: str, timeout_s: float, nominal: ArmModel, load: ExpectedLoad | None) -> None:
-        self._load = load
+    def __init__(
+        self, host: str, timeout_s: float, nominal: ArmModel, load: ExpectedLoad | None, doubles: int
+    ) -> None:  # fmt: skip
+        self._load, self._doubles = load, doubles
         self._host, self._timeout_s, self._nominal = host, timeout_s, nominal
         self._done: dict[str, Check] = {}
         self._seen: Mapping[str, Value] = {}
@@ -224,7 +228,7 @@ class _Look:
             self._version = rtde.version
             if not self._check_version(rtde.version):
                 return {}
-            claims = rtde.claim(register_names(self._offset))
+            claims = rtde.claim(register_names(self._offset, self._doubles))
             self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, GRAVITY_OUTPUT, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:
             self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.VERSION)

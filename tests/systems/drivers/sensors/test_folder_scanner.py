@@ -16,6 +16,7 @@ import pytest
 from tests.systems.drivers.sensors.scripted import wait_until
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, DeviceFault
+from weldcal.systems.drivers.sensors.files.triggers import KEEP_ALIVE, TcpTrigger
 from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, acquire
 
@@ -315,6 +316,21 @@ def test_a_program_is_triggered_over_tcp_and_missed_when_it_ends(start: Start, t
     assert wait_until(lambda: scanner.fault(time.monotonic()) is not None)
     assert time.monotonic() - begin < 1.0
     assert "is not connected: its trigger at 127.0.0.1" in (scanner.fault(time.monotonic()) or "")
+
+
+def test_a_cable_that_is_pulled_between_scans_is_missed_within_seconds() -> None:
+    """The kernel asks the other side; that it answers nothing any more cannot be played on one computer."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        trigger = TcpTrigger(*server.getsockname())
+        trigger.open()
+        try:
+            asked = trigger._socket
+            assert asked is not None
+            assert asked.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+            idle, between, count = (asked.getsockopt(socket.IPPROTO_TCP, getattr(socket, o)) for o in KEEP_ALIVE)
+            assert idle + between * count <= 5
+        finally:
+            trigger.close()
 
 
 def test_what_the_program_says_is_in_the_fault(start: Start, tmp_path: Path) -> None:
