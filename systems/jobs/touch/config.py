@@ -19,7 +19,7 @@ class TouchConfig:
     result: str = dc.field(default="", metadata=FILE)
     points: int = 8  # along the seam, on both sides in turn
     aside_mm: float = 9.0  # of the groove's middle, where the face is flat
-    clearance_mm: float = 15.0  # of the tip above the face, where the descent begins
+    clearance_mm: float = 20.0  # of the tip above the face, where the descent begins; the torch hangs as low as the tip
     descent_mm_s: float = 3.0
     press_mm: float = 1.0  # deflection of the tip at which it has touched
     deepest_mm: float = 5.0  # below the scanned face, where the touch is abandoned

@@ -12,10 +12,12 @@ from pydrake.math import RigidTransform
 from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.planning.clearance import arm_bodies
+from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.calibration.touch.judge import judge_touches
 from weldcal.calibration.touch.table import read_touches, touches_text
 from weldcal.models.arms.inverse import nearest_solution
-from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.arms.kinematics import forward_kinematics, link_frames
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.touch.config import TouchConfig
 from weldcal.systems.jobs.touch.job import AddedTouches
@@ -23,6 +25,7 @@ from weldcal.systems.jobs.touch.planner import Place, PlannedTouches, TouchPlann
 from weldcal.systems.jobs.touch.procedure import FRAMES, Felt, TouchMotion, TouchSeen, TouchState, next_touch_state
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.jobs.weld.job import seam_planning
+from weldcal.systems.jobs.weld.seam_planner import CLEAR_OF_PART_M
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import Scan, UrStatus
 from weldcal.systems.scenario.checks import check_scenario
@@ -56,7 +59,22 @@ def test_the_places_are_on_the_flat_face_on_both_sides_and_the_tip_stands_above_
     assert (np.sign(side[::2]) != np.sign(side[1::2])).all()
     for place in planned.places:
         tip = (forward_kinematics(the_arm(), place.q_above) @ TOOL.X_FT).translation()
-        np.testing.assert_allclose(tip - place.p_B, (TOOL.tip_radius_m + 0.015) * place.n_B, atol=1e-6)
+        np.testing.assert_allclose(
+            tip - place.p_B, (TOOL.tip_radius_m + 1e-3 * TouchConfig().clearance_mm) * place.n_B, atol=1e-6
+        )
+
+
+def test_a_face_that_seems_tilted_by_three_degrees_does_not_refuse_a_place(planned: PlannedTouches) -> None:
+    """The torch hangs as low as the tip, 60 mm from it: a few points of noise in the scanned face must not bring it to the part."""
+    told = scenario(SMALL_IDEAL_SCANNER, EXACT_PLATE)
+    station = plain_station()
+    seam = seam_planning(told, station, servo_config(told, station))
+    assert station.truth.X_BP is not None
+    part = Obstacle(
+        "part", seam.workpiece.mesh.transformed(station.truth.X_BP), CLEAR_OF_PART_M + 0.06 * np.sin(np.radians(3.0))
+    )
+    bodies = arm_bodies(the_arm(), TOOL.capsules())
+    assert all(Surroundings((part,)).touched(bodies, link_frames(the_arm(), p.q_above)) == "" for p in planned.places)
 
 
 class Bench:
