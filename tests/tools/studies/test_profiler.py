@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
+from weldcal.tools.cli.app import app
+from weldcal.tools.studies.profiler import command
 from weldcal.tools.studies.profiler.command import run_profiler_study
 from weldcal.tools.studies.profiler.edge import edge_rows
 from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines
@@ -16,6 +20,7 @@ from weldcal.tools.studies.profiler.results import ProfilerStudyOptions
 from weldcal.tools.studies.profiler.sets import made_edge_trials
 from weldcal.tools.studies.profiler.sphere import METHODS, WorldData, measure
 from weldcal.tools.studies.profiler.worlds import SphereWorld, sphere_trial
+from weldcal.tools.studies.targets import Target
 
 
 def test_on_other_edges_the_joint_method_is_near_its_bound_and_the_papers_is_not() -> None:
@@ -70,3 +75,15 @@ def test_everything_random_follows_from_the_seed() -> None:
     one, two, other = (sphere_trial(SphereWorld.made(s), s, touches=8, views=1) for s in (3, 3, 4))
     np.testing.assert_array_equal(one.data.profiles[5], two.data.profiles[5])
     assert not np.allclose(one.data.profiles[5], other.data.profiles[5])
+
+
+@pytest.mark.parametrize(("data", "code"), [([], 0), (["--data", "fixed"], 1)])
+def test_targets_of_the_fixed_files_do_not_decide_on_other_worlds(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, data: list[str], code: int
+) -> None:
+    missed = Target("frustum, length", "mm", 0.053, 0.042)
+    study = SimpleNamespace(met=False, summary=lambda: {"state": "failed"}, targets=lambda: [missed])
+    monkeypatch.setattr(command, "run_profiler_study", lambda options, progress: study)
+    found = CliRunner().invoke(app, ["reproduce", "profiler", *data, "--out", str(tmp_path / "out")])
+    assert found.exit_code == code, found.output
+    assert "MISSED" in found.output
