@@ -13,12 +13,14 @@ from typing import Any
 import pytest
 
 from tests.browser import RUNNING, browser
+from tests.compiling import compile_one_by_one
 from tests.places import SHARED_DATA, require_data
 from tests.scheduling import Scheduling, order, processes
 from tests.short_job import finished_demo, short_jobs
 
 __all__ = ["browser", "finished_demo", "short_jobs"]
 
+compile_one_by_one()
 # Imports and collected tests stay for good: to look through all of them again and again takes a third of what collecting takes.
 gc.disable()
 
