@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
-from selenium.common.exceptions import WebDriverException
+from selenium.common.exceptions import TimeoutException, WebDriverException
 from selenium.webdriver import Chrome, ChromeOptions, ChromeService
 from selenium.webdriver.support.ui import WebDriverWait
 
@@ -68,10 +68,18 @@ class Browser:
             self._driver.get("about:blank")
 
     def wait(self, condition: str, timeout_s: float = 30) -> None:
-        """Waits until a JavaScript expression is true; raises selenium.common.TimeoutException if it never is."""
-        WebDriverWait(self._driver, timeout_s).until(
-            lambda driver: driver.execute_script(f"return Boolean({condition})")
-        )
+        """Waits until a JavaScript expression is true.
+
+        Raises:
+            selenium.common.TimeoutException: if it never is; it tells what the page showed instead.
+        """
+        try:
+            WebDriverWait(self._driver, timeout_s).until(
+                lambda driver: driver.execute_script(f"return Boolean({condition})")
+            )
+        except TimeoutException:
+            shown = f"{self._driver.current_url} shows {self.text()!r}, console {self._driver.get_log('browser')}"
+            raise TimeoutException(f"not in {timeout_s:g} s: {condition}; {shown}") from None
 
     def run(self, script: str) -> object:
         """The value that a piece of JavaScript returns."""
