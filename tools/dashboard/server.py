@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,50 @@ LAST_WORDS_S = 0.6
 _PAGE = Path(__file__).parent / "page"
 
 
-class _Quiet(WSGIRequestHandler):
-    """A handler that writes no line for each request: the terminal belongs to the progress bar."""
+class _Connections:
+    """The connections of a page. A browser keeps some open that it has not used yet: those would reach a page that is over."""
 
-    def log(self, type: str, message: str, *args: Any) -> None:
-        """See WSGIRequestHandler."""
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: set[socket.socket] = set()
+        self._over = False
+
+    def add(self, connection: socket.socket) -> None:
+        """A new connection; it ends at once where the page is over."""
+        with self._lock:
+            self._open.add(connection)
+            if self._over:
+                _end(connection)
+
+    def discard(self, connection: socket.socket) -> None:
+        """A connection that is closed."""
+        with self._lock:
+            self._open.discard(connection)
+
+    def end(self) -> None:
+        """End all of them, and those that still come."""
+        with self._lock:
+            self._over = True
+            for connection in self._open:
+                _end(connection)
+
+    def handler(self) -> type[WSGIRequestHandler]:
+        """A handler whose connections these are. It writes no line for each request: the terminal belongs to the progress bar."""
+        connections = self
+
+        class Handler(WSGIRequestHandler):
+            def setup(self) -> None:
+                super().setup()
+                connections.add(self.connection)
+
+            def finish(self) -> None:
+                connections.discard(self.connection)
+                super().finish()
+
+            def log(self, type: str, message: str, *args: Any) -> None:
+                """See WSGIRequestHandler."""
+
+        return Handler
 
 
 class Dashboard:
@@ -45,6 +85,7 @@ class Dashboard:
         self._closing = threading.Event()
         self._streams = 0
         self._servers: list[BaseWSGIServer] = []
+        self._connections = _Connections()
         key = secrets.token_urlsafe(24)
         port = self._serve(self._application(view_url, key, None), LOOPBACK)
         self.url = f"http://{LOOPBACK}:{port}/"
@@ -65,14 +106,16 @@ class Dashboard:
         for server in self._servers:
             server.shutdown()
             server.server_close()
+        self._connections.end()
 
     def _serve(self, application: Flask, host: str) -> int:
         """Serve an application on a free port of this host; returns the port."""
         bound = _bound(host)
         with bound:
             server = make_server(
-                host, bound.getsockname()[1], application, threaded=True, request_handler=_Quiet, fd=bound.fileno()
-            )
+                host, bound.getsockname()[1], application, threaded=True, request_handler=self._connections.handler(),
+                fd=bound.fileno(),
+            )  # fmt: skip
         self._servers.append(server)
         threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True, name="dashboard").start()
         return int(server.port)
@@ -165,6 +208,11 @@ class Dashboard:
                 self._closing.wait(PERIOD_S)
         finally:
             self._streams -= 1
+
+
+def _end(connection: socket.socket) -> None:
+    with suppress(OSError):  # the browser was first
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 def _bound(host: str) -> socket.socket:

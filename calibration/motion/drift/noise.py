@@ -16,6 +16,7 @@ _STRAIGHT = 0.98  # cosine between the directions of three frames whose noise is
 _GAP = 3.0  # usual intervals: frames farther apart do not differ by noise alone
 _CLIP = 4.0  # sigmas: a wrong fit counts as that far off
 _LEAST_FACTOR, _LARGEST_FACTOR = 0.3, 30.0
+_LEAST_JITTER_S = 1e-5  # a few micrometres of motion
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,27 @@ class FrameNoise:
         """Covariance (5, 5) of a residual with the fit's (5, 5) and its derivative (5,) by the time: S + sigma_j^2 u u'."""
         factors = np.array([self.center] * 3 + [self.normal] * 2)
         return np.asarray(fit * np.outer(factors, factors) + self.jitter_s**2 * np.outer(motion, motion))
+
+
+class NoiseMemory:
+    """The noise to test with, from windows of some hundred frames that are measured one after another.
+
+    A window's factors vary by a tenth, with its few triples and wrong fits. A statistic that counts in sigmas of the window that happens
+    to be the quietest is too large, and a test of many frames meets such windows. So the noise is the newest window's, but in no part less
+    than the geometric mean over the windows of the last ``frames``, to which a moment of wrong fits adds little.
+    """
+
+    def __init__(self, frames: int) -> None:
+        self._most, self._count = frames, 0
+        self._mean = np.zeros(3)  # logarithms
+
+    def noise(self, window: FrameNoise, new: int) -> FrameNoise:
+        """The noise after a window with ``new`` frames more than the one before it."""
+        now = np.log([window.center, window.normal, max(window.jitter_s, _LEAST_JITTER_S)])
+        self._count = min(self._count + new, self._most)
+        self._mean += (now - self._mean) * min(new / self._count, 1.0)
+        mean = np.exp(self._mean)
+        return FrameNoise(max(window.center, mean[0]), max(window.normal, mean[1]), max(window.jitter_s, mean[2]))
 
 
 def measured_noise(rows: Rows, *, clock_s: float = 0.0) -> FrameNoise | None:

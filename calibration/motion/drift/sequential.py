@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.geometry.quantiles import chi2_threshold
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.motion.drift.hypotheses import RAMP, RAMP_S, STEP, DriftFilter, FilterConfig
-from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
+from weldcal.calibration.motion.drift.noise import FrameNoise, NoiseMemory, measured_noise
 from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, Rows, about, moved_about
 from weldcal.models.arrays import Array
 
@@ -32,6 +32,7 @@ class DriftConfig:
     averages away; ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a change that is
     as old as the first frame; it is tested for ``stated_s``. Changes older than ``longest_s`` are not tested. An alarm waits
     ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a warm-up explains a slow change as well.
+    The noise is that of the last ``noise_frames``, and no less than the mean of the last ``noise_memory``.
     Where ``novel_frames`` of the last 80 or so are at poses that the field's features do not reach, the field is learnt anew.
     """
 
@@ -47,6 +48,7 @@ class DriftConfig:
     confirm_s: float = 4.0
     slow_s: float = 60.0
     noise_frames: int = 400
+    noise_memory: int = 12000
     novel_frames: int = 40
     filter: FilterConfig = field(default_factory=FilterConfig)
 
@@ -92,6 +94,7 @@ class DriftTest:
         self._lever = self._pivot - np.asarray(X_BC.translation())
         self.filter = DriftFilter(about(covariance, self._lever), self.config.filter)
         self._given, self.noise = noise, noise
+        self._memory = NoiseMemory(self.config.noise_memory)
         self._recent: list[Rows] = []
         self._waiting: list[Rows] = []
         self._alarm_s: float | None = None
@@ -175,7 +178,9 @@ class DriftTest:
         joined = _joined(self._recent)
         joined = joined.part(slice(max(0, len(joined) - self.config.noise_frames), None))
         self._recent = [joined]
-        self.noise = measured_noise(joined, clock_s=self.clock_s) or self.noise
+        window = measured_noise(joined, clock_s=self.clock_s)
+        if window is not None:
+            self.noise = self._memory.noise(window, len(rows))
 
     def _changes(self, unknowns: NDArray[np.intp]) -> tuple[Array, Array, Array, Array]:
         """Of every hypothesis (k,): estimates (k, m) of these unknowns, covariances (k, m, m), gains in twice the log

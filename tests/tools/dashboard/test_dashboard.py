@@ -6,9 +6,11 @@ import http.client
 import json
 import math
 import queue
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -284,6 +286,20 @@ def test_the_network_reads_with_a_token_and_cannot_act(
     assert "Read-only" in browser.text()
     assert browser.run("return document.querySelectorAll('button, input, iframe').length") == 0
     assert browser.console_messages() == []
+
+
+def test_a_page_that_is_over_answers_nothing_on_connections_that_a_browser_keeps(
+    source: DashboardSource, view: Meshcat
+) -> None:
+    """The next run's page may have the same port: a request on such a connection would be answered by the page before it."""
+    dashboard = Dashboard(source, view.web_url())
+    address = dashboard.url.split("/")[2].split(":")
+    with socket.create_connection((address[0], int(address[1])), timeout=5) as kept:
+        assert _status(dashboard.url) == 200
+        dashboard.close()
+        with suppress(ConnectionError):
+            kept.sendall(b"GET /values HTTP/1.1\r\nHost: 127.0.0.1:1\r\n\r\n")
+            assert kept.recv(1000) == b""
 
 
 def _key(page: Dashboard) -> str:
