@@ -37,9 +37,15 @@ TRUTH_IS_KNOWN = (
 LONGEST_FILE = 500
 
 
+@cache
+def nodes(tree: ast.Module) -> tuple[ast.AST, ...]:
+    """All of a file: every rule looks at all files, and to walk through them takes longer than to parse them."""
+    return tuple(ast.walk(tree))
+
+
 def imported(tree: ast.Module) -> Iterator[str]:
     """The dotted name of every module that the file imports, at its top or inside a function."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -50,13 +56,13 @@ def imported(tree: ast.Module) -> Iterator[str]:
 
 def called(tree: ast.Module) -> set[str]:
     """The plain names that the file calls."""
-    return {node.func.id for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+    return {node.func.id for node in nodes(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
 
 
 def names(tree: ast.Module) -> set[str]:
     """Every identifier of the file: names, attributes and what is imported."""
-    plain = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-    attributes = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    plain = {node.id for node in nodes(tree) if isinstance(node, ast.Name)}
+    attributes = {node.attr for node in nodes(tree) if isinstance(node, ast.Attribute)}
     return plain | attributes | {name.rsplit(".", 1)[-1] for name in imported(tree)}
 
 
@@ -66,11 +72,19 @@ def trees() -> dict[str, ast.Module]:
     return {name: ast.parse(path.read_text(), filename=name) for name, path in FILES.items()}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forgotten() -> Iterator[None]:
+    """A million nodes are not kept for the files after this one, whose garbage collector would look through them."""
+    yield
+    trees.cache_clear()
+    nodes.cache_clear()
+
+
 def of_the_truth(tree: ast.Module) -> set[str]:
     """What the file says of the simulation's truth: attributes and types with `truth` in them, and ports called `cheat`."""
-    attributes = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    types = names(tree) | {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    attributes = {node.attr for node in nodes(tree) if isinstance(node, ast.Attribute)}
+    texts = {node.value for node in nodes(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    types = names(tree) | {node.name for node in nodes(tree) if isinstance(node, ast.ClassDef)}
     spoken = {name for name in attributes if "truth" in name.lower()} | {name for name in types if "Truth" in name}
     return spoken | {text for text in texts if re.search(r"\bcheat\b", text)}
 
@@ -173,9 +187,7 @@ def test_no_algorithm_speaks_of_the_simulations_truth() -> None:
 
 def test_nothing_prints_and_nothing_changes_globals() -> None:
     assert [name for name, tree in trees().items() if "print" in called(tree)] == []
-    assert [
-        name for name, tree in trees().items() if any(isinstance(node, ast.Global) for node in ast.walk(tree))
-    ] == []
+    assert [name for name, tree in trees().items() if any(isinstance(node, ast.Global) for node in nodes(tree))] == []
 
 
 def test_each_file_says_its_one_idea_first() -> None:
