@@ -289,7 +289,8 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     else:
         values = dict(summary if outcome.values is None else outcome.values)
         if outcome.first is not None and isinstance(warnings := values.get("warnings"), list):
-            values["warnings"] = [text for text in warnings if text not in outcome.first.concerns]  # said there
+            said_there = (*outcome.first.concerns, *outcome.first.notes)
+            values["warnings"] = [text for text in warnings if text not in said_there]
         rows = console.rows(values) | dict(outcome.rows)
         if outcome.first is None:
             rows |= {} if call.written is None else {"written to": str(call.written)}

@@ -1,6 +1,6 @@
 """The first screen of every report and of the terminal: verdict, expected error, what could be wrong, next step, poses; and the verdict's rule."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -179,11 +179,12 @@ class FirstScreen:
     @property
     def concerns(self) -> tuple[str, ...]:
         """At most three things that could be wrong, the gravest first; the third says how many more there are."""
-        every = list(dict.fromkeys([*self.found.against[1:], *self.found.concerns, *self.found.notes]))
-        if len(every) <= MOST_CONCERNS:
-            return tuple(every)
-        kept = every[: MOST_CONCERNS - 1]
-        return (*kept, f"{len(every) - len(kept)} more are listed in the report.")
+        return _first_few([*self.found.against[1:], *self.found.concerns])
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """At most three things that a reader should know and that do not speak against the result; the third says how many more there are."""
+        return _first_few(text for text in self.found.notes if text not in self.concerns)
 
     @property
     def nothing(self) -> str:
@@ -196,6 +197,7 @@ class FirstScreen:
             "verdict": f"{self.verdict}. {self.reason}",
             self.expected.what: f"{self.expected.figure} ({self.expected.backing})",
             "could be wrong": "\n".join(f"- {text}" for text in self.concerns) or self.nothing,
+            **({"good to know": "\n".join(f"- {text}" for text in self.notes)} if self.notes else {}),
             "next": self.next.text + (f"\n{self.next.command}" if self.next.command else ""),
             **self.more,
         }
@@ -214,6 +216,7 @@ class FirstScreen:
             "tolerance": None if tolerance is None else vars(tolerance),
             "unseen": self.found.unseen,
             "could_be_wrong": list(self.concerns),
+            "good_to_know": list(self.notes),
             "next": self.next.text,
             "command": self.next.command or None,
         }
@@ -283,6 +286,14 @@ def refused_note(refused: Sequence[tuple[str, str]], n: int, what: str = "scans"
     names = ", ".join(name for name, _ in refused[:4]) + (" ..." if len(refused) > 4 else "")
     was = "was not used ({}); the reason is" if len(refused) == 1 else "were not used ({}); the reasons are"
     return (f"{len(refused)} of {n} {what} {was.format(names)} listed in the report.",)
+
+
+def _first_few(texts: Iterable[str]) -> tuple[str, ...]:
+    every = list(dict.fromkeys(texts))
+    if len(every) <= MOST_CONCERNS:
+        return tuple(every)
+    kept = every[: MOST_CONCERNS - 1]
+    return (*kept, f"{len(every) - len(kept)} more are listed in the report.")
 
 
 def _upper(text: str) -> str:

@@ -65,12 +65,23 @@ def test_the_first_rule_that_applies_decides(found: Findings, verdict: str, word
 
 
 def test_at_most_three_things_could_be_wrong_the_gravest_first() -> None:
-    two = screen(Findings(concerns=["First."], notes=["Second.", "Second."]))
-    assert two.concerns == ("First.", "Second.")
-    many = screen(Findings(against=["Held.", "Lost."], concerns=["First.", "Third."], notes=["Fourth."]))
+    two = screen(Findings(against=["Held.", "Lost."], concerns=["First.", "First."]))
+    assert two.concerns == ("Lost.", "First.")
+    many = screen(Findings(against=["Held.", "Lost."], concerns=["First.", "Third.", "Fourth."]))
     assert many.concerns[:2] == ("Lost.", "First.")
     assert len(many.concerns) == 3
     assert many.concerns[2].startswith("2 more")
+
+
+def test_what_is_good_to_know_is_not_said_to_be_wrong() -> None:
+    fine = screen(Findings(tolerance=WITHIN, unseen=8, notes=["One scan was refused.", "One scan was refused."]))
+    assert fine.concerns == ()
+    assert fine.rows()["could be wrong"] == "Nothing was found."
+    assert fine.rows()["good to know"] == "- One scan was refused."
+    assert fine.document()["good_to_know"] == ["One scan was refused."]
+    both = screen(Findings(concerns=["First."], notes=["First.", "Second.", "Third.", "Fourth.", "Fifth."]))
+    assert both.notes == ("Second.", "Third.", "2 more are listed in the report.")
+    assert "good to know" not in screen(Findings(concerns=["First."])).rows()
 
 
 def test_every_form_of_a_pose_to_copy_is_the_same_pose() -> None:

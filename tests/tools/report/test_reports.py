@@ -77,6 +77,7 @@ def test_a_report_is_one_file_with_the_first_screen_first(name: str) -> None:
     assert at[-1] < 1800
     assert " ".join(first.reason.split()) in text
     assert len(first.concerns) <= 3
+    assert ("Good to know" in text) is bool(first.notes)
     for pose in first.poses:
         assert f"{pose.symbol}: {pose.words}" in text
         assert all(" ".join(form.split()) in text for _, _, form in pose.forms)
@@ -95,6 +96,7 @@ def test_the_terminal_says_what_the_page_says(name: str) -> None:
     assert rows["verdict"] == f"{first.verdict}. {first.reason}"
     assert first.expected.figure in rows[first.expected.what]
     assert all(text in rows["could be wrong"] for text in first.concerns)
+    assert all(text in rows["good to know"] for text in first.notes)
     for pose in first.poses:
         assert pose.symbol in {row.rstrip() for row in rows}
 
