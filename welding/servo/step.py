@@ -121,13 +121,21 @@ def watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Weld
     # Past the seam's end the tip is not used, so the tag is not needed.
     blind = sample.time - max(state.frame_time, state.started)
     if state.phase != Phase.FINISH and blind > faults.hidden_s:
-        text = f"Tag hidden: the finger camera has not seen it for {blind:.2f} s; clean the tag and its window."
-        return fault(state, text)
+        return fault(state, _blind_sentence(state, sample, blind, faults.hidden_s))
     # Identical readings to the last bit mean one picture repeated with new times.
     if state.same_readings >= faults.frozen_frames:
         text = f"The finger camera repeats one picture ({state.same_readings} identical readings); restart the camera."
         return fault(state, text)
     return state
+
+
+def _blind_sentence(state: WeldingState, sample: ServoSample, blind_s: float, limit_s: float) -> str:
+    """Why there is no reading: pictures come and do not show the tag, or none came."""
+    newest = sample.deflection
+    without_s = sample.time - max(state.started, -math.inf if newest is None else newest.capture_time)
+    if without_s > limit_s:
+        return f"No picture from the finger camera for {without_s:.2f} s; check its power, its cable and the network."
+    return f"Tag hidden: the finger camera has not seen it for {blind_s:.2f} s; clean the tag and its window."
 
 
 def _touch(

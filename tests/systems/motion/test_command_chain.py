@@ -217,8 +217,9 @@ def test_a_weld_begins_with_the_touch_and_the_torch_off() -> None:
 
 def test_a_tag_that_is_not_seen_faults_the_weld_and_the_reason_stays() -> None:
     servo = Servo()
-    feed(servo.system, servo.context, job=WELD, deformation=servo.deformation(0.0, False))
+    feed(servo.system, servo.context, job=WELD)
     for k in range(1, 60):
+        feed(servo.system, servo.context, deformation=servo.deformation(0.01 * k, False))
         servo.run(0.01 * k)
     report = servo.report()
     assert report.phase == "FAULT"

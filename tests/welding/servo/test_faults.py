@@ -126,7 +126,25 @@ def test_a_frozen_camera_stops_the_weld() -> None:
     for k in range(60):
         state, command = welding_step(state, ServoSample(0.008 * k, X, frame), plan, CONFIG)
     assert command.phase == Phase.FAULT
-    assert "Tag hidden" in (command.reason or "")
+    assert (command.reason or "").startswith("No picture from the finger camera for 0.3")
+
+
+def test_without_any_picture_the_camera_is_named_and_not_the_tag() -> None:
+    plan = SeamCurve.from_points(straight(0.2).points)
+    state, X = WeldingState(), touch_start_pose(plan, CONFIG)
+    for k in range(60):
+        state, command = welding_step(state, ServoSample(0.008 * k, X, None), plan, CONFIG)
+    assert (command.reason or "").startswith("No picture from the finger camera for 0.3")
+
+
+def test_pictures_that_do_not_show_the_tag_stop_the_weld() -> None:
+    plan = SeamCurve.from_points(straight(0.2).points)
+    state, X = WeldingState(), touch_start_pose(plan, CONFIG)
+    for k in range(60):
+        frame = DeflectionSample(0.008 * k, X, np.zeros(3), False)
+        state, command = welding_step(state, ServoSample(0.008 * k, X, frame), plan, CONFIG)
+    assert command.phase == Phase.FAULT
+    assert (command.reason or "").startswith("Tag hidden: the finger camera has not seen it for 0.3")
 
 
 def test_one_picture_told_again_and_again_stops_the_weld(
