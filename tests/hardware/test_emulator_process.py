@@ -84,6 +84,16 @@ def test_a_listener_on_the_usual_address_is_in_nobodys_way() -> None:
         link.close()
 
 
+def test_when_a_link_is_closed_its_program_has_ended() -> None:
+    """On a controller whose frame takes 40 ms: what runs on afterwards would be nobody's."""
+    with emulator_process(pace=0.05) as made:
+        config = UrRtde(host=made.host, pace=0.05)
+        link = UrLink.start(made.host, load_arm(), config.limits(load_arm()))
+        assert made.state()["program"] is not None
+        link.close()
+        assert made.state()["program"] is None
+
+
 def test_a_taken_port_and_wrong_arguments_are_one_sentence(mine: str) -> None:
     with (
         socket.create_server((mine, 30003)),

@@ -14,7 +14,7 @@ from weldcal.systems.drivers.ur.torch.set_points import apart
 NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
 SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7
 RUNNING = 7
-PLAYING, PAUSING, PAUSED = 2, 3, 4
+STOPPING, STOPPED, PLAYING, PAUSING, PAUSED = range(5)
 MODES = range(-1, 100)  # of robot, safety and program; PolyScope has some fifteen of each, from -1 on
 POSE_M = 5e-5
 # states that the guard script writes into its output register

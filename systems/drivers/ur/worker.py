@@ -21,7 +21,16 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.precedence import take_priority
 from weldcal.systems.drivers.ur.robot import Refused, Robot
 from weldcal.systems.drivers.ur.shared import Memory, TornRead
-from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Limits, RobotSample, Supervisor
+from weldcal.systems.drivers.ur.supervisor import (
+    PLAYING,
+    STOPPING,
+    Action,
+    Command,
+    Decision,
+    Limits,
+    RobotSample,
+    Supervisor,
+)
 from weldcal.systems.drivers.ur.time_scale import TimeScale
 from weldcal.systems.drivers.ur.torch.arc_inputs import ArcInputs
 from weldcal.systems.drivers.ur.torch.gas import Gas
@@ -31,6 +40,7 @@ ACCELERATION = 40.0  # rad/s^2 of speedj: the cell ramps the stream, the control
 LATE_PASS_S = 0.020
 REST_RAD_S = 1e-3
 STOP_LIMIT_S = 2.0
+ENDS_S = 0.5  # for which the program's end is waited for
 RESTS_S = 5.0  # for which an arm at rest waits for a cell that computes
 LEFT = 3  # exit code of a worker that exited because of the link
 
@@ -120,6 +130,7 @@ class Worker:
             self._publish(now, robot, sample, decision)
             if (command.stop or command.orphaned) and self._phase is not Phase.OBEYING:
                 self._valve(robot, False)
+                self._await_the_end(robot, period)
                 self._phase = Phase.ENDED
                 self._publish(now, robot, sample, decision)
                 return 0
@@ -185,6 +196,12 @@ class Worker:
         if rested or now - self._braking_since > STOP_LIMIT_S / self._config.limits.pace:
             robot.end_program()
             self._phase = Phase.STOPPED
+
+    def _await_the_end(self, robot: Robot, period: float) -> None:
+        """Wait until the controller says that the program has ended, so that nothing of it runs on after this process."""
+        until = time.monotonic() + ENDS_S / self._config.limits.pace
+        while (now := time.monotonic()) < until and robot.sample(now).runtime_state in (PLAYING, STOPPING):
+            time.sleep(period)
 
     def _publish(self, now: float, robot: Robot, sample: RobotSample, decision: Decision) -> None:
         host_time = robot.clock.to_host(sample.robot_time)
