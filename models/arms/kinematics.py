@@ -9,6 +9,7 @@ factory calibration has the same schema as the nominal numbers, so nothing else 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -118,15 +119,21 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
     """
     if name not in known_arms():
         raise InputError(f"There is no arm {name!r}; choose one of: {', '.join(known_arms())}.")
+    nominal = _nominal(name)
+    if kinematics is None:
+        return nominal
+    stack, calibration = _read_kinematics(Path(kinematics))
+    stack = _slide_to_nominal(stack, nominal.stack)
+    advice = f"give the calibration of a {name}, in metres and radians"
+    _require_same_arm(stack, nominal.stack, name, Path(kinematics).name, advice)
+    return replace(nominal, stack=_frozen(stack), calibration=calibration)
+
+
+@lru_cache(maxsize=8)
+def _nominal(name: str) -> ArmModel:
+    """An arm that is known, read once: a run asks for it a hundred times."""
     folder = _HERE / name
     stack, _ = _read_kinematics(folder / "default_kinematics.yaml")
-    calibration: str | None = None
-    if kinematics is not None:
-        nominal = stack
-        stack, calibration = _read_kinematics(Path(kinematics))
-        stack = _slide_to_nominal(stack, nominal)
-        advice = f"give the calibration of a {name}, in metres and radians"
-        _require_same_arm(stack, nominal, name, Path(kinematics).name, advice)
     limits = _read(folder / "joint_limits.yaml", "joint_limits")
     physical = folder / "physical_parameters.yaml"
     inertia = _read(physical, "inertia_parameters")
@@ -160,7 +167,6 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
         tube_offsets=(_number(offsets, "shoulder_offset"), _number(offsets, "elbow_offset")),
         dh=DenavitHartenberg(**{k: _number(dh, k) for k in ("d1", "a2", "a3", "d4", "d5", "d6")}),
         housings=Housings(**{f.name: _number(radii, f.name) for f in fields(Housings)}),
-        calibration=calibration,
     )
 
 
