@@ -31,12 +31,14 @@ SEQUENCE_COLUMNS = (
 )  # fmt: skip
 
 GOING_S = 0.4
+TURN_S = 0.5  # in which an arm that goes on is at its speed again
 STARTS = 3
 # faults of a loaded computer: a wrong result with one of these is tried again, and counted
 LOADED = ("LINK_STALE", "COMMAND_LATE", "WORKER_DIED")
 PLAYED_S = 0.25
 HASTE_S = 0.1
 STILL_RAD = 0.0005
+_SPEED_OFF = 0.1 * SPEED_M_S
 ENDED_S = 3.0  # a worker without its cell brakes, ends the program and closes its connections
 
 
@@ -119,12 +121,20 @@ def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
     if case.must != STOP:
         paused = case.must == GO and not case.may_rest and bench.at_rest_after(at, REST_S)["rest_after_s"] is not None
         if not paused and bench.stream.state.fault is Fault.NONE:
-            speed = bench.tool_speed()
-            problems = [] if abs(speed - SPEED_M_S) < 0.1 * SPEED_M_S else [f"its speed is {speed:.4f} m/s"]
+            speed = _speed_of_the_way(bench)
+            problems = [] if abs(speed - SPEED_M_S) < _SPEED_OFF else [f"its speed is {speed:.4f} m/s"]
             problems += _burnt(bench, case, at)
             return Outcome(case.name, case.must, "went on", "", "", problems=tuple(problems))
     time.sleep(max(0.0, case.watch_s - GOING_S - (HASTE_S if hasty else 0.0)))
     return _stopped(bench, case, at, children, PLAYED_S - (HASTE_S if hasty else 0.0))
+
+
+def _speed_of_the_way(bench: Bench) -> float:
+    """The tool's speed; on a busy computer the arm may be in one of its turns by now, which take 0.2 s."""
+    until = time.monotonic() + TURN_S
+    while abs((speed := bench.tool_speed()) - SPEED_M_S) >= _SPEED_OFF and time.monotonic() < until:
+        time.sleep(0.01)
+    return speed
 
 
 def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played_s: float) -> Outcome:
