@@ -86,7 +86,7 @@ class Lockstep:
         if self._controller.runtime_state != RuntimeState.PLAYING:
             self._run = 0
             return False
-        return client.readable(now) and now >= client.faults.deaf_until
+        return client.readable(now) and not client.faults.deaf(now)
 
     def _end_wait(self, now: float) -> None:
         if self._since is not None:

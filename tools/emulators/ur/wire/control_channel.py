@@ -57,7 +57,7 @@ class ControlServer(Server):
             "drop_p": lambda r, now: self._each(r, drop_share=_number(r, "p")),
             "delay": self._delay,
             "freeze": self._freeze,
-            "mute_input": lambda r, now: self._each(r, deaf_until=now + _number(r, "seconds", math.inf)),
+            "mute_input": self._mute,
             "corrupt": lambda r, now: self._each(r, corrupt=int(_number(r, "n", 1))),
             "wrong_size": lambda r, now: self._each(r, wrong_size=int(_number(r, "n", 1))),
             "partial_writes": lambda r, now: self._each(r, piece=int(_number(r, "bytes", 7))),
@@ -202,6 +202,14 @@ class ControlServer(Server):
             delay_until=now + _number(request, "for", math.inf),
             delay_clock=(lambda: self._controller.timestamp) if request.get("clock") == "controller" else None,
         )
+
+    def _mute(self, request: Request, now: float) -> None:
+        """For so long of the controller's own time: a busy host makes no frames in which its guard could notice."""
+
+        def own() -> float:
+            return self._controller.frame * STEP_S
+
+        self._each(request, deaf_until=own() + _number(request, "seconds", math.inf), deaf_clock=own)
 
     def _freeze(self, request: Request, now: float) -> None:
         until = now + _number(request, "seconds")

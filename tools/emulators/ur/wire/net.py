@@ -29,10 +29,15 @@ class LinkFaults:
     delay_clock: Callable[[], float] | None = None  # of the delay; None: the host's
     freeze_until: float = 0.0
     deaf_until: float = 0.0
+    deaf_clock: Callable[[], float] | None = None  # of deaf_until; None: the host's
     corrupt: int = 0
     wrong_size: int = 0
     piece: int = 0
     half_open: bool = False
+
+    def deaf(self, now: float) -> bool:
+        """Whether what comes in is not heard."""
+        return (now if self.deaf_clock is None else self.deaf_clock()) < self.deaf_until
 
 
 class Connection:
@@ -124,7 +129,7 @@ class Connection:
             return b""
         if not data:
             self.closed = True
-        return b"" if now < self.faults.deaf_until else data
+        return b"" if self.faults.deaf(now) else data
 
     def lines(self, data: bytes) -> Iterator[bytes]:
         """The lines that are complete with these bytes, without their ends; the rest waits in the inbox."""
