@@ -19,7 +19,6 @@ _ROWS = 5
 _STEPS, _RAMPS = 64, 12  # hypotheses kept of each kind
 _EVERY = {STEP: 2, RAMP: 40}  # frames between new ones
 _INFLUENCE = 25.0  # of chi-square with 5: a frame farther off counts as that far
-_NEW = 0.05  # unexplained share of the field's variance at a pose that the features do not reach
 _NOVEL_OVER = 80.0  # frames over which those at new poses are counted
 _HOURS = 3600.0
 
@@ -117,8 +116,12 @@ class DriftFilter:
             self._F[:, k * SIZE : (k + 1) * SIZE] = 0.0
             self.information[k], self.vector[k], self.squares[k], self.frames[k] = 0.0, 0.0, 0.0, 0
 
-    def update(self, rows: Rows, i: int, noise: FrameNoise, *, spawn: bool = True) -> Array:
-        """Take frame i of the rows; returns its innovation (5,). With ``spawn``, hypotheses are added as they are due."""
+    def update(self, rows: Rows, i: int, noise: FrameNoise, *, spawn: bool = True) -> None:
+        """Take frame i of the rows. With ``spawn``, hypotheses are added as they are due.
+
+        A frame at a pose that the features of a full field do not reach says nothing: scanner and arm err there as they do in every lap, and
+        taken for noise that would become a move within some hundred frames.
+        """
         t = float(rows.times[i])
         if self._time is not None:
             between = t - self._time
@@ -134,6 +137,8 @@ class DriftFilter:
         self.count += 1
         H = rows.derivatives[i]
         G, unexplained = self._rows(H, rows.centers[i], rows.normals[i])
+        if unexplained > self.config.field.novelty:
+            return
         n = self._n
         P = self._P[:n, :n]
         PG = P @ G.T
@@ -155,7 +160,6 @@ class DriftFilter:
         self._accumulate(D, K, w)
         self._x[:n] += K @ w
         P -= K @ K.T
-        return innovation
 
     def renew_field(self) -> None:
         """Forget what was learnt of the field, and the hypotheses, where the arm works at poses that its features do not reach;
@@ -170,7 +174,7 @@ class DriftFilter:
 
     def _rows(self, H: Array, p_C: Array, n_C: Array) -> tuple[Array, float]:
         phi, unexplained = self._field.features(p_C, n_C)
-        self.novel += float(unexplained > _NEW) - self.novel / _NOVEL_OVER
+        self.novel += float(unexplained > self.config.field.novelty) - self.novel / _NOVEL_OVER
         n = SIZE + _ROWS * len(phi)
         if n > self._n:
             new = np.arange(self._n, n)

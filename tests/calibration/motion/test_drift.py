@@ -111,6 +111,23 @@ def test_frames_that_show_something_else_for_a_moment_raise_no_alarm() -> None:
     assert test.events == []
 
 
+def test_where_a_full_field_does_not_reach_a_frame_says_nothing() -> None:
+    """Taken for noise, what scanner and arm err by at a new place would become a move."""
+    rows = simulate(WorldConfig(outliers=0.0), 30.0, 4).rows
+    f = DriftFilter(1e-8 * np.eye(6), FilterConfig(field=FieldConfig(largest=8)))
+    noise, learnt = FrameNoise(2.0, 2.0, 1e-4), []
+    for i in range(len(rows)):
+        before = f.error, f.frames.copy(), f.vector.copy()
+        f.update(rows, i, noise, spawn=i == 0)
+        learnt.append(bool((f.frames > before[1]).any()))
+        if not learnt[-1]:
+            assert f.error == pytest.approx(before[0], abs=0.0)
+            assert f.vector == pytest.approx(before[2], abs=0.0)
+    assert learnt[:8] == [True] * 8
+    assert 0.05 < np.mean(learnt) < 0.9, "the path leaves what three features reach, and comes back"
+    assert f.novel > 5.0
+
+
 def test_the_noise_rises_at_once_and_falls_slowly() -> None:
     """What is measured in some hundred frames varies; the test does not count in sigmas of the quietest."""
     usual, loud = (simulate(WorldConfig(centre_m=f * 3.5e-5, depth_m=f * 2e-5), 60.0, 8) for f in (1.0, 3.0))
