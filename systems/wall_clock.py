@@ -37,6 +37,10 @@ class Lateness:
         total = sum(self.counts)
         return 100.0 * sum(self.counts[: LIMITS_MS.index(ON_TIME_MS) + 1]) / total if total else 100.0
 
+    def over(self, limit_ms: float) -> int:
+        """How many were this late (one of LIMITS_MS) or later."""
+        return sum(self.counts[LIMITS_MS.index(limit_ms) + 1 :])
+
     def summary(self) -> dict[str, object]:
         """The JSON object: limits and counts of the bins (one more than limits), the share on time, and the worst."""
         return {

@@ -32,6 +32,7 @@ SEAT = np.array([0.0, 0.0, 1.2e-4])
 STIFFNESS = np.array([600.0, 600.0, 300.0])
 
 
+@cache
 def rays(samples: int = 3) -> np.ndarray:
     """Rays (H, W, samples^2, 3) through the pixels, by inverting the lens."""
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
@@ -44,14 +45,11 @@ def rays(samples: int = 3) -> np.ndarray:
     return np.concatenate([shaped, np.ones((*grid.shape[:-1], 1))], axis=-1)
 
 
-RAYS = rays()
-
-
 def drawn(texture: np.ndarray, pixels_per_m: float, X_KP: RigidTransform, number: int) -> np.ndarray:
     """What the camera sees of a plane's print; `texture` has its first pixel's corner at the plane's origin, x right, y down."""
     R, p = X_KP.rotation().matrix(), X_KP.translation()
-    t = (R[:, 2] @ p) / (RAYS @ R[:, 2])
-    on = (RAYS * t[..., None] - p) @ R
+    t = (R[:, 2] @ p) / (rays() @ R[:, 2])
+    on = (rays() * t[..., None] - p) @ R
     column, row = (np.floor(on[..., k] * pixels_per_m).astype(int) for k in (0, 1))
     inside = (column >= 0) & (row >= 0) & (column < texture.shape[1]) & (row < texture.shape[0])
     grey = np.where(inside, texture[np.where(inside, row, 0), np.where(inside, column, 0)], 215).mean(axis=2)

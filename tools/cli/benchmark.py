@@ -292,7 +292,8 @@ def robot_jobs(
 
     folder = call.folder("benchmark", f"robot-jobs-{scenario}")
     result = run_jobs(scenario, folder, runs, seed=call.seed, load=load, seam_mm=seam_mm, progress=call.progress)
-    return Outcome(result.summary(), rows={f"seed {job.seed}": job.line for job in result.jobs})
+    rows = {f"seed {job.seed}": job.line for job in result.jobs} | {"this computer": result.host.line}
+    return Outcome(result.summary(), rows=rows)
 
 
 @command("benchmark fuzz-files")

@@ -148,3 +148,9 @@ def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
     assert leak["low"] > FLAT_MB_H
     assert leak["mb_per_h"] == pytest.approx(100.0, abs=12.0)
     assert growth(hours[:4], noise[:4])["flat"] is None
+
+
+def test_memory_that_grows_until_the_longest_job_has_run_is_flat_from_then_on() -> None:
+    hours = np.linspace(0.0, 1.0, 60)
+    assert growth(hours, 400.0 + 150.0 * np.minimum(hours, 0.3))["flat"] is True
+    assert growth(hours, 400.0 + 150.0 * np.maximum(hours, 0.5))["flat"] is False

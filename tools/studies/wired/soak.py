@@ -1,5 +1,6 @@
 """Calibrate and weld cycles by wire for minutes or hours with random faults: memory, stuck processes, names, motion and arc."""
 
+import ctypes
 import gc
 import os
 import time
@@ -20,7 +21,8 @@ from weldcal.tools.studies.wired.fault_run import DEVICES, FAULTS, OF_THE_CONTRO
 SEAM_MM = 20.0
 CALIBRATES = 0.25  # share of the cycles
 FAULTY = 0.75
-WARM_UP = 2  # cycles that do not count for the memory: what is loaded and compiled once
+# of the run; does not count for the memory: what is loaded and compiled once, and jobs longer than any before
+WARM_UP_SHARE = 1 / 3
 FLAT_MB_H = 10.0  # memory is flat where growth above this is not shown at 95 %
 FEWEST = 5  # cycles for a slope
 COLUMNS = (
@@ -80,9 +82,17 @@ def _drawn(rng: np.random.Generator) -> tuple[Happening | None, bool]:
 def _processes(world: WiredWorld) -> dict[str, object]:
     """Resident memory (MB) of each process, and the processes that a cycle left behind."""
     gc.collect()
+    _return_free_memory()
     pids = dict(zip(PROCESSES, (os.getpid(), world.process.pid, world.scanner, world.finger), strict=True))
     stuck = [pid for pid in _children(os.getpid()) if pid != world.process.pid and not _is_pythons_own(pid)]
     return {"stuck": len(stuck), **{f"{name}_mb": _resident_mb(pid) for name, pid in pids.items()}}
+
+
+def _return_free_memory() -> None:
+    """Let the C library give what is free back to the system: else resident memory is the largest that any cycle needed."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # only the GNU library has it
+    if trim is not None:
+        trim(0)
 
 
 def _resident_mb(pid: int) -> float:
@@ -116,9 +126,14 @@ def _alive(pid: int) -> bool:
 
 
 def growth(hours: np.ndarray, megabytes: np.ndarray) -> dict[str, float | bool | None]:
-    """The slope of a memory (MB/h) with its 95 % interval by least squares; `flat`: growth above FLAT_MB_H is not shown."""
-    kept = np.isfinite(megabytes)
-    hours, megabytes = hours[kept][WARM_UP:], megabytes[kept][WARM_UP:]
+    """The slope of a memory (MB/h) with its 95 % interval by least squares; `flat`: growth above FLAT_MB_H is not shown.
+
+    Args:
+        hours: (n,) when each cycle began, h.
+        megabytes: (n,) resident memory after it, MB; NaN where unknown.
+    """
+    kept = np.isfinite(megabytes) & (hours >= WARM_UP_SHARE * np.max(hours, initial=0.0))
+    hours, megabytes = hours[kept], megabytes[kept]
     if len(hours) < FEWEST:
         return {"mb_per_h": None, "low": None, "high": None, "flat": None}
     line = stats.linregress(hours, megabytes)

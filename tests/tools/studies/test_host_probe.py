@@ -1,0 +1,35 @@
+"""The probe of the computer's timing counts wake-ups on every core and sees a pause."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+
+from weldcal.systems.host_timing import TICK_S
+from weldcal.tools.studies.robot.host_probe import watched_host
+
+PAUSE_S = 0.1
+
+
+def test_every_core_is_watched_and_a_pause_is_seen() -> None:
+    cores = len(os.sched_getaffinity(0))
+    with watched_host() as host:
+        probes = multiprocessing.active_children()
+        assert len(probes) == cores
+        time.sleep(1.0)  # they start
+        os.kill(probes[0].pid or 0, signal.SIGSTOP)
+        time.sleep(PAUSE_S)
+        os.kill(probes[0].pid or 0, signal.SIGCONT)
+        time.sleep(0.3)
+    late = host.lateness
+    assert sum(late.counts) > 0.1 / TICK_S
+    assert late.worst_ms > 1e3 * (PAUSE_S - TICK_S) * 0.9
+    assert host.summary()["over_8_ms"] == late.over(8.0) > 0
+
+
+def test_the_probes_end_with_the_watch() -> None:
+    with watched_host():
+        probes = multiprocessing.active_children()
+    assert not any(probe.is_alive() for probe in probes)
