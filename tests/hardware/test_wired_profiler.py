@@ -113,7 +113,7 @@ def test_the_profilers_pose_is_that_of_the_truth_file(wired: Wired, tmp_path: Pa
 
 
 def test_a_sphere_is_scanned_and_touched_by_wire(wired: Wired, tmp_path: Path) -> None:
-    live = wired.run("wired_profiler_sphere", FEW_TOUCHES, tmp_path / "run")
+    live = wired.run("wired_profiler_sphere", FEWEST, tmp_path / "run")
     assert not live.run.held, live.run.reason
     assert live.run.cell.station.world is None
     truth, arm = wired.truth(), live.run.cell.station.arm
@@ -129,30 +129,14 @@ def test_a_sphere_is_scanned_and_touched_by_wire(wired: Wired, tmp_path: Path) -
     # each touch has the joints of its sample: no deeper than the way of 2 ms at 10 mm/s, and as deep as half of it in the mean
     tips = [forward_kinematics(arm, q).multiply(np.array(truth["p_FTip"])) for q in live.state.touches]
     depth_mm = 1e3 * (0.020 + TIP_RADIUS_M - np.linalg.norm(np.array(tips) - truth["sphere_center"], axis=1))
+    print(
+        f"{1e3 * float(np.sqrt(np.trace(e.covariance[3:6, 3:6]))):.3f} mm sigma; {live.run.simulated_s if hasattr(live.run, 'simulated_s') else live.run.timing()}"
+    )
     print(f"touches {depth_mm.min():.4f} to {depth_mm.max():.4f} mm deep")
-    assert len(depth_mm) == 8
+    assert len(depth_mm) == 6
     assert 0.0 <= depth_mm.min() <= depth_mm.max() < 0.021
-    assert truth["touch_probe"]["touches"] == 8
+    assert truth["touch_probe"]["touches"] == 6
     assert (tmp_path / "run" / "sphere" / "profiler.yaml").exists()
-
-
-def test_a_probe_whose_cable_is_broken_stops_the_arm_below_the_expected_surface(wired: Wired, tmp_path: Path) -> None:
-    with wired.broken_probe("cut"):
-        live = wired.run("wired_profiler_sphere", FEWEST, tmp_path / "run")
-        pressed_mm = wired.truth()["touch_probe"]["deepest_mm"]
-    s = live.state
-    assert live.run.held
-    assert "did not touch the sphere at touch 1, and stopped 5 mm below the surface expected" in s.reason
-    assert s.planning is not None
-    # where the controller says that it is now, after the program has ended: at rest
-    with RtdeProbe(wired.host) as controller:
-        q, qd = (np.array(v) for v in controller.read(("actual_q", "actual_qd")).values())
-    assert np.abs(qd).max() < 1e-3
-    tip = forward_kinematics(live.run.cell.station.arm, q).multiply(s.planning.p_FTip)
-    below_mm = 20.0 - 1e3 * float(np.linalg.norm(tip - s.planning.center))
-    print(f"stopped {below_mm:.2f} mm below the surface expected, {pressed_mm:.2f} mm below the true one")
-    assert 4.5 < below_mm < 5.5
-    assert pressed_mm > 1.0  # it did reach the sphere, and nothing told
 
 
 @pytest.mark.parametrize(
@@ -168,5 +152,24 @@ def test_a_probe_that_is_closed_or_chatters_holds_the_job_before_it_scans(
     assert live.run.held
     assert sentence in live.state.reason
     assert live.state.sequence == 0, "no profile was asked for"
-    assert found.ok or how != "stuck", "check-cell finds a closed probe"
+    assert not found.ok or how != "stuck", "check-cell finds a closed probe"
     assert preflight(UrTouchProbe(wired.host, 16)).checks[0].ok
+
+
+def test_a_probe_whose_cable_is_broken_stops_the_arm_below_the_expected_surface(wired: Wired, tmp_path: Path) -> None:
+    with wired.broken_probe("cut"):  # the last run: it leaves the torch in the sphere
+        live = wired.run("wired_profiler_sphere", FEWEST, tmp_path / "run")
+        pressed_mm = wired.truth()["touch_probe"]["deepest_mm"]
+    s = live.state
+    assert live.run.held
+    assert "did not touch the sphere at touch 1, and stopped 5 mm below the surface expected" in s.reason
+    assert s.planning is not None
+    # where the controller says that it is now, after the program has ended: at rest
+    with RtdeProbe(wired.host) as controller:
+        q, qd = (np.array(v) for v in controller.read(("actual_q", "actual_qd")).values())
+    assert np.abs(qd).max() < 1e-3
+    tip = forward_kinematics(live.run.cell.station.arm, q).multiply(s.planning.p_FTip)
+    below_mm = 20.0 - 1e3 * float(np.linalg.norm(tip - s.planning.center))
+    print(f"stopped {below_mm:.2f} mm below the surface expected, {pressed_mm:.2f} mm below the true one")
+    assert 4.5 < below_mm < 5.5
+    assert pressed_mm > 1.0  # it did reach the sphere, and nothing told

@@ -154,6 +154,15 @@ def test_a_stopped_robot_holds_it_with_its_own_words(alone: Alone) -> None:
     assert not alone.procedure.GetOutputPort("creep").Eval(alone.simulator.get_context()).any()
 
 
+def test_a_torch_that_touches_on_its_way_holds_it(alone: Alone) -> None:
+    alone.run(0.1)
+    alone.tell(touch=AbstractValue.Make(TorchTouch(1, 0.1, True)))
+    alone.run(0.04)
+    assert alone.state.phase == "held"
+    assert "touches something in the step 'edge'" in alone.state.reason
+    assert not alone.procedure.GetOutputPort("creep").Eval(alone.simulator.get_context()).any()
+
+
 def test_a_person_holds_it(alone: Alone) -> None:
     alone.run(0.1)
     alone.tell(hold=[1.0])

@@ -25,6 +25,7 @@ INPUTS = "actual_digital_input_bits"
 READ = ("timestamp", INPUTS, "actual_q", "actual_qd")
 N_INPUTS = 18  # 0 to 7 standard, 8 to 15 configurable, 16 and 17 of the tool connector
 FIRST_LIMIT_S = 2.0
+FIRST_LOOKS, LOOK_S = 5, 0.01
 SILENT_S = 0.2  # of the cell's time, without a new sample
 PERIOD_S = 0.004
 # Of the controller's time. A touch is on for HELD_S, and its bounce leaves it off for less than BOUNCE_S; a contact that opens has
@@ -81,15 +82,15 @@ class Touches:
     def add(self, time: float, on: bool, q: Array) -> None:
         """Add a sample: the controller's time (s), whether the contact is closed, and the joints (6,) rad."""
         if on != self._on:
+            if on and not self.down and (self._first is None or time - self._last > BOUNCE_S):
+                self._first = (time, q)
             self._on, self._since = on, time
             self._changes.append(time)
         while self._changes and self._changes[0] < time - CHATTER_S:
             self._changes.popleft()
         if on:
-            if self._first is None or (not self.down and time - self._last > BOUNCE_S):
-                self._first = (time, q)
             self._last = time
-            if not self.down and time - self._since >= HELD_S - 1e-6:
+            if not self.down and self._first is not None and time - self._since >= HELD_S - 1e-6:
                 self.number, self.down = self.number + 1, True
                 self.time, self.q = self._first
         elif time - self._last > RELEASED_S:
@@ -119,6 +120,9 @@ class ProbeInput:
         self.touches = Touches()
         self.newest = -np.inf  # the controller's time of the newest sample
         self._heard = time.now()
+        for _ in range(FIRST_LOOKS):  # so that a probe that is closed now is known before anything moves
+            self._stream.wait(LOOK_S)
+            self.poll()
 
     def poll(self) -> None:
         """Take all samples that have arrived. Never waits."""
@@ -171,8 +175,10 @@ class UrTouchProbeInput(LeafSystem):
 
     def __init__(self, probe: ProbeInput, period_s: float = PERIOD_S) -> None:
         super().__init__()
-        self._probe, self._shown = probe, TorchTouch()
-        state = self.DeclareDiscreteState([0.0, 0.0])  # number of the newest touch, whether it is held
+        self._probe = probe
+        self._shown = TorchTouch(probe.touches.number, 0.0, probe.touches.down, probe.touches.q)
+        # number of the newest touch, whether it is held
+        state = self.DeclareDiscreteState([float(probe.touches.number), float(probe.touches.down)])
         ticket = {self.discrete_state_ticket(state)}
         self.DeclareAbstractOutputPort("touch", lambda: AbstractValue.Make(TorchTouch()), self._output, ticket)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)

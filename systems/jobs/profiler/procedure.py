@@ -178,7 +178,7 @@ class ProfilerProcedure(LeafSystem):
             number = len(s.touches) + 1
             reason = (
                 f"The torch did not touch the sphere at touch {number}, and stopped {stage.deepest_mm:g} mm below the surface expected: check "
-                "the sphere's position and radius, and the touch probe's cable and input."
+                "the sphere's position and radius, and the touch probe's cable and input. Jog the torch away from the sphere before the next start."
             )
             return replace(s, phase="held", since=now, reason=reason)
         return s
