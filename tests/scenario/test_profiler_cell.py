@@ -199,14 +199,18 @@ def test_a_scenario_without_a_profiler_is_refused_on_the_command_line(tmp_path: 
     assert not (tmp_path / "out").exists()
 
 
-def test_moves_between_touches_keep_clear_of_the_sphere_all_along() -> None:
+def test_moves_between_touches_keep_torch_and_tip_clear_of_the_sphere_all_along() -> None:
     job, q_home = ProfilerJob(), np.deg2rad([190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
     tip, ball = np.array(job.torch.tip_m), np.array(job.ball.xyz_m)
     planning = PlanningContext(load_arm("ur10e"), job, q_home, drawn_pose(RenderedProfiler()), tip, ball)
     for seed in range(2):
-        q, gaps = q_home, []
+        q, gaps, tips = q_home, [], []
         for goal in plan_touches(planning, q_home, seed):
             n = int(np.ceil(np.abs(goal.q - q).max() / 0.01)) + 1
-            gaps += [planning.gap(forward_kinematics(planning.arm, at)) for at in np.linspace(q, goal.q, n)]
+            for at in np.linspace(q, goal.q, n):
+                X_BF = forward_kinematics(planning.arm, at)
+                gaps.append(planning.gap(X_BF))
+                tips.append(float(np.linalg.norm(X_BF.multiply(tip) - ball)) - planning.radius_m)
             q = goal.q
         assert min(gaps) > 0.5e-3 * job.clearance_mm - 2e-4
+        assert min(tips) > 0.5e-3 * job.clearance_mm  # more than the tip is off its drawing
