@@ -105,7 +105,7 @@ class OwnProcess:
 
     _pool: ProcessPoolExecutor = field(
         default_factory=lambda: ProcessPoolExecutor(
-            1, mp_context=multiprocessing.get_context("spawn"), initializer=before_other_programs
+            1, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_process
         )
     )
     waiting_since: float | None = None  # wall clock (monotonic) of the newest question, while it has no answer
@@ -142,6 +142,17 @@ class OwnProcess:
 def import_module(name: str) -> None:
     """Import a module by name, for Background.prepare."""
     importlib.import_module(name)
+
+
+def _begin_process() -> None:
+    """Prepare the process: before other programs, and with one thread for linear algebra.
+
+    The fits' matrices are small. On a loaded computer two threads wait busily for each other: a fit of 3 s took 40 s, longer than an
+    emulated robot waits for its cell.
+    """
+    importlib.import_module("scipy.linalg")  # its linear algebra is not NumPy's, and only what is loaded can be limited
+    importlib.import_module("threadpoolctl").threadpool_limits(1, user_api="blas")
+    before_other_programs()
 
 
 def before_other_programs(thread: int = 0) -> None:

@@ -77,11 +77,14 @@ class ProfileScan(Message):
 
 @dataclass(frozen=True, eq=False)
 class TorchTouch(Message):
-    """The newest touch: its number, its start time, and whether the contact persists."""
+    """The newest touch: its number, its start time, whether the contact persists, and the joints (6,) rad that its sensor
+    read at its start; None where the sensor reads none, and those at `time` count.
+    """
 
     sequence: int = 0
     time: float = -np.inf
     down: bool = False
+    q: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

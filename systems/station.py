@@ -178,7 +178,7 @@ def make_station(
     `arm.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
     `finger_camera.image`, `.capture_time`, `query_object`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`,
     `cheat.torch`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`. With a
-    profiler: in `profiler.trigger`, out `profiler.profile`, `torch.touch`.
+    profiler: in `profiler.trigger`, out `profiler.profile`; with a simulated one or a touch probe: `torch.touch`.
 
     Raises:
         InputError: the scenario has no robot. A driver adds its own: RobotRefused where the robot does not allow the job.

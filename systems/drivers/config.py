@@ -10,7 +10,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.scanners import ScannerPreset
 from weldcal.models.tool import FingerCamera
 
-DEVICES = ("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digitizer", "profiler")
+DEVICES = ("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digitizer", "profiler", "touch_probe")
 """The devices of a station, by their key in the scenario; drivers are applied in this order."""
 
 

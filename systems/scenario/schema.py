@@ -208,6 +208,7 @@ class Scenario:
     wrist_camera: DriverConfig = dc.field(default_factory=NoDevice)
     digitizer: DriverConfig = dc.field(default_factory=NoDevice)
     profiler: DriverConfig = dc.field(default_factory=NoDevice)
+    touch_probe: DriverConfig = dc.field(default_factory=NoDevice)
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None

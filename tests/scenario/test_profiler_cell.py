@@ -17,6 +17,7 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.jobs.profiler.config import ProfilerJob
+from weldcal.systems.jobs.profiler.plan import plan_touches
 from weldcal.systems.jobs.profiler.planning_context import PlanningContext
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure
 from weldcal.systems.jobs.profiler.state import ProfilerState
@@ -154,6 +155,15 @@ def test_a_stopped_robot_holds_it_with_its_own_words(alone: Alone) -> None:
     assert not alone.procedure.GetOutputPort("creep").Eval(alone.simulator.get_context()).any()
 
 
+def test_a_torch_that_touches_on_its_way_holds_it(alone: Alone) -> None:
+    alone.run(0.1)
+    alone.tell(touch=AbstractValue.Make(TorchTouch(1, 0.1, True)))
+    alone.run(0.04)
+    assert alone.state.phase == "held"
+    assert "touches something in the step 'edge'" in alone.state.reason
+    assert not alone.procedure.GetOutputPort("creep").Eval(alone.simulator.get_context()).any()
+
+
 def test_a_person_holds_it(alone: Alone) -> None:
     alone.run(0.1)
     alone.tell(hold=[1.0])
@@ -187,3 +197,20 @@ def test_a_scenario_without_a_profiler_is_refused_on_the_command_line(tmp_path: 
     assert result.exit_code == 1
     assert "has no profiler" in " ".join(result.output.split())
     assert not (tmp_path / "out").exists()
+
+
+def test_moves_between_touches_keep_torch_and_tip_clear_of_the_sphere_all_along() -> None:
+    job, q_home = ProfilerJob(), np.deg2rad([190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
+    tip, ball = np.array(job.torch.tip_m), np.array(job.ball.xyz_m)
+    planning = PlanningContext(load_arm("ur10e"), job, q_home, drawn_pose(RenderedProfiler()), tip, ball)
+    for seed in range(2):
+        q, gaps, tips = q_home, [], []
+        for goal in plan_touches(planning, q_home, seed):
+            n = int(np.ceil(np.abs(goal.q - q).max() / 0.01)) + 1
+            for at in np.linspace(q, goal.q, n):
+                X_BF = forward_kinematics(planning.arm, at)
+                gaps.append(planning.gap(X_BF))
+                tips.append(float(np.linalg.norm(X_BF.multiply(tip) - ball)) - planning.radius_m)
+            q = goal.q
+        assert min(gaps) > 0.5e-3 * job.clearance_mm - 2e-4
+        assert min(tips) > 0.5e-3 * job.clearance_mm  # more than the tip is off its drawing

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
+from threadpoolctl import threadpool_info
 
 from weldcal.systems.addresses import AddressError, controller_address
 from weldcal.systems.background import Answer, Background, BackgroundFailed, Inline, OwnProcess
@@ -58,6 +59,12 @@ def test_asking_does_not_wait_for_the_answer(own_process: OwnProcess) -> None:
     assert not asked.ready
     assert asked.value is None
     assert asked.ready
+
+
+def test_the_process_uses_one_thread_for_linear_algebra(own_process: OwnProcess) -> None:
+    pools = own_process.ask(threadpool_info).value
+    assert [pool["num_threads"] for pool in pools if pool["user_api"] == "blas"] != []
+    assert {pool["num_threads"] for pool in pools if pool["user_api"] == "blas"} == {1}
 
 
 def test_a_process_that_ends_is_named() -> None:

@@ -10,6 +10,7 @@ import textwrap
 import weakref
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -54,6 +55,7 @@ from weldcal.systems.drivers.simulated.streaming.scanner import DepthStream, Str
 from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
+from weldcal.systems.drivers.ur.touch_probe import ProbeInput, Touches, UrTouchProbeInput
 from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
 from weldcal.systems.jobs.motion.collector import MotionCollector
 from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord, MotionState
@@ -152,6 +154,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
         RenderedFingerCamera(), 0, 0.002, lambda poses: np.zeros((300, 400), np.uint8)
     ),
     DepthStream: lambda: DepthStream(IDEAL, ScannerStream(), StreamingScanner(), 0, 0.002),
+    UrTouchProbeInput: lambda: UrTouchProbeInput(cast("ProbeInput", SimpleNamespace(touches=Touches()))),
     DeviceWatch: lambda: DeviceWatch(acquisition()),
     OnTrigger: lambda: OnTrigger(acquisition(), "scan", Scan, 0.02),
     WiredScanStream: lambda: WiredScanStream(acquisition()),
@@ -312,6 +315,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "stream": ScanStream,
         "newest_capture": 2,
     },
+    UrTouchProbeInput: {"touch": TorchTouch},
     DeviceWatch: {"robot_status": UrStatus, "status": UrStatus},
     OnTrigger: {"trigger": 1, "scan": Scan},
     WiredScanStream: {"streaming": 1, "stream": ScanStream},

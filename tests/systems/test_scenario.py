@@ -110,6 +110,11 @@ tablet:
   deepest_mm: 11.0
   turn_deg: 20.0
   tilt_deg: 10.0
+touch_probe: !UrTouchProbe
+  host: 192.168.1.10
+  input: 3
+  normally_closed: true
+  latency_s: 0.002
 profiler: !RenderedProfiler
   xyz_m: [0.08, 0.01, 0.05]
   rpy_deg: [1.0, 0.0, 80.0]

@@ -81,7 +81,7 @@ def box_mesh(center: list[float], size: list[float]) -> TriMesh:
 
 def rig_points(tip_F: Array, X_FS: RigidTransform) -> tuple[Array, Array]:
     """Spheres that bound torch and profiler for clearance checks: centres (n, 3) m in F, and radii (n,) m."""
-    along = np.linspace(0.15, 0.97, 10)[:, None]
+    along = np.linspace(0.15, 1.0, 11)[:, None]  # as far as the tip, which is nearest to a touched sphere
     torch = along * tip_F
     radii = np.minimum(0.008, 0.2 * np.linalg.norm(tip_F - torch, axis=1) + 0.001)
     body = np.array([[x, y, z] for x in (-0.04, 0.0, 0.04) for y in (-0.018, 0.018) for z in (-0.025, 0.0)])

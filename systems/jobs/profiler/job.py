@@ -88,7 +88,8 @@ class Profiler(Job[PlanningContext]):
         job = scenario.part(ProfilerJob)
         if job is not None and "sphere" in job.stages and not station.diagram.HasOutputPort("torch.touch"):
             raise InputError(
-                "No driver tells when the torch touches the sphere in this cell: write profiler_job: {stages: [edge]}."
+                "Nothing tells when the torch touches the sphere in this cell: add touch_probe: !UrTouchProbe {host: ..., input: ...}, or "
+                "write profiler_job: {stages: [edge]}."
             )
         return planning_context(scenario, station)
 

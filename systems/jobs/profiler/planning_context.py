@@ -21,7 +21,11 @@ from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.simulated.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
 from weldcal.systems.jobs.profiler.config import ProfilerJob, pose_of
 
-STEP_RAD = 0.1  # along a move, between the checked configurations
+STEP_RAD = (
+    0.1  # along a move, between the configurations that are checked against table, surroundings and the arm itself
+)
+STEP_M = 5e-4  # of torch and profiler, between those that are checked against the objects, where these are near
+FASTER = 1.2  # than the mean speed in a step of STEP_RAD: no point of the rig is
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +85,30 @@ class PlanningContext:
 
     def clear_way(self, q_a: Array, q_b: Array) -> bool:
         """Whether a straight move in joint space keeps torch, profiler and arm clear of all objects."""
-        n = max(2, int(np.ceil(float(np.abs(q_b - q_a).max()) / STEP_RAD)) + 1)
-        for u in np.linspace(0.0, 1.0, n):
-            if self.gap(forward_kinematics(self.arm, q_a + u * (q_b - q_a))) < 0.5e-3 * self.job.clearance_mm:
-                return False
+        if not self._keeps_gap(q_a, q_b, 0.5e-3 * self.job.clearance_mm):
+            return False
         if self.surroundings.touched_on_path(self.arm, self.bodies(), q_a, q_b):
             return False
         lowest, gap = path_clearance(self.arm, self.bodies(), q_a, q_b, 2.0 * STEP_RAD)
         return lowest > self.table_z_m and gap > 0.0
+
+    def _keeps_gap(self, q_a: Array, q_b: Array, least_m: float) -> bool:
+        """Whether torch and profiler keep `least_m` (m) on a straight move in joint space; from each checked configuration on by no more
+        than what they have left there.
+        """
+        n = max(2, int(np.ceil(float(np.abs(q_b - q_a).max()) / STEP_RAD)) + 1)
+        rig, _ = rig_points(self.p_FTip, self.X_FS)
+        at = [forward_kinematics(self.arm, q_a + u * (q_b - q_a)).multiply(rig.T).T for u in np.linspace(0.0, 1.0, n)]
+        # m of the fastest point for the whole of the move
+        speed = max(FASTER * (n - 1) * float(np.linalg.norm(np.diff(at, axis=0), axis=2).max()), STEP_M)
+        u = 0.0
+        while True:
+            left = self.gap(forward_kinematics(self.arm, q_a + u * (q_b - q_a))) - least_m
+            if left < 0.0:
+                return False
+            if u >= 1.0:
+                return True
+            u = min(u + max(left, STEP_M) / speed, 1.0)
 
     def standing(self, poses: FlangePoses) -> tuple[Array, NDArray[np.intp]]:
         """Joints (n, 6) of the poses that are reachable and clear, and their indices."""

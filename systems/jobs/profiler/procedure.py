@@ -21,6 +21,7 @@ from weldcal.systems.messages import JobCommand, ProfileScan, TorchTouch, UrStat
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
 ENDS = ("done", "held")
+TOUCHING = ("descend", "lift")  # the phases in which the torch may touch
 DWELL_S = 0.1  # at rest before a profile is taken
 FEEDBACK_PER_S = 8.0  # feedback gain towards the path
 PLANS = {"edge": ("edge",), "sphere": ("sphere", "touch"), "seam": ("pass", "torch")}  # steps of each stage, in order
@@ -112,6 +113,12 @@ class ProfilerProcedure(LeafSystem):
         if self._hold.Eval(context)[0] > 0.5:
             reason = f"A person ended the job, in the step '{s.step or 'start'}'."
             return replace(s, phase="held", since=now, reason=reason)
+        if s.phase not in TOUCHING and self._touch.HasValue(context) and self._touch.Eval(context).down:
+            reason = (
+                f"The torch touches something in the step '{s.step or 'start'}', while it should be free: look for what is in the way, and "
+                "at the touch probe, its cable and input."
+            )
+            return replace(s, phase="held", since=now, reason=reason)
         if now > self._planning.job.maximum_time_s:
             reason = f"The job took longer than its {self._planning.job.maximum_time_s:.0f} s; allow more with maximum_time_s."
             return replace(s, phase="held", since=now, reason=reason)
@@ -163,13 +170,16 @@ class ProfilerProcedure(LeafSystem):
         stage = self._planning.job.sphere
         if touch.sequence > s.felt:
             history: PoseHistory = self._history.Eval(context)
-            q = history.joints_at(touch.time)
+            q = history.joints_at(touch.time) if touch.q is None else touch.q
             if q is None:
                 return s
             return replace(s, phase="lift", since=now, goal_id=s.goal_id + 1, touches=(*s.touches, q))
         if now - s.since > (stage.gap_mm + stage.deepest_mm) / stage.descent_mm_s:
             number = len(s.touches) + 1
-            reason = f"The torch did not touch the sphere at touch {number}: check the sphere's position and radius."
+            reason = (
+                f"The torch did not touch the sphere at touch {number}, and stopped {stage.deepest_mm:g} mm below the surface expected: check "
+                "the sphere's position and radius, and the touch probe's cable and input. Jog the torch away from the sphere before the next start."
+            )
             return replace(s, phase="held", since=now, reason=reason)
         return s
 

@@ -106,6 +106,11 @@ class Physics:
             self.collisions += int(touches and not self._touches)
             self._touches = touches
 
+    @property
+    def true_q(self) -> Array:
+        """The arm's true joints (6,) rad in the newest frame."""
+        return self._true_q
+
     def forget(self) -> None:
         """Begin the record of another job."""
         self.arc_on_s, self.collisions = 0.0, 0

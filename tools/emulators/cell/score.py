@@ -22,6 +22,7 @@ def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest:
         found["X_BC"] = truth.X_BC.GetAsMatrix4().tolist()
     if truth.profiler is not None:
         found["X_FS"] = truth.profiler.X_FS.GetAsMatrix4().tolist()
+        found["p_FTip"], found["sphere_center"] = truth.profiler.p_FTip.tolist(), truth.profiler.center.tolist()
     seam = true_seam(truth)
     if seam is None:  # a world without a workpiece
         return found | {"collisions": physics.collisions, "time_s": physics.time_s}

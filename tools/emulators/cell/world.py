@@ -26,6 +26,7 @@ from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
+from weldcal.systems.drivers.ur.touch_probe import UrTouchProbe
 from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -37,6 +38,7 @@ from weldcal.tools.emulators.cell.scanner_process import PROFILER, SCANNER, Scan
 from weldcal.tools.emulators.cell.score import score
 from weldcal.tools.emulators.cell.stream_process import StreamSetup, run_stream
 from weldcal.tools.emulators.cell.streamer import Streamer
+from weldcal.tools.emulators.cell.touch_probe import TouchProbe
 from weldcal.tools.emulators.cell.waiter import Waiter
 from weldcal.tools.emulators.ur.addresses import take_address
 from weldcal.tools.emulators.ur.controller.core import Controller
@@ -67,6 +69,7 @@ class Wires:
     trigger: tuple[str, int] | None  # None: the scanner streams
     stream: tuple[str, int] | None  # None: there is no finger camera
     set_points: Mapping[str, AnalogSetPoint]
+    touch_probe: UrTouchProbe | None
 
 
 def wires_of(cell: Scenario) -> Wires:
@@ -95,6 +98,11 @@ def wires_of(cell: Scenario) -> Wires:
             "The world needs folder and trigger: tcp://HOST:PORT of scanner or profiler (or streams: true without a trigger) and "
             "finger_camera.source: http://HOST:PORT/PATH in the cell's scenario."
         )
+    probe = cell.touch_probe if isinstance(cell.touch_probe, UrTouchProbe) else None
+    if probe is not None:
+        probe.check()
+        if probe.host != robot.host:
+            raise InputError(f"The world has one controller: write touch_probe.host: {robot.host}, as robot.host.")
     x, y, z = robot.payload_cog_m
     return Wires(
         loopback_address(robot.host),
@@ -108,6 +116,7 @@ def wires_of(cell: Scenario) -> Wires:
         None if streams else (loopback_address(trigger.hostname or ""), trigger.port or 0),
         (loopback_address(stream.hostname or ""), stream.port or 0) if stream.scheme else None,
         {name: point for name in SET_POINTS if (point := getattr(robot, name)) is not None},
+        probe,
     )
 
 
@@ -128,6 +137,7 @@ class _World:
         self._controller, self._physics, self._wires = controller, physics, wires
         self._scanner, self._streamer, self._wanted_m, self._write = scanner, streamer, wanted_m, write
         self._arc, self._wire = Arc(), InputWire()
+        self._probe = _probe_of(physics, wires.touch_probe)
         self._every, self._latency_s = (
             (np.inf, 0.0) if finger is None else (1.0 / finger[0].rate_hz, finger[0].latency_s)
         )
@@ -154,6 +164,8 @@ class _World:
                 self._given = {}
             self._programs = c.script_count
         physics.step(c.arm.q, c.arm.qd, self._arc)
+        if self._probe is not None and wires.touch_probe is not None:
+            self._set_input(wires.touch_probe.input, self._probe.step(physics.true_q))
         if self._arc.burns and shares:
             points = wires.set_points
             self._given = {n: p.at_zero + shares[n] * (p.at_full - p.at_zero) for n, p in points.items()}
@@ -173,7 +185,13 @@ class _World:
             "arc_inputs": lambda r, now: setattr(self._wire, "how", str(r.get("how", ""))),
             "arc_fails": lambda r, now: setattr(self._arc, "fails", bool(r.get("on", True))),
             "knock": lambda r, now: self._knock(),
+            "touch_probe": lambda r, now: self._break_probe(str(r.get("how", ""))),
         }
+
+    def _break_probe(self, how: str) -> None:
+        if self._probe is None:
+            raise InputError("Only a cell with touch_probe: !UrTouchProbe has a probe that can fail.")
+        self._probe.set_how(how)
 
     def _knock(self) -> None:
         if self._streamer is None:
@@ -188,6 +206,8 @@ class _World:
         found = score(self._physics, self._wanted_m, arc_burns=self._arc.burns, at_rest=rests)
         found |= {"set_points": self._given} if self._wires.set_points else {}
         found |= {} if self._streamer is None else self._streamer.truth()
+        if self._probe is not None:
+            found["touch_probe"] = {"touches": self._probe.touches, "deepest_mm": 1e3 * self._probe.deepest_m}
         found["robot_time_at_0_s"] = self._controller.timestamp - self._physics.time_s
         self._write(found)
 
@@ -216,6 +236,16 @@ class _World:
             if self._scanner.poll(0.0):
                 self._scanner.recv()
                 self._scanner.send((unix_now(), self._physics.positions()))
+
+
+def _probe_of(physics: Physics, config: UrTouchProbe | None) -> TouchProbe | None:
+    """The world's touch probe; raises InputError where the world has no sphere that it could touch."""
+    if config is None:
+        return None
+    truth = physics.station.truth.profiler
+    if truth is None:
+        raise InputError("A cell with a touch_probe needs a world with a sphere, such as profiler_sphere.")
+    return TouchProbe(physics.station.arm, truth, config.normally_closed)
 
 
 def run_world(

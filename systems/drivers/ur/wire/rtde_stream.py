@@ -20,7 +20,8 @@ HEADER = struct.Struct(">HB")
 
 
 class RtdeStream:
-    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed.
+    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed; without `inputs` it
+    only reads.
 
     Raises:
         RobotUnreachable: nothing answers, or not as RTDE does. RobotRefused: the inputs are taken, or an output is unknown.
@@ -29,7 +30,7 @@ class RtdeStream:
     def __init__(self, host: str, outputs: Sequence[str], inputs: Sequence[str]) -> None:
         self._probe = RtdeProbe(host)
         try:
-            self._recipe, kinds = self._probe.claim_recipe(inputs)
+            self._recipe, kinds = self._probe.claim_recipe(inputs) if inputs else (0, [])
             if {IN_USE, NOT_FOUND} & set(kinds):
                 raise RobotRefused("Another client or a fieldbus writes the command registers.")
             self._package = struct.Struct(">B" + "".join(CODES[kind] for kind in kinds))
@@ -49,12 +50,27 @@ class RtdeStream:
             self._at[name] = slice(at, at + width) if width else at
             at += width or 1
         self._newest: tuple[float, ...] | None = None
+        self._read = 0
         self.connected = True
 
     def poll(self) -> None:
         """Read all packages that have arrived; the newest counts. A connection that has ended is told by `connected`."""
+        if starts := self._arrived():
+            self._newest = self._layout.unpack_from(self._inbox, starts[-1])
+        del self._inbox[: self._read]
+
+    def packages(self) -> list[tuple[float, ...]]:
+        """Every package since the last call, oldest first: the recipe's number, then the outputs' numbers in order. See poll."""
+        found = [self._layout.unpack_from(self._inbox, at) for at in self._arrived()]
+        self._newest = found[-1] if found else self._newest
+        del self._inbox[: self._read]
+        return found
+
+    def _arrived(self) -> list[int]:
+        """Where the outputs of whole packages begin in the inbox, of which `_read` bytes are then read."""
+        self._read = 0
         if not self.connected:
-            return
+            return []
         self._socket.settimeout(0.0)
         try:
             while data := self._socket.recv(65536):
@@ -64,7 +80,7 @@ class RtdeStream:
             pass
         except OSError:
             self.connected = False
-        self._decode()
+        return self._starts()
 
     def wait(self, seconds: float) -> None:
         """Poll, after the next package or this time."""
@@ -118,18 +134,17 @@ class RtdeStream:
         """Hang up, which releases the inputs."""
         self._probe.close()
 
-    def _decode(self) -> None:
-        newest, inbox, at = None, self._inbox, 0
+    def _starts(self) -> list[int]:
+        found, inbox, at = [], self._inbox, 0
         while len(inbox) - at >= HEADER.size:
             size, kind = HEADER.unpack_from(inbox, at)
             if size < HEADER.size:
                 self.connected = False
-                return
+                return []
             if len(inbox) - at < size:
                 break
             if kind == DATA and size - HEADER.size == self._layout.size:
-                newest = at + HEADER.size
+                found.append(at + HEADER.size)
             at += size
-        if newest is not None:
-            self._newest = self._layout.unpack_from(inbox, newest)
-        del inbox[:at]
+        self._read = at
+        return found
