@@ -137,9 +137,11 @@ def growth(hours: np.ndarray, megabytes: np.ndarray) -> dict[str, float | bool |
     if len(hours) < FEWEST:
         return {"mb_per_h": None, "low": None, "high": None, "flat": None}
     line = stats.linregress(hours, megabytes)
-    half = float(stats.t.ppf(0.975, len(hours) - 2)) * line.stderr
-    low, high = line.slope - half, line.slope + half
-    return {"mb_per_h": line.slope, "low": low, "high": high, "flat": bool(low <= FLAT_MB_H)}
+    # the error of a slope through equal numbers is 0/0 there
+    half = float(stats.t.ppf(0.975, len(hours) - 2) * np.nan_to_num(line.stderr))
+    slope = float(line.slope)
+    low, high = slope - half, slope + half
+    return {"mb_per_h": slope, "low": low, "high": high, "flat": bool(low <= FLAT_MB_H)}
 
 
 def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool) -> dict[str, object]:
