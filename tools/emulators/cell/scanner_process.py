@@ -19,6 +19,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.messages import ProfileScan, Scan
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.emulators.cell.physics import still, true_station
+from weldcal.tools.emulators.cell.scans import DONE, POSE
 
 EXPOSED_S = 0.3  # of the copy's time: a little longer than the scanner's exposure
 PROFILED_S = 0.03  # of the copy's time, for a profiler
@@ -87,7 +88,7 @@ def drop(folder: Path, number: int, points: NDArray[Any], note: Mapping[str, flo
 
 
 def run_scanner(setup: ScannerSetup, world: Connection) -> None:
-    """Serve until the world closes its end of the pipe. `world` answers "pose" with (Unix time s, plant positions)."""
+    """Serve until the world closes its end of the pipe. `world` answers POSE with (Unix time s, plant positions)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     renderer = Renderer(setup)
@@ -131,11 +132,12 @@ def _answer(line: str, renderer: Renderer, folder: Path, world: Connection, numb
     word, _, request = line.partition(" ")
     if word != "scan" or not request.isdigit():
         return "error send: scan N"
-    world.send("pose")
+    world.send(POSE)
     if not world.poll(POSE_LIMIT_S):
         return "error the world stands still"
     taken, positions = world.recv()
     drop(folder, number, renderer.scan(positions), {"capture_time": taken, "request": int(request)})
+    world.send(DONE)
     return f"ok {request}"
 
 

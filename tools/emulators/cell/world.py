@@ -35,6 +35,7 @@ from weldcal.tools.emulators.cell.finger_process import FingerSetup, run_finger_
 from weldcal.tools.emulators.cell.input_wire import InputWire
 from weldcal.tools.emulators.cell.physics import STEP_S, Physics
 from weldcal.tools.emulators.cell.scanner_process import PROFILER, SCANNER, ScannerSetup, run_scanner
+from weldcal.tools.emulators.cell.scans import Scans
 from weldcal.tools.emulators.cell.score import score
 from weldcal.tools.emulators.cell.stream_process import StreamSetup, run_stream
 from weldcal.tools.emulators.cell.streamer import Streamer
@@ -135,7 +136,8 @@ class _World:
         write: Callable[[Truth], None],
     ) -> None:
         self._controller, self._physics, self._wires = controller, physics, wires
-        self._scanner, self._streamer, self._wanted_m, self._write = scanner, streamer, wanted_m, write
+        self._streamer, self._wanted_m, self._write = streamer, wanted_m, write
+        self._scans = None if streamer is not None else Scans(scanner, lambda: (unix_now(), physics.positions()))
         self._arc, self._wire = Arc(), InputWire()
         self._probe = _probe_of(physics, wires.touch_probe)
         self._every, self._latency_s = (
@@ -170,7 +172,8 @@ class _World:
             points = wires.set_points
             self._given = {n: p.at_zero + shares[n] * (p.at_full - p.at_zero) for n, p in points.items()}
         self._expose()
-        self.answer_scanner()
+        if self._scans is not None:
+            self._scans.step(physics.time_s)
         if self._streamer is not None:
             self._streamer.step(c.frame, physics.positions, c.program is not None)
         rests = float(np.abs(c.arm.qd).max()) < REST_RAD_S
@@ -230,12 +233,8 @@ class _World:
 
     def answer_scanner(self) -> None:
         """Tell the scanner how the world stands, where it has asked."""
-        if self._streamer is not None:
-            return
-        with contextlib.suppress(OSError, EOFError):
-            if self._scanner.poll(0.0):
-                self._scanner.recv()
-                self._scanner.send((unix_now(), self._physics.positions()))
+        if self._scans is not None:
+            self._scans.answer(self._physics.time_s)
 
 
 def _probe_of(physics: Physics, config: UrTouchProbe | None) -> TouchProbe | None:
