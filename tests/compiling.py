@@ -16,26 +16,28 @@ from numba.core.dispatcher import Dispatcher
 
 from tests.places import ROOT
 
-_LOCK = Path(tempfile.gettempdir()) / f"weldcal-tests-compile-{sha1(str(ROOT).encode()).hexdigest()[:12]}.lock"
+_LOCKS = Path(tempfile.gettempdir()) / f"weldcal-tests-compile-{sha1(str(ROOT).encode()).hexdigest()[:12]}"
 _thread = threading.RLock()
-_depth = 0
+_held: set[str] = set()
 
 
 @contextmanager
-def _alone() -> Iterator[None]:
-    """Held by one thread of one process; that thread may enter again, for a loop that calls another."""
-    global _depth
+def _alone(loop: str) -> Iterator[None]:
+    """Held by one thread of one process for this loop; that thread may enter again. A loop that calls another takes that one's lock, too:
+    calls do not go in circles, so no two processes wait for each other.
+    """
     with _thread:
-        if _depth:
+        if loop in _held:
             yield
             return
-        with _LOCK.open("w") as lock:
+        _LOCKS.mkdir(exist_ok=True)
+        with (_LOCKS / loop).open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            _depth += 1
+            _held.add(loop)
             try:
                 yield
             finally:
-                _depth -= 1
+                _held.discard(loop)
 
 
 def compile_one_by_one() -> None:
@@ -44,7 +46,7 @@ def compile_one_by_one() -> None:
 
     @wraps(found)
     def compile(self: Dispatcher, signature: Any) -> Any:
-        with _alone():
+        with _alone(f"{self.py_func.__module__}.{self.py_func.__qualname__}"):
             return found(self, signature)
 
     Dispatcher.compile = compile

@@ -15,6 +15,8 @@ STREAMING = (
 )
 # They look at the finished demo. A core that is left with them at the end keeps the other waiting.
 DEMO = ("tests/scenario/test_readme.py", "tests/scenario/test_cell.py")
+# Folders whose files take a second or less come last, so that the processes end together.
+SHORT = ("models", "contract")
 MOST_PROCESSES = 4
 
 
@@ -24,10 +26,11 @@ def processes() -> int:
 
 
 def order(item: pytest.Item) -> tuple[object, ...]:
-    """Streams first, for they take their time whatever the others do; then what takes longest."""
-    name = item.path.name
+    """Streams first, for they take their time whatever the others do; then what takes longest; short files last."""
+    name, room = item.path.name, item.nodeid.split("/")[1]
     streams = STREAMING.index(name) if name in STREAMING else len(STREAMING)
-    return streams, not item.nodeid.startswith(DEMO), item.path.parent.name != "scenario"
+    late = SHORT[::-1].index(room) + 1 if room in SHORT else 0
+    return streams, not item.nodeid.startswith(DEMO), room != "scenario", late
 
 
 class Scheduling(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types
