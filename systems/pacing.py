@@ -3,12 +3,13 @@
 import gc
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY
 
 SWITCH_S = 0.0002  # the interpreter's own is 5 ms
+_CELL = (os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(CELL_PRIORITY))
 
 
 @contextmanager
@@ -35,23 +36,33 @@ def draw_in_this_thread() -> None:
 
 
 @contextmanager
-def real_time_priority() -> Iterator[None]:
+def real_time_priority() -> Iterator[Callable[[bool], None]]:
     """Give this thread real-time priority for the duration of the block, where the system allows it (rtprio, or root).
 
     The priority is below that of the link's worker and the emulated controller, so that neither waits for the cell. No other
     thread has it: fits and plans would keep the processor from the robot's peer. Threads and processes started in the block
-    have ordinary priority.
+    have ordinary priority. What the block is given takes the priority back (False) and gives it again (True), in this thread.
     """
     policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    before, ordinary = (policy, parameter), (os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    has = refused = False
+
+    def give(on: bool) -> None:
+        nonlocal has
+        if on == has or refused:
+            return
+        os.sched_setscheduler(0, *(_CELL if on else ordinary))
+        has = on
+
     try:
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(CELL_PRIORITY))
+        give(True)
     except OSError:
-        yield
-        return
+        refused = True
     try:
-        yield
+        yield give
     finally:
-        os.sched_setscheduler(0, policy, parameter)
+        if not refused:
+            os.sched_setscheduler(0, *before)
 
 
 @contextmanager

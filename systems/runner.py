@@ -108,6 +108,10 @@ def _nothing(run: Run[JobOf]) -> None:
     """Do nothing at the end of a run."""
 
 
+def _no_precedence(_: bool) -> None:
+    """Leave the thread's priority as it is: a simulation has none, and a robot that waits needs none."""
+
+
 def run_cell(
     cell: Cell[JobOf],
     progress: Progress = no_progress,
@@ -137,6 +141,7 @@ def run_cell(
         meshcat.StartRecording(frames_per_second=cell.scenario.visualization.recording_fps)
     finished_at, has_panel, person = np.inf, cell.diagram.HasSubsystemNamed("operator_panel"), cell.person
     next_at = dict.fromkeys(LOOKS, 0.0)
+    precedence: Callable[[bool], None] = _no_precedence
 
     def due(what: str, now: float) -> bool:
         if now < next_at[what] - 1e-9:
@@ -152,8 +157,11 @@ def run_cell(
             else:
                 run.clock.held = True
         if run.clock is not None:
+            moving = _commanded(cell, root)
+            # at rest nothing is urgent, and a scan that is drawn here would keep the processor from the robot's peer
+            precedence(moving)
             run.clock.waiting_s = 0.0 if station.robot.waits else station.waiting_s(time.monotonic())
-            run.clock.wait_for(root.get_time(), _commanded(cell, root))
+            run.clock.wait_for(root.get_time(), moving)
         if not due("job", root.get_time()):
             return EventStatus.DidNothing()
         command = cell.job.command(root)
@@ -182,7 +190,7 @@ def run_cell(
                     require_timely_host(run.host)
                 around.enter_context(short_turns())
                 if not run.clock.follows:  # a robot that waits needs no precedence, and shares this computer
-                    around.enter_context(real_time_priority())
+                    precedence = around.enter_context(real_time_priority())
             simulator.Initialize()
             simulator.AdvanceTo(cell.job.maximum_time_s + OVERTIME_S)
     except KeyboardInterrupt as stop:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 
 import pytest
 
-from weldcal.systems.pacing import SWITCH_S, no_long_garbage_collections, short_turns
+from weldcal.systems.pacing import SWITCH_S, no_long_garbage_collections, real_time_priority, short_turns
 
 
 def test_garbage_of_the_run_is_still_collected_and_the_rest_is_left_alone() -> None:
@@ -43,3 +44,16 @@ def test_other_threads_have_short_turns_for_the_duration_of_the_block() -> None:
     with short_turns():
         assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
     assert sys.getswitchinterval() == before
+
+
+def test_the_priority_is_taken_back_and_given_again_and_ends_with_the_block() -> None:
+    before = os.sched_getscheduler(0)
+    with real_time_priority() as give:
+        if not os.sched_getscheduler(0) & os.SCHED_RR:
+            pytest.skip("this user may not have real-time priority (ulimit -r)")
+        give(False)
+        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+        give(False)
+        give(True)
+        assert os.sched_getscheduler(0) & os.SCHED_RR
+    assert os.sched_getscheduler(0) == before

@@ -276,7 +276,7 @@ def _plot(
     """A plot for the page: curves of (name, colour, points), ranges, and a dashed line with its name."""
     last = [[p for p in points if math.isfinite(p[1])][-1:] for *_, points in curves]
     places = 0 if y[1] - y[0] > 20.0 else 1 if y[1] - y[0] > 2.0 else 2
-    now = ", ".join(f"{p[0][1]:.{max(places, 1)}f}" for p in last if p)
+    now = ", ".join(f"{p[0][1]:z.{max(places, 1)}f}" for p in last if p)
     return {
         "title": title,
         "now": f"{now} {unit}".strip() if now else "",
