@@ -13,6 +13,7 @@ from weldcal.systems.messages import JobCommand, Message
 FEEDBACK_PER_S = 8.0  # proportional correction towards the path
 SETTLED_RAD = 2e-4
 SETTLED_RAD_S = 1e-3
+REST_WINDOW_S = 0.1  # over which the joints tell their mean speed, where the measured one is noisy
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -60,8 +61,9 @@ class FlangeMover(LeafSystem):
         - velocity
         - settled_goal
 
-    `velocity` (6) rad/s; `settled_goal` (1) is the id of the newest goal at which the arm has come to rest. The path is
-    straight in joint space: every goal of the cell is a checked configuration, and the channel is joint velocity.
+    `velocity` (6) rad/s; `settled_goal` (1) is the id of the newest goal at which the arm has come to rest: by its measured velocity, or, where
+    that is noisier than SETTLED_RAD_S, by how little the joints have turned in REST_WINDOW_S. The path is straight in joint space: every goal
+    of the cell is a checked configuration, and the channel is joint velocity.
     """
 
     def __init__(self, speed: float = 1.0, acceleration: float = 2.5, period_s: float = 0.008) -> None:
@@ -73,6 +75,8 @@ class FlangeMover(LeafSystem):
         self._move = self.DeclareAbstractState(AbstractValue.Make(_Move()))
         self._commanded = self.DeclareDiscreteState(np.zeros(6))
         self._settled = self.DeclareDiscreteState(1)
+        # the time, s, at which the present window began, and the least and greatest joint angles in it, rad
+        self._window = self.DeclareDiscreteState(13)
         self.DeclareStateOutputPort("velocity", self._commanded)
         self.DeclareStateOutputPort("settled_goal", self._settled)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
@@ -91,6 +95,14 @@ class FlangeMover(LeafSystem):
             q_path, v_path = quintic(move.q_start, move.q_goal, u, move.duration)
             velocity = v_path + FEEDBACK_PER_S * (q_path - q)
             at_rest = np.max(np.abs(self._velocity.Eval(context))) < SETTLED_RAD_S
+            window = context.get_discrete_state(self._window).value()
+            begun, least, greatest = window[0], np.minimum(window[1:7], q), np.maximum(window[7:], q)
+            if u < 1.0 or begun < move.t_start:
+                begun, least, greatest = now, q, q
+            elif now - begun >= REST_WINDOW_S:
+                at_rest = at_rest or float(np.max(greatest - least)) < SETTLED_RAD_S * (now - begun)
+                begun, least, greatest = now, q, q
+            out.set_value(self._window, [begun, *least, *greatest])
             if u >= 1.0 and at_rest and np.max(np.abs(q - move.q_goal)) < SETTLED_RAD:
                 out.set_value(self._settled, [move.goal_id])
         out.set_value(self._commanded, velocity)

@@ -13,7 +13,7 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 
 from tests.systems.cells import Q_HOME
 from weldcal.systems.messages import JobCommand
-from weldcal.systems.motion.flange_mover import FlangeMover, move_duration, quintic
+from weldcal.systems.motion.flange_mover import SETTLED_RAD, SETTLED_RAD_S, FlangeMover, move_duration, quintic
 
 GOAL = Q_HOME + np.array([0.4, -0.2, 0.1, 0.0, -0.05, 0.3])
 DT = 1e-4
@@ -144,3 +144,28 @@ def test_a_new_goal_starts_from_where_the_arm_is() -> None:
     q, settled = loop.run(2.5)
     assert settled == 4
     assert q == pytest.approx(Q_HOME, abs=2e-4)
+
+
+def settled(turns_rad_s: float) -> float:
+    """The settled goal 3 s after a move to where the arm is, where each joint is measured to turn at 2 mrad/s, and swings about its goal at
+    this speed.
+    """
+    mover = FlangeMover()
+    simulator = Simulator(mover)
+    context = simulator.get_mutable_context()
+    job = JobCommand(mode="move", goal_id=7, q_goal=Q_HOME)
+    mover.GetInputPort("job").FixValue(context, AbstractValue.Make(job))
+    mover.GetInputPort("velocity_measured").FixValue(context, np.full(6, 2.0 * SETTLED_RAD_S))
+    for t in np.arange(0.0, 3.0, 0.008):
+        swing = 0.9 * SETTLED_RAD * np.sin(turns_rad_s / (0.9 * SETTLED_RAD) * t)
+        mover.GetInputPort("position_measured").FixValue(context, Q_HOME + swing)
+        simulator.AdvanceTo(t)
+    return float(mover.GetOutputPort("settled_goal").Eval(context)[0])
+
+
+def test_an_arm_whose_measured_velocity_is_noisy_is_at_rest_where_its_joints_stay() -> None:
+    assert settled(0.0) == 7.0
+
+
+def test_an_arm_that_swings_about_its_goal_is_not_at_rest() -> None:
+    assert settled(10.0 * SETTLED_RAD_S) == 0.0

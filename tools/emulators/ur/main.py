@@ -44,7 +44,7 @@ SLOWEST, FASTEST = 0.05, 1.0
 PARENT_CHECK_S = 0.2
 WAIT_S = 0.01
 KEEP_ALIVE_S = 0.5
-WORLD_AHEAD_FRAMES = 4  # with a world: 8 ms, so that no velocity is later
+WORLD_AHEAD_FRAMES = 3  # with a world: 6 ms, so that no velocity is 8 ms late with the time on the wire
 LONGEST_WAIT_S = 60.0
 
 
