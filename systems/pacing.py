@@ -4,7 +4,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY
 
@@ -62,7 +62,10 @@ def real_time_priority() -> Iterator[Callable[[bool], None]]:
         yield give
     finally:
         if not refused:
-            os.sched_setscheduler(0, *before)
+            give(False)
+            # without privilege the flag for children stays, which have ordinary priority in any case
+            with suppress(PermissionError):
+                os.sched_setscheduler(0, *before)
 
 
 @contextmanager

@@ -57,3 +57,17 @@ def test_the_priority_is_taken_back_and_given_again_and_ends_with_the_block() ->
         give(True)
         assert os.sched_getscheduler(0) & os.SCHED_RR
     assert os.sched_getscheduler(0) == before
+
+
+def test_a_user_without_privilege_gets_ordinary_priority_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    policies = [os.SCHED_OTHER]
+
+    def as_the_kernel(_: int, policy: int, __: object) -> None:
+        if policies[-1] & os.SCHED_RESET_ON_FORK and not policy & os.SCHED_RESET_ON_FORK:
+            raise PermissionError("only CAP_SYS_NICE clears the flag")
+        policies.append(policy)
+
+    monkeypatch.setattr(os, "sched_setscheduler", as_the_kernel)
+    with real_time_priority():
+        assert policies[-1] & os.SCHED_RR
+    assert policies[-1] == os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
