@@ -18,13 +18,12 @@ def test_every_core_is_watched_and_a_pause_is_seen() -> None:
     with watched_host() as host:
         probes = multiprocessing.active_children()
         assert len(probes) == cores
-        time.sleep(1.0)  # they start
+        time.sleep(10.0 * TICK_S)
         os.kill(probes[0].pid or 0, signal.SIGSTOP)
         time.sleep(PAUSE_S)
         os.kill(probes[0].pid or 0, signal.SIGCONT)
-        time.sleep(0.3)
     late = host.lateness
-    assert sum(late.counts) > 0.1 / TICK_S
+    assert sum(late.counts) >= cores
     assert late.worst_ms > 1e3 * (PAUSE_S - TICK_S) * 0.9
     assert host.summary()["over_8_ms"] == late.over(8.0) > 0
 

@@ -50,14 +50,16 @@ def watched_host() -> Iterator[HostLateness]:
         its.close()
         probes.append((process, ours))
     try:
+        for _, pipe in probes:
+            if pipe.poll(ANSWERS_WITHIN_S):
+                found.precedence = pipe.recv() and found.precedence
         yield found
     finally:
         for process, pipe in probes:
             with contextlib.suppress(OSError, EOFError):
                 pipe.send("end")
                 if pipe.poll(ANSWERS_WITHIN_S):
-                    precedence, counts, worst_ms = pipe.recv()
-                    found.precedence = found.precedence and precedence
+                    counts, worst_ms = pipe.recv()
                     late = found.lateness
                     late.counts = [a + b for a, b in zip(late.counts, counts, strict=True)]
                     late.worst_ms = max(late.worst_ms, worst_ms)
@@ -66,16 +68,19 @@ def watched_host() -> Iterator[HostLateness]:
 
 
 def probe(core: int, pipe: Connection) -> None:
-    """Wake up every TICK_S on one core until something comes through the pipe; answers (precedence, counts, worst ms)."""
+    """Wake up every TICK_S on one core until something comes through the pipe. Says first whether it has precedence, and at the end
+    (counts, worst ms).
+    """
     os.sched_setaffinity(0, {core})
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(ABOVE_ALL))
         precedence = True
     except OSError:
         precedence = False
+    pipe.send(precedence)
     late = Lateness()
     while not pipe.poll(0.0):
         due = time.monotonic() + TICK_S
         time.sleep(TICK_S)
         late.add(1e3 * max(time.monotonic() - due, 0.0))
-    pipe.send((precedence, late.counts, late.worst_ms))
+    pipe.send((late.counts, late.worst_ms))
