@@ -11,6 +11,7 @@ from pathlib import Path
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.wall_clock import Lateness, WallClock
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.emulators.cell.process import WiredWorld
 from weldcal.tools.emulators.ur.process import Emulator
@@ -137,7 +138,14 @@ def run_job(
         "moved": counts["moves_without_a_command"] + counts["moves_after_a_fault"],
         "arc_s": torch["on_s"],
         "problems": problems,
+        **_lateness(result.run.clock),
     }  # fmt: skip
+
+
+def _lateness(clock: WallClock | None) -> dict[str, object]:
+    """How many velocities left while the arm moved, how many of them over 8 ms late, and the latest (ms)."""
+    late = Lateness() if clock is None else clock.lateness
+    return {"velocities": sum(late.counts), "over_8_ms": late.over(8.0), "latest_ms": late.worst_ms}
 
 
 def _of_a_job_that_is_done(world: WiredWorld, happening: Happening | None, *, calibrates: bool) -> list[str]:

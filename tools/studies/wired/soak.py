@@ -27,7 +27,7 @@ FLAT_MB_H = 10.0  # memory is flat where growth above this is not shown at 95 %
 FEWEST = 5  # cycles for a slope
 COLUMNS = (
     "cycle", "at_s", "job", "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s", "named_after_s", "wall_s", "moved",
-    "arc_s", "problems", "stuck", "cell_mb", "world_mb", "scanner_mb", "finger_mb",
+    "arc_s", "problems", "velocities", "over_8_ms", "latest_ms", "stuck", "cell_mb", "world_mb", "scanner_mb", "finger_mb",
 )  # fmt: skip
 PROCESSES = ("cell", "world", "scanner", "finger")
 
@@ -154,6 +154,7 @@ def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool
     wrong = [f"cycle {row['cycle']} ({row['device']} {row.get('fault', '')}, {row.get('phase', '')}): {'; '.join(map(str, row['problems']))}"  # type: ignore[call-overload]
              for row in rows if row["problems"]]  # fmt: skip
     total = {name: sum(float(str(row.get(name) or 0.0)) for row in rows) for name in ("moved", "arc_s", "stuck")}
+    sound = [row for row in rows if not row.get("fault") and "velocities" in row]
     good = (
         not wrong and world_lives and not any(total.values()) and all(m["flat"] is not False for m in memory.values())
     )
@@ -164,6 +165,10 @@ def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool
         "faults": len(faults), "faults_held_by_name": sum(row["state"] == "held" and not row["problems"] for row in faults),
         "faults_without_effect": sum(row["state"] == "done" and not row["problems"] for row in faults),
         "motions_without_a_command": total["moved"], "arc_without_a_command_s": total["arc_s"],
+        "jobs_without_a_fault": len(sound),
+        "their_velocities_while_the_arm_moves": sum(int(str(row["velocities"])) for row in sound),
+        "of_them_over_8_ms_late": sum(int(str(row["over_8_ms"])) for row in sound),
+        "latest_ms": max((float(str(row["latest_ms"])) for row in sound), default=0.0),
         "stuck_processes": total["stuck"], "world_lives": world_lives, "memory": memory, "wrong": wrong,
         **({} if good else {"reason": wrong[0] if wrong else "Memory grew, a process is stuck, or the world has ended: see the table."}),
     }  # fmt: skip
