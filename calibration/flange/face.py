@@ -257,10 +257,12 @@ def lowered_by(beyond: Array, height: float) -> float:
     """How far below its plane (m) a face ``height`` thick ends at an edge, from the heights (N,) past the edge.
 
     Where a chamfer continues the face, the face "ends" one thickness below its plane, and a slanting ray moves that
-    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole.
+    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. What is past
+    the edge of a face lies lower than its thickness, so that a rough face's chamfer and wall are looked for deeper.
     """
     beyond = beyond[np.isfinite(beyond)]
-    share = float(np.mean((beyond < 0.0) & (beyond > -_CHAMFER_M))) if len(beyond) else 0.0
+    deepest = max(_CHAMFER_M, 2.0 * height)
+    share = float(np.mean((beyond < 0.0) & (beyond > -deepest))) if len(beyond) else 0.0
     return height if share > _CHAMFER_SHARE else 0.0
 
 
