@@ -16,6 +16,9 @@ from weldcal.models.flanges import FlangeStandard
 
 _CHAMFER_M = 0.0025  # a surface that goes on at most this far below the face is its chamfer, not another part
 _CHAMFER_SHARE = 0.2  # of the edge: more than flying pixels and noise could make look so
+_WALL_WEIGHT = (
+    0.75  # of the half of an edge that shows its wall: more than half, because the other half loses more pixels
+)
 _WIDEST = 1.5  # connected parts much wider than a flange are tables and plates
 _ALONE = 0.5  # of the outer edge; less of it counts only beside a part of the bore
 _BORE_SEEN = 0.25
@@ -189,7 +192,16 @@ def _measure(
             t = thickness(plane)
             xy, edges, pixels = scene.edges(plane, t, center3, 0.7 * standard.outer_m, labels=final)
             outer = _edge(
-                xy, edges, pixels, center, outer.radius, pitch, t, clear_band(standard, pitch, True), outer=True
+                xy,
+                edges,
+                pixels,
+                center,
+                outer.radius,
+                pitch,
+                t,
+                standard.chamfer_m,
+                clear_band(standard, pitch, True),
+                outer=True,
             )
         except (PlaneFitError, CircleFitError) as e:
             refusal.note(4, str(e))
@@ -197,7 +209,16 @@ def _measure(
         try:
             radius = standard.face_inner_radius_m if bore is None else bore.radius
             bore = _edge(
-                xy, edges, pixels, outer.center, radius, pitch, t, clear_band(standard, pitch, False), outer=False
+                xy,
+                edges,
+                pixels,
+                outer.center,
+                radius,
+                pitch,
+                t,
+                standard.chamfer_m,
+                clear_band(standard, pitch, False),
+                outer=False,
             )
         except CircleFitError:
             bore = None
@@ -253,17 +274,22 @@ def clear_band(standard: FlangeStandard, pitch: float, outer: bool) -> float:
     return float(max(min([2.5 * pitch, *gaps]), 1.2 * pitch))
 
 
-def lowered_by(beyond: Array, height: float) -> float:
+def lowered_by(beyond: Array, height: float, chamfer: float) -> float:
     """How far below its plane (m) a face ``height`` thick ends at an edge, from the heights (N,) past the edge.
 
     Where a chamfer continues the face, the face "ends" one thickness below its plane, and a slanting ray moves that
-    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. What is past
-    the edge of a face lies lower than its thickness, so that a rough face's chamfer and wall are looked for deeper.
+    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. A rough face
+    is thicker than the ``chamfer`` (m) is deep: it ends with it, and on the side that shows its wall one thickness below
+    the plane (docs/flange.md).
     """
     beyond = beyond[np.isfinite(beyond)]
+    # what is past the edge lies lower than the thickness: where that is much, chamfer and wall are looked for deeper
     deepest = max(_CHAMFER_M, 2.0 * height)
     share = float(np.mean((beyond < 0.0) & (beyond > -deepest))) if len(beyond) else 0.0
-    return height if share > _CHAMFER_SHARE else 0.0
+    goes_on = share > _CHAMFER_SHARE
+    if height <= chamfer:
+        return height if goes_on else 0.0
+    return chamfer + _WALL_WEIGHT * (height - chamfer) if goes_on else chamfer
 
 
 def _edge(
@@ -274,6 +300,7 @@ def _edge(
     radius: float,
     pitch: float,
     height: float,
+    chamfer: float,
     clear: float,
     *,
     outer: bool,
@@ -288,7 +315,7 @@ def _edge(
     near = np.abs(rho - radius) < width
     if int(near.sum()) < 12:
         raise CircleFitError("Too little of the edge was seen.")
-    lowered = lowered_by(edges.beyond[near], height)
+    lowered = lowered_by(edges.beyond[near], height, chamfer)
     points = edges.points[near] - lowered * edges.slide[near]
     sigma = np.hypot((edges.step[near] * d[near]).sum(axis=1) / rho[near], 0.3 * pitch)
     start = fit_circle(points, sigma=sigma, initial=(center, radius), noise_floor=0.03 * pitch)

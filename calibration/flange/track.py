@@ -179,7 +179,7 @@ def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) ->
         e = np.sqrt(e[0] * e[0] + e[1] * e[1]) - f.radius
         clear.append(clear_band(standard, pitch, k == 0))
         at = np.flatnonzero((np.abs(e) < max(clear[k], 1.2 * pitch) + height) & way)
-        lowered.append(lowered_by(view.above.ravel()[beyond[at]], height))
+        lowered.append(lowered_by(view.above.ravel()[beyond[at]], height, standard.chamfer_m))
         center = near + f.center
         if lowered[k]:
             center = center - lowered[k] * view.slide(center)

@@ -187,7 +187,7 @@ def _edges(
             near = (np.abs(rho - r) < width) & (way > 0.0)
             if unseen.any():
                 near &= ~unseen[_sector(d[:, 0], d[:, 1], len(unseen))]
-            low = lowered_by(beyond[near], height)
+            low = lowered_by(beyond[near], height, standard.chamfer_m)
             lowered.append(low)
             rims.append(d[near] - low * slide[near])
         if len(rims[0]) < 24:

@@ -3,6 +3,8 @@ refuse."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.flange.observation import observation_from_fit
 from weldcal.calibration.geometry.se3 import rotation_vector
+from weldcal.calibration.motion.frames import IN_MOTION
 from weldcal.models.depth_noise import DepthNoise, noisy_depth
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.scanners import get_scanner
@@ -44,6 +47,7 @@ def render(
     focal: float = 908.0,
     scanner: DepthNoise = SCANNER,
     plate_below: float | None = 0.008,
+    wall: bool = False,
     hidden: float = 0.0,
 ) -> Array:
     """Organised cloud (H, W, 3) of a face with bore, holes and chamfers, a plate close below and a table far behind.
@@ -75,6 +79,11 @@ def render(
         for hx, hy, hr in standard.openings():
             ring &= np.hypot(x - hx, y - hy) > hr
         depth = np.minimum(depth, np.where(ring, t, np.inf))
+    for z in np.linspace(-0.008, -standard.chamfer_m, 60) if wall else ():  # a body, where a face alone is a thin ring
+        t, x, y = at_height(float(z))
+        rho = np.hypot(x, y)
+        body = (rho < standard.outer_radius_m) & (rho > standard.bore_radius_m)
+        depth = np.minimum(depth, np.where(body, t, np.inf))
     if plate_below is not None:
         t, x, y = at_height(-plate_below)
         plate = (np.abs(x + 0.03) < 0.075) & (np.abs(y) < 0.045) & (np.hypot(x, y) > standard.bore_radius_m)
@@ -142,6 +151,24 @@ def test_perfect_scan_gives_the_centre_to_a_fiftieth_of_a_pixel() -> None:
     # only the pixel grid is left: about 600 edge pixels of 0.9 mm, 0.29 pixels rms each, would give 0.012 mm by averaging
     centre, _, _, _ = errors(10, 3, scanner=DepthNoise(), standard=STANDARD)
     assert np.sqrt((centre**2).sum(axis=1).mean()) < 3e-5
+
+
+@pytest.mark.parametrize("wall", [True, False])
+@pytest.mark.parametrize("sigma_mm", [0.8, 1.2, 1.6])
+def test_a_rough_face_at_a_slant_is_not_pulled_to_the_side_that_shows_its_wall(wall: bool, sigma_mm: float) -> None:
+    """Its thickness, three sigmas of 0.4 to 0.8 mm, is more than the chamfer is deep."""
+    noise = replace(get_scanner("motioncam_3d_stream").noise, sigma_m=1e-3 * sigma_mm, reference_m=1.0)
+    rng, along = np.random.default_rng(8), []
+    for _ in range(12):
+        X_CR = facing_pose((rng.uniform(-0.1, 0.1), rng.uniform(-0.1, 0.1), 0.7), 20.0, rng.uniform(0, 360))
+        guess = FlangeGuess(X_CR.translation(), 0.085, X_CR.rotation().matrix()[:, 2])
+        found = fit_flange(render(X_CR, rng, scanner=noise, wall=wall), STANDARD, guess=guess, config=IN_MOTION)
+        assert found.plane_rms_m > 3.5e-4
+        view = found.center_C / np.linalg.norm(found.center_C)
+        slide = view - (view @ found.normal_C) * found.normal_C
+        along.append((found.center_C - X_CR.translation()) @ slide / np.linalg.norm(slide))
+    # one thickness, 1.2 to 2.4 mm, would be 0.4 to 0.9 mm at this slant
+    assert np.sqrt(np.mean(np.square(along))) < 1.2e-4
 
 
 def test_radii_are_those_of_the_flat_face() -> None:
