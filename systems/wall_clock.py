@@ -77,7 +77,6 @@ class WallClock:
         self.lost_s = 0.0
         self.lateness = Lateness()
         self.held = False
-        self.behind_s = 0.0  # how late the newest tick was, where the clock follows a robot
         self.waiting_s = 0.0  # wall seconds for which the oldest picture or detection has been waited for
 
     @classmethod
@@ -122,7 +121,6 @@ class WallClock:
         self._at = diagram_time
         late = (now - self._due) * self.pace
         self._set_rate(step, late, moving)
-        self.behind_s = late if self.follows else 0.0
         if late <= 0.0:
             self._sleep(self._due - now)
             return
@@ -139,11 +137,17 @@ class WallClock:
         """The Diagram's time (s) at a time of the clock that it waits for; `now` before it has waited."""
         return now if self._at is None else self._at + (clock_s - self._due) * self.pace * self.rate
 
-    def velocity_leaves(self, diagram_time: float, moving: bool) -> None:
-        """Count how late a velocity of this time of the Diagram leaves it; one at rest is not counted."""
+    def overdue_s(self, diagram_time: float) -> float:
+        """How late (s of robot time) a velocity of this time of the Diagram would leave it now; 0 before the clock has waited."""
+        if self._at is None:
+            return 0.0
+        due = self._due + (diagram_time - self._at) / (self.pace * self.rate)
+        return max((self._clock() - due) * self.pace, 0.0)
+
+    def velocity_leaves(self, late_s: float, moving: bool) -> None:
+        """Count how late a velocity left the Diagram; one at rest is not counted."""
         if moving and self._at is not None:
-            due = self._due + (diagram_time - self._at) / (self.pace * self.rate)
-            self.lateness.add(max(1e3 * (self._clock() - due) * self.pace, 0.0))
+            self.lateness.add(1e3 * late_s)
 
     def _set_rate(self, step: float, late: float, moving: bool) -> None:
         wanted = min(max(1.0 - (late - SLOW_FROM_S) / SLOW_SPAN_S, SLOWEST), 1.0)

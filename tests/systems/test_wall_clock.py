@@ -65,7 +65,7 @@ def on_a_computer_that_needs(work_s: float, ticks: int) -> tuple[FakeTime, WallC
             clock.lateness = Lateness()
         wall.now += work_s
         clock.wait_for(TICK_S * k, moving=True)
-        clock.velocity_leaves(TICK_S * k, moving=True)
+        clock.velocity_leaves(clock.overdue_s(TICK_S * k), moving=True)
         rates.append(clock.rate)
     return wall, clock, rates
 
@@ -99,8 +99,8 @@ def test_lateness_is_counted_in_bins_of_robot_time_while_the_arm_moves() -> None
     wall, clock = clock_at(0.5)
     for late_ms in (0.1, 0.7, 3.0, 5.0, 300.0):
         wall.now += 2e-3 * late_ms  # at half the pace the robot's milliseconds are twice as long
-        clock.velocity_leaves(0.0, moving=True)
-        clock.velocity_leaves(0.0, moving=False)
+        clock.velocity_leaves(clock.overdue_s(0.0), moving=True)
+        clock.velocity_leaves(clock.overdue_s(0.0), moving=False)
         wall.now -= 2e-3 * late_ms
     assert clock.lateness.counts == [1, 1, 0, 1, 1, 0, 0, 0, 1]
     assert clock.lateness.on_time_percent == pytest.approx(60.0)

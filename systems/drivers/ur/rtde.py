@@ -159,15 +159,16 @@ class UrRtdeArm(LeafSystem):
         discrete.set_value(self._codes, found.codes)
 
     def _send(self, context: Context) -> EventStatus:
-        if self._clock.behind_s > CATCHES_UP_S:
+        wanted = np.array(self._command.Eval(context))  # the servo's tick, which takes what time it takes
+        late_s = self._clock.overdue_s(context.get_time())
+        if self._clock.follows and late_s > CATCHES_UP_S:
             return EventStatus.DidNothing()  # the robot that is followed waits until the Diagram has caught up with it
-        wanted = np.array(self._command.Eval(context))
         # at rest exactly zero is sent: only then may the cell compute without a time limit
         process = self._process.HasValue(context) and bool(self._process.Eval(context)[0] > 0.5)
         moving = (
             not np.abs(wanted).max() < STILL_RAD_S
         )  # so that what is no number reaches the worker, which refuses it
-        self._clock.velocity_leaves(context.get_time(), moving)
+        self._clock.velocity_leaves(late_s, moving)
         self._link.command(self._clock.rate * wanted if moving else np.zeros(6), process)
         return EventStatus.Succeeded()
 

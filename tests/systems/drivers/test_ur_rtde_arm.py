@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, DiagramBuilder, VectorSystem
 
 from tests.systems.drivers.still_link import StillLink
 from weldcal.models.arms.kinematics import load_arm
@@ -24,8 +24,8 @@ def link() -> StillLink:
 class Driven:
     """The system alone in a simulator."""
 
-    def __init__(self, link: StillLink, pace: float = 1.0) -> None:
-        self.clock = WallClock(pace)
+    def __init__(self, link: StillLink, pace: float = 1.0, clock: WallClock | None = None) -> None:
+        self.clock = clock or WallClock(pace)
         self.system = UrRtdeArm(load_arm(), link, self.clock)
         self.simulator = Simulator(self.system)
         self.tell(np.zeros(6))
@@ -80,6 +80,40 @@ def test_each_command_is_sent_and_next_to_nothing_is_sent_as_nothing(link: Still
     driven.simulator.AdvanceTo(0.04)
     assert len(link.commands) == sent + 5  # every 4 ms
     assert link.commands[-1] == pytest.approx(np.full(6, 0.1))
+
+
+class ComputesLong(VectorSystem):
+    """A source of a velocity that takes so long to compute that the robot's time goes on."""
+
+    def __init__(self, robot_time: list[float]) -> None:
+        super().__init__(0, 6, direct_feedthrough=False)
+        self.takes_s, self._robot_time = 0.0, robot_time
+
+    def DoCalcVectorOutput(self, context: Context, inputs: object, state: object, output: np.ndarray) -> None:
+        self._robot_time[0] += self.takes_s
+        output[:] = 0.1
+
+
+@pytest.mark.parametrize(("takes_s", "leaves"), [(0.003, True), (0.005, False)])
+def test_a_robot_that_waits_is_sent_no_velocity_that_has_become_late_while_it_was_computed(
+    link: StillLink, takes_s: float, leaves: bool
+) -> None:
+    robot_time = [0.0]
+    clock = WallClock.following(lambda: robot_time[0])
+    builder = DiagramBuilder()
+    source = builder.AddSystem(ComputesLong(robot_time))
+    arm = builder.AddSystem(UrRtdeArm(load_arm(), link, clock))
+    builder.Connect(source.get_output_port(), arm.GetInputPort("velocity_command"))
+    simulator = Simulator(builder.Build())
+    clock.wait_for(0.0, moving=True)
+    simulator.Initialize()
+    sent = len(link.commands)
+    robot_time[0], source.takes_s = 0.004, takes_s
+    clock.wait_for(0.004, moving=True)  # the tick begins in time
+    simulator.AdvanceTo(0.004)
+    simulator.AdvancePendingEvents()
+    assert (len(link.commands) > sent) == leaves
+    assert clock.lateness.worst_ms <= 4.0
 
 
 def test_the_process_is_asked_for_with_the_velocity_of_the_same_tick_and_off_where_nobody_asks(link: StillLink) -> None:
