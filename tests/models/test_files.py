@@ -31,11 +31,11 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 def refusal(read: Callable[[Path], object], path: Path) -> str:
-    """The sentence, which must come within a second."""
-    begin = time.monotonic()
+    """The sentence, which must come within a second of computing time."""
+    begin = time.process_time()
     with pytest.raises(InputError) as caught:
         read(path)
-    assert time.monotonic() - begin < 1.0
+    assert time.process_time() - begin < 1.0
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -174,10 +174,10 @@ LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     ],
 )
 def test_a_document_without_end_or_with_two_answers_is_refused(text: str, kind: str, sentence: str) -> None:
-    begin = time.monotonic()
+    begin = time.process_time()
     with pytest.raises(InputError, match=sentence):
         parse_document("a", text, kind)
-    assert time.monotonic() - begin < 2.0
+    assert time.process_time() - begin < 2.0
     assert not Path("executed").exists()
 
 

@@ -219,4 +219,4 @@ def test_reading_never_waits_for_the_device(started: Acquisition[Any], device: S
         started.frames()
         started.fault(time.monotonic())
         started.request(3)
-    assert time.monotonic() - begin < 0.2
+    assert time.monotonic() - begin < 0.9  # a single one would be a second
