@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,14 @@ def test_a_cell_is_judged_by_its_newest_dataset_and_its_history(
     cell = judge_cell("cell", datasets, 0.2)
     assert (cell.state, cell.since) == (state, since)
     assert bool(cell.reason and cell.next) == (state != FINE)
+
+
+def test_a_first_calibration_that_could_not_be_verified_is_no_fine_cell() -> None:
+    *before, newest = history(0.2, 0.2, 0.2)
+    lost = replace(newest, verification={"state": "failed", "reason": "There is no calibration at 'x'."})
+    cell = judge_cell("cell", (*before, lost), 0.2)
+    assert cell.state == LOOK
+    assert "could not be verified on '2026-03'. There is no calibration at 'x'." in cell.reason
 
 
 def test_datasets_of_one_folder_are_a_cell_and_a_dataset_at_the_top_is_one_by_itself(tmp_path: Path) -> None:

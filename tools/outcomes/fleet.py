@@ -146,6 +146,12 @@ def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> Cel
             f"Since '{since}' the first calibration does not hold. {(newest.verification or {}).get('reason', '')}",
         )
         then = "Find what moved, then use the newest calibration."
+    elif newest.verification is not None and newest.verification["state"] == "failed":
+        state = LOOK
+        reason = (
+            f"The first calibration could not be verified on '{newest.name}'. {newest.verification.get('reason', '')}"
+        )
+        then = "Correct what the reason names, then run the command again with a new --out."
     elif trend:
         state, reason = LOOK, f"The error of the first calibration grows: {_mm(datasets[0])} to {_mm(newest)} mm."
         then = "Check the mounts of scanner and robot, and the scanner's warm-up. Use the newest calibration."
