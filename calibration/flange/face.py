@@ -16,9 +16,7 @@ from weldcal.models.flanges import FlangeStandard
 
 _CHAMFER_M = 0.0025  # a surface that goes on at most this far below the face is its chamfer, not another part
 _CHAMFER_SHARE = 0.2  # of the edge: more than flying pixels and noise could make look so
-_WALL_WEIGHT = (
-    0.75  # of the half of an edge that shows its wall: more than half, because the other half loses more pixels
-)
+_HIDDEN_LESS = 0.25  # of the chamfer: the half of an edge that hides its wall loses more pixels, and counts less
 _WIDEST = 1.5  # connected parts much wider than a flange are tables and plates
 _ALONE = 0.5  # of the outer edge; less of it counts only beside a part of the bore
 _BORE_SEEN = 0.25
@@ -289,7 +287,8 @@ def lowered_by(beyond: Array, height: float, chamfer: float) -> float:
     goes_on = share > _CHAMFER_SHARE
     if height <= chamfer:
         return height if goes_on else 0.0
-    return chamfer + _WALL_WEIGHT * (height - chamfer) if goes_on else chamfer
+    half = 0.5 * (height - chamfer)
+    return chamfer + half + min(half, _HIDDEN_LESS * chamfer) if goes_on else chamfer
 
 
 def _edge(
