@@ -81,6 +81,15 @@ class Run(Generic[JobOf]):
         """Why the job was held; None where it was completed."""
         return self.interrupted or self.command.reason
 
+    def raise_if_interrupted(self) -> None:
+        """For a study of many runs, which a person ends with any one of them.
+
+        Raises:
+            KeyboardInterrupt: a person ended this run.
+        """
+        if self.interrupted is not None:
+            raise KeyboardInterrupt(self.interrupted)
+
     def real_time_factor(self, phase: str | None = None) -> float:
         """Simulated seconds per wall second of the whole run, or of one phase."""
         if phase is None:

@@ -99,6 +99,7 @@ def run_profiler_seeds(scenario: Scenario, options: RunOptions, runs: int, progr
         seed = options.seed + k
         one = replace(options, seed=seed, out=options.out / f"seed{seed:02d}", recording=False)
         live = run_profiler_live(scenario, one, lambda what, share, k=k: progress(what, (k + share) / runs))  # type: ignore[misc]
+        live.run.raise_if_interrupted()
         rows.append(_flat(live.summary()))
         outcomes.append(live.outcome)
         columns = list(dict.fromkeys(name for row in rows for name in row))

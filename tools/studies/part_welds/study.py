@@ -163,7 +163,9 @@ def run_part_welds(
             progress(f"{name}: {stage}", (k + share) / len(runs))
 
         options = RunOptions(str(cell), folder / f"seed{seed}", seed, recording=False)
-        summary = run_scenario(trial.scenario(cell), options, shown).summary()
+        result = run_scenario(trial.scenario(cell), options, shown)
+        result.run.raise_if_interrupted()
+        summary = result.summary()
         found = summary.get("refinement")
         refined = isinstance(found, Mapping) and found.get("accepted") is True
         rows.append({**summary, "part": name, "joint": part.joint, "seed": seed, "refined": refined})

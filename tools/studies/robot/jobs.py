@@ -134,6 +134,7 @@ def _job(described: Any, out: Path, name: str, seed: int) -> JobTiming:
             result = run_scenario(described, options)
         except WeldcalError as error:  # the start was refused
             return JobTiming(seed, "refused", str(error), Lateness(), 0.0, 0.0, {})
+    result.run.raise_if_interrupted()
     summary, clock = result.summary(), result.run.clock
     assert clock is not None
     return JobTiming(
