@@ -16,7 +16,7 @@ import pytest
 from weldcal.tools.emulators.cell.bridges import Bridge, PictureBridge, ScannerBridge
 from weldcal.tools.emulators.cell.input_wire import DELAY_S, InputWire
 from weldcal.tools.studies.wired.fault_run import DEVICES, FAULTS, PHASES, Happening
-from weldcal.tools.studies.wired.soak import FLAT_MB_H, growth
+from weldcal.tools.studies.wired.soak import FLAT_MB_H, grows, growth
 
 HOST = "127.0.0.1"
 
@@ -154,3 +154,12 @@ def test_memory_that_grows_until_the_longest_job_has_run_is_flat_from_then_on() 
     hours = np.linspace(0.0, 1.0, 60)
     assert growth(hours, 400.0 + 150.0 * np.minimum(hours, 0.3))["flat"] is True
     assert growth(hours, 400.0 + 150.0 * np.maximum(hours, 0.5))["flat"] is False
+
+
+def test_the_cell_is_judged_by_what_it_uses_and_not_by_the_gaps_that_its_library_keeps() -> None:
+    level, rises, unknown = {"flat": True}, {"flat": False}, {"flat": None}
+    others = {"world": level, "scanner": level, "finger": level}
+    assert grows({"cell": rises, **others, "in_use": level}) == []
+    assert grows({"cell": rises, **others, "in_use": rises}) == ["in_use"]
+    assert grows({"cell": rises, **others, "in_use": unknown}) == ["cell"], "another library than GNU's"
+    assert grows({"cell": level, **others, "world": rises, "in_use": level}) == ["world"]
