@@ -125,8 +125,12 @@ def _to_next_pose(state: JobState, seen: Seen, phase: str) -> JobState:
     if seen.next_pose.after_sequence < seen.calibration.sequence:
         return state  # the planner has not processed the newest status yet
     if seen.next_pose.q is None:
+        refused = seen.calibration.refused
+        why = f" {len(refused)} scans could not be used, the last one because: {refused[-1][1]}" if refused else ""
         return hold(
-            state, seen, "The planned calibration poses are used up: plan more of them or free more of the workspace."
+            state,
+            seen,
+            f"The planned calibration poses are used up: plan more of them or free more of the workspace.{why}",
         )
     return _move(state, seen, phase, seen.next_pose.q)
 

@@ -234,7 +234,18 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
     "no scan": ("scan_pose", 9.0, {}, "No scan arrived within 8 s"),
     "no verification scan": ("scan_verify", 9.0, {}, "No scan arrived within 8 s"),
     "no workpiece scan": ("scan_workpiece", 9.0, {}, "No workpiece scan arrived within 8 s"),
-    "no more poses": ("scan_pose", 0.1, {"calibration": status(), "next_pose": NO_POSE}, "poses are used up"),
+    "no more poses": (
+        "scan_pose",
+        0.1,
+        {"calibration": status(), "next_pose": NO_POSE},
+        "free more of the workspace.$",
+    ),
+    "no more poses after refused scans": (
+        "scan_pose",
+        0.1,
+        {"calibration": status(refused=(("pose03", "it is too dark"),) * 3), "next_pose": NO_POSE},
+        "poses are used up: .* 3 scans could not be used, the last one because: it is too dark",
+    ),
     "required error not reached": (
         "scan_pose",
         0.1,
