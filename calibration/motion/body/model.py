@@ -16,7 +16,7 @@ from weldcal.models.open3d_core import o3d
 _SAMPLES_PER_M2 = 6e5  # one in 1.3 mm
 _INSIDE_M = 1e-4
 _VOXEL_M = 0.0015
-_LEAST_SHARE, _LEAST_FRAMES = 0.25, 4  # of the frames a voxel must be seen in: what moves otherwise is not of the body
+_LEAST_SHARE, _LEAST_FRAMES = 0.5, 4  # of the frames a voxel must be seen in: what moves otherwise is not of the body
 _PITCHES = 1.5
 _NORMAL_VOXELS = 4.0  # radius of the neighbours that tell a normal
 _SAMPLE = 2000
@@ -67,7 +67,7 @@ def fused_model(frames: Iterable[tuple[Array, RigidTransform]], middle: Array, r
     """Fuse scans to the surface of what moves with a frame L: ``frames`` are clouds (N, 3) or (H, W, 3) m in C with the pose X_LC by
     calibration and robot. Only points within ``radius_m`` of ``middle`` (3,) m in L count.
 
-    A surfel is the mean of all points in a voxel of 1.5 mm (or 1.5 pixels) that a quarter of the frames saw: what stands still or belongs to
+    A surfel is the mean of all points in a voxel of 1.5 mm (or 1.5 pixels) that half of the frames saw: what stands still or belongs to
     another link sweeps through the voxels. Raises InputError where too little is left.
     """
     keys: list[Array] = []
