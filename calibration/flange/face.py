@@ -189,35 +189,13 @@ def _measure(
             center = (center3 - plane.point) @ np.column_stack(plane_axes(plane.normal))
             t = thickness(plane)
             xy, edges, pixels = scene.edges(plane, t, center3, 0.7 * standard.outer_m, labels=final)
-            outer = _edge(
-                xy,
-                edges,
-                pixels,
-                center,
-                outer.radius,
-                pitch,
-                t,
-                standard.chamfer_m,
-                clear_band(standard, pitch, True),
-                outer=True,
-            )
+            outer = _edge(xy, edges, pixels, center, outer.radius, pitch, t, standard, outer=True)
         except (PlaneFitError, CircleFitError) as e:
             refusal.note(4, str(e))
             return None
         try:
             radius = standard.face_inner_radius_m if bore is None else bore.radius
-            bore = _edge(
-                xy,
-                edges,
-                pixels,
-                outer.center,
-                radius,
-                pitch,
-                t,
-                standard.chamfer_m,
-                clear_band(standard, pitch, False),
-                outer=False,
-            )
+            bore = _edge(xy, edges, pixels, outer.center, radius, pitch, t, standard, outer=False)
         except CircleFitError:
             bore = None
         if bore is not None and (
@@ -299,8 +277,7 @@ def _edge(
     radius: float,
     pitch: float,
     height: float,
-    chamfer: float,
-    clear: float,
+    standard: FlangeStandard,
     *,
     outer: bool,
 ) -> CircleFit:
@@ -314,7 +291,7 @@ def _edge(
     near = np.abs(rho - radius) < width
     if int(near.sum()) < 12:
         raise CircleFitError("Too little of the edge was seen.")
-    lowered = lowered_by(edges.beyond[near], height, chamfer)
+    lowered = lowered_by(edges.beyond[near], height, standard.chamfer_m)
     points = edges.points[near] - lowered * edges.slide[near]
     sigma = np.hypot((edges.step[near] * d[near]).sum(axis=1) / rho[near], 0.3 * pitch)
     start = fit_circle(points, sigma=sigma, initial=(center, radius), noise_floor=0.03 * pitch)
@@ -322,7 +299,7 @@ def _edge(
         return start
     places = pixels.points - lowered * pixels.slide
     d = places - start.center
-    close = np.abs(np.hypot(d[:, 0], d[:, 1]) - start.radius) < clear
+    close = np.abs(np.hypot(d[:, 0], d[:, 1]) - start.radius) < clear_band(standard, pitch, outer)
     fit = refine_circle(places[close], pixels.on_face[close], start, pitch, outer=outer)
     return replace(fit, covariance=_SHARED * fit.covariance)
 

@@ -20,7 +20,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 
 AWAY_RAD = 0.8
-MOVING_S, HELD_S = 0.6, 0.6
+MOVING_S, HELD_S = 0.6, 2.0
 AT_REST_RAD_S = 1e-3
 
 
@@ -75,7 +75,7 @@ def test_the_arm_rests_on_its_path_while_it_is_held_and_then_ends_its_way(contro
     assert 0.02 < way[0] < 0.98
     assert np.abs(np.array(controller.state()["q"]) - Q_HOME).max() < 1e-3
     assert run.clock is not None
-    assert run.clock.lost_s < HELD_S  # the time that it stood is none that was lost
+    assert run.clock.lost_s < 0.5 * HELD_S, "the time that it stood is none that was lost"  # a busy computer loses some
 
 
 def test_a_held_weld_is_finished_over_the_join() -> None:

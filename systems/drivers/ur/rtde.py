@@ -159,7 +159,7 @@ class UrRtdeArm(LeafSystem):
         discrete.set_value(self._codes, found.codes)
 
     def _send(self, context: Context) -> EventStatus:
-        wanted = np.array(self._command.Eval(context))  # the servo's tick, which takes what time it takes
+        wanted = np.array(self._command.Eval(context))  # computed here: only now is known how late it is
         late_s = self._clock.overdue_s(context.get_time())
         if self._clock.follows and late_s > CATCHES_UP_S:
             return EventStatus.DidNothing()  # the robot that is followed waits until the Diagram has caught up with it

@@ -126,7 +126,7 @@ def _to_next_pose(state: JobState, seen: Seen, phase: str) -> JobState:
         return state  # the planner has not processed the newest status yet
     if seen.next_pose.q is None:
         refused = seen.calibration.refused
-        why = f" {len(refused)} scans could not be used, the last one because: {refused[-1][1]}" if refused else ""
+        why = f" Scans that could not be used: {len(refused)}. The last one: {refused[-1][1]}" if refused else ""
         return hold(
             state,
             seen,

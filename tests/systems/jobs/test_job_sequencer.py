@@ -238,13 +238,13 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         "scan_pose",
         0.1,
         {"calibration": status(), "next_pose": NO_POSE},
-        "free more of the workspace.$",
+        "free more of the workspace\\.$",
     ),
     "no more poses after refused scans": (
         "scan_pose",
         0.1,
         {"calibration": status(refused=(("pose03", "it is too dark"),) * 3), "next_pose": NO_POSE},
-        "poses are used up: .* 3 scans could not be used, the last one because: it is too dark",
+        r"poses are used up: .* Scans that could not be used: 3\. The last one: it is too dark",
     ),
     "required error not reached": (
         "scan_pose",

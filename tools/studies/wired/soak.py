@@ -3,6 +3,7 @@
 import ctypes
 import gc
 import os
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,7 +31,8 @@ COLUMNS = (
     "arc_s", "problems", "velocities", "over_8_ms", "latest_ms", "stuck", "cell_mb", "in_use_mb", "world_mb", "scanner_mb", "finger_mb",
 )  # fmt: skip
 PROCESSES = ("cell", "world", "scanner", "finger")
-IN_USE = "in_use"  # of the cell's resident memory, what is not kept free by the C library for the next allocation
+IN_USE = "in_use"  # of the cell's memory: what C library and Python have given out, and not what they keep for the next allocation
+BLOCK_BYTES = 512  # at most, of what Python gives out itself: larger things come from the C library
 
 
 def run_soak(
@@ -103,13 +105,13 @@ class _Mallinfo2(ctypes.Structure):
 
 
 def _in_use_mb() -> float:
-    """What this process has allocated from the C library and not freed, MB; NaN for another library."""
+    """What this process has allocated from the GNU C library and from Python and not freed, MB, at most; NaN for another library."""
     ask = getattr(ctypes.CDLL(None), "mallinfo2", None)
     if ask is None:
         return float("nan")
     ask.restype = _Mallinfo2
     found = ask()
-    return float(found.uordblks + found.hblkhd) / 2**20
+    return float(found.uordblks + found.hblkhd + BLOCK_BYTES * sys.getallocatedblocks()) / 2**20
 
 
 def _resident_mb(pid: int) -> float:
