@@ -3,6 +3,9 @@
 import json
 from pathlib import Path
 
+import pytest
+
+from weldcal.models.errors import InputError
 from weldcal.tools.studies.motion.whole_body import run_whole_body
 from weldcal.tools.studies.motion.world import MotionOptions
 
@@ -22,3 +25,10 @@ def test_a_wrist_link_is_tracked_as_well_as_the_flange(tmp_path: Path) -> None:
         assert row["rms_mm"] < 0.3
         assert row["spread_mm"] < 0.1
     assert json.loads((tmp_path / "result.json").read_text())["mesh"] == found["mesh"]
+
+
+def test_a_link_that_the_arm_does_not_have_is_named_before_anything_is_rendered(tmp_path: Path) -> None:
+    told: list[str] = []
+    with pytest.raises(InputError, match="has no link 'elbow': use one of shoulder_link"):
+        run_whole_body(tmp_path, MotionOptions(frames=12), "elbow", lambda stage, share: told.append(stage))
+    assert told == []

@@ -11,6 +11,8 @@ from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.motion.drift.watch import Watched, watch
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arms.link_mesh import link_index
 from weldcal.tools.commands.monitor_body import see_link
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
@@ -25,7 +27,12 @@ _SIGMA = 1e-5  # rad and m: the calibration of the study is the truth, so that w
 def run_whole_body(
     out: Path | None, options: MotionOptions, link: str = LINK, progress: Progress | None = None
 ) -> tuple[dict[str, object], list[Target]]:
-    """Render a recording, track flange and link with the true calibration; rms and spread of the error (mm) of each."""
+    """Render a recording, track flange and link with the true calibration; rms and spread of the error (mm) of each.
+
+    Raises:
+        InputError: the arm has no such link; before anything is rendered.
+    """
+    link_index(load_arm(options.robot), link)
     tell: Progress = progress or (lambda stage, fraction: None)
     world = MotionWorld(options)
     result = CalibrationResult(
