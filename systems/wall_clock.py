@@ -134,8 +134,14 @@ class WallClock:
             self.lost_s += late if moving else 0.0
 
     def diagram_time(self, clock_s: float, now: float) -> float:
-        """The Diagram's time (s) at a time of the clock that it waits for; `now` before it has waited."""
-        return now if self._at is None else self._at + (clock_s - self._due) * self.pace * self.rate
+        """The Diagram's time (s) at a time of the clock that it waits for; `now` before it has waited.
+
+        `now`, too, for what lies more than LATE_S ahead: the Diagram has stood, and will go on from where it is.
+        """
+        if self._at is None:
+            return now
+        found = self._at + (clock_s - self._due) * self.pace * self.rate
+        return found if found - now <= LATE_S else now
 
     def overdue_s(self, diagram_time: float) -> float:
         """How late (s of robot time) a velocity of this time of the Diagram would leave it now; 0 before the clock has waited."""

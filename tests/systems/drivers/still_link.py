@@ -14,6 +14,7 @@ class StillLink:
     def __init__(self, q: np.ndarray) -> None:
         self.q, self.qd = np.array(q), np.zeros(6)
         self.age_s = 0.0
+        self.robot_time = 0.0
         self.fault = Fault.NONE
         self.commands: list[np.ndarray] = []
         self.processes: list[bool] = []
@@ -27,7 +28,7 @@ class StillLink:
         return LinkState(
             q=self.q,
             qd=self.qd,
-            robot_time=0.0,
+            robot_time=self.robot_time,
             sampled_at=0.0,
             age_s=self.age_s,
             fault=self.fault,

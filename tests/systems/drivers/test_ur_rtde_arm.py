@@ -60,6 +60,20 @@ def test_the_clock_of_the_samples_never_runs_backwards(link: StillLink) -> None:
     assert np.all(np.diff(times) >= 0.0)
 
 
+def test_the_clock_of_the_samples_goes_on_after_the_cell_has_stood_at_rest_and_its_robot_has_not(
+    link: StillLink,
+) -> None:
+    """The first call of a compiled function takes 16 s: the pose of no scan after it may be lost."""
+    driven = Driven(link, clock=WallClock.following(lambda: link.robot_time))
+    times = []
+    for k in range(1, 40):
+        link.robot_time += 16.0 if k == 20 else 0.002
+        driven.simulator.AdvanceTo(0.002 * k)
+        driven.clock.wait_for(0.002 * k, moving=False)
+        times.append(driven.get("sample_time")[0])
+    assert np.abs(np.array(times) - 0.002 * np.arange(1, 40)).max() < 0.005
+
+
 def test_the_shadow_is_where_the_arm_will_be_at_the_next_tick(link: StillLink) -> None:
     link.qd, link.age_s = np.array([0.1, 0, 0, 0, 0, -0.2]), 0.003
     driven = Driven(link)
