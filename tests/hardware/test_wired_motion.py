@@ -60,7 +60,7 @@ def test_pose_and_clock_are_those_of_the_truth_file(wired: tuple[Played, str, Pa
     assert run.held is False
     device = np.array([f.device for f, _ in calibrated.record.seen], dtype=float)
     world_s = (device - clock["at_0_s"]) / clock["rate"]
-    true = np.array([ticks.diagram_time(t, np.nan) for t in world_s + truth["robot_time_at_0_s"]])
+    true = np.array([ticks.diagram_time(t, np.inf) for t in world_s + truth["robot_time_at_0_s"]])
     found = np.array([e.clock.capture(np.nan, d) for d in device], dtype=float)
     assert 1e3 * np.abs(found - true).max() < 2.0
 
@@ -83,7 +83,7 @@ def test_the_monitor_finds_the_stand_that_the_world_knocks(
     truth, ticks = played.truth(), found.finished.run.clock
     assert found.finished.run.reason is None
     assert ticks is not None
-    knocked = ticks.diagram_time(truth["knocked_at_s"] + truth["robot_time_at_0_s"], np.nan)
+    knocked = ticks.diagram_time(truth["knocked_at_s"] + truth["robot_time_at_0_s"], np.inf)
     live = [event.found_s - knocked for event in found.found_live]
     assert len(live) == 1, live
     assert 0.0 < live[0] < 3.0, live
