@@ -18,9 +18,9 @@ from weldcal.tools.emulators.cell.process import Played, played_world
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, Emulator
 from weldcal.tools.outcomes.options import RunOptions
 
-SEED, FRAMES, WATCHED = 3, 60, 120
+SEED, FRAMES, WATCHED = 3, 60, 80
 KNOCK_MM = [0.9, 0.0, -1.2]
-PIXELS = "width: 480\n  height: 360\n"
+PIXELS = "width: 360\n  height: 270\n"
 
 
 @pytest.fixture(scope="module")
