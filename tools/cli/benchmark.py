@@ -213,6 +213,18 @@ def replays(
     return Outcome(summary, text=table)
 
 
+@command("benchmark recording")
+def recording(
+    call: Call,
+    pairs: Annotated[int, option("--pairs", "N", "Pairs of runs.", min=3)] = 5,
+) -> Outcome:
+    """Run a short demo with and without --record in turn, and compare the computing time."""
+    from weldcal.tools.studies.replay.overhead import run_overhead
+
+    summary, table = run_overhead(call.folder("benchmark", "recording"), pairs, call.seed, call.progress)
+    return Outcome(summary, text=table)
+
+
 @command("benchmark doctor", options=FARM)
 def doctor(
     call: Call,

@@ -6,12 +6,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from weldcal.systems.runner import no_progress
 from weldcal.tools.commands.record import RECORDING
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.studies.replay import study
+from weldcal.tools.studies.replay import overhead, study
 from weldcal.tools.studies.replay.study import KINDS, Kind, run_replays
 
 HELD = "job: {maximum_time_s: 1.0}\nscanner: {width: 412, height: 308}"
@@ -51,3 +53,30 @@ def test_simulation_controller_wires_and_faults_are_all_among_the_kinds() -> Non
     assert {kind.robot for kind in kinds} == {"simulated", "emulated", "wired"}
     assert {kind.fault for kind in kinds} == {"", "hole", "protective_stop", "finger", "scanner"}
     assert sum(kind.fault != "" or "hidden" in kind.overrides for kind in kinds) >= 5
+
+
+def test_the_overhead_is_that_of_the_pairs_and_its_interval_holds_it() -> None:
+    rng = np.random.default_rng(3)
+    plain = rng.uniform(20.0, 40.0, 6)
+    found = overhead.overhead(np.column_stack([plain, 1.03 * plain * np.exp(rng.normal(0.0, 0.01, 6))]))
+    assert found["low"] < 3.0 < found["high"]
+    assert found["percent"] == pytest.approx(3.0, abs=1.5)
+    assert found["high"] - found["low"] < 5.0
+
+
+def test_recorded_and_plain_runs_take_turns_and_the_first_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def seconds(_: Path, seed: int, *, record: bool) -> tuple[float, float, float]:
+        assert seed == 4
+        asked.append(record)
+        return (99.0 if len(asked) == 1 else 10.2 if record else 10.0), 20.0, 130.0
+
+    monkeypatch.setattr(overhead, "_seconds", seconds)
+    summary, table = overhead.run_overhead(tmp_path, 2, 4, no_progress)
+    assert asked == [True, True, False, False, True]
+    assert summary["overhead"] == pytest.approx({"percent": 2.0, "low": 2.0, "high": 2.0})
+    assert "| 1 | 10.0 | 10.2 |" in table
+    assert "2.0 % of computing time" in table

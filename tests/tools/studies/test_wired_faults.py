@@ -148,6 +148,8 @@ def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
     assert leak["low"] > FLAT_MB_H
     assert leak["mb_per_h"] == pytest.approx(100.0, abs=12.0)
     assert growth(hours[:4], noise[:4])["flat"] is None
+    # three minutes in which each cycle loads a megabyte more say nothing of the hours
+    assert growth(0.05 * hours, 400.0 + 20.0 * hours)["flat"] is None
 
 
 def test_memory_that_grows_until_the_longest_job_has_run_is_flat_from_then_on() -> None:

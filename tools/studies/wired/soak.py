@@ -25,7 +25,7 @@ FAULTY = 0.75
 # of the run; does not count for the memory: what is loaded and compiled once, and jobs longer than any before
 WARM_UP_SHARE = 1 / 3
 FLAT_MB_H = 10.0  # memory is flat where growth above this is not shown at 95 %
-FEWEST = 5  # cycles for a slope
+FEWEST, SHORTEST_H = 5, 0.25  # cycles and hours for a slope: within minutes what is loaded late looks like growth
 COLUMNS = (
     "cycle", "at_s", "job", "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s", "named_after_s", "wall_s", "moved",
     "arc_s", "problems", "velocities", "over_8_ms", "latest_ms", "stuck", "cell_mb", "in_use_mb", "world_mb", "scanner_mb", "finger_mb",
@@ -147,13 +147,15 @@ def _alive(pid: int) -> bool:
 def growth(hours: np.ndarray, megabytes: np.ndarray) -> dict[str, float | bool | None]:
     """The slope of a memory (MB/h) with its 95 % interval by least squares; `flat`: growth above FLAT_MB_H is not shown.
 
+    None where the cycles after the warm-up are fewer than FEWEST, or within SHORTEST_H.
+
     Args:
         hours: (n,) when each cycle began, h.
         megabytes: (n,) resident memory after it, MB; NaN where unknown.
     """
     kept = np.isfinite(megabytes) & (hours >= WARM_UP_SHARE * np.max(hours, initial=0.0))
     hours, megabytes = hours[kept], megabytes[kept]
-    if len(hours) < FEWEST:
+    if len(hours) < FEWEST or np.ptp(hours) < SHORTEST_H:
         return {"mb_per_h": None, "low": None, "high": None, "flat": None}
     line = stats.linregress(hours, megabytes)
     # the error of a slope through equal numbers is 0/0 there
@@ -202,7 +204,7 @@ def _table(found: Mapping[str, object]) -> str:
             for key, value in found.items() if not isinstance(value, dict | list)]  # fmt: skip
     for name, m in found["memory"].items():  # type: ignore[attr-defined]
         slope = (
-            "too few cycles"
+            "too short a run for a slope"
             if m["mb_per_h"] is None
             else f"{m['mb_per_h']:+.1f} MB/h ({m['low']:+.1f} to {m['high']:+.1f})"
         )
