@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.welding.numerics import Array, dot, norm
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 
 
@@ -127,11 +127,13 @@ def chord_map(
 
 def _ends(plan: SeamCurve, tip: float, torch: float, tip_left: float) -> tuple[float, float, float]:
     """(tip direction . u, torch direction . u, distance m) of a pair of arc lengths; on the inside of a bend the tip's path is shorter."""
-    a, b = plan.frame(tip), plan.frame(torch)
-    gap = a.position - b.position
+    x, y, z, tx, ty, tz, nx, ny, nz, _, _, _, curvature = plan.frame_numbers(tip)
+    at_x, at_y, at_z, to_x, to_y, to_z, *_ = plan.frame_numbers(torch)
+    x, y, z = x - at_x, y - at_y, z - at_z
     share = 1.0
     if tip_left != 0.0:
-        gap = gap + tip_left * a.normal
-        share = max(1.0 - a.curvature * tip_left, 0.1)
-    distance = max(norm(gap), 1e-12)
-    return share * dot(gap, a.tangent) / distance, dot(gap, b.tangent) / distance, distance
+        x, y, z = x + tip_left * nx, y + tip_left * ny, z + tip_left * nz
+        share = max(1.0 - curvature * tip_left, 0.1)
+    distance = max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    at_tip, at_torch = x * tx + y * ty + z * tz, x * to_x + y * to_y + z * to_z
+    return share * at_tip / distance, at_torch / distance, distance

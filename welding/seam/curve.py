@@ -10,11 +10,16 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 from scipy.interpolate import CubicSpline, make_smoothing_spline
 
+from weldcal.models.compiled import compiled
 from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
 
 _REPEAT_M = 1e-6  # neighbours closer than a micrometre are the same point
 _KNOT_M = 1e-3  # knots at most a millimetre apart: a 1 mm radius is still a curve
+
+
+# Position m, unit tangent, normal and up, three numbers each, then the curvature 1/m.
+FrameNumbers = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
 
 
 class SeamError(InputError):
@@ -161,80 +166,32 @@ class SeamCurve:
         return np.asarray(np.where(beyond == 0.0, bend, 0.0))
 
     @cached_property
-    def _rows(self) -> list[list[float]]:
-        """Per piece: the cubic's 12 coefficients, highest power first, then the up-normals at its two knots."""
-        n = len(self.coefficients)
-        rows: list[list[float]] = np.hstack([self.coefficients.reshape(n, 12), self.ups[:-1], self.ups[1:]]).tolist()
-        return rows
+    def _rows(self) -> Array:
+        """(n, 18), per piece: the cubic's 12 coefficients, highest power first, then the up-normals at its two knots."""
+        return np.hstack([self.coefficients.reshape(len(self.coefficients), 12), self.ups[:-1], self.ups[1:]])
 
     @cached_property
     def _scale(self) -> tuple[float, float]:
         """(distance between knots, arc length), m."""
         return float(self.knots[1]), float(self.knots[-1])
 
+    def frame_numbers(self, s: float) -> FrameNumbers:
+        """The seam's frame at one arc length s m as plain numbers: a third of the time of `frame`."""
+        return _frame_numbers(self._rows, *self._scale, float(s))
+
     def frame(self, s: float) -> SeamFrame:
-        """The seam's frame and curvature at one arc length s m, in plain floats: five times as fast as with arrays."""
-        step, last = self._scale
-        inside = 0.0 if s < 0.0 else last if s > last else s
-        rows = self._rows
-        i = min(int(inside / step), len(rows) - 1)
-        x = inside - i * step
-        ax, ay, az, bx, by, bz, cx, cy, cz, px, py, pz, ux, uy, uz, vx, vy, vz = rows[i]
-        tx, ty = (3.0 * x * ax + 2.0 * bx) * x + cx, (3.0 * x * ay + 2.0 * by) * x + cy
-        tz = (3.0 * x * az + 2.0 * bz) * x + cz
-        size = math.sqrt(tx * tx + ty * ty + tz * tz)
-        tx, ty, tz = tx / size, ty / size, tz / size
-        px, py, pz = (
-            ((ax * x + bx) * x + cx) * x + px,
-            ((ay * x + by) * x + cy) * x + py,
-            ((az * x + bz) * x + cz) * x + pz,
-        )
-        share = x / step
-        rest = 1.0 - share
-        ux, uy, uz = rest * ux + share * vx, rest * uy + share * vy, rest * uz + share * vz
-        along = ux * tx + uy * ty + uz * tz
-        ux, uy, uz = ux - along * tx, uy - along * ty, uz - along * tz
-        size = math.sqrt(ux * ux + uy * uy + uz * uz)
-        ux, uy, uz = ux / size, uy / size, uz / size
-        nx, ny, nz = uy * tz - uz * ty, uz * tx - ux * tz, ux * ty - uy * tx
-        bend, beyond = 0.0, s - inside
-        if beyond == 0.0:
-            bend = (6.0 * x * ax + 2.0 * bx) * nx + (6.0 * x * ay + 2.0 * by) * ny + (6.0 * x * az + 2.0 * bz) * nz
-        else:
-            px, py, pz = px + beyond * tx, py + beyond * ty, pz + beyond * tz
-        return SeamFrame(
-            np.array((px, py, pz)), np.array((tx, ty, tz)), np.array((nx, ny, nz)), np.array((ux, uy, uz)), bend
-        )
+        """The seam's frame and curvature at one arc length s m, by a compiled loop, not by arrays of one row."""
+        n = self.frame_numbers(s)
+        return SeamFrame(np.array(n[0:3]), np.array(n[3:6]), np.array(n[6:9]), np.array(n[9:12]), n[12])
 
     def least_radius(self, s: float, within: float) -> float:
         """The least radius of curvature m in five places at most `within` m from an arc length s m; at most 1000 km."""
-        return 1.0 / max(1e-6, *(abs(self.frame(s + k * within).curvature) for k in (-1.0, -0.5, 0.0, 0.5, 1.0)))
+        return _least_radius(self._rows, *self._scale, float(s), float(within))
 
     def nearest(self, p: Array, s_near: float, window: float = 0.01) -> float:
         """The arc length m of the point nearest to p (3,) m, by Newton's steps from s_near, never `window` m away."""
-        step, last = self._scale
-        rows, s = self._rows, s_near
         p0, p1, p2 = p.tolist()
-        for _ in range(3):
-            inside = 0.0 if s < 0.0 else last if s > last else s
-            i = min(int(inside / step), len(rows) - 1)
-            x = inside - i * step
-            ax, ay, az, bx, by, bz, cx, cy, cz, px, py, pz = rows[i][:12]
-            dx, dy = (3.0 * x * ax + 2.0 * bx) * x + cx, (3.0 * x * ay + 2.0 * by) * x + cy
-            dz = (3.0 * x * az + 2.0 * bz) * x + cz
-            gx, gy = p0 - ((ax * x + bx) * x + cx) * x - px, p1 - ((ay * x + by) * x + cy) * x - py
-            gz = p2 - ((az * x + bz) * x + cz) * x - pz
-            slope = dx * dx + dy * dy + dz * dz
-            along = gx * dx + gy * dy + gz * dz
-            if s == inside:
-                # A bend towards p tighter than the distance would reverse Newton's step: keep half of the slope.
-                bend = 6.0 * x * (gx * ax + gy * ay + gz * az) + 2.0 * (gx * bx + gy * by + gz * bz)
-                slope = max(slope - bend, 0.5 * slope)
-            step_s = along / slope - (s - inside)
-            s = min(max(s + step_s, s_near - window), s_near + window)
-            if abs(step_s) < 1e-8:
-                break
-        return s
+        return _nearest(self._rows, *self._scale, p0, p1, p2, float(s_near), float(window))
 
     def project(self, p: ArrayLike, s_near: ArrayLike | None = None, window: float | None = None) -> Array:
         """Arc lengths (...) m of the seam points nearest to p (...,3) m.
@@ -275,3 +232,73 @@ class SeamCurve:
     def __post_init__(self) -> None:
         for array in (self.knots, self.coefficients, self.ups):
             array.flags.writeable = False
+
+
+@compiled()
+def _frame_numbers(rows: Array, step: float, last: float, s: float) -> FrameNumbers:
+    inside = 0.0 if s < 0.0 else last if s > last else s
+    # Of an arc length that is not a number, so is the frame: its piece must exist all the same.
+    i = max(0, min(int(inside / step), len(rows) - 1))
+    x = inside - i * step
+    ax, ay, az, bx, by, bz = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4], rows[i, 5]
+    cx, cy, cz, px, py, pz = rows[i, 6], rows[i, 7], rows[i, 8], rows[i, 9], rows[i, 10], rows[i, 11]
+    tx, ty = (3.0 * x * ax + 2.0 * bx) * x + cx, (3.0 * x * ay + 2.0 * by) * x + cy
+    tz = (3.0 * x * az + 2.0 * bz) * x + cz
+    size = math.sqrt(tx * tx + ty * ty + tz * tz)
+    tx, ty, tz = tx / size, ty / size, tz / size
+    px, py, pz = (
+        ((ax * x + bx) * x + cx) * x + px,
+        ((ay * x + by) * x + cy) * x + py,
+        ((az * x + bz) * x + cz) * x + pz,
+    )
+    share = x / step
+    rest = 1.0 - share
+    ux, uy = rest * rows[i, 12] + share * rows[i, 15], rest * rows[i, 13] + share * rows[i, 16]
+    uz = rest * rows[i, 14] + share * rows[i, 17]
+    along = ux * tx + uy * ty + uz * tz
+    ux, uy, uz = ux - along * tx, uy - along * ty, uz - along * tz
+    size = math.sqrt(ux * ux + uy * uy + uz * uz)
+    ux, uy, uz = ux / size, uy / size, uz / size
+    nx, ny, nz = uy * tz - uz * ty, uz * tx - ux * tz, ux * ty - uy * tx
+    bend, beyond = 0.0, s - inside
+    if beyond == 0.0:
+        bend = (6.0 * x * ax + 2.0 * bx) * nx + (6.0 * x * ay + 2.0 * by) * ny + (6.0 * x * az + 2.0 * bz) * nz
+    else:
+        px, py, pz = px + beyond * tx, py + beyond * ty, pz + beyond * tz
+    return px, py, pz, tx, ty, tz, nx, ny, nz, ux, uy, uz, bend
+
+
+@compiled()
+def _least_radius(rows: Array, step: float, last: float, s: float, within: float) -> float:
+    most = 1e-6
+    for k in (-1.0, -0.5, 0.0, 0.5, 1.0):
+        most = max(most, abs(_frame_numbers(rows, step, last, s + k * within)[12]))
+    return 1.0 / most
+
+
+@compiled()
+def _nearest(
+    rows: Array, step: float, last: float, p0: float, p1: float, p2: float, s_near: float, window: float
+) -> float:
+    s = s_near
+    for _ in range(3):
+        inside = 0.0 if s < 0.0 else last if s > last else s
+        i = max(0, min(int(inside / step), len(rows) - 1))
+        x = inside - i * step
+        ax, ay, az, bx, by, bz = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4], rows[i, 5]
+        cx, cy, cz, px, py, pz = rows[i, 6], rows[i, 7], rows[i, 8], rows[i, 9], rows[i, 10], rows[i, 11]
+        dx, dy = (3.0 * x * ax + 2.0 * bx) * x + cx, (3.0 * x * ay + 2.0 * by) * x + cy
+        dz = (3.0 * x * az + 2.0 * bz) * x + cz
+        gx, gy = p0 - ((ax * x + bx) * x + cx) * x - px, p1 - ((ay * x + by) * x + cy) * x - py
+        gz = p2 - ((az * x + bz) * x + cz) * x - pz
+        slope = dx * dx + dy * dy + dz * dz
+        along = gx * dx + gy * dy + gz * dz
+        if s == inside:
+            # A bend towards p tighter than the distance would reverse Newton's step: keep half of the slope.
+            bend = 6.0 * x * (gx * ax + gy * ay + gz * az) + 2.0 * (gx * bx + gy * by + gz * bz)
+            slope = max(slope - bend, 0.5 * slope)
+        step_s = along / slope - (s - inside)
+        s = min(max(s + step_s, s_near - window), s_near + window)
+        if abs(step_s) < 1e-8:
+            break
+    return s

@@ -60,7 +60,7 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
         p_BW: torch point, (3,) m.
     """
     tool = config.tool
-    s = curve.nearest(p_BW - config.clearance_m * curve.frame(state.s_torch).up, state.s_torch)
+    s = curve.nearest(p_BW - config.clearance_m * np.array(curve.frame_numbers(state.s_torch)[9:12]), state.s_torch)
     plan = curve.frame(s)
     seam = state.refined
     residual, fit, arc = state.residual, None, state.torch_arc
@@ -117,7 +117,8 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     if config.clearance_m:
         # Where the surface twists along the seam, the direction of a line above or below it differs slightly.
         h = 2.0e-3
-        twist = dot(curve.frame(s + h).up - curve.frame(s - h).up, n) / (2.0 * h)
+        up_after, up_before = (np.array(curve.frame_numbers(at)[9:12]) for at in (s + h, s - h))
+        twist = dot(up_after - up_before, n) / (2.0 * h)
         t = unit(t + config.clearance_m * twist * n, t)
         n = cross(up, t)
     point = on_path + config.clearance_m * up + tool.side_offset_m * n
@@ -143,7 +144,7 @@ def _carried_on(
 
 def _nearest_point(arcs: Array, arc: float) -> float:
     """Distance to the nearest of ascending arcs, m."""
-    i = int(np.searchsorted(arcs, arc))
+    i = int(arcs.searchsorted(arc))
     return min(abs(arc - float(arcs[k])) for k in (max(0, i - 1), min(i, len(arcs) - 1)))
 
 

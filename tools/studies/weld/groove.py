@@ -112,20 +112,23 @@ class Tip:
         Along the groove the tip sticks within the friction of both walls and else slides until it is at that edge;
         across, the walls' slope turns the axial spring into a lateral force, which both walls share at the seat.
         """
-        line = self._groove.line
+        groove, line, wedge = self._groove, self._groove.line, self._wedge
+        r0, r1, r2 = rest.tolist()
         for _ in range(max(1, round(dt / STEP_S))):
-            f = line.frame(self.s)
-            gap = rest - f.position
-            gt, gn, gb = dot(gap, f.tangent), dot(gap, f.normal) - self.y, dot(gap, f.up) - self.z
-            low, slope = self._wedge.floor(self.y)
-            if not self._groove.present(self.s) or (self.z > low + 1e-9 and self.z + _SHARE * gb > low):
+            p0, p1, p2, t0, t1, t2, n0, n1, n2, u0, u1, u2, curvature = line.frame_numbers(self.s)
+            g0, g1, g2 = r0 - p0, r1 - p1, r2 - p2
+            gt = g0 * t0 + g1 * t1 + g2 * t2
+            gn = g0 * n0 + g1 * n1 + g2 * n2 - self.y
+            gb = g0 * u0 + g1 * u1 + g2 * u2 - self.z
+            low, slope = wedge.floor(self.y)
+            if not groove.present(self.s) or (self.z > low + 1e-9 and self.z + _SHARE * gb > low):
                 self.touching = False
                 self.s, self.y, self.z = self.s + _SHARE * gt, self.y + _SHARE * gn, self.z + _SHARE * gb
-                if self._groove.present(self.s):
-                    self.z = max(self.z, self._wedge.floor(self.y)[0])
+                if groove.present(self.s):
+                    self.z = max(self.z, wedge.floor(self.y)[0])
                 continue
             self.touching = True
-            self._slide(gt, gn, gb, low, slope, f.curvature)
+            self._slide(gt, gn, gb, low, slope, curvature)
         f = line.frame(self.s)
         side = self.y
         if self.touching:
