@@ -25,7 +25,8 @@ def dot(a: Array, b: Array) -> float:
     """The scalar product of two (3,) arrays, as a Python float."""
     a0, a1, a2 = a.tolist()
     b0, b1, b2 = b.tolist()
-    return float(a0 * b0 + a1 * b1 + a2 * b2)
+    product: float = a0 * b0 + a1 * b1 + a2 * b2
+    return product
 
 
 def norm(a: Array) -> float:
@@ -45,8 +46,8 @@ def clip(value: float, low: float, high: float) -> float:
 
 
 def finite(value: Any) -> bool:
-    """Whether every number of `value` is finite."""
-    return bool(np.isfinite(np.asarray(value, dtype=float)).all())
+    """Whether every number of a short array, or of what makes one, is finite."""
+    return all(map(math.isfinite, np.asarray(value, dtype=float).ravel().tolist()))
 
 
 def pose(R: Any, p: Any) -> RigidTransform:
@@ -105,9 +106,9 @@ def changed(value: Value, **changes: Any) -> Value:
         TypeError: a field that the value does not have.
     """
     fields = value.__dict__
-    if not changes.keys() <= fields.keys():
+    together = {**fields, **changes}
+    if len(together) != len(fields):
         raise TypeError(f"{type(value).__name__} has no field {', '.join(changes.keys() - fields.keys())}.")
     copy = object.__new__(type(value))
-    copy.__dict__.update(fields)
-    copy.__dict__.update(changes)
+    copy.__dict__.update(together)
     return copy

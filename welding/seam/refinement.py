@@ -202,7 +202,7 @@ def local_fit(
     if edge < 2.0 * sigma and not len(seam.corners):
         sigma = max(sigma, min((2.0 - max(edge, 0.0) / (2.0 * sigma)) * sigma, config.fit_sigma_max_m, 0.2 * radius))
     while True:
-        low, high = np.searchsorted(seam.arc, (arc - 3.0 * sigma, arc + 3.0 * sigma)).tolist()
+        low, high = seam.arc.searchsorted((arc - 3.0 * sigma, arc + 3.0 * sigma)).tolist()
         n = high - low
         if n >= 3:
             x = (seam.arc[low:high] - arc) / sigma
@@ -215,10 +215,12 @@ def local_fit(
                 return None
             break
         sigma = min(1.5 * sigma, widest)
-    basis = np.stack([np.ones(n), x, x * x])
+    basis = np.empty((3, n))
+    basis[0], basis[1], basis[2] = 1.0, x, x * x
     weighted = basis * w
     normal = weighted @ basis.T
-    rhs = weighted @ (seam.points[low:high] - seam.points[low])
+    points = seam.points[low:high] - seam.points[low]
+    rhs = weighted @ points
     ridge = config.slope_ridge
     normal[1, 1] += ridge
     normal[2, 2] += 1e-6
@@ -230,7 +232,7 @@ def local_fit(
         return None
     # The fitted point moves along the slope plus the effect of the moving weights as the window advances: where
     # the curvature jumps the two differ by 0.2 sigma/R, and a torch that headed along the slope would leave the point.
-    left_over = seam.points[low:high] - seam.points[low] - basis.T @ c
+    left_over = points - basis.T @ c
     slope = slope + np.linalg.solve(normal, (weighted * x) @ left_over)[0] / sigma
     speed = math.sqrt(float(slope @ slope))
     # A tip that sticks leaves points that hardly advance, and their direction is noise: the plan's stands in for it. In a

@@ -12,7 +12,7 @@ from weldcal.tools.studies.weld.groove import DROP_M, SEAT_M, Groove, Tip
 from weldcal.tools.studies.weld.seams import TrueSeam
 from weldcal.tools.studies.weld.stamps import Stamps
 from weldcal.tools.studies.weld.unknowns import draw_world
-from weldcal.welding.numerics import Array
+from weldcal.welding.numerics import Array, norm
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.feel_start import with_touch_place
 from weldcal.welding.servo.settings import ServoConfig
@@ -107,7 +107,7 @@ def simulate(
     wanted = root.raised(SEAT_M)
     torch_line = wanted.raised(settings.clearance_m) if settings.clearance_m else wanted
     reason: str | None = None
-    dt = settings.period_s
+    dt, p_TW = settings.period_s, settings.p_TW
     X_BT = touch_start_pose(plan, settings)
     R, p = np.array(X_BT.rotation().matrix()), np.array(X_BT.translation())
     tip, state, V = Tip(p, groove), WeldingState(), np.zeros(6)
@@ -134,14 +134,14 @@ def simulate(
         commands.append(command)
         d = command.diagnostics
         rows.append(
-            (t, PHASES.index(command.phase), float(command.torch_on), *(p + R @ settings.p_TW), *p, *centre,
-             *command.V_BT[3:], d.omega, d.n_d_dot_n_t, d.delta_n, d.delta_axial, d.e_t, d.s_torch, d.s_tip, d.tip_speed,
-             *R[:, 0], *R[:, 1])
+            (t, PHASES.index(command.phase), float(command.torch_on), *(p + R @ p_TW).tolist(), *p.tolist(), *centre.tolist(),
+             *command.V_BT[3:].tolist(), d.omega, d.n_d_dot_n_t, d.delta_n, d.delta_axial, d.e_t, d.s_torch, d.s_tip, d.tip_speed,
+             *R[:, 0].tolist(), *R[:, 1].tolist())
         )  # fmt: skip
         stopped = stopped + 1 if command.phase in (Phase.DONE, Phase.FAULT) else 0
         if stopped > 30:
             break
-        if k % 50 == 0 and state.phase == Phase.TRACK and _lost(torch_line, p + R @ settings.p_TW):
+        if k % 50 == 0 and state.phase == Phase.TRACK and _lost(torch_line, p + R @ p_TW, state.s_torch):
             reason = "The torch was lost: more than 60 mm off the seam."
             break
         V = V + blend * (command.V_BT - V)
@@ -149,8 +149,10 @@ def simulate(
     return StudyRun(np.array(rows), torch_line, plan.raised(SEAT_M), tuple(commands), state, reason or state.reason)
 
 
-def _lost(line: SeamCurve, p: Array) -> bool:
-    """Whether p (3,) m is more than 60 mm off a line, its straight extensions included."""
+def _lost(line: SeamCurve, p: Array, s_near: float) -> bool:
+    """Whether p (3,) m is more than 60 mm off a line, its straight extensions included; at s_near m it is probably not."""
+    if norm(p - line.frame(s_near).position) <= 0.060:
+        return False
     return float(np.linalg.norm(p - line.position(line.project(p)))) > 0.060
 
 
