@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -110,6 +110,24 @@ class Layout:
         return np.concatenate([known, s.arm]) if self.joints else np.array(known)
 
 
+class _Points(NamedTuple):
+    """Where the unknowns `x`, with the turn `R0` before them, place everything.
+
+    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches; `rotation` (m, 3, 3):
+    of the flange at each point; `R`: of the sensor; `turned` (m, 3): the points about the sensor's origin, by F's axes.
+    """
+
+    x: Floats
+    R0: Floats
+    at: Floats
+    felt: Floats
+    poses: FlangePoses
+    touches: FlangePoses | None
+    rotation: Floats
+    R: Floats
+    turned: Floats
+
+
 class Problem:
     """The whitened residuals of one model on one set of measurements."""
 
@@ -123,6 +141,8 @@ class Problem:
         self._R0, self._t0 = np.eye(3), np.zeros(3)
         self._whiten: list[tuple[Floats, Floats]] | None = None
         self._slant = np.ones(len(self.p))
+        self._placed: _Points | None = None
+        self._rotation, self._translation = data.poses.rotation[self.of], data.poses.translation[self.of]
         arm, q, touch_q = data.arm, data.q, data.touch_q
         self._loads = arm.loads(q) if arm is not None and q is not None else None
         self._touch_loads = arm.loads(touch_q) if arm is not None and touch_q is not None else None
@@ -164,15 +184,27 @@ class Problem:
 
     def off(self, x: Floats) -> tuple[Floats, Floats, FlangePoses]:
         """Vectors (m, 3) from the centre to all profile points, and to the tip at all touches (k, 3)."""
+        points = self._points(x)
+        return points.at, points.felt, points.poses
+
+    def _points(self, x: Floats) -> _Points:
+        """The points placed by x. The last answer is kept: a solver asks for residuals and derivatives at the same x."""
+        last = self._placed
+        if last is not None and last.R0 is self._R0 and np.array_equal(last.x, x):
+            return last
         pose, c, tip, affine, arm = self.layout.unpack(x)
         poses, touches = self._poses(arm)
+        rotation, translation = self._rotation, self._translation
+        if poses is not self.data.poses:
+            rotation, translation = poses.rotation[self.of], poses.translation[self.of]
         R = Rotation.from_rotvec(pose[:3]).as_matrix() @ self._R0
-        p_F = corrected(self.p, affine, self.origin) @ R.T + pose[3:]
-        at = np.einsum("nij,nj->ni", poses.rotation[self.of], p_F) + poses.translation[self.of] - c
+        turned = corrected(self.p, affine, self.origin) @ R.T
+        at = np.einsum("nij,nj->ni", rotation, turned + pose[3:]) + translation - c
         felt = np.empty((0, 3))
         if touches is not None and self.data.tip is not None:
             felt = touches.rotation @ (self.data.tip + tip) + touches.translation - c
-        return at, felt, poses
+        self._placed = _Points(np.array(x), self._R0, at, felt, poses, touches, rotation, R, turned)
+        return self._placed
 
     def residual(self, x: Floats) -> Floats:
         at, felt, _ = self.off(x)
@@ -196,13 +228,10 @@ class Problem:
 
     def derivatives(self, x: Floats) -> Floats:
         """Jacobian of `residual`."""
-        pose, c, _, affine, arm = self.layout.unpack(x)
-        poses, touches = self._poses(arm)
-        at, felt, _ = self.off(x)
-        R = Rotation.from_rotvec(pose[:3]).as_matrix() @ self._R0
-        turned = corrected(self.p, affine, self.origin) @ R.T
+        pose, c, _, _, arm = self.layout.unpack(x)
+        _, _, at, felt, _, touches, rotation, R, turned = self._points(x)
         n_B = at / np.linalg.norm(at, axis=1, keepdims=True)
-        n_F = np.einsum("nij,ni->nj", poses.rotation[self.of], n_B)
+        n_F = np.einsum("nij,ni->nj", rotation, n_B)
         m_B = felt / np.linalg.norm(felt, axis=1, keepdims=True)
         m = len(felt)
         scan = [np.cross(turned, n_F) @ left_jacobian(pose[:3]), n_F, -n_B]
