@@ -213,7 +213,7 @@ class DriftTest:
         T = np.einsum("ki,ki->k", a, Wa)
         for E, share in self._alone:  # a pure translation or rotation has fewer unknowns, and so a lower threshold
             z = Wa @ E
-            N = np.einsum("ia,kij,jb->kab", E, W, E)
+            N = E.T @ W @ E
             fewer = np.einsum("ka,ka->k", z, np.linalg.solve(N, z[:, :, None])[:, :, 0])
             T = np.maximum(T, fewer * share)
         least = np.where(f.kind == RAMP, c.creep_frames, c.least_frames)
