@@ -6,14 +6,14 @@ import json
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from tests.browser import Browser, colours
 from tests.short_job import ShortJob
+from weldcal.tools.cli.app import app
 
 # Each command of the README and the test that runs it, here or in another file (with a short job, where the job is long).
 RUN_BY = {
@@ -90,17 +90,19 @@ def own_scans(source: Path, folder: Path, header: str, rows: slice) -> None:
         shutil.copyfile(source / "clouds" / name, folder / "clouds" / name)
 
 
-def test_the_users_own_scans_calibrate_and_others_verify_them(shared_data: Path, readme: str, tmp_path: Path) -> None:
+def test_the_users_own_scans_calibrate_and_others_verify_them(
+    shared_data: Path, readme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     aubo, (header,) = shared_data / "flange/aubo_i5_phoxi_s", blocks(readme, "yaml")
     columns = re.search(r"header `(id,[a-z,]+)`", readme)
     assert columns is not None
     assert columns[1] == (aubo / "poses.csv").read_text().splitlines()[0]
     own_scans(aubo, tmp_path / "my_scans", header, slice(0, None, 2))
     own_scans(aubo, tmp_path / "other_scans", header, slice(1, None, 2))
+    monkeypatch.chdir(tmp_path)
     for line in next(text for text in blocks(readme, "sh") if "calibrate" in text).splitlines():
-        command = [sys.executable, "-P", "-m", "weldcal.tools", *shlex.split(line)[1:], "--json"]
-        finished = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=1200)
-        assert finished.returncode == 0, finished.stderr
+        finished = CliRunner().invoke(app, [*shlex.split(line)[1:], "--json"])
+        assert finished.exit_code == 0, finished.stderr
         summary = json.loads(finished.stdout.splitlines()[-1])
         assert summary["state"] == "done"
         if "calibrate" in line:
