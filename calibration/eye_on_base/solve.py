@@ -157,14 +157,12 @@ def _arrays(observations: tuple[Observation, ...], use_normals: bool) -> _Data:
 
 
 def _residuals(data: _Data, X_BC: RigidTransform) -> tuple[Array, Array]:
-    R = X_BC.rotation().matrix()
-    position = np.linalg.norm(data.c @ R.T + X_BC.translation() - data.b, axis=1)
-    seen = data.m @ R.T
+    seen = data.m @ X_BC.rotation().matrix().T
     z = data.z
     cross = [seen[:, i] * z[:, j] - seen[:, j] * z[:, i] for i, j in ((1, 2), (2, 0), (0, 1))]
     sine = np.sqrt(cross[0] ** 2 + cross[1] ** 2 + cross[2] ** 2)  # np.cross and norm take four times as long
     tilt = np.arctan2(sine, (seen * z).sum(axis=1))
-    return position, np.where(data.has, tilt, np.nan)
+    return _distances(data, X_BC), np.where(data.has, tilt, np.nan)
 
 
 def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
@@ -190,13 +188,15 @@ def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
     candidates = [(float(costs[k]), RigidTransform(RotationMatrix.ProjectToRotationMatrix(R[k]), t[k])) for k in order]
     best = candidates[0]
     for cost, X in candidates:
+        e = _distances(data, X)
         for _ in range(6):
-            nearest = np.argsort(_residuals(data, X)[0], kind="stable")[:h]
+            nearest = np.argsort(e, kind="stable")[:h]
             try:
                 better = fit_rigid(data.b[nearest], data.c[nearest])
             except ValueError:
                 break
-            new = _trimmed(data, better, h)
+            e = _distances(data, better)
+            new = float(np.sum(np.partition(e**2, h - 1)[:h]))
             if new >= cost * (1.0 - 1e-9):
                 break
             cost, X = new, better
@@ -205,9 +205,9 @@ def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
     return best[1]
 
 
-def _trimmed(data: _Data, X: RigidTransform, h: int) -> float:
-    e = np.linalg.norm(data.c @ X.rotation().matrix().T + X.translation() - data.b, axis=1)
-    return float(np.sum(np.partition(e**2, h - 1)[:h]))
+def _distances(data: _Data, X: RigidTransform) -> Array:
+    """Of each centre seen from its stated place, (n,) m."""
+    return np.asarray(np.linalg.norm(data.c @ X.rotation().matrix().T + X.translation() - data.b, axis=1))
 
 
 def _closed_form(data: _Data) -> RigidTransform:

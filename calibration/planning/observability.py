@@ -35,7 +35,7 @@ def check_diversity(
         )
     distinct: list[Array] = []
     for p in p_B:
-        if all(float(np.linalg.norm(p - q)) > SAME_PLACE_M for q in distinct):
+        if len(distinct) < min_poses and all(float(np.linalg.norm(p - q)) > SAME_PLACE_M for q in distinct):
             distinct.append(p)
     if len(distinct) < min_poses:
         raise RepeatedPoses(
