@@ -6,6 +6,7 @@ import gc
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,11 +38,17 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         require_data(*mark.args)
 
 
-def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """The browser leaves the last page of a file."""
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    """The browser leaves the last page of a file. A run of a cell has unfrozen all objects; when its file has ended, they are frozen again."""
+    last = nextitem is None or nextitem.path != item.path
     running = item.session.stash.get(RUNNING, None)
-    if running is not None and (nextitem is None or nextitem.path != item.path):
+    if running is not None and last:
         running.rest()
+    yield
+    if last and gc.get_freeze_count() == 0:
+        gc.collect()
+        gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)
