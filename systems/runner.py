@@ -19,7 +19,7 @@ from weldcal.systems.host_timing import HostTiming, measure_host, require_timely
 from weldcal.systems.messages import JobCommand, Scan
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
 from weldcal.systems.person import KEYS
-from weldcal.systems.wall_clock import WallClock
+from weldcal.systems.wall_clock import PictureWait, WallClock
 
 Progress = Callable[[str, float], None]
 LOOKS = {
@@ -149,7 +149,7 @@ def run_cell(
     if meshcat is not None:
         meshcat.StartRecording(frames_per_second=cell.scenario.visualization.recording_fps)
     finished_at, has_panel, person = np.inf, cell.diagram.HasSubsystemNamed("operator_panel"), cell.person
-    next_at = dict.fromkeys(LOOKS, 0.0)
+    next_at, pictures = dict.fromkeys(LOOKS, 0.0), PictureWait()
     precedence: Callable[[bool], None] = _no_precedence
 
     def due(what: str, now: float) -> bool:
@@ -170,6 +170,8 @@ def run_cell(
             # at rest nothing is urgent, and a scan that is drawn here would keep the processor from the robot's peer
             precedence(moving)
             run.clock.waiting_s = 0.0 if station.robot.waits else station.waiting_s(time.monotonic())
+            if run.clock.follows:
+                pictures.wait(_picture_age(cell, root))
             run.clock.wait_for(root.get_time(), moving)
         if not due("job", root.get_time()):
             return EventStatus.DidNothing()
@@ -249,6 +251,17 @@ def _commanded(cell: Cell[JobOf], root: Context) -> bool:
     station = cell.station.diagram
     command = station.GetInputPort(f"{FIRST}.velocity_command").Eval(station.GetMyContextFromRoot(root))
     return bool(np.max(np.abs(command)) > COMMANDED_RAD_S)
+
+
+def _picture_age(cell: Cell[JobOf], root: Context) -> float:
+    """How old the finger camera's newest picture is, s; 0 where none is asked for."""
+    station = cell.station.diagram
+    if not station.HasOutputPort("finger_camera.capture_time"):
+        return 0.0
+    context = station.GetMyContextFromRoot(root)
+    if station.GetInputPort("finger_camera.streaming").Eval(context)[0] < 0.5:
+        return 0.0
+    return float(root.get_time() - station.GetOutputPort("finger_camera.capture_time").Eval(context)[0])
 
 
 def _at_rest(cell: Cell[JobOf], root: Context) -> bool:

@@ -14,6 +14,8 @@ FALL_PER_S, RISE_PER_S = 25.0, 2.0  # moves are at most 1 rad/s: a fall adds 25 
 SLOWEST = 0.1
 # The servo needs pictures and detections: where this computer makes them late the path is slowed too.
 PICTURE_LATE_S, PICTURE_SPAN_S = 0.025, 0.100
+# A robot that waits for its cell gives it time for a picture, too: each tick at most so long for one this old, and no longer in all.
+PICTURE_DUE_S, PICTURE_STEP_S, PICTURE_PATIENCE_S = 0.150, 0.050, 2.0
 # A robot that waits for this computer's next velocity does not move its time: go on after this time of the wall clock.
 ROBOT_STANDS_S, ROBOT_LOOK_S = 0.100, 0.0005
 STOPPED = 0.02  # the rate at which a held path stands: at 1 rad/s the arm stops within a step of the slew limit
@@ -193,3 +195,23 @@ class WallClock:
             "The arm slowed down during that time, and the times of the run are too short by the same amount. "
             "Close other programs."
         )
+
+
+class PictureWait:
+    """Gives a loaded computer time to take a late picture where the robot waits for its cell; a camera that has stopped gets little of it.
+
+    Picture and Diagram are late by the same computer, and only the Diagram is waited for by the robot: without this the servo misses
+    pictures that are on their way.
+    """
+
+    def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
+        self._sleep = sleep
+        self._waited_s = 0.0
+
+    def wait(self, age_s: float) -> None:
+        """Wait a little, once in a tick, where the newest picture was taken more than PICTURE_DUE_S ago (s of the Diagram)."""
+        if age_s <= PICTURE_DUE_S:
+            self._waited_s = 0.0
+        elif self._waited_s < PICTURE_PATIENCE_S:
+            self._sleep(PICTURE_STEP_S)
+            self._waited_s += PICTURE_STEP_S

@@ -7,7 +7,19 @@ from itertools import pairwise
 
 import pytest
 
-from weldcal.systems.wall_clock import FALL_PER_S, LATE_S, RISE_PER_S, SLOWEST, Lateness, WallClock
+from weldcal.systems.wall_clock import (
+    FALL_PER_S,
+    LATE_S,
+    PICTURE_DUE_S,
+    PICTURE_PATIENCE_S,
+    PICTURE_STEP_S,
+    RISE_PER_S,
+    SLOWEST,
+    Lateness,
+    PictureWait,
+    WallClock,
+)
+from weldcal.welding.servo.settings import FaultLimits
 
 
 class FakeTime:
@@ -166,3 +178,21 @@ def test_thinking_while_the_arm_stands_still_is_no_lateness() -> None:
     before = wall.now
     clock.wait_for(0.2, moving=True)
     assert wall.now - before == pytest.approx(0.1)
+
+
+def test_a_late_picture_is_given_time_until_it_comes_and_a_camera_that_has_stopped_little() -> None:
+    slept: list[float] = []
+    pictures = PictureWait(slept.append)
+    for age_s in (0.0, 0.05, PICTURE_DUE_S):
+        pictures.wait(age_s)
+    assert slept == [], "pictures in time cost nothing"
+    for k in range(10):
+        pictures.wait(PICTURE_DUE_S + 0.002 * (k + 1))
+    pictures.wait(0.04)  # it has come
+    assert slept == [PICTURE_STEP_S] * 10
+    slept.clear()
+    for k in range(1000):
+        pictures.wait(PICTURE_DUE_S + 0.002 * (k + 1))
+    assert sum(slept) == pytest.approx(PICTURE_PATIENCE_S)
+    # the whole patience passes before the servo misses the picture
+    assert PICTURE_DUE_S + 0.002 * len(slept) < 0.8 * FaultLimits().hidden_s
