@@ -89,9 +89,6 @@ def _begin(state: WeldingState, sample: ServoSample, plan: SeamCurve, config: Se
         check_feasible(line, tool.torch_offset_m, config.weld_speed_m_s, config.windows)
     except (InfeasibleSeam, SeamError) as problem:
         return fault(state, str(problem))
-    # The first use of a compiled loop loads it, or compiles it: now the arm stands, later it presses.
-    line.nearest(line.frame(0.0).position, 0.0)
-    line.least_radius(0.0, config.refinement.corner.reach_m)
     return changed(
         state, plan_fit=PlanFit.start(tip_line), started=sample.time, s_tip=config.touch.arc_m, s_end=tip_line.length
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.welding.seam import curve
 from weldcal.welding.seam.curve import NonFiniteSeamPoints, RepeatedSeamPoints, SeamCurve, SeamError, TooFewSeamPoints
 
 R = 0.060
@@ -122,3 +123,20 @@ def test_points_that_make_no_seam_are_named(points: np.ndarray, error: type[Exce
 def test_a_seam_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="read-only"):
         arc().knots[0] = 1.0
+
+
+def test_no_tick_compiles_a_loop_of_the_seam() -> None:
+    loops = (curve._frame_numbers, curve._least_radius, curve._nearest)
+    loaded = [list(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
+    seam = arc().raised(1e-3).transformed(RigidTransform([0.1, 0.0, 0.0]))
+    seam.frame(0)
+    seam.frame(np.float64(0.01))
+    seam.nearest(np.zeros(3), 0)
+    seam.least_radius(0.02, 5e-3)
+    assert [list(loop.signatures) for loop in loops] == loaded  # type: ignore[attr-defined]
+    assert all(loaded)
+
+
+def test_the_frame_of_no_number_is_none_and_no_place_outside_the_seam_is_read() -> None:
+    assert math.isnan(arc().frame(math.nan).position[0])
+    assert math.isnan(arc().nearest(np.array([math.nan, 0.0, 0.0]), 0.01))
