@@ -354,6 +354,7 @@ COMMANDS = (
     doctor,
     fleet,
     replays,
+    recording,
     arms,
     fuzz_files,
     robot_faults,
