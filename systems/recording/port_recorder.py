@@ -83,10 +83,9 @@ class PortRecorder(LeafSystem):
             self._sink.changed(STAGES * tick_of(context.get_time()) + UPDATED, found, messages, {})
 
     def _before(self, context: Context) -> EventStatus:
-        tick, last = tick_of(context.get_time()), self._last
-        for name, port in self._vectors:
-            last[name] = port.Eval(context)
-        found = {name: last[name] for name, _ in self._vectors}
+        tick = tick_of(context.get_time())
+        found = {name: port.Eval(context) for name, port in self._vectors}
+        self._last |= found
         if tick % UPDATE_TICKS:
             entered, left = self._new_messages(context, "in.", self._quick), {}
         else:
@@ -98,15 +97,17 @@ class PortRecorder(LeafSystem):
     def _new_messages(self, context: Context, side: str, ports: Any) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for name, port in ports:
-            value = port.Eval(context)
-            last = self._last.get(side + name)
+            value, key = port.Eval(context), side + name
+            last = self._last.get(key)
+            if value is last:
+                continue
             if isinstance(value, RigidTransform):
                 value = value.GetAsMatrix34()
                 if last is not None and np.array_equal(value, last):
                     continue
-            elif value is last or _both_empty(value, last):
+            elif _both_empty(value, last):
                 continue
-            self._last[side + name] = found[name] = value
+            self._last[key] = found[name] = value
         return found
 
 

@@ -31,6 +31,8 @@ JOINTS: Final = "arm.position_measured"
 TRANSFORM_PERIOD_S = 0.05
 LISTED = 500  # numbers of an array of a result; of a larger one the digest is kept
 MAY_WAIT = 200_000  # messages that wait for the disk; more are a disk that cannot keep up
+BUFFER = 1 << 20  # bytes: each write gives the interpreter away and waits for it again
+REST_S = 0.05  # between two turns of the writing thread: each turn takes the interpreter from the Diagram
 _ANY = json.dumps({"type": "object"}).encode()
 _TRANSFORM = json.dumps(
     {
@@ -82,7 +84,7 @@ class RecordingWriter:
         self._joints = next((a for name, a, _ in self._slices[ENTERED] if name == JOINTS), None)
         self._waiting: list[_Row] = []
         self._next_key = 0
-        self._file = path.open("wb")
+        self._file = path.open("wb", BUFFER)
         self._start_ns = self._at_ns = time.time_ns()
         self._writer = Writer(self._file, use_chunking=False, compression=CompressionType.NONE)
         self._writer.start(profile="weldcal", library="weldcal")
@@ -156,6 +158,7 @@ class RecordingWriter:
                     self._write(*item)
                 if self._queue.empty():
                     self._file.flush()
+                    time.sleep(REST_S)
         except Exception as error:  # what is said at the end, from the caller's thread
             self._failed = error
 
@@ -164,7 +167,7 @@ class RecordingWriter:
         at = self._at_ns = self._start_ns + round(now * 1e9)
         if rows:
             # the newest values by name, for plots, and every bit of all of them
-            newest = {side: row.tolist() for _, side, row in rows}
+            newest = {side: row.tolist() for side, row in {side: row for _, side, row in rows}.items()}
             named = {
                 side: {name: [_number(x) for x in row[a:b]] for name, a, b in self._slices[side]}
                 for side, row in newest.items()
