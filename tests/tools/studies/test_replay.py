@@ -69,10 +69,10 @@ def test_recorded_and_plain_runs_take_turns_and_the_first_does_not_count(
 ) -> None:
     asked: list[bool] = []
 
-    def seconds(_: Path, seed: int, *, record: bool) -> tuple[float, float, float]:
+    def seconds(_: Path, seed: int, *, record: bool) -> tuple[float, float, float, float]:
         assert seed == 4
         asked.append(record)
-        return (99.0 if len(asked) == 1 else 10.2 if record else 10.0), 20.0, 130.0
+        return (99.0 if len(asked) == 1 else 10.2 if record else 10.0), 20.0, 130.0, 5.0
 
     monkeypatch.setattr(overhead, "_seconds", seconds)
     summary, table = overhead.run_overhead(tmp_path, 2, 4, no_progress)
@@ -80,3 +80,4 @@ def test_recorded_and_plain_runs_take_turns_and_the_first_does_not_count(
     assert summary["overhead"] == pytest.approx({"percent": 2.0, "low": 2.0, "high": 2.0})
     assert "| 1 | 10.0 | 10.2 |" in table
     assert "2.0 % of computing time" in table
+    assert summary["percent_of_a_core"] == pytest.approx(4.0)
