@@ -18,8 +18,9 @@ from weldcal.tools.studies.replay.study import FEW, SHORT
 def run_overhead(folder: Path, pairs: int, seed: int, progress: Progress) -> tuple[dict[str, object], str]:
     """Pairs of one run (the S groove, 30 mm of seam), one of each pair recorded: the JSON object, and a table in Markdown.
 
-    Computing time (all threads of this process, s) of whole runs, reports included, is compared: it hardly depends on what else the
-    computer does. Who is first alternates. A first run, which compiles and loads, does not count. Each recording is removed.
+    Computing time (all threads of this process, s) of whole runs, reports included, is compared. Run it on an idle computer: on a busy one
+    the same work takes up to half as long again. Who is first alternates. A first run, which compiles and loads, does not count.
+    Each recording is removed. `percent_of_a_core`: what recording takes, spread over the run's own seconds.
     """
     progress("first run, not counted", 0.0)
     _seconds(folder / "first", seed, record=True)
@@ -44,7 +45,7 @@ def run_overhead(folder: Path, pairs: int, seed: int, progress: Progress) -> tup
     text = markdown_table(header, lines)
     share = 100.0 * float(np.mean([(row["recorded_cpu_s"] - row["plain_cpu_s"]) / row["run_s"] for row in rows]))
     text += "recording costs {percent:.1f} % of computing time ({low:.1f} to {high:.1f} at 95 %)".format(**found)
-    text += f"; on a robot, in real time, {share:.1f} % of one core\n"
+    text += f"; at the pace of a robot that is {share:.1f} % of one core\n"
     return {"state": "done", "overhead": found, "percent_of_a_core": share, "per_pair": rows}, text
 
 
