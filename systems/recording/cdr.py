@@ -80,7 +80,7 @@ class _Out:
 
     def data(self, array: np.ndarray) -> None:
         self.number("I", array.nbytes)
-        self.parts += np.ascontiguousarray(array).tobytes()
+        self.parts += np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
 
 
 class _In:
@@ -116,7 +116,7 @@ class _In:
         return found
 
 
-def write_cloud(points: np.ndarray, time_ns: int, frame: str) -> bytes:
+def write_cloud(points: np.ndarray, time_ns: int, frame: str) -> bytearray:
     """An organised cloud (H, W, 3) of float32 or float64, NaN where there is no point, as sensor_msgs/msg/PointCloud2."""
     out, kind = _Out(), _FLOATS[points.dtype]
     step = 3 * points.dtype.itemsize
@@ -134,7 +134,7 @@ def write_cloud(points: np.ndarray, time_ns: int, frame: str) -> bytes:
     out.number("I", step * points.shape[1])
     out.data(points)
     out.number("?", False)
-    return bytes(out.parts)
+    return out.parts
 
 
 def read_cloud(data: bytes) -> np.ndarray:
@@ -155,7 +155,7 @@ def read_cloud(data: bytes) -> np.ndarray:
     return _shaped(given.data(), dtype, (height, width, 3))
 
 
-def write_image(pixels: np.ndarray, time_ns: int, frame: str) -> bytes:
+def write_image(pixels: np.ndarray, time_ns: int, frame: str) -> bytearray:
     """A grey image (H, W) uint8 as sensor_msgs/msg/Image, mono8."""
     out = _Out()
     out.header(time_ns, frame)
@@ -165,7 +165,7 @@ def write_image(pixels: np.ndarray, time_ns: int, frame: str) -> bytes:
     out.number("B", 0)
     out.number("I", pixels.shape[1])
     out.data(pixels)
-    return bytes(out.parts)
+    return out.parts
 
 
 def read_image(data: bytes) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.systems.recording.port_recorder import LEFT, PERIOD_S, STAGES
+from weldcal.systems.recording.port_recorder import BEFORE, LEFT, PERIOD_S, STAGES
 from weldcal.systems.recording.reader import Recording
 from weldcal.systems.recording.values import encode, first_difference
 from weldcal.systems.recording.writer import LISTED
@@ -44,14 +44,13 @@ class Comparison:
         """The earliest difference."""
         return min(self.differences.values(), key=lambda d: (d.time_s, d.message), default=None)
 
-    def changed(
-        self, key: int, vectors: Mapping[str, np.ndarray], entered: Mapping[str, Any], left: Mapping[str, Any]
-    ) -> None:
+    def changed(self, key: int, row: np.ndarray | None, entered: Mapping[str, Any], left: Mapping[str, Any]) -> None:
         """See PortSink."""
         if key // STAGES > self._recording.end_tick:
             return
-        if LEFT in vectors:
-            self._row(key, vectors[LEFT])
+        n = sum(self._sizes.values())
+        if n and row is not None and key % STAGES == BEFORE:
+            self._row(key, row[len(row) - n :])
         for name, value in left.items():
             self._message(key, name, value)
 

@@ -19,10 +19,11 @@ from weldcal.models.files import opened
 from weldcal.systems import messages
 from weldcal.systems.recording.cdr import read_cloud, read_image
 from weldcal.systems.recording.player import Track
-from weldcal.systems.recording.port_recorder import ENTERED, STAGES
+from weldcal.systems.recording.port_recorder import BOTH, ENTERED, LEFT, STAGES
 from weldcal.systems.recording.values import array, decode
 from weldcal.systems.recording.writer import FORMAT
 
+READS = ("1", str(FORMAT))
 LARGEST_RECORDING = 64 * 1024**3
 _PLAYED = {
     kind.__name__: kind
@@ -60,6 +61,11 @@ class Recording:
     n_messages: int = 0
 
     @property
+    def n_entered(self) -> int:
+        """The size of a row of all vector ports that entered."""
+        return sum(json.loads(self.about["sizes"])[ENTERED].values())
+
+    @property
     def end_tick(self) -> int:
         """The newest tick that is complete in the file."""
         return self.last_key // STAGES if self.end is not None else max(0, self.last_key // STAGES - 1)
@@ -93,9 +99,9 @@ def read_recording(path: Path) -> Recording:
                 raise
     if not found.about:
         raise InputError(f"'{path}' is no recording of weldcal: give a recording.mcap that --record has written.")
-    if found.about.get("format") != str(FORMAT):
+    if found.about.get("format") not in READS:
         raise InputError(
-            f"'{path}' has the format {found.about.get('format')}, and this weldcal reads {FORMAT}: use the version that wrote it "
+            f"'{path}' has the format {found.about.get('format')}, and this weldcal reads {' and '.join(READS)}: use the version that wrote it "
             f"({found.about.get('version', 'unknown')})."
         )
     sizes = json.loads(found.about["sizes"])
@@ -140,8 +146,7 @@ def _take(
     key = int(text["key"])
     found.last_key = max(found.last_key, key)
     if topic == "/vectors":
-        for k, side, data in text["rows"]:
-            found.rows.setdefault(side, []).append((found.n_messages, k, np.frombuffer(b64decode(data))))
+        _add_rows(found, text["rows"])
         return None
     side, _, port = topic.strip("/").partition("/")
     if side == "out":
@@ -149,6 +154,24 @@ def _take(
     else:
         _add(rising, port, key, _played(text["type"], text["value"], body))
     return None
+
+
+def _add_rows(found: Recording, given: list[Any]) -> None:
+    """Add the rows of a message, in the order of their keys. In a recording of format 1 each has an entry of its own."""
+    rows: dict[str, list[tuple[int, np.ndarray]]] = {}
+    for keys, side, data in given:
+        values = np.frombuffer(b64decode(data))
+        if isinstance(keys, int):
+            rows.setdefault(side, []).append((keys, values))
+            continue
+        table = values.reshape(len(keys), -1)
+        n = found.n_entered if side == BOTH else table.shape[1]
+        for name, part in ((ENTERED, table[:, :n]), (LEFT, table[:, n:])):
+            if part.size:
+                rows.setdefault(name, []).extend(zip(keys, part, strict=True))
+    for side, of_side in rows.items():
+        of_side.sort(key=lambda row: row[0])
+        found.rows.setdefault(side, []).extend((found.n_messages, key, row) for key, row in of_side)
 
 
 def _add(rising: dict[str, tuple[list[int], list[Any]]], port: str, key: int, value: Any) -> None:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from pydrake.systems.framework import LeafSystem, OutputPort, PortDataType
+from pydrake.systems.framework import OutputPort, PortDataType
 from pydrake.systems.primitives import Multiplexer
 
 from weldcal.systems.recording.answers import Note
-from weldcal.systems.recording.port_recorder import ENTERED, LEFT, PortRecorder, PortSink
+from weldcal.systems.recording.port_recorder import PortRecorder, PortSink
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
 
@@ -54,9 +54,13 @@ def add_recorder(wiring: Wiring, results: Mapping[str, OutputPort], open_sink: O
     quick = tuple(name for name in messages[0] if name.endswith(QUICK))
     models = [{name: port.Allocate() for name, port in side.items()} for side in messages]
     recorder = wiring.add("port_recorder", PortRecorder(totals, models[0], models[1], sink, quick))
-    for name, ports in zip((ENTERED, LEFT), rows, strict=True):
-        if ports:
-            _connect_in_a_row(wiring, f"recorded_{name}", ports, recorder, name)
+    row = list(rows[0].values())
+    if row:
+        row = [_in_a_row(wiring, "recorded_entered", row)]
+        wiring.builder.Connect(row[0], recorder.GetInputPort("entered"))
+    if row or rows[1]:
+        both = _in_a_row(wiring, "recorded_both", [*row, *rows[1].values()])
+        wiring.builder.Connect(both, recorder.GetInputPort("both"))
     for side, ports in zip(("in", "out"), messages, strict=True):
         for name, port in ports.items():
             wiring.builder.Connect(port, recorder.GetInputPort(f"{side}.{name}"))
@@ -71,10 +75,8 @@ def _messages(ports: Mapping[str, OutputPort]) -> dict[str, OutputPort]:
     return {name: p for name, p in ports.items() if p.get_data_type() != PortDataType.kVectorValued}
 
 
-def _connect_in_a_row(
-    wiring: Wiring, name: str, ports: Mapping[str, OutputPort], reader: LeafSystem, input_name: str
-) -> None:
-    row = wiring.add(name, Multiplexer([port.size() for port in ports.values()]))
-    for k, port in enumerate(ports.values()):
+def _in_a_row(wiring: Wiring, name: str, ports: Sequence[OutputPort]) -> OutputPort:
+    row = wiring.add(name, Multiplexer([port.size() for port in ports]))
+    for k, port in enumerate(ports):
         wiring.builder.Connect(port, row.get_input_port(k))
-    wiring.builder.Connect(row.get_output_port(), reader.GetInputPort(input_name))
+    return row.get_output_port()

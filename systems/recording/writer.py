@@ -6,12 +6,12 @@ import json
 import queue
 import threading
 import time
-from base64 import b64encode
+from binascii import b2a_base64
 from collections.abc import Mapping
 from itertools import accumulate
 from math import isfinite
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -21,14 +21,15 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.messages import CalibrationStatus, Image, Scan
 from weldcal.systems.recording.cdr import IMAGE, POINT_CLOUD, SCHEMAS, write_cloud, write_image
-from weldcal.systems.recording.port_recorder import ENTERED, PERIOD_S, STAGES, UPDATE_TICKS
+from weldcal.systems.recording.port_recorder import BEFORE, BOTH, ENTERED, LEFT, PERIOD_S, STAGES, UPDATED
 from weldcal.systems.recording.values import encode
 
-_Row = tuple[int, str, np.ndarray]  # key, side, values
+_Row = tuple[int, np.ndarray]  # key, values
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 JOINTS: Final = "arm.position_measured"
 TRANSFORM_PERIOD_S = 0.05
+ROWS_TICKS = 10  # 20 ms between messages of rows; each has the values of all its ticks, and by name those of the newest
 LISTED = 500  # numbers of an array of a result; of a larger one the digest is kept
 MAY_WAIT = 200_000  # messages that wait for the disk; more are a disk that cannot keep up
 BUFFER = 1 << 20  # bytes: each write gives the interpreter away and waits for it again
@@ -81,6 +82,7 @@ class RecordingWriter:
     ) -> None:
         self._path, self._arm = path, arm
         self._slices = {side: _slices(of_side) for side, of_side in sizes.items()}
+        self._n_entered = sum(sizes[ENTERED].values())
         self._joints = next((a for name, a, _ in self._slices[ENTERED] if name == JOINTS), None)
         self._waiting: list[_Row] = []
         self._next_key = 0
@@ -100,13 +102,12 @@ class RecordingWriter:
         self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
         self._thread.start()
 
-    def changed(
-        self, key: int, vectors: Mapping[str, np.ndarray], entered: Mapping[str, Any], left: Mapping[str, Any]
-    ) -> None:
+    def changed(self, key: int, row: np.ndarray | None, entered: Mapping[str, Any], left: Mapping[str, Any]) -> None:
         """See PortSink."""
-        self._waiting.extend((key, side, row) for side, row in vectors.items())
+        if row is not None:
+            self._waiting.append((key, row))
         if entered or left or key >= self._next_key:
-            self._next_key = key + STAGES * UPDATE_TICKS
+            self._next_key = key + STAGES * ROWS_TICKS
             self._put((key, self._waiting, entered, left))
             self._waiting = []
 
@@ -167,16 +168,16 @@ class RecordingWriter:
         at = self._at_ns = self._start_ns + round(now * 1e9)
         if rows:
             # the newest values by name, for plots, and every bit of all of them
-            newest = {side: row.tolist() for side, row in {side: row for _, side, row in rows}.items()}
-            named = {
-                side: {name: [_number(x) for x in row[a:b]] for name, a, b in self._slices[side]}
-                for side, row in newest.items()
-            }
-            exact = [[k, side, b64encode(row.tobytes()).decode("ascii")] for k, side, row in rows]
+            whole, entered_only = ([r for r in rows if r[0] % STAGES == stage] for stage in (BEFORE, UPDATED))
+            n = self._n_entered
+            newest = {ENTERED: rows[-1][1][:n], LEFT: whole[-1][1][n:] if whole else rows[-1][1][n:]}
+            numbers = {side: _numbers(row) for side, row in newest.items() if len(row)}
+            named = {side: {name: row[a:b] for name, a, b in self._slices[side]} for side, row in numbers.items()}
+            exact = [_exact(side, given) for side, given in ((BOTH, whole), (ENTERED, entered_only)) if given]
             self._message("/vectors", at, json.dumps({"key": key, "time": now, **named, "rows": exact}).encode())
-            if ENTERED in newest and self._joints is not None and now >= self._next_transform_s:
+            if self._joints is not None and now >= self._next_transform_s:
                 self._next_transform_s = now + TRANSFORM_PERIOD_S
-                q = np.array(newest[ENTERED][self._joints : self._joints + 6])
+                q = newest[ENTERED][self._joints : self._joints + 6]
                 self._transform(at, "base", "flange", forward_kinematics(self._arm, q))
         for name, value in entered.items():
             self._value("in", key, now, at, name, value)
@@ -207,7 +208,7 @@ class RecordingWriter:
         }
         self._message("/tf", at, json.dumps(text).encode())
 
-    def _message(self, topic: str, at: int, data: bytes, ros: str | None = None) -> None:
+    def _message(self, topic: str, at: int, data: bytes | bytearray, ros: str | None = None) -> None:
         channel = self._channels.get(topic)
         if channel is None:
             if ros is not None:
@@ -220,7 +221,7 @@ class RecordingWriter:
             self._channels[topic] = channel
         number = self._sequence.get(topic, 0)
         self._sequence[topic] = number + 1
-        self._writer.add_message(channel, at, data, at, number)
+        self._writer.add_message(channel, at, cast("bytes", data), at, number)  # a bytearray is not copied first
 
 
 def _slices(sizes: Mapping[str, int]) -> list[tuple[str, int, int]]:
@@ -228,6 +229,15 @@ def _slices(sizes: Mapping[str, int]) -> list[tuple[str, int, int]]:
     return [(name, end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)]
 
 
-def _number(value: float) -> float | None:
-    """A number as a plot takes it."""
-    return value if isfinite(value) else None
+def _exact(side: str, rows: list[_Row]) -> tuple[list[int], str, str]:
+    """Keys of rows, what they hold, and every bit of them."""
+    return (
+        [key for key, _ in rows],
+        side,
+        b2a_base64(b"".join(row.data for _, row in rows), newline=False).decode("ascii"),
+    )
+
+
+def _numbers(row: np.ndarray) -> list[float | None]:
+    """Numbers as a plot takes them."""
+    return [x if isfinite(x) else None for x in row.tolist()]

@@ -449,7 +449,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "planned_seam": PlannedSeam,
         "servo_report": ServoReport,
     },
-    PortRecorder: {"entered": 6, "left": 2},
+    PortRecorder: {"entered": 6, "both": 8},
     PortPlayer: {},
     CameraDirector: {"job": JobCommand},
     LiveWriter: {"job": JobCommand, "margin": 2},

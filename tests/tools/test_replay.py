@@ -160,6 +160,6 @@ def test_a_full_disk_ends_in_a_sentence_and_the_run_goes_on(tmp_path: Path, monk
 
     monkeypatch.setattr(writer, "_message", full)
     for tick in range(100):
-        writer.changed(2 * tick, {"entered": np.zeros(6)}, {}, {})
+        writer.changed(2 * tick, np.zeros(6), {}, {})
     with pytest.raises(RecordingFailed, match=r"is incomplete \(.*No space left on device\): free some space"):
         writer.close({})

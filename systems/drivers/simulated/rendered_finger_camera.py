@@ -53,6 +53,9 @@ class _Stream(Message):
     frames: tuple[Image, ...] = ()
 
 
+_NO_IMAGE = Image()
+
+
 @lru_cache(maxsize=4)
 def _noise_table(sigma: float) -> np.ndarray:
     """65536 equally likely values of Gaussian noise, rounded to whole grey levels as by a camera; a draw is one look-up."""
@@ -123,9 +126,8 @@ class StreamingCamera(LeafSystem):
 
     def _arrived(self, context: Context) -> Image:
         stream: _Stream = context.get_abstract_state(self._state).get_value()
-        now = context.get_time()
-        ripe = [frame for frame in stream.frames if now >= frame.exposed_at + self._config.latency_s - 1e-9]
-        return ripe[-1] if ripe else Image()
+        now, latency = context.get_time(), self._config.latency_s
+        return next((f for f in reversed(stream.frames) if now >= f.exposed_at + latency - 1e-9), _NO_IMAGE)
 
     def _image(self, context: Context, output: Any) -> None:
         output.set_value(self._arrived(context))
