@@ -216,7 +216,7 @@ def replays(
 @command("benchmark recording")
 def recording(
     call: Call,
-    pairs: Annotated[int, option("--pairs", "N", "Pairs of runs.", min=3)] = 5,
+    pairs: Annotated[int, option("--pairs", "N", "Pairs of runs.", min=6)] = 11,
 ) -> Outcome:
     """Run a short demo with and without --record in turn, and compare the computing time."""
     from weldcal.tools.studies.replay.overhead import run_overhead
