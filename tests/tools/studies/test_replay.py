@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from weldcal.systems.runner import no_progress
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.record import RECORDING
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
@@ -76,20 +78,51 @@ def test_the_interval_holds_the_true_overhead_in_nineteen_of_twenty_studies() ->
     assert held >= 370  # 380 expected, less three standard deviations
 
 
-def test_recorded_and_plain_runs_take_turns_and_the_first_does_not_count(
+def test_the_runs_of_a_pair_work_in_turns_and_the_first_pair_does_not_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[bool] = []
+    worked: list[tuple[int, int]] = []  # pair, side
 
-    def seconds(_: Path, seed: int, *, record: bool) -> tuple[float, float, float, float]:
+    def seconds(folder: Path, seed: int, *, record: bool, progress: Progress) -> tuple[float, float, float]:
         assert seed == 4
-        asked.append(record)
-        return (99.0 if len(asked) == 1 else 10.2 if record else 10.0), 20.0, 130.0, 5.0
+        pair, side = int(folder.parent.name.removeprefix("pair_")), int(folder.name)
+        assert record == (side == 1)
+        for _ in range(20 if record else 30):
+            worked.append((pair, side))
+            progress("", 0.0)
+        used = 99.0 if pair == 0 else 10.2 if record else 10.0
+        return used, 117.0 if record else 0.0, 5.0
 
-    monkeypatch.setattr(overhead, "_seconds", seconds)
+    monkeypatch.setattr(overhead, "seconds", seconds)
+    monkeypatch.setattr(overhead, "get_context", lambda _: ThreadsInTurns)
+    monkeypatch.setattr(overhead, "ProcessPoolExecutor", ThreadsInTurns.pool)
+    monkeypatch.setattr(overhead, "_TURNS", [])
     summary, table = overhead.run_overhead(tmp_path, 6, 4, no_progress)
-    assert asked == [True, *3 * [True, False, False, True]]
+    of_a_pair = [side for pair, side in worked if pair == 3]
+    assert of_a_pair == 20 * [0, 1] + 10 * [0]
     assert summary["overhead"] == pytest.approx({"percent": 2.0, "low": 2.0, "high": 2.0})
-    assert "| 1 | 10.0 | 10.2 |" in table
+    assert "| 1 | 10.00 | 10.20 | 117 |" in table
     assert "2.0 % of computing time" in table
     assert summary["percent_of_a_core"] == pytest.approx(4.0)
+
+
+class ThreadsInTurns:
+    """Threads in place of processes."""
+
+    @staticmethod
+    def Semaphore(value: int) -> TimedSemaphore:
+        return TimedSemaphore(value)
+
+    @staticmethod
+    def pool(
+        workers: int, *, mp_context: object, initializer: Callable[..., None], initargs: Iterable[Any]
+    ) -> ThreadPoolExecutor:
+        initializer(*initargs)
+        return ThreadPoolExecutor(workers)
+
+
+class TimedSemaphore(threading.Semaphore):
+    """With the words of a semaphore of processes."""
+
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
+        return super().acquire(block, timeout)
