@@ -17,6 +17,8 @@ from weldcal.systems.drivers.sensors.stamps import UnixClock
 
 Datum = TypeVar("Datum")
 POLL_S = 0.01
+LISTING_SHARE = 0.1  # of the time that a folder of many files may be listed
+LONGEST_POLL_S = 0.1
 PATIENCE_S = 2.0  # for which a settled file that cannot be read may still become complete
 BEFORE_S = 0.005  # a stamp may be this much before its trigger: the resolution of file times
 SIDECAR = ".json"
@@ -50,6 +52,7 @@ class FolderSource(Source[Datum]):
         self._asked_at = 0.0  # s, monotonic
         self._unix = UnixClock()
         self._waiting: list[Path] = []
+        self._list_at = 0.0  # s, monotonic
 
     def open(self) -> None:
         """See Source."""
@@ -73,10 +76,8 @@ class FolderSource(Source[Datum]):
         until = time.monotonic() + timeout_s
         while True:
             self._trigger.look()
-            try:
-                self._waiting += self._files.complete()
-            except OSError as error:
-                raise DeviceLost(f"the folder '{self.folder}' cannot be read: {error.strerror}") from error
+            if time.monotonic() >= self._list_at:
+                self._list()
             while self._waiting:
                 path = self._waiting.pop(0)
                 if (found := self._read(path)) is not None:
@@ -89,7 +90,17 @@ class FolderSource(Source[Datum]):
         """See Source."""
         self._trigger.close()
 
+    def _list(self) -> None:
+        begun = time.monotonic()
+        try:
+            self._waiting += self._files.complete()
+        except OSError as error:
+            raise DeviceLost(f"the folder '{self.folder}' cannot be read: {error.strerror}") from error
+        ended = time.monotonic()
+        self._list_at = ended + min(max(POLL_S, (ended - begun) / LISTING_SHARE), LONGEST_POLL_S)
+
     def _start(self) -> None:
+        self._list_at = 0.0
         try:
             self._files.start()
         except OSError as error:

@@ -16,6 +16,8 @@ import pytest
 from tests.systems.drivers.sensors.scripted import wait_until
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, DeviceFault
+from weldcal.systems.drivers.sensors.files.new import NewFiles
+from weldcal.systems.drivers.sensors.files.source import FolderSource
 from weldcal.systems.drivers.sensors.files.triggers import KEEP_ALIVE, TcpTrigger
 from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, acquire
@@ -84,6 +86,28 @@ def test_a_file_that_comes_after_the_request_answers_it(start: Start, tmp_path: 
     points = answer(scanner, 2)
     assert number_of(points) == 2
     assert (points.shape, points.dtype) == ((12, 16, 3), np.float32)
+
+
+def test_a_folder_that_takes_long_to_list_is_listed_a_tenth_of_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listings, complete = [], NewFiles.complete
+
+    def slow(files: NewFiles) -> list[Path]:
+        listings.append(time.monotonic())
+        time.sleep(0.01)
+        return complete(files)
+
+    monkeypatch.setattr(NewFiles, "complete", slow)
+    source = FolderSource("scanner", str(tmp_path), "", (".npz",), Path.read_bytes, 0.0, False)
+    source.open()
+    until = time.monotonic() + 0.6
+    while time.monotonic() < until:
+        assert source.next(0.02) is None
+    assert 2 <= len(listings) <= 6, "one in 0.11 s"
+    path = drop(tmp_path, "new.npz", cloud(1))
+    found = next(filter(None, (source.next(0.02) for _ in range(100))))
+    assert found.datum == path.read_bytes()
 
 
 def test_a_file_is_taken_only_when_it_is_whole(start: Start, tmp_path: Path) -> None:
