@@ -40,10 +40,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
-    """The browser leaves the last page of a file. A run of a cell has unfrozen all objects; when its file has ended, those that are left are frozen again."""
+    """The browser leaves a test's page. A run of a cell has unfrozen all objects; when its file has ended, those that are left are frozen again."""
     last = nextitem is None or nextitem.path != item.path
     running = item.session.stash.get(RUNNING, None)
-    if running is not None and last:
+    if running is not None and "browser" in getattr(item, "fixturenames", ()):
         running.rest()
     yield
     if last:
