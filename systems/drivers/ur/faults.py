@@ -45,7 +45,7 @@ class Fault(IntEnum):
 
 
 SENTENCES = {
-    Fault.LINK_STALE: "LINK: no new state from the robot for {detail:.0f} ms; check the network cable and the load of this computer, then start again.",
+    Fault.LINK_STALE: "LINK: the robot's newest state is {detail:.0f} ms old; check the network cable and the load of this computer, then start again.",
     Fault.LINK_CLOSED: "LINK: the controller closed the connection; check the network cable and that the controller is on, then start again.",
     Fault.WORKER_DIED: "LINK: the connection failed, and its worker process ended; check that the controller is on, and the cable, then start again.",
     Fault.CONTROLLER_DEAF: "LINK: the controller has not taken a command for {detail:.0f} ms; "

@@ -70,6 +70,9 @@ class Limits:
     late_s: float = 0.050
     lost_s: float = 0.5  # the arm is at rest since late_s
     deaf_s: float = 0.200  # later than the guard, which latches after 150 ms without a number
+    # A state that comes so long after the command that it answers, for so long: no gap shows that a connection has become slow.
+    behind_s: float = 0.080
+    behind_for_s: float = 0.100
     jump_s: float = 0.5
     braking: float = 5.0
     tracking_rad: float = 0.01
@@ -94,6 +97,8 @@ class Limits:
             late_s=self.late_s / pace,
             lost_s=self.lost_s / pace,
             deaf_s=self.deaf_s / pace,
+            behind_s=self.behind_s / pace,
+            behind_for_s=self.behind_for_s / pace,
             pace=pace,
         )
 
@@ -106,6 +111,7 @@ class Limits:
             late_s=max(self.late_s, patience_s),
             lost_s=max(self.lost_s, patience_s),
             deaf_s=max(self.deaf_s, patience_s),
+            behind_s=max(self.behind_s, patience_s),
             jump_s=max(self.jump_s, patience_s),
             hold_s=held_s / self.pace,
         )
@@ -186,6 +192,7 @@ class Supervisor:
         self._referred_at = 0.0
         self._lost_s = 0.0
         self._slow_since: float | None = None
+        self._behind_since: float | None = None
         self._asked, self._asked_at = False, -np.inf
         self._off_since: float | None = None
         self._apart_since: float | None = None
@@ -317,6 +324,10 @@ class Supervisor:
         limits = self._limits
         if robot.unheard_s > limits.deaf_s:
             return Fault.CONTROLLER_DEAF, 1e3 * robot.unheard_s
+        behind = robot.unheard_s > limits.behind_s
+        self._behind_since = (self._behind_since or now) if behind else None
+        if self._behind_since is not None and now - self._behind_since > limits.behind_for_s:
+            return Fault.LINK_STALE, 1e3 * robot.unheard_s
         if robot.guard_silent_s > GUARD_SILENT_S:
             return Fault.CONTROLLER_DEAF, 1e3 * robot.guard_silent_s
         # only of an arm that is to move: the scaling may ramp up when a program starts

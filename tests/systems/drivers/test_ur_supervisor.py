@@ -182,6 +182,20 @@ def test_a_state_that_stays_the_same_is_stale_earlier_under_a_burning_torch(proc
     assert 1e3 * limit_s < decision.detail < 1e3 * limit_s + 5.0
 
 
+def test_states_without_a_gap_that_come_ever_later_after_their_commands_are_stale(rig: Rig) -> None:
+    for _ in range(24):  # once late, by a computer that stood still
+        assert rig.one(unheard_s=0.12) == Decision(Action.SEND)
+    assert rig.one(unheard_s=0.01) == Decision(Action.SEND)
+    decisions = [rig.one(unheard_s=0.12) for _ in range(30)]
+    assert decisions[24] == Decision(Action.SEND)
+    assert decisions[-1] == Decision(Action.LEAVE, Fault.LINK_STALE, 120.0)
+    assert "120 ms old" in sentence(decisions[-1].fault, decisions[-1].detail)
+
+
+def test_states_70_ms_after_their_commands_are_slow_and_no_fault(rig: Rig) -> None:
+    assert all(rig.one(unheard_s=0.07) == Decision(Action.SEND) for _ in range(100))
+
+
 @pytest.mark.parametrize(("process", "limit_s"), [(True, 0.05), (False, 0.5)])
 def test_a_command_that_grows_old_brakes_a_burning_torch_at_once_and_an_arm_that_was_slowed_to_rest_later(
     process: bool, limit_s: float

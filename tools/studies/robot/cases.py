@@ -101,6 +101,14 @@ def _slider(percent: int) -> Callable[[Bench], float]:
     return _fault("speed_scaling", value=0.01 * percent)
 
 
+def _grows_late(bench: Bench) -> float:
+    """States 60 ms late, then 120 ms: no gap between two of them is a fault."""
+    at = bench.emulator.fault("delay", latch=False, seconds=0.06)
+    time.sleep(0.07)
+    bench.emulator.fault("delay", latch=False, seconds=0.12)
+    return at
+
+
 def _joint(number: int, speed: float) -> Array:
     qd: Array = speed * np.eye(6)[number]
     return qd
@@ -155,6 +163,7 @@ RUNNING: tuple[Case, ...] = (
     _stops("no state for 100 ms", _fault("drop", seconds=0.1), LINK),
     _stops("no state any more", _fault("drop", seconds=1e9), LINK, CLEAR, short=False),
     _stops("state 100 ms late", _fault("delay", seconds=0.1), LINK, CLEAR),
+    _stops("state later and later", _grows_late, LINK, CLEAR, rest_s=0.6, slow_s=0.4),
     _stops("state late by up to 200 ms", _fault("delay", seconds=0.05, jitter=0.15), LINK, CLEAR, short=False),
     _stops("half-open connections", _fault("half_open"), LINK, CLEAR),
     _stops("RTDE stands still for 200 ms", _fault("freeze", seconds=0.2, kind="rtde"), LINK),
