@@ -67,6 +67,8 @@ def held_weld(scenario: Scenario, open_sink: OpenSink | None = None) -> HeldWeld
     log = cell.logs["position"].FindLog(run.root)
     times, on = log.sample_times(), cell.logs["torch_on"].FindLog(run.root).data()[0] > 0.5
     speed = np.linalg.norm(np.diff(log.data(), axis=1), axis=0) / np.diff(times)
+    assert on.any(), f"the torch has not burned: {run.reason}"
+    assert run.held_by_person, f"nobody has held it: {run.reason}"
     off = int(np.flatnonzero(on[:-1] & ~on[1:])[0])
     still = off + int(np.flatnonzero(speed[off:] < STILL_RAD_S)[0])
     outcome = weld_outcome(cell, run.root)

@@ -53,7 +53,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
     running = []
 
     def begin(wait_s: float = 2.0, **keys: object) -> Acquisition[Cloud]:
-        config = FolderScanner(**{"folder": str(tmp_path), "settle_s": 0.05, "scan_timeout_s": 1.0, **keys})
+        config = FolderScanner(**{"folder": str(tmp_path), "settle_s": 0.05, "scan_timeout_s": 10.0, **keys})
         acquisition = acquire(config, config.source())
         acquisition.start(wait_s, first_frame=False)
         running.append(acquisition)
@@ -65,7 +65,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def answer(acquisition: Acquisition[Cloud], number: int) -> Cloud:
-    assert wait_until(lambda: acquisition.answer(number) is not None)
+    assert wait_until(lambda: acquisition.answer(number) is not None, 10.0), acquisition.fault(time.monotonic())
     found = acquisition.answer(number)
     assert found is not None
     return found.datum
@@ -184,7 +184,7 @@ def test_the_time_of_the_scan_is_its_sidecars_or_that_of_its_arrival(start: Star
     ],
 )
 def test_a_scan_of_another_time_is_refused(start: Start, tmp_path: Path, beside: dict[str, object], said: str) -> None:
-    scanner = start()
+    scanner = start(scan_timeout_s=1.0)
     scanner.request(1)
     time.sleep(0.05)
     drop(tmp_path, "a.npz", cloud(1), **beside)
@@ -245,7 +245,7 @@ def test_a_stream_keeps_the_time_of_the_scanners_own_clock_beside_that_of_the_ho
 
 
 def test_points_in_another_unit_are_refused_and_read_with_the_right_one(start: Start, tmp_path: Path) -> None:
-    scanner = start()
+    scanner = start(scan_timeout_s=1.0)
     scanner.request(1)
     time.sleep(0.05)
     drop(tmp_path, "a.npz", 1e3 * cloud(1))
