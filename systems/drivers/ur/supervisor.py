@@ -70,7 +70,8 @@ class Limits:
     late_s: float = 0.050
     lost_s: float = 0.5  # the arm is at rest since late_s
     deaf_s: float = 0.200  # later than the guard, which latches after 150 ms without a number
-    # A state that comes so long after the command that it answers, for so long: no gap shows that a connection has become slow.
+    # States that come so long after the commands that they answer, for so long: no gap shows that a connection has become slow. The guard
+    # waits 150 ms for a number, and one that reaches it 120 ms late is no fault: that is 40 ms above behind_s.
     behind_s: float = 0.080
     behind_for_s: float = 0.100
     jump_s: float = 0.5
