@@ -4,6 +4,7 @@ import contextlib
 import signal
 import socketserver
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler
 from multiprocessing.connection import Connection
@@ -38,6 +39,24 @@ class Stream:
     def __init__(self) -> None:
         self._news = threading.Condition()
         self._number, self._part = 0, b""
+        self._clients = 0
+
+    @property
+    def watched(self) -> bool:
+        """Whether any client is connected."""
+        return self._clients > 0
+
+    @contextlib.contextmanager
+    def client(self) -> Iterator[int]:
+        """A client is connected for the duration of the block; gives the number of the newest part, which may be old."""
+        with self._news:
+            self._clients += 1
+            number = self._number
+        try:
+            yield number
+        finally:
+            with self._news:
+                self._clients -= 1
 
     def put(self, jpeg: bytes, taken: float) -> None:
         """Show another picture, taken at this Unix time (s)."""
@@ -65,8 +84,7 @@ def _handler(stream: Stream) -> type[BaseHTTPRequestHandler]:
             self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
-            number = 0
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError), stream.client() as number:
                 while True:
                     number, part = stream.next(number)
                     self.wfile.write(part)
@@ -97,5 +115,6 @@ def run_finger_camera(setup: FingerSetup, world: Connection) -> None:
         world.send("ready")
         while True:
             taken, X_FM = world.recv()
-            stream.put(draw(view, X_FM, setup.camera.noise_grey, rng), taken)
+            if stream.watched:
+                stream.put(draw(view, X_FM, setup.camera.noise_grey, rng), taken)
             world.send("shown")

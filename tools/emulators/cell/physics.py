@@ -25,6 +25,8 @@ from weldcal.tools.emulators.cell.world_arm import Repeatability, WorldArm
 STEP_S = 0.002
 LOG_EVERY = 4  # frames: the servo's period
 COLLISION_EVERY = 20
+STILL = 1e-6  # m/s and rad/s: the plant rests where nothing of it is faster
+STILL_FRAMES = 50  # for so many frames; then its state stays as it is until the controller's joints move
 
 
 def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
@@ -78,6 +80,8 @@ class Physics:
         self._torch_port = diagram.GetOutputPort("cheat.torch") if self.station.tool is not None else None
         self._tag = None if self.station.tool is None else _tag_on(self.world, self.station.tool)
         self._true_q = np.array(self.station.q_start)
+        self._reference = np.full(12, np.nan)
+        self._still_frames = self._plant_frame = 0
         self._frame = 0
         self.time_s = 0.0
         self.arc_on_s = 0.0
@@ -91,8 +95,7 @@ class Physics:
         self.time_s = STEP_S * self._frame
         true_q = self._true_q = self._joints.true_joints(q, qd)
         if self._torch_port is not None:
-            self._desired.FixValue(self._context, np.concatenate([true_q, qd]))
-            self._simulator.AdvanceTo(self.time_s)
+            self._advance(np.concatenate([true_q, qd]))
         if arc.burns:
             self.arc_on_s += STEP_S
             if self._frame % LOG_EVERY == 0 and self._torch_port is not None:
@@ -105,6 +108,21 @@ class Physics:
             )
             self.collisions += int(touches and not self._touches)
             self._touches = touches
+
+    def _advance(self, reference: Array) -> None:
+        """One step of the plant with the joint servos' reference (12,) rad, rad/s; none where plant and reference rest.
+
+        The plant counts its own time: it knows nothing that depends on the world's.
+        """
+        if not np.array_equal(reference, self._reference):
+            self._reference, self._still_frames = reference, 0
+            self._desired.FixValue(self._context, reference)
+        if self._still_frames >= STILL_FRAMES:
+            return
+        self._plant_frame += 1
+        self._simulator.AdvanceTo(STEP_S * self._plant_frame)
+        fastest = float(np.abs(self.world.plant.GetVelocities(self._plant_context)).max())
+        self._still_frames = self._still_frames + 1 if fastest < STILL else 0
 
     @property
     def true_q(self) -> Array:
