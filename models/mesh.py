@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from pydrake.common import MemoryFile
-from pydrake.geometry import InMemoryMesh, Mesh
 from pydrake.math import RigidTransform
-from scipy.spatial import Delaunay, cKDTree
 
 from weldcal.models.errors import InputError
+
+if TYPE_CHECKING:
+    from pydrake.geometry import Mesh
+
+# pydrake.geometry and scipy.spatial are imported where they are used: they take half of the time in which a process starts
+# that only asks for a robot's name.
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -105,6 +110,8 @@ class TriMesh:
 
     def to_drake(self, hint: str = "weldcal mesh") -> Mesh:
         """The mesh as a Drake shape held in memory; `hint` names it in Drake's messages."""
+        from pydrake.geometry import InMemoryMesh, Mesh
+
         return Mesh(InMemoryMesh(mesh_file=MemoryFile(self.to_obj(), ".obj", hint)))
 
 
@@ -115,6 +122,8 @@ def merge(*meshes: TriMesh, tolerance_m: float = 0.0) -> TriMesh:
     triangles = np.concatenate([m.triangles + k for m, k in zip(meshes, offsets, strict=True)])
     if tolerance_m <= 0.0:
         return TriMesh(vertices, triangles)
+    from scipy.spatial import cKDTree
+
     # Every vertex takes the lowest index within reach; two passes settle chains of equal points.
     pairs = cKDTree(vertices).query_pairs(tolerance_m, output_type="ndarray")
     owner = np.arange(len(vertices))
@@ -150,6 +159,8 @@ def triangulate_polygon(outline: Floats, holes: list[Floats] | None = None, inte
     Delaunay triangles with centroids inside; no point is added, so neighbouring faces stay watertight. Raises
     InputError where a boundary edge is not in the triangulation: the outline must be sampled finer there.
     """
+    from scipy.spatial import Delaunay
+
     loops = [np.asarray(outline, dtype=np.float64), *[np.asarray(h, dtype=np.float64) for h in (holes or [])]]
     extra = np.zeros((0, 2)) if interior is None else np.asarray(interior, dtype=np.float64)
     points = np.concatenate([*loops, extra])
