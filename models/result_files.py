@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import tempfile
+import zipfile
 from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
@@ -42,7 +43,11 @@ def write_npz(path: Path, **arrays: Any) -> None:
     import numpy as np  # the command line's help does without it
 
     data = io.BytesIO()
-    np.savez_compressed(data, **arrays)
+    # NumPy's own level, 6, takes four times the time and makes a depth image no smaller.
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
     write_atomic(path, data.getvalue())
 
 
