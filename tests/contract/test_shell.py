@@ -365,6 +365,22 @@ def test_a_python_that_refuses_to_run_does_not_hide_one_that_works(machine: Mach
     assert subprocess.run(run, env={"PATH": both, "LOG": str(machine.log)}, check=False).returncode == 0
 
 
+def test_of_one_version_the_distributions_is_taken_and_another_where_it_has_no_venv(machine: Machine) -> None:
+    distribution = machine.tools.parent / "usr" / "bin"
+    distribution.mkdir(parents=True)
+    its = Machine(distribution, machine.project, machine.log)
+    run = [str(machine.project / "tools" / "run")]
+    environment = {"PATH": f"{machine.tools}:{distribution}", "LOG": str(machine.log)}
+    for of_it, taken in (("", distribution / "python3"), ("; exit 1", machine.tools / "python3.11")):
+        its.install("python3", python("3.11").replace('[ ! -e "$LOG.no-ensurepip" ]', f"true{of_it}"))
+        finished = subprocess.run(run, env=environment, check=True, capture_output=True, text=True)
+        assert f" with {taken}" in finished.stderr
+        shutil.rmtree(machine.project / ".venv")
+    machine.install("python3.12", python("3.12"))
+    finished = subprocess.run(run, env=environment, check=True, capture_output=True, text=True)
+    assert f" with {machine.tools / 'python3.12'}" in finished.stderr, "a newer one goes before it"
+
+
 def test_missing_libraries_are_named_with_the_line_to_type(machine: Machine) -> None:
     machine.install("ldconfig", "#!/bin/sh\n")
     finished = machine.run("demo")
