@@ -11,6 +11,7 @@ import matplotlib
 matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
@@ -130,5 +131,11 @@ def svg(figure: Figure, *all_axes: Axes) -> bytes:
         axes.set_axisbelow(True)
     stream = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "weldcal", "svg.fonttype": "path"}):
+        # laid out here, savefig does not draw the whole figure once more only for its layout
+        FigureCanvasSVG(figure)
+        figure.dpi = FigureCanvasSVG.fixed_dpi
+        if (layout := figure.get_layout_engine()) is not None:
+            layout.execute(figure)
+            figure.set_layout_engine("none")
         figure.savefig(stream, format="svg", metadata={"Date": None}, facecolor="white")
     return stream.getvalue()
