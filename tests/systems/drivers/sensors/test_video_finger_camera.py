@@ -54,7 +54,9 @@ def test_each_picture_has_the_time_it_was_taken(camera: MjpegCamera, start: Star
     seen = start(camera.url, stamps=stamps, latency_s=0.06)
     assert wait_until(lambda: seen.counts.received > 25)
     errors = [f.stamp.captured - camera.taken[number_in(f.datum)] for f in seen.frames()]
-    assert np.abs(errors).max() < error_s
+    # a computer that was away is late with one of them; the picture before or after is a period, 20 ms, off
+    assert np.median(np.abs(errors)) < error_s
+    assert np.abs(errors).max() < 0.01
     assert seen.frames()[-1].stamp.clock == stamps
     assert seen.summary()["capture_time_from"] == stamps
 
