@@ -40,7 +40,7 @@ class Scan(Message):
 @dataclass(frozen=True, eq=False)
 class StreamedScan(Scan):
     """A frame of a streaming scanner. When it was captured is not known; `arrival_time` s is on the arm's clock, `device_time` s on
-    the device's own (None: it has none)."""
+    the device's own (None: it has none), which stands while the Diagram stands."""
 
     arrival_time: float = -np.inf
     device_time: float | None = None

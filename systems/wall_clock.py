@@ -4,6 +4,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from weldcal.systems.lost_time import LostTime
+
 LATE_S = 0.020  # of robot time: a longer delay is not made up for
 LIMITS_MS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # upper limits of the histogram's bins; the last bin has none
 ON_TIME_MS = 4.0
@@ -79,6 +81,7 @@ class WallClock:
         self.lost_s = 0.0
         self.lateness = Lateness()
         self.held = False
+        self._course = LostTime()
         self.waiting_s = 0.0  # wall seconds for which the oldest picture or detection has been waited for
 
     @classmethod
@@ -111,15 +114,19 @@ class WallClock:
 
     def go_on(self) -> None:
         """Let a held path go on: the time that it stood is no lateness."""
-        self.held, self._due = False, self._clock()
+        self.held = False
+        self._stand_until(self._clock())
 
     def wait_for(self, diagram_time: float, moving: bool) -> None:
         """Wait until the wall clock reaches this time of the Diagram. `moving`: the arm is commanded to move."""
         now = self._clock()
         if self._at is None:
             self._due, self._at = now, diagram_time
+            self._course.reach(now)
         step = diagram_time - self._at
-        self._due += step / (self.pace * self.rate)
+        taken = step / (self.pace * self.rate)
+        self._due += taken
+        self._course.reach(self._due, taken - step / self.pace if self.rate != 1.0 else 0.0)
         self._at = diagram_time
         late = (now - self._due) * self.pace
         self._set_rate(step, late, moving)
@@ -131,7 +138,7 @@ class WallClock:
         else:
             self.thinking_s = max(self.thinking_s, late)
         if late > LATE_S:
-            self._due = now
+            self._stand_until(now)
             self.reanchored += int(moving)
             self.lost_s += late if moving else 0.0
 
@@ -142,8 +149,21 @@ class WallClock:
         """
         if self._at is None:
             return now
+        if clock_s < self._due:
+            lost = self._course.newest - self._course.at(clock_s)
+            return self._at - (self._due - clock_s - lost) * self.pace
         found = self._at + (clock_s - self._due) * self.pace * self.rate
         return found if found - now <= LATE_S else now
+
+    def lost_by(self, clock_s: float) -> float:
+        """Seconds by which the Diagram had fallen behind the clock that it waits for at an earlier time of it, since it began."""
+        return self._course.at(clock_s)
+
+    def _stand_until(self, clock_s: float) -> None:
+        """The Diagram has stood until this time of the clock, and goes on from where it is."""
+        if self._at is not None:
+            self._course.reach(clock_s, clock_s - self._due)
+        self._due = clock_s
 
     def overdue_s(self, diagram_time: float) -> float:
         """How late (s of robot time) a velocity of this time of the Diagram would leave it now; 0 before the clock has waited."""

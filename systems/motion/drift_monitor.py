@@ -192,10 +192,10 @@ def watched_frame(
     c, status = watch.watched, dc.replace(watch.status, sequence=estimate.sequence)
     if c is None or estimate.fit is None:
         return dc.replace(watch, status=dc.replace(status, dropped=status.dropped + 1))
+    waited = 0 if watch.clock is None else len(watch.clock.waiting)
     clock, done = followed(watch.clock, estimate, c.delay_s, c.clock), 1
     usable: tuple[FlangeEstimate, ...] = (estimate,)
     if clock is not None:
-        waited = len(clock.waiting)
         clock, usable = with_frame(clock, estimate, Seen(c.X_BC, c.correction, arm, X_FR, history))
         done = waited + 1 - len(clock.waiting)
     tracked = [_tracked(c, f, history, arm, X_FR, clock) for f in usable]

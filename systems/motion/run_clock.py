@@ -14,7 +14,9 @@ from weldcal.systems.messages import FlangeEstimate
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
 SEARCHED_S = 0.3  # by which a frame may come later or earlier than usual
-_APART_S = 0.5  # a device time that is this far from the arrival is one of a clock that was set anew
+_APART_S = 0.5  # a frame that is this early is of a clock that was set anew; one this late may be late
+_RELEARN_S = 3.0  # frames that stay so late for so long belong to a clock that was set back
+_NEVER_S = 5.0  # no frame is so late
 _STEP_S, _HALF_S = 0.02, 0.01
 _FEWEST, _MOST = 12, 60  # frames
 _CERTAIN_S = 1e-3
@@ -28,8 +30,8 @@ class RunClock:
     """A device time and the robot's time then (s), and the robot's rate over the device's.
 
     ``learnt``: frames in motion have shown it. Until then it is what the calibration's clock says (``known``), which is of another
-    run and another start of the robot's clock, or what one arrival says, wrong by what that frame came late. ``waiting`` are the
-    frames that could not be used yet.
+    run and another start of the robot's clock, or what the earliest arrival says, wrong by what that frame came late. ``waiting``
+    are the frames that could not be used yet; ``late_since``: the arrival (s) of the first of those that come very late now.
     """
 
     device_s: float
@@ -38,6 +40,7 @@ class RunClock:
     known: bool = False
     learnt: bool = False
     waiting: tuple[FlangeEstimate, ...] = ()
+    late_since: float | None = None
 
     def time(self, device_s: float) -> float:
         """A device time on the robot's clock, s."""
@@ -69,27 +72,41 @@ class Seen:
 def followed(
     clock: RunClock | None, estimate: FlangeEstimate, delay_s: float, known: ScannerClock | None
 ) -> RunClock | None:
-    """The clock with a new frame's times: one that was set anew is learnt again. ``known`` is the calibration's clock. None where a
-    frame has no device time."""
-    if estimate.device_time is None or not np.isfinite(estimate.arrival_time):
+    """The clock with a new frame's times. ``known`` is the calibration's clock. None where a frame has no device time.
+
+    No frame comes before its time, so that a clock that is not learnt yet moves to the earliest. One that was set anew is learnt
+    again: at once where a frame is too early for it, or later than any frame is, else where frames stay late.
+    """
+    device, arrival = estimate.device_time, estimate.arrival_time
+    if device is None or not np.isfinite(arrival):
         return None
-    expected = None if known is None else known.capture(estimate.arrival_time, estimate.device_time)
+    expected = None if known is None else known.capture(arrival, device)
     by_device = known is not None and known.kind == DEVICE
-    usual = estimate.arrival_time - delay_s if by_device or expected is None else expected
-    if clock is not None and abs(clock.time(estimate.device_time) - usual) < _APART_S:
-        return clock
+    usual = arrival - delay_s if by_device or expected is None else expected
     rate = 1.0 if known is None else 1.0 + (known.drift or 0.0)
-    if by_device and expected is not None and abs(expected - usual) < _APART_S:
-        return RunClock(estimate.device_time, expected, rate, known=True)
-    return RunClock(estimate.device_time, usual, rate)
+    late = 0.0 if clock is None else usual - clock.time(device)
+    if clock is None or late >= _NEVER_S or late <= -(_APART_S if clock.learnt else _NEVER_S):
+        if by_device and expected is not None and abs(expected - usual) < SEARCHED_S:
+            return RunClock(device, expected, rate, known=True)
+        return RunClock(device, usual, rate)
+    if not clock.learnt and (abs(late) >= SEARCHED_S if clock.known else late < 0.0):
+        return dc.replace(clock, device_s=device, robot_s=usual, known=False, late_since=None)
+    if late < _APART_S:
+        return clock if clock.late_since is None else dc.replace(clock, late_since=None)
+    if clock.late_since is None:
+        return dc.replace(clock, late_since=arrival)
+    return clock if arrival - clock.late_since < _RELEARN_S else RunClock(device, usual, rate)
 
 
 def with_frame(clock: RunClock, estimate: FlangeEstimate, seen: Seen) -> tuple[RunClock, tuple[FlangeEstimate, ...]]:
     """The clock after a frame with a fit, and the frames that can be used now: at rest each at once, because no time is wrong there;
-    in motion those that waited, once they show the clock. One that has left the history is given up."""
+    in motion those that waited, once they show the clock. One that has left the history is given up. By a clock that is learnt
+    only a very late frame waits, for the next: then it was late, and the clock is right."""
     assert estimate.device_time is not None
+    if clock.learnt and clock.late_since is not None:
+        return dc.replace(clock, waiting=(*clock.waiting, estimate)), ()
     if clock.learnt:
-        return clock, (estimate,)
+        return dc.replace(clock, waiting=()) if clock.waiting else clock, (*clock.waiting, estimate)
     time = clock.time(estimate.device_time)
     around = seen.features(time + np.array([-SEARCHED_S, 0.0, min(SEARCHED_S, seen.history.times[-1] - time)]))
     if np.linalg.norm(around - around[1], axis=1).max() < _REST_M:

@@ -54,13 +54,14 @@ def test_pose_and_clock_are_those_of_the_truth_file(wired: tuple[Played, str, Pa
     X_BC, p = RigidTransform(np.array(truth["X_BC"])), np.array([0.65, 0.0, 0.30])
     assert 1e3 * np.linalg.norm(e.X_BC @ (X_BC.inverse() @ p) - p) < 0.2
     assert e.clock.kind == "device"
-    # the scanner's clock counts the world's time, and the Diagram's time is the world's less a constant
+    # the scanner's clock counts the world's time; the Diagram's is less by a constant and what it has lost, as device times are here
     clock, ticks, run = truth["scanner_clock"], calibrated.run.clock, calibrated.run
     assert ticks is not None
     assert run.held is False
     device = np.array([f.device for f, _ in calibrated.record.seen], dtype=float)
     world_s = (device - clock["at_0_s"]) / clock["rate"]
-    true = np.array([ticks.diagram_time(t, np.inf) for t in world_s + truth["robot_time_at_0_s"]])
+    times = world_s + truth["robot_time_at_0_s"]
+    true = np.array([ticks.diagram_time(t, np.inf) + ticks.lost_by(t) for t in times])
     found = np.array([e.clock.capture(np.nan, d) for d in device], dtype=float)
     assert 1e3 * np.abs(found - true).max() < 2.0
 
@@ -84,9 +85,11 @@ def test_the_monitor_finds_the_stand_that_the_world_knocks(
     assert found.finished.run.reason is None
     assert ticks is not None
     knocked = ticks.diagram_time(truth["knocked_at_s"] + truth["robot_time_at_0_s"], np.inf)
-    live = [event.found_s - knocked for event in found.found_live]
-    assert len(live) == 1, live
-    assert 0.0 < live[0] < 3.0, live
+    live = [event.found_s for event in found.found_live]
+    assert len(live) == 1, found.summary()
+    # 3 s of the scanner's rate: a busy computer fits fewer frames a second
+    frames = found.finished.cell.job.drift(found.finished.run.root).recent[:, 0]
+    assert 0 < ((frames > knocked) & (frames <= live[0])).sum() <= 30, (knocked, live, frames)
     assert found.report is not None
     moves = [(event.time_s - knocked, 1e3 * event.translation_m) for event in found.report.moves]
     assert len(moves) == 1, moves

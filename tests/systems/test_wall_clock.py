@@ -196,3 +196,47 @@ def test_a_late_picture_is_given_time_until_it_comes_and_a_camera_that_has_stopp
     assert sum(slept) == pytest.approx(PICTURE_PATIENCE_S)
     # the whole patience passes before the servo misses the picture
     assert PICTURE_DUE_S + 0.002 * len(slept) < 0.8 * FaultLimits().hidden_s
+
+
+def test_a_time_before_the_diagram_stood_is_still_known_and_what_came_while_it_stood_belongs_to_where_it_stood() -> (
+    None
+):
+    wall, clock = clock_at(0.5)
+    for k in range(1, 51):
+        clock.wait_for(0.002 * k, moving=True)  # 0.1 s in 0.2 s
+    assert wall.now == pytest.approx(100.2)
+    wall.now = 101.0  # at rest: a plan is made
+    clock.wait_for(0.102, moving=False)
+    for k in range(52, 102):
+        clock.wait_for(0.002 * k, moving=True)
+    assert wall.now == pytest.approx(101.2)
+    expected = {100.0: 0.0, 100.1: 0.05, 100.2: 0.1, 100.6: 0.102, 101.0: 0.102, 101.1: 0.152, 101.2: 0.202}
+    found = {t: clock.diagram_time(t, math.inf) for t in expected}
+    assert found == pytest.approx(expected)
+    lost = {t: clock.lost_by(t) for t in expected}
+    assert lost == pytest.approx({t: t - 100.0 - s / 0.5 for t, s in expected.items()})
+
+
+def test_the_time_lost_on_a_slow_computer_is_what_its_clock_and_the_diagram_differ_by_at_every_tick() -> None:
+    wall, clock = clock_at(1.0)
+    ticks = []
+    for k in range(1, 2001):
+        wall.now += 1.3 * TICK_S if 500 < k < 1500 else 0.1 * TICK_S
+        clock.wait_for(TICK_S * k, moving=True)
+        ticks.append((wall.now, TICK_S * k))
+    assert clock.rate == 1.0
+    assert clock.lost_by(wall.now) > 0.25
+    for at, diagram in ticks:
+        assert at - 100.0 - clock.lost_by(at) == pytest.approx(diagram, abs=0.006)  # as late as it was then
+        assert clock.diagram_time(at, math.inf) == pytest.approx(at - 100.0 - clock.lost_by(at))
+
+
+def test_a_hold_is_time_lost() -> None:
+    wall, clock = clock_at(1.0)
+    clock.wait_for(1.0, moving=True)
+    clock.held = True
+    wall.now += 30.0
+    clock.go_on()
+    clock.wait_for(2.0, moving=True)
+    assert clock.lost_by(wall.now) == pytest.approx(30.0)
+    assert clock.diagram_time(100.5, math.inf) == pytest.approx(0.5)

@@ -118,13 +118,14 @@ class WiredScanStream(LeafSystem):
         output_ports:
         - stream
 
-    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's own. Where the
-    cell follows an emulated robot's time (``followed``), a host that is late does not make a frame late.
+    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's own, less
+    what the Diagram had lost on its ``clock`` when the frame was taken: the two stay together while the computer is late. Where
+    the cell follows an emulated robot's time, a host that is late does not make a frame late.
     """
 
-    def __init__(self, acquisition: Acquisition[Cloud], followed: WallClock | None = None) -> None:
+    def __init__(self, acquisition: Acquisition[Cloud], clock: WallClock | None = None) -> None:
         super().__init__()
-        self.acquisition, self._followed = acquisition, followed
+        self.acquisition, self._clock = acquisition, clock
         self._times = DiagramTime()
         self._shown: tuple[StreamedScan, ...] = ()
         self._streaming = self.DeclareVectorInputPort("streaming", 1)
@@ -144,15 +145,18 @@ class WiredScanStream(LeafSystem):
         discrete.set_value([float(newest)])
 
     def _streamed(self, frame: Frame[Cloud], now: float) -> StreamedScan:
+        device = frame.device_time
+        if device is not None and self._clock is not None:
+            device -= self._clock.lost_by(self.acquisition.time.at(frame.stamp.captured))
         return StreamedScan(
-            frame.number, points_C=frame.datum, arrival_time=self._arrival(frame.arrived, now), device_time=frame.device_time
-        )  # fmt: skip
+            frame.number, points_C=frame.datum, arrival_time=self._arrival(frame.arrived, now), device_time=device
+        )
 
     def _arrival(self, host_s: float, now: float) -> float:
         """The Diagram's time at a time of the host."""
-        if self._followed is None:
+        if self._clock is None or not self._clock.follows:
             return self._times.at(host_s)
-        return self._followed.diagram_time(self.acquisition.time.at(host_s), now)
+        return self._clock.diagram_time(self.acquisition.time.at(host_s), now)
 
     def _output(self, context: Context, output: Any) -> None:
         output.set_value(ScanStream(self._shown))
@@ -176,8 +180,7 @@ def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild
     watch(build, acquisition, "scanner")
     if config.streams:
         clock = None if build.robot is None else build.robot.clock
-        followed = clock if clock is not None and clock.follows else None
-        stream = build.builder.AddSystem(WiredScanStream(acquisition, followed))
+        stream = build.builder.AddSystem(WiredScanStream(acquisition, clock))
         build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
         build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
         stream.set_name("scanner")

@@ -30,9 +30,11 @@ def joints(t: Array) -> Array:
     return base + 0.08 * wave
 
 
-def estimate(k: int, t: float, rng: np.random.Generator, *, seen: bool = True) -> FlangeEstimate:
+def estimate(
+    k: int, t: float, rng: np.random.Generator, *, seen: bool = True, knock_s: float = KNOCK_S
+) -> FlangeEstimate:
     """Estimate k of a frame captured at ``t`` s, after the knock from a scanner that stands elsewhere."""
-    X = RigidTransform(X_BC.rotation(), X_BC.translation() + SHIFT * (t > KNOCK_S))
+    X = RigidTransform(X_BC.rotation(), X_BC.translation() + SHIFT * (t > knock_s))
     X_CR = X.InvertAndCompose(forward_kinematics(ARM, joints(np.array([t]))[0]))
     n = X_CR.rotation().matrix()[:, 2] + SIGMA_RAD * rng.standard_normal(3)
     center = X_CR.translation() + SIGMA_M * rng.standard_normal(3)
@@ -122,7 +124,14 @@ def watched(clock: ScannerClock | None, at_0_s: float, late_s: Array) -> DriftSt
 
 
 @pytest.mark.parametrize(
-    "late_s", [[0.15, 0.0, 0.01, 0.05], [0.0, 0.02, 0.2, 0.01, 0.03]], ids=["first late", "others late"]
+    "late_s",
+    [
+        [0.15, 0.0, 0.01, 0.05],
+        [0.0, 0.02, 0.2, 0.01, 0.03],
+        [0.42, 0.0, 0.02, 0.01],
+        [0.9, 0.7, 0.4, 0.2, 0.0, 0.02, 0.01],
+    ],
+    ids=["first late", "others late", "first very late", "a queue at first"],
 )
 @pytest.mark.parametrize(
     "clock",
@@ -148,20 +157,24 @@ def test_one_knock_is_found_whatever_the_calibration_says_of_the_clock(
     assert status.dropped == 0
 
 
-def test_a_scanner_that_counts_anew_is_learnt_again() -> None:
-    """Nothing moves: what the second half shows is another start of the device's clock."""
+@pytest.mark.parametrize(("set_by_s", "lost"), [(-70.0, 0), (1.2, 0), (-1.2, 62)], ids=["anew", "forward", "back"])
+def test_a_clock_that_is_set_is_learnt_again(set_by_s: float, lost: int) -> None:
+    """Nothing moves: what the second half shows is another device clock. One that was set back a little may be late for 3 s."""
     calibration = MonitoredCalibration(X_BC, np.diag([1e-9] * 6), delay_s=DELAY_S)
     monitor = DriftMonitor(ARM, RigidTransform(), calibration)
     context, rng = monitor.CreateDefaultContext(), np.random.default_rng(3)
-    times = np.arange(0.0, 9.0, 0.008)
+    times = np.arange(0.0, 11.0, 0.008)
     monitor.GetInputPort("history").FixValue(context, AbstractValue.Make(PoseHistory(times, joints(times))))
-    for k, t in enumerate(np.arange(0.5, 7.5, 0.05)):
-        device = 70.0 + float(t) if t < 4.0 else float(t) - 4.0
+    frames = np.arange(0.5, 9.5, 0.05)
+    for k, t in enumerate(frames):
+        device = 70.0 + float(t) + (set_by_s if t > 4.0 else 0.0)
         arrival = float(t) + DELAY_S + 0.1 * (k % 7 == 0)
-        seen = dc.replace(estimate(k + 1, float(t), rng), arrival_time=arrival, device_time=device)
+        seen = estimate(k + 1, float(t), rng, knock_s=np.inf)
+        seen = dc.replace(seen, arrival_time=arrival, device_time=device)
         monitor.GetInputPort("flange_estimate").FixValue(context, AbstractValue.Make(seen))
         monitor._update(context, context.get_mutable_state())
     status = monitor.status(context)
     assert status.events == ()
     assert not status.moved
-    assert status.frames > 120
+    assert status.dropped <= lost
+    assert status.frames + status.dropped == len(frames)
