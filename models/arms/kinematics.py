@@ -6,21 +6,26 @@ in link i-1 at zero angle, and the chain is their plain product: X_BF = prod_i X
 factory calibration has the same schema as the nominal numbers, so nothing else changes when one is given.
 """
 
+from __future__ import annotations
+
+import importlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 from weldcal.models.limits import LARGEST_NUMBER
+
+if TYPE_CHECKING:
+    from pydrake.math import RigidTransform
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 LINK_NAMES = ("base", *(f"{link}_link" for link in LINKS))
@@ -201,7 +206,7 @@ def forward_kinematics(arm: ArmModel, q: ArrayLike) -> RigidTransform:
 def link_frames(arm: ArmModel, q: ArrayLike) -> list[RigidTransform]:
     """Poses in B of the seven links of `arm.link_names` at q (6,) rad: the base (identity) first, the flange F last."""
     chain = _chain(arm.stack, np.asarray(q, dtype=np.float64))
-    return [RigidTransform(), *(_rigid(X[:3, :3], X[:3, 3]) for X in chain)]
+    return [_drake().RigidTransform(), *(_rigid(X[:3, :3], X[:3, 3]) for X in chain)]
 
 
 def jacobian(arm: ArmModel, q: ArrayLike, p_FP: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
@@ -332,11 +337,19 @@ def _tensor(t: Mapping[str, float]) -> Array:
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Array:
-    return np.asarray(RollPitchYaw(roll, pitch, yaw).ToRotationMatrix().matrix(), dtype=np.float64)
+    return np.asarray(_drake().RollPitchYaw(roll, pitch, yaw).ToRotationMatrix().matrix(), dtype=np.float64)
+
+
+@cache
+def _drake() -> Any:
+    """pydrake.math, imported at the first call: the process that supervises a robot has an ArmModel and no use for it."""
+    return importlib.import_module("pydrake.math")
 
 
 def _rigid(R: Any, p: Any) -> RigidTransform:
-    return RigidTransform(RotationMatrix(R), p)
+    drake = _drake()
+    X: RigidTransform = drake.RigidTransform(drake.RotationMatrix(R), p)
+    return X
 
 
 def _frozen(values: ArrayLike) -> Array:

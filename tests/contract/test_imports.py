@@ -220,3 +220,14 @@ def test_the_rules_would_catch_an_offender() -> None:
 
 def test_every_folder_is_looked_at() -> None:
     assert {name.split("/")[0] for name in FILES} == set(FOLDERS)
+
+
+def test_the_process_that_supervises_a_robot_loads_no_drake() -> None:
+    """It starts in half the time, and takes half of the memory."""
+    script = (
+        "import sys\nimport weldcal.systems.drivers.ur.worker\n"
+        "loaded = {name.split('.')[0] for name in sys.modules} & {'pydrake', 'scipy', 'numba', 'cv2', 'open3d'}\n"
+        "assert not loaded, loaded\n"
+    )
+    finished = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
