@@ -52,6 +52,24 @@ def check_arm(scenario: Scenario) -> None:
         )
 
 
+def check_inputs(scenario: Scenario) -> None:
+    """Check that no digital input of the controller is to show two things.
+
+    Raises:
+        InputError: it names the two.
+    """
+    probe, robot = scenario.touch_probe, scenario.robot
+    keys = {f"robot.{name}": getattr(robot, name, None) for name in ("arc_input", "arc_fault_input")}
+    if getattr(probe, "host", "") == getattr(robot, "host", None):
+        keys["touch_probe.input"] = getattr(probe, "input", None)
+    seen: dict[int, str] = {}
+    for key, number in keys.items():
+        if number is not None and number in seen:
+            raise InputError(f"{seen[number]} and {key} are both digital input {number}: wire them to two inputs.")
+        if number is not None:
+            seen[number] = key
+
+
 def check_refinement(scenario: Scenario) -> None:
     """Check that the live calibration can be refined as the scenario wants it.
 
@@ -82,6 +100,7 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     found = job_of(scenario)  # raises for the parts of two jobs
     check_numbers(scenario)
+    check_inputs(scenario)
     if found.key and scenario.base != PoseConfig():
         raise InputError(
             f"A {found.key} job runs with the robot's base upright at the world's origin only: leave out base, or calibrate with "

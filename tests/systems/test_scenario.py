@@ -461,6 +461,32 @@ def test_two_settings_that_contradict_each_other_are_refused(overrides: str, sai
         load_scenario("s_groove", overrides)
 
 
+@pytest.mark.parametrize(
+    ("robot", "probe", "said"),
+    [
+        (
+            "arc_input: 4, arc_fault_input: 4",
+            "host: 10.0.0.9, input: 4",
+            "robot.arc_input and robot.arc_fault_input are both",
+        ),
+        (
+            "arc_input: 4, arc_fault_input: 5",
+            "host: 10.0.0.1, input: 5",
+            "robot.arc_fault_input and touch_probe.input are both",
+        ),
+        ("arc_input: 4, arc_fault_input: 5", "host: 10.0.0.9, input: 5", None),
+    ],
+    ids=["arc and fault", "fault and probe", "another controller"],
+)
+def test_an_input_of_the_controller_shows_one_thing(robot: str, probe: str, said: str | None) -> None:
+    text = f"robot: !UrRtde {{host: 10.0.0.1, {robot}}}\ntouch_probe: !UrTouchProbe {{{probe}}}"
+    if said is None:
+        load_scenario("s_groove", text)
+        return
+    with pytest.raises(InputError, match=f"{said} digital input [45]: wire them to two inputs"):
+        load_scenario("s_groove", text)
+
+
 def test_the_first_of_two_faults_is_named_and_the_second_when_that_is_mended() -> None:
     scenario = load_scenario("s_groove")
     scenario.home_deg = scenario.home_deg[:5]
