@@ -34,6 +34,17 @@ FLAGS = (
     "--disable-default-apps",
 )
 
+# Without a graphics card a frame of a cell takes half a second of a core, and it is drawn again as long as it is open: frames queue up,
+# and a screenshot waits for all of them. Once a second, with hard edges, is enough to look at.
+SLOW_ANIMATION = """
+window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 1000);
+window.cancelAnimationFrame = clearTimeout;
+const getContext = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, wanted) {
+  return getContext.call(this, kind, { ...wanted, antialias: false });
+};
+"""
+
 
 class Browser:
     """One headless browser; a file is opened with no network at all, a server on this machine with it."""
@@ -41,6 +52,7 @@ class Browser:
     def __init__(self, driver: Chrome) -> None:
         self._driver = driver
         driver.execute_cdp_cmd("Network.enable", {})
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": SLOW_ANIMATION})
 
     def open(
         self, page: Path | str, *, wait_for: str = "document.readyState === 'complete'", timeout_s: float = 30
