@@ -431,6 +431,16 @@ def test_the_arm_may_be_somewhere_else(robot: Emulator) -> None:
         assert client.until("actual_q", q)["actual_qd"] == [0.0] * 6
 
 
+def test_an_arm_whose_joints_jump_moves_on_from_there(robot: Emulator) -> None:
+    move(robot)
+    at = robot.fault("set_q", q=[1.0, *HOME[1:]], latch=False)
+    with Rtde(robot.host).watch("actual_q", "actual_qd") as client:
+        seen = [row for row in (client.next() for _ in range(20)) if row["actual_q"][0] > 0.99]
+    assert [row["actual_qd"][0] for row in seen] == pytest.approx([SPEED_RAD_S] * len(seen))
+    assert len(seen) > 10
+    assert robot.ask(check="at_rest_after", fault_time=at, within=0.3)["rest_after_s"] is None
+
+
 def test_tool_contact_is_what_a_script_sees(robot: Emulator) -> None:
     robot.fault("tool_contact", n=7)
     run(robot, "def touch():\nwrite_output_integer_register(3, tool_contact())\nend")

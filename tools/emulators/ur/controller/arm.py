@@ -45,6 +45,12 @@ class EmulatedArm:
         self.motion = self.compliance = None
         self._cache.clear()
 
+    def displace(self, q: Array) -> None:
+        """The joints are elsewhere from one step to the next, as no robot's are; what moves goes on from there."""
+        self.q_target = np.array(q, dtype=np.float64)
+        self.q = self.q_target.copy()
+        self._cache.clear()
+
     def set_tcp(self, pose: list[float]) -> None:
         """The tool centre point in the flange frame."""
         self.X_FT = matrix(pose)

@@ -90,7 +90,7 @@ class ControlServer(Server):
             "slow_start": lambda r, now: setattr(c, "start_delay_s", _number(r, "seconds")),
             "tracking_lag": lambda r, now: setattr(c.arm, "lag_s", _number(r, "seconds")),
             "wrong_tcp": lambda r, now: c.set_tcp(_six(r, "pose", [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])),
-            "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
+            "set_q": lambda r, now: c.arm.displace(np.array(_six(r, "q"))),
             "tool_contact": lambda r, now: setattr(c, "tool_contact_steps", int(_number(r, "n", 1))),
         }
         self._faults |= more_faults or {}
