@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOu
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.compiled_rotation import cross_rows, rotation_of
 from weldcal.calibration.geometry.quantiles import chi2_quantile, f_quantile
-from weldcal.calibration.geometry.rigid import fit_rigid, fit_rigid_sets, fit_rotation
+from weldcal.calibration.geometry.rigid import fit_all_rigid_sets, fit_rigid_sets, fit_rotation
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
 from weldcal.models.arrays import Array
@@ -171,38 +172,47 @@ def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
     if n < 3:
         return _closed_form(data)
     h = min(n, max(3, int(np.ceil((1.0 - config.max_outliers) * n))))
-    rng = np.random.default_rng(config.seed)
-    total = n * (n - 1) * (n - 2) // 6
-    if total <= config.hypotheses:
-        i, j, k = np.meshgrid(*[np.arange(n)] * 3, indexing="ij")
-        sets = np.stack([i, j, k], axis=-1).reshape(-1, 3)
-        sets = sets[(sets[:, 0] < sets[:, 1]) & (sets[:, 1] < sets[:, 2])]
-    else:
-        sets = np.array([rng.choice(n, 3, replace=False) for _ in range(config.hypotheses)])
+    sets = _minimal_sets(n, config.hypotheses, config.seed)
     R, t = fit_rigid_sets(data.b[sets], data.c[sets])
     if len(R) == 0:
         return _closed_form(data)
-    square = ((np.einsum("kij,nj->kni", R, data.c) + t[:, None] - data.b) ** 2).sum(axis=2)
-    costs = np.partition(square, h - 1, axis=1)[:, :h].sum(axis=1)
-    order = np.argsort(costs, kind="stable")[:15]
-    candidates = [(float(costs[k]), RigidTransform(RotationMatrix.ProjectToRotationMatrix(R[k]), t[k])) for k in order]
-    best = candidates[0]
-    for cost, X in candidates:
-        e = _distances(data, X)
-        for _ in range(6):
-            nearest = np.argsort(e, kind="stable")[:h]
-            try:
-                better = fit_rigid(data.b[nearest], data.c[nearest])
-            except ValueError:
-                break
-            e = _distances(data, better)
-            new = float(np.sum(np.partition(e**2, h - 1)[:h]))
-            if new >= cost * (1.0 - 1e-9):
-                break
-            cost, X = new, better
-        if cost < best[0]:
-            best = (cost, X)
-    return best[1]
+    costs = _trimmed(_squares(data, R, t), h)
+    best = np.argsort(costs, kind="stable")[:15]
+    R, t, costs = R[best], t[best], costs[best]
+    going = np.arange(len(best))
+    for _ in range(6):
+        nearest = np.argsort(_squares(data, R[going], t[going]), axis=1, kind="stable")[:, :h]
+        R_new, t_new, fixed = fit_all_rigid_sets(data.b[nearest], data.c[nearest])
+        new = _trimmed(_squares(data, R_new, t_new), h)
+        better = fixed & (new < costs[going] * (1.0 - 1e-9))
+        going = going[better]
+        if len(going) == 0:
+            break
+        R[going], t[going], costs[going] = R_new[better], t_new[better], new[better]
+    k = int(np.argmin(costs))
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R[k]), t[k])
+
+
+@lru_cache(maxsize=32)
+def _minimal_sets(n: int, hypotheses: int, seed: int) -> NDArray[np.int64]:
+    """All triples of n poses (k, 3), or as many drawn ones as there are hypotheses; folds of one size share them."""
+    if n * (n - 1) * (n - 2) // 6 <= hypotheses:
+        sets = np.array(list(itertools.combinations(range(n), 3)))
+    else:
+        rng = np.random.default_rng(seed)
+        sets = np.array([rng.choice(n, 3, replace=False) for _ in range(hypotheses)])
+    sets.setflags(write=False)
+    return sets
+
+
+def _squares(data: _Data, R: Array, t: Array) -> Array:
+    """Squared distances (k, n) m^2 of the flange centres for k poses R (k, 3, 3), t (k, 3)."""
+    return np.asarray(((data.c @ np.swapaxes(R, 1, 2) + t[:, None] - data.b) ** 2).sum(axis=2))
+
+
+def _trimmed(square: Array, h: int) -> Array:
+    """The sum (k,) over the h smallest of each row of `square` (k, n)."""
+    return np.asarray(np.partition(square, h - 1, axis=1)[:, :h].sum(axis=1))
 
 
 def _distances(data: _Data, X: RigidTransform) -> Array:
