@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.compliance import Compliance, Nominal
 from weldcal.tools.emulators.ur.controller.motions import REST_RAD_S, STEP_S, Motion, MotionRefused, slowed
-from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
+from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, rotation_vector
 
 # [M] how the arm slows when its program stops, pauses, or a safety function acts
 STOP_RAD_S2 = 10.0
@@ -35,7 +36,7 @@ class EmulatedArm:
         self.touch: Callable[[], Array] = lambda: np.zeros(6)
         self.lag_s = 0.0
         self.history: deque[Array] = deque(maxlen=HISTORY)
-        self._cache: dict[str, list[float]] = {}
+        self._cache: tuple[dict[str, Any], dict[str, Any]] = ({}, {})  # of the actual and of the target joints
 
     def place(self, q: Array) -> None:
         """Puts the arm somewhere at rest, as no robot can."""
@@ -43,19 +44,19 @@ class EmulatedArm:
         self.q = self.q_target.copy()
         self.qd_target, self.qdd_target, self.qd = np.zeros(6), np.zeros(6), np.zeros(6)
         self.motion = self.compliance = None
-        self._cache.clear()
+        self._forget()
 
     def displace(self, q: Array) -> None:
         """The joints are elsewhere from one step to the next, as no robot's are; what moves goes on from there."""
         self.q_target = np.array(q, dtype=np.float64)
         self.q = self.q_target.copy()
-        self._cache.clear()
+        self._forget()
 
     def set_tcp(self, pose: list[float]) -> None:
         """The tool centre point in the flange frame."""
         self.X_FT = matrix(pose)
         self.p_FT = self.X_FT[:3, 3].copy()
-        self._cache.clear()
+        self._forget()
 
     @property
     def at_rest(self) -> bool:
@@ -111,6 +112,7 @@ class EmulatedArm:
         return qd
 
     def _integrate(self, qd: Array) -> None:
+        moves = qd.any() or self.lag_s > 0.0 or self.q is not self.q_target
         self.qdd_target = (qd - self.qd_target) / STEP_S
         self.qd_target = qd
         self.q_target = self.q_target + qd * STEP_S
@@ -121,8 +123,12 @@ class EmulatedArm:
         else:
             self.qd, self.q = qd, self.q_target
         self.history.append(self.q)
-        if qd.any() or self.lag_s > 0.0:
-            self._cache.clear()
+        if moves:
+            self._forget()
+
+    def _forget(self) -> None:
+        for cache in self._cache:
+            cache.clear()
 
     def flange(self, q: Array) -> Array:
         """X_BF (4, 4) at q."""
@@ -137,19 +143,30 @@ class EmulatedArm:
 
     def tool_pose(self, target: bool = False) -> list[float]:
         """The tool's pose in the base, from the actual or the target joints."""
-        key = "target" if target else "actual"
-        if key not in self._cache:
-            self._cache[key] = pose_of(self.flange(self.q_target if target else self.q) @ self.X_FT)
-        return self._cache[key]
+        cache = self._cache_of(target)
+        if "pose" not in cache:
+            R, p, _ = self._tool(cache, target)
+            cache["pose"] = [*p.tolist(), *rotation_vector(R @ self.X_FT[:3, :3]).tolist()]
+        return list(cache["pose"])
 
     def tool_speed(self, target: bool = False) -> list[float]:
         """The tool's twist [v; w] in base axes (m/s, rad/s)."""
         qd = self.qd_target if target else self.qd
         if not qd.any():
             return [0.0] * 6
-        key = "target speed" if target else "actual speed"
-        if key not in self._cache:
-            J = kinematics_and_jacobian(self.model, self.q_target if target else self.q, self.p_FT)[2]
-            V = (J @ qd).tolist()
-            self._cache[key] = [*V[3:], *V[:3]]
-        return self._cache[key]
+        cache = self._cache_of(target)
+        if "speed" not in cache:
+            V = (self._tool(cache, target)[2] @ qd).tolist()
+            cache["speed"] = [*V[3:], *V[:3]]
+        return list(cache["speed"])
+
+    def _tool(self, cache: dict[str, Any], target: bool) -> tuple[Array, Array, Array]:
+        """R_BF, the tool's place p_BT and its Jacobian: once a step for all that ask."""
+        if "tool" not in cache:
+            cache["tool"] = kinematics_and_jacobian(self.model, self.q_target if target else self.q, self.p_FT)
+        found: tuple[Array, Array, Array] = cache["tool"]
+        return found
+
+    def _cache_of(self, target: bool) -> dict[str, Any]:
+        """What was computed in this step; an arm that does not trail its target has one of both."""
+        return self._cache[target and self.q is not self.q_target]

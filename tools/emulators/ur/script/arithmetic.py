@@ -27,6 +27,8 @@ def copied(value: Any) -> Any:
 
 def item(values: Any, index: Any) -> Any:
     """values[index], or the member of a struct."""
+    if type(values) is list and type(index) is int and 0 <= index < len(values):
+        return values[index]
     if isinstance(values, Struct):
         if index not in values:
             raise ScriptError(f"The struct has no member {index!r}.")

@@ -14,6 +14,8 @@ from weldcal.tools.emulators.ur.script.syntax import Expression, Routine, Script
 
 SOURCE_NAME = "<urscript>"
 _OPERATORS = {"+": "added", "-": "subtracted", "*": "multiplied", "/": "divided", "%": "remainder"}
+_LOGICAL = ("not", "and", "or", "xor")
+_BOOLEAN = (*_LOGICAL, "==", "!=", "<", "<=", ">", ">=")
 _HELPERS = ("Pose", "copied", "item", "place", "truth", "negated", "number", "method")
 Slices = Generator[None, None, Any]
 
@@ -134,13 +136,13 @@ class _Emitter:
             case syntax.Conditional(branches=branches, otherwise=otherwise):
                 for i, (condition, body) in enumerate(branches):
                     # `elif` whose condition calls a routine stays correct: Python evaluates it only when it is reached
-                    self.emit(depth, f"{'elif' if i else 'if'} truth({self.value(condition)}):")
+                    self.emit(depth, f"{'elif' if i else 'if'} {self._truth(condition)}:")
                     self._body(body, depth + 1)
                 if otherwise:
                     self.emit(depth, "else:")
                     self._body(otherwise, depth + 1)
             case syntax.Loop(condition=condition, body=body):
-                self.emit(depth, f"while truth({self.value(condition)}):")
+                self.emit(depth, f"while {self._truth(condition)}:")
                 self.emit(depth + 1, "loop()")
                 self._body(body, depth + 1)
             case syntax.Command():
@@ -191,18 +193,25 @@ class _Emitter:
                 listed = ", ".join([self.value(target), repr(name), *map(self.value, arguments)])
                 return f"method({listed})"
             case syntax.Operation(operator=operator, operands=operands):
+                if operator in _LOGICAL:
+                    return self._logical(operator, [self._truth(operand) for operand in operands])
                 return self._operation(operator, [self.value(operand) for operand in operands])
 
-    def _operation(self, operator: str, values: list[str]) -> str:
+    def _truth(self, expression: Expression) -> str:
+        """The expression as a condition; what can only be True or False is not asked what it is, a hundred times a frame."""
+        value = self.value(expression)
+        boolean = isinstance(expression, syntax.Operation) and expression.operator in _BOOLEAN
+        return value if boolean else f"truth({value})"
+
+    def _logical(self, operator: str, values: list[str]) -> str:
         if operator == "not":
-            return f"(not truth({values[0]}))"
+            return f"(not {values[0]})"
+        return f"({values[0]} {'!=' if operator == 'xor' else operator} {values[1]})"
+
+    def _operation(self, operator: str, values: list[str]) -> str:
         if len(values) == 1:
             return f"negated({values[0]})" if operator == "-" else values[0]
         left, right = values
-        if operator == "xor":
-            return f"(truth({left}) != truth({right}))"
-        if operator in ("and", "or"):
-            return f"(truth({left}) {operator} truth({right}))"
         if operator in _OPERATORS:
             return f"{_OPERATORS[operator]}({left}, {right})"
         return f"({left} {operator} {right})"
