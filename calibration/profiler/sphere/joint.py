@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
 from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
@@ -123,7 +123,7 @@ def _started(init: SphereEstimate, data: SphereData, layout: Layout) -> Floats:
 
 
 def _turned(R: Floats, x: Floats) -> Floats:
-    return np.asarray(Rotation.from_rotvec(x[:3]).as_matrix() @ R)
+    return exp_rotation(x[:3]) @ R
 
 
 def _refuse_open(estimate: SphereEstimate, best: Floats, rivals: list[Floats]) -> None:
@@ -218,7 +218,7 @@ def _check(data: SphereData, model: Model) -> None:
 def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
     """The result with its covariance, and whether it may be believed."""
     # linearised about itself: a large rotation vector's own covariance is not that of a turn in F
-    R = np.asarray(Rotation.from_rotvec(x[:3]).as_matrix() @ R0)
+    R = exp_rotation(x[:3]) @ R0
     problem.linearise_about(R)
     x = np.concatenate([np.zeros(3), x[3:]])
     pose, c, tip, affine, arm = problem.layout.unpack(x)

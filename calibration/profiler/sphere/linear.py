@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.profiler.errors import DegenerateMotion, RadiusError, TooFewRotations, TooFewTranslations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_axes_spread
 from weldcal.models.errors import InputError
@@ -202,7 +202,7 @@ def compensate(
     P, c = np.asarray(centers, float), np.asarray(touched, float)
 
     def moved(x: Floats) -> tuple[Floats, Floats]:
-        return Rotation.from_rotvec(x[:3]).as_matrix() @ start.rotation, start.translation + x[3:]
+        return exp_rotation(x[:3]) @ start.rotation, start.translation + x[3:]
 
     def residual(x: Floats) -> Floats:
         R, t = moved(x)

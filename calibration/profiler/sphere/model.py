@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, OFFSET_JOINTS, SAG_JOINTS, ArmErrors, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, left_jacobian
 
@@ -197,7 +197,7 @@ class Problem:
         rotation, translation = self._rotation, self._translation
         if poses is not self.data.poses:
             rotation, translation = poses.rotation[self.of], poses.translation[self.of]
-        R = Rotation.from_rotvec(pose[:3]).as_matrix() @ self._R0
+        R = exp_rotation(pose[:3]) @ self._R0
         turned = corrected(self.p, affine, self.origin) @ R.T
         at = np.einsum("nij,nj->ni", rotation, turned + pose[3:]) + translation - c
         felt = np.empty((0, 3))
@@ -274,7 +274,7 @@ class Problem:
         at, _, poses = self.off(x)
         normals = at / np.linalg.norm(at, axis=1, keepdims=True)
         # noise lies in the scan plane, and the sphere's normal does not: only its part in the plane carries noise
-        y_F = Rotation.from_rotvec(x[:3]).as_matrix() @ self._R0[:, 1]
+        y_F = exp_rotation(x[:3]) @ self._R0[:, 1]
         y_B = np.einsum("nij,j->ni", poses.rotation, y_F)[self.of]
         self._slant = np.sqrt(np.maximum(1.0 - np.einsum("ni,ni->n", normals, y_B) ** 2, 0.01))
         normals = normals / self._slant[:, None]
