@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -159,10 +159,18 @@ def triangulate_polygon(outline: Floats, holes: list[Floats] | None = None, inte
     Delaunay triangles with centroids inside; no point is added, so neighbouring faces stay watertight. Raises
     InputError where a boundary edge is not in the triangulation: the outline must be sampled finer there.
     """
+    loops = [np.asarray(part, dtype=np.float64) for part in (outline, *(holes or []))]
+    extra = np.zeros((0, 2)) if interior is None else np.asarray(interior, dtype=np.float64)
+    return _triangulated(tuple(loop.tobytes() for loop in loops), extra.tobytes()).copy()
+
+
+@lru_cache(maxsize=16)
+def _triangulated(outlines: tuple[bytes, ...], interior: bytes) -> Ints:
+    """`triangulate_polygon` of points as bytes: a cell makes the same flange and the same plate several times."""
     from scipy.spatial import Delaunay
 
-    loops = [np.asarray(outline, dtype=np.float64), *[np.asarray(h, dtype=np.float64) for h in (holes or [])]]
-    extra = np.zeros((0, 2)) if interior is None else np.asarray(interior, dtype=np.float64)
+    loops = [np.frombuffer(part).reshape(-1, 2) for part in outlines]
+    extra = np.frombuffer(interior).reshape(-1, 2)
     points = np.concatenate([*loops, extra])
     scaled = (points - points.mean(axis=0)) / np.ptp(points, axis=0).max()
     triangles = Delaunay(scaled).simplices.astype(np.int64)

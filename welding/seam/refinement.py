@@ -225,7 +225,8 @@ def local_fit(
     normal[1, 1] += ridge
     normal[2, 2] += 1e-6
     rhs[1] += ridge * sigma * plan_tangent
-    c = np.linalg.solve(normal, rhs)
+    inverse = np.linalg.inv(normal)  # of (3, 3), well conditioned by its scale; two right sides follow one another
+    c = inverse @ rhs
     slope = c[1] / sigma
     speed = math.sqrt(float(slope @ slope))
     if not math.isfinite(speed):
@@ -233,7 +234,7 @@ def local_fit(
     # The fitted point moves along the slope plus the effect of the moving weights as the window advances: where
     # the curvature jumps the two differ by 0.2 sigma/R, and a torch that headed along the slope would leave the point.
     left_over = points - basis.T @ c
-    slope = slope + np.linalg.solve(normal, (weighted * x) @ left_over)[0] / sigma
+    slope = slope + (inverse[0] @ (weighted * x)) @ left_over / sigma
     speed = math.sqrt(float(slope @ slope))
     # A tip that sticks leaves points that hardly advance, and their direction is noise: the plan's stands in for it. In a
     # concave corner of 1 mm the tip still comes on by a third of the rest point's way, and its direction is good.

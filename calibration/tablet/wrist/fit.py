@@ -178,6 +178,8 @@ def _refine(
 ) -> tuple[tuple[RigidTransform, Array, RigidTransform], Array, Array, Array]:
     """Least squares over (X_BT, p_FP, X_FC); returns them, their covariance (15, 15) and both kinds of residuals."""
     R_BT = start[0].rotation().matrix()
+    R_BF = np.array([X.rotation().matrix() for X in data.X_BF])
+    p_BF = np.array([X.translation() for X in data.X_BF])
     touched = np.c_[data.touched_m, np.full(len(data.touched_m), -data.tip_radius_m)]
     landmarks = np.c_[data.landmark_m, np.zeros(len(data.landmark_m))]
     spread = np.array([_OPEN_PRIOR_M] * 2 + [_OPEN_PRIOR_M if pen_length_m is None else _KNOWN_PRIOR_M])
@@ -188,7 +190,7 @@ def _refine(
 
     def parts(x: Array) -> tuple[Array, Array]:
         X_BT, p_FP, X_FC = moved(x)
-        tip = np.array([X.multiply(p_FP) for X in data.X_BF])
+        tip = R_BF @ p_FP + p_BF
         touch = tip - X_BT.multiply(touched.T).T
         pixel = []
         for X_BF, rays in data.views:
