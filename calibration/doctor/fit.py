@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from weldcal.calibration.doctor.case import Case
-from weldcal.calibration.geometry.rigid import fit_rigid, fit_rigid_sets
+from weldcal.calibration.geometry.rigid import drawn_triples, fit_rigid, fit_rigid_sets
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arrays import Array
 
@@ -63,8 +63,7 @@ class Fit:
 def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
     """Rotation (3, 3) and position (3,) that explain most of the centres (least trimmed squares over seeded triples)."""
     n = len(b)
-    rng = np.random.default_rng(seed)
-    sets = np.array([rng.choice(n, 3, replace=False) for _ in range(_TRIPLES if n > 3 else 1)])
+    sets = drawn_triples(n, _TRIPLES if n > 3 else 1, seed)
     R, t = fit_rigid_sets(b[sets], c[sets])
     if len(R) == 0:
         return np.eye(3), np.asarray(b.mean(axis=0) - c.mean(axis=0))

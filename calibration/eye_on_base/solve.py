@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOu
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.compiled_rotation import cross_rows, rotation_of
 from weldcal.calibration.geometry.quantiles import chi2_quantile, f_quantile
-from weldcal.calibration.geometry.rigid import fit_all_rigid_sets, fit_rigid_sets, fit_rotation
+from weldcal.calibration.geometry.rigid import drawn_triples, fit_all_rigid_sets, fit_rigid_sets, fit_rotation
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
 from weldcal.models.arrays import Array
@@ -193,16 +193,11 @@ def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R[k]), t[k])
 
 
-@lru_cache(maxsize=32)
 def _minimal_sets(n: int, hypotheses: int, seed: int) -> NDArray[np.int64]:
-    """All triples of n poses (k, 3), or as many drawn ones as there are hypotheses; folds of one size share them."""
+    """All triples of n poses (k, 3), or as many drawn ones as there are hypotheses."""
     if n * (n - 1) * (n - 2) // 6 <= hypotheses:
-        sets = np.array(list(itertools.combinations(range(n), 3)))
-    else:
-        rng = np.random.default_rng(seed)
-        sets = np.array([rng.choice(n, 3, replace=False) for _ in range(hypotheses)])
-    sets.setflags(write=False)
-    return sets
+        return np.array(list(itertools.combinations(range(n), 3)))
+    return drawn_triples(n, hypotheses, seed)
 
 
 def _squares(data: _Data, R: Array, t: Array) -> Array:

@@ -1,5 +1,7 @@
 """Closed-form rigid registration of two point sets or direction sets: the paper's Eq. (10) to (12)."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
@@ -39,6 +41,15 @@ def fit_all_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array, NDArray[np
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
     R = U @ Vt
     return R, mean_B - np.einsum("kij,kj->ki", R, mean_C), good
+
+
+@lru_cache(maxsize=64)
+def drawn_triples(n: int, count: int, seed: int) -> NDArray[np.int64]:
+    """Minimal sets (count, 3) of n points, each of three different ones; drawn once, for folds and models ask for the same."""
+    rng = np.random.default_rng(seed)
+    sets = np.array([rng.choice(n, 3, replace=False) for _ in range(count)])
+    sets.setflags(write=False)
+    return sets
 
 
 def fit_rotation(u_B: Array, u_C: Array) -> RotationMatrix:
