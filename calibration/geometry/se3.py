@@ -62,9 +62,9 @@ def rotation_vector(R: RotationMatrix) -> Array:
 def exp_rotation(w: Array) -> Array:
     """Rotations (..., 3, 3) of rotation vectors (..., 3) rad."""
     w = np.asarray(w, dtype=float)
-    if w.ndim > 1:
+    if w.ndim > 1 or not math.isfinite(w @ w):
         return np.asarray(Rotation.from_rotvec(w).as_matrix())
-    # one at a time, as solvers ask: Rodrigues' formula on plain numbers takes a tenth of the time
+    # one at a time, as solvers ask: Rodrigues' formula on plain numbers takes a sixth of the time
     x, y, z = w.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     a = math.sin(angle) / angle if angle > 0.0 else 1.0
