@@ -470,3 +470,5 @@ def test_what_is_not_a_fault_is_refused_with_a_sentence(robot: Emulator) -> None
         robot.fault("earthquake")
     with pytest.raises(InputError, match="Give a number as 'seconds'"):
         robot.fault("drop")
+    with pytest.raises(InputError, match="Give six numbers as 'q'"):
+        robot.fault("set_q", q=[*HOME[:5], None])

@@ -314,7 +314,7 @@ def _six(request: Request, key: str, default: list[float] | None = None) -> list
 
 def _several(request: Request, key: str, count: int, default: list[float] | None = None) -> list[float]:
     value = request.get(key, default)
-    if not isinstance(value, list) or len(value) != count:
+    if not isinstance(value, list) or len(value) != count or not all(type(v) in (int, float) for v in value):
         raise InputError(f"Give {'six' if count == 6 else 'three'} numbers as {key!r}.")
     return [float(v) for v in value]
 
