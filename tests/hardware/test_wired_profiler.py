@@ -30,7 +30,7 @@ from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.profiler import ProfilerLive
 
 SEED = 3
-FEW_EDGES = "profiler_job: {edge: {scans: 12, held_out: 2}}"
+FEW_EDGES = "profiler_job: {edge: {scans: 8, held_out: 1}}"
 FEW_TOUCHES = "profiler_job: {sphere: {scans: 6, held_out: 1, touches: 6, descent_mm_s: 10.0, gap_mm: 6.0}}"
 """Sphere and edge stand in the same world: it plays all of this."""
 
