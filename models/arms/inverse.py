@@ -13,6 +13,7 @@ from weldcal.models.errors import InputError
 RESIDUAL = 1e-9  # m and rad: what a returned solution fulfils
 _TARGET = 1e-12  # where Newton stops: three orders below, above rounding
 _MAX_STEPS = 20
+_BRANCHES = 8  # shoulder, elbow and wrist, two each
 _MAX_STEP_RAD = 0.3
 # How far outside [-1, 1] a cosine may lie and still seed Newton: a calibrated arm may reach past the nominal one.
 _COSINE_SLACK = 0.02
@@ -62,12 +63,13 @@ def nearest_solution(arm: ArmModel, X_BF: RigidTransform, q_near: ArrayLike) -> 
     if near.shape != (6,) or not np.isfinite(near).all():
         raise InputError("The joint angles to stay near must be six finite numbers.")
     q = inverse_kinematics(arm, X_BF, free_wrist_3=float(_wrapped(near)[5]))
-    # Beside a singularity the branch that holds q_near may have no closed-form seed of its own: q_near is one.
-    goal = X_BF.GetAsMatrix4()
-    here = _polish(arm, goal[:3, :3], goal[:3, 3], near)
-    if here is not None and np.all((here >= arm.position_lower) & (here <= arm.position_upper)):
-        q = np.vstack([q, here])
-    if q.shape[0] == 0:
+    if len(q) < _BRANCHES:
+        # Beside a singularity the branch that holds q_near may have no closed-form seed of its own: q_near is one.
+        goal = X_BF.GetAsMatrix4()
+        here = _polish(arm, goal[:3, :3], goal[:3, 3], near)
+        if here is not None and np.all((here >= arm.position_lower) & (here <= arm.position_upper)):
+            q = np.vstack([q, here])
+    if len(q) == 0:
         return None
     turn = 2.0 * np.pi
     lowest = np.ceil((arm.position_lower - q) / turn)
