@@ -113,7 +113,7 @@ class ContinuousMotion:
         X_R = np.eye(4) if X_FR is None else X_FR.GetAsMatrix4()
         begin, end = self.span
         early, late = np.maximum(t - _STEP_S, begin), np.minimum(t + _STEP_S, end)
-        now, before, after = (self.poses(at) @ X_R for at in (t, early, late))
+        now, before, after = (self.poses(np.concatenate([t, early, late])) @ X_R).reshape(3, -1, 4, 4)
         dt = np.maximum(late - early, 1e-9)[:, None]
         p, n = now[:, :3, 3], now[:, :3, 2]
         return FeatureMotion(p, n, (after[:, :3, 3] - before[:, :3, 3]) / dt, (after[:, :3, 2] - before[:, :3, 2]) / dt)
