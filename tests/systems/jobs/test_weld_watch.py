@@ -58,7 +58,7 @@ def test_a_scanner_knocked_before_the_weld_holds_the_job() -> None:
 
 
 def test_a_scanner_knocked_in_the_weld_is_a_warning_and_the_weld_goes_on() -> None:
-    result = knocked(8.5, 1.0, 10.0)
+    result = knocked(8.5, 1.0, 6.0)
     said: dict[str, Any] = result.summary()
     assert result.run.command.phase == "weld"
     assert not result.run.command.held

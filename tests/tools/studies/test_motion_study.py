@@ -13,7 +13,7 @@ from weldcal.tools.studies.motion.throughput import run_throughput
 
 
 def test_synchronised_frames_agree_and_frames_at_their_arrival_do_not(tmp_path: Path) -> None:
-    study = run_motion_study(MotionStudyOptions(tmp_path, seed=1, quick=True, frames=40), lambda *_: None)
+    study = run_motion_study(MotionStudyOptions(tmp_path, seed=1, quick=True, frames=30), lambda *_: None)
     static, raw, joint = study.rows
     assert static.rms_mm < 0.1
     assert raw.rms_mm > 5.0  # the paper: about 10 mm
