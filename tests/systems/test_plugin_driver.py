@@ -10,8 +10,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from tests.places import ROOT
+from weldcal.tools.cli.app import app
 
 METADATA = "Metadata-Version: 2.1\nName: somebodys-scanner\nVersion: 1.0\n"
 SCENARIO = """
@@ -63,8 +65,8 @@ def test_a_job_runs_with_the_scanner_of_an_installed_package(environment: dict[s
 
 def test_without_the_package_the_scenario_is_refused_by_its_scanners_name(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(SCENARIO.format(robot="!SimulatedUr {}"))
-    finished = weldcal(dict(os.environ), "calibrate", "--scenario", str(tmp_path / "mine.yaml"))
-    assert finished.returncode == 1
+    finished = CliRunner().invoke(app, ["calibrate", "--scenario", str(tmp_path / "mine.yaml")])
+    assert finished.exit_code == 1
     assert "RayScanner" in finished.stderr
     assert "Traceback" not in finished.stderr
 
