@@ -17,6 +17,7 @@ _ARM_M = 0.1  # a lever that turns an error of the normal into a length
 _SHARE = 0.8  # of the frames that must agree
 _FEWEST = 8
 _ROBUST_M = 3e-3
+_STEP_RAD = 1.5e-8  # of a difference: the root of the machine's precision
 
 
 def search_in_hand(frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion) -> Start | None:
@@ -75,11 +76,25 @@ def _at(
         m = np.einsum("nij,nj->ni", R_B, n_C @ turned.T) - n / np.linalg.norm(n)
         return np.asarray(np.concatenate([e, _ARM_M * m], axis=1).ravel())
 
+    def slopes(x: Array) -> Array:
+        # forward differences for the rotation only: a call of the residuals for each of eleven unknowns takes most of the search
+        J = np.zeros((len(R_B), 6, 11))
+        n = n_T + x[9] * a + x[10] * b
+        length = np.linalg.norm(n)
+        across = (np.eye(3) - np.outer(n, n) / length**2) / length
+        J[:, :3, 3:6], J[:, :3, 6:9] = R_B, -np.eye(3)
+        J[:, 3:, 9:] = -_ARM_M * across @ np.column_stack([a, b])
+        now = residuals(x)
+        for k in range(3):
+            turned = x.copy()
+            turned[k] += _STEP_RAD
+            J[:, :, k] = ((residuals(turned) - now) / _STEP_RAD).reshape(-1, 6)
+        return J.reshape(-1, 11)
+
     a = np.linalg.svd(n_T[None])[2][1]
     b = np.cross(n_T, a)
-    x = least_squares(
-        residuals, np.concatenate([np.zeros(3), p, p_T, np.zeros(2)]), loss="soft_l1", f_scale=_ROBUST_M, max_nfev=12
-    ).x
+    x0 = np.concatenate([np.zeros(3), p, p_T, np.zeros(2)])
+    x = least_squares(residuals, x0, slopes, loss="soft_l1", f_scale=_ROBUST_M, max_nfev=12).x
     square = np.sort((residuals(x).reshape(-1, 6) ** 2).sum(axis=1))
     n = n_T + x[9] * a + x[10] * b
     cost = float(square[: max(int(_SHARE * len(square)), 1)].mean())
