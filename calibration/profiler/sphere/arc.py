@@ -11,6 +11,7 @@ TRIPLES = 600
 MINIMUM_SAMPLES = 12
 GAP_SAMPLES = 6  # without support that end an arc
 ROUNDS = 10
+_NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 
 
 def fit_circle(points: ArrayLike) -> tuple[Floats, float]:
@@ -55,13 +56,11 @@ def find_arc(
     span = rng.integers(MINIMUM_SAMPLES - 1, max(len(q) // 2, MINIMUM_SAMPLES), TRIPLES)
     first = (rng.random(TRIPLES) * (len(q) - span).clip(1)).astype(int)
     last = np.minimum(first + span, len(q) - 1)
-    best: NDArray[np.intp] = np.empty(0, dtype=np.intp)
+    best = _NONE
     for circle in _through(q[first], q[(first + last) // 2], q[last]):
         if not (np.isfinite(circle).all() and 0.05 * radius_m < circle[2] < 1.05 * radius_m):
             continue
-        run = _run(q, circle, tolerance_m)
-        if len(run) > len(best):
-            best = run
+        best = _run(q, circle, tolerance_m, best)
     if len(best) < MINIMUM_SAMPLES:
         raise ArcNotFound("The profile shows no arc of the sphere: move until the laser line crosses it.")
     for _ in range(ROUNDS):
@@ -88,13 +87,13 @@ def _through(a: Floats, b: Floats, c: Floats) -> Floats:
     return np.column_stack([a + centre, np.linalg.norm(centre, axis=1)])
 
 
-def _run(q: Floats, circle: Floats, tolerance_m: float) -> NDArray[np.intp]:
-    """The longest stretch of samples on one side of a circle (z may grow to or from the sensor), bridging short gaps."""
-    off = q - circle[:2]
-    near = np.abs(np.linalg.norm(off, axis=1) - circle[2]) < tolerance_m
-    longest = np.empty(0, dtype=np.intp)
-    for side in (off[:, 1] < 0.0, off[:, 1] > 0.0):
-        good = np.flatnonzero(near & side)
+def _run(q: Floats, circle: Floats, tolerance_m: float, longest: NDArray[np.intp] = _NONE) -> NDArray[np.intp]:
+    """The longest stretch of samples on one side of a circle (z may grow to or from the sensor), bridging short gaps; where none is
+    longer than ``longest``, that one."""
+    x, z = q[:, 0] - circle[0], q[:, 1] - circle[1]
+    near = np.abs(np.sqrt(x * x + z * z) - circle[2]) < tolerance_m
+    for side in (z < 0.0, z > 0.0):
+        good = (near & side).nonzero()[0]
         if good.size > longest.size:
             pieces = np.split(good, np.flatnonzero(np.diff(good) > GAP_SAMPLES) + 1)
             longest = max([longest, *pieces], key=len)
