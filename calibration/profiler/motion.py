@@ -107,6 +107,11 @@ def turned(R: Floats, w: Floats) -> Floats:
     return np.asarray(R @ (np.eye(3) + s * K + c * (K @ K)))
 
 
+def times_own(rows: Floats, M: Floats) -> Floats:
+    """Row vectors (m, n, 3), the nth of each of m candidates times its own matrix M (n, 3, k)."""
+    return np.asarray(np.swapaxes(np.swapaxes(rows, 0, 1) @ M, 0, 1))
+
+
 def left_jacobian(w: Floats) -> Floats:
     """J (3, 3) with exp(w + d) = exp(J d) exp(w) for a small d."""
     angle, K = float(np.linalg.norm(w)), skew(w)

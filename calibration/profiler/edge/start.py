@@ -10,7 +10,7 @@ import numpy as np
 
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.model import EdgeState
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, turned
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, times_own, turned
 
 ITERATIONS = 60
 SETTLED = 1e-6  # of the cost, in one step: the reprojection goes on from there
@@ -95,8 +95,8 @@ def _point_to_line(poses: FlangePoses, p: Floats) -> tuple[Floats, Floats, Float
 
 def _in_base(poses: FlangePoses, R: Floats, t: Floats, p_S: Floats) -> Floats:
     """Profile points (n, 3) in B (m, n, 3) for m candidates."""
-    p_F = np.einsum("mij,nj->mni", R, p_S) + t[:, None]
-    return np.asarray(np.einsum("nij,mnj->mni", poses.rotation, p_F) + poses.translation)
+    p_F = p_S @ np.swapaxes(R, 1, 2) + t[:, None]
+    return times_own(p_F, np.swapaxes(poses.rotation, 1, 2)) + poses.translation
 
 
 def _distances(points: Floats, mean: Floats, e: Floats) -> Floats:
@@ -132,7 +132,7 @@ def _linearised(
     J = np.empty((m, n, 3, 10))
     turn = -np.einsum("nij,mjk,nkl->mnil", poses.rotation, R, skew(p_S), optimize=True)
     J[..., :3] = P[:, None] @ turn
-    J[..., 3:6] = np.einsum("mij,njk->mnik", P, poses.rotation)
+    J[..., 3:6] = P[:, None] @ poses.rotation
     J[..., 6:8] = -across[:, None]
     # e changes: the part along the old line leaves, and what lies off it leans
     J[..., 8:10] = -along[:, :, None, None] * across[:, None]

@@ -6,7 +6,7 @@ import numpy as np
 
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.start import cube_rotations
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, turned
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, times_own, turned
 
 POINTS = 7  # of each profile
 ITERATIONS = 80
@@ -27,7 +27,7 @@ def sphere_starts(
     R = cube_rotations()
     m = len(R)
     t, damping = np.zeros((m, 3)), np.full(m, 1e-2)
-    at = np.einsum("nij,mnj->mni", R_BF, np.einsum("mij,nj->mni", R, p_S)) + p_BF
+    at = times_own(p_S @ np.swapaxes(R, 1, 2), np.swapaxes(R_BF, 1, 2)) + p_BF
     c = at.mean(axis=1)
     cost = np.full(m, np.inf)
     r, J = _linearised(R_BF, p_BF, R, t, c, p_S, radius_m)
@@ -74,10 +74,10 @@ def _linearised(
     R_BF: Floats, p_BF: Floats, R: Floats, t: Floats, c: Floats, p_S: Floats, radius_m: float
 ) -> tuple[Floats, Floats]:
     """Distances (m, n) to the sphere and their Jacobian (m, n, 9) by [turn in S; p_FS; centre]."""
-    at = np.einsum("nij,mnj->mni", R_BF, np.einsum("mij,nj->mni", R, p_S) + t[:, None]) + p_BF - c[:, None]
+    p_F = p_S @ np.swapaxes(R, 1, 2) + t[:, None]
+    at = times_own(p_F, np.swapaxes(R_BF, 1, 2)) + p_BF - c[:, None]
     length = np.maximum(np.linalg.norm(at, axis=2), 1e-9)
     n_B = at / length[:, :, None]
-    n_F = np.einsum("nij,mni->mnj", R_BF, n_B)
-    n_S = np.einsum("mij,mni->mnj", R, n_F)
-    turn = -np.einsum("mni,nij->mnj", n_S, skew(p_S))
+    n_F = times_own(n_B, R_BF)
+    turn = -times_own(n_F @ R, skew(p_S))
     return np.asarray(length - radius_m), np.concatenate([turn, n_F, -n_B], axis=2)
