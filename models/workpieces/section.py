@@ -16,6 +16,8 @@ REACH_M = 0.025  # of a cut, about the seam
 PROBES_M = (0.001, 0.002, 0.0032, 0.0045)  # radii at which the free space is looked for
 LEAST_FREE_RAD = math.radians(6.0)
 _CHUNK = 40  # seam points whose nearby triangles are found together
+_NEXT = [1, 2, 0]  # corner after each of a triangle's
+_BOTH = np.array([[-1.0], [1.0]])  # signs of a quadratic equation's roots
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,46 +67,47 @@ def cut(mesh: TriMesh, points: Floats, tangents: Floats, ups: Floats, reach_m: f
     corners = mesh.vertices[mesh.triangles]
     low, high = corners.min(axis=1), corners.max(axis=1)
     normals = mesh.normals
+    up = ups - np.vecdot(ups, tangents)[:, None] * tangents
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    right = np.cross(tangents, up)
     sections: list[Section] = []
     for begin in range(0, len(points), _CHUNK):
         some = slice(begin, begin + _CHUNK)
         box_low, box_high = points[some].min(axis=0) - reach_m, points[some].max(axis=0) + reach_m
         near = np.flatnonzero(((low <= box_high) & (high >= box_low)).all(axis=1))
-        for p, t, u in zip(points[some], tangents[some], ups[some], strict=True):
-            sections.append(_cut_one(corners[near], normals[near], p, t, u, reach_m))
+        near_corners, near_normals = corners[near], normals[near]
+        for p, t, x, y in zip(points[some], tangents[some], right[some], up[some], strict=True):
+            sections.append(_cut_one(near_corners, near_normals, p, t, x, y, reach_m))
     return sections
 
 
-def _cut_one(corners: Floats, normals: Floats, p: Floats, t: Floats, u: Floats, reach: float) -> Section:
-    up = u - (u @ t) * t
-    up = up / np.linalg.norm(up)
-    right = np.cross(t, up)
+def _cut_one(
+    corners: Floats, normals: Floats, p: Floats, t: Floats, right: Floats, up: Floats, reach: float
+) -> Section:
     height = (corners - p) @ t
     # A corner exactly in the plane counts as before it, so that every crossing is found once.
     side = height > 0.0
-    crossed = np.flatnonzero(side.any(axis=1) & ~side.all(axis=1))
-    height, side, corners, normals = height[crossed], side[crossed], corners[crossed], normals[crossed]
-    ends = []
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        share = height[:, a] / np.where(side[:, a] != side[:, b], height[:, a] - height[:, b], 1.0)
-        ends.append(corners[:, a] + share[:, None] * (corners[:, b] - corners[:, a]))
-    split = np.stack([side[:, 0] != side[:, 1], side[:, 1] != side[:, 2], side[:, 2] != side[:, 0]], axis=1)
-    order = np.argsort(~split, axis=1, kind="stable")[:, :2]
-    found = np.stack(ends, axis=1)[np.arange(len(crossed))[:, None], order] - p if len(crossed) else np.zeros((0, 2, 3))
-    segments = np.stack([found @ right, found @ up], axis=2)
-    flat = np.column_stack([normals @ right, normals @ up])
-    size = np.linalg.norm(flat, axis=1)
-    length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
-    keep = (size > 1e-9) & (length > 1e-9)
-    keep &= _distance(segments) <= reach
+    split = side != side[:, _NEXT]
+    crossed = np.flatnonzero(split.any(axis=1))
+    height, split, corners, normals = height[crossed], split[crossed], corners[crossed], normals[crossed]
+    # Two of the three sides of each triangle that is crossed.
+    before, after = height[split], height[:, _NEXT][split]
+    a, b = corners[split], corners[:, _NEXT][split]
+    found = (a + (before / (before - after))[:, None] * (b - a) - p).reshape(-1, 2, 3)
+    axes = np.column_stack([right, up])
+    segments, flat = found @ axes, normals @ axes
+    size = np.hypot(flat[:, 0], flat[:, 1])
+    d = segments[:, 1] - segments[:, 0]
+    keep = (size > 1e-9) & (np.hypot(d[:, 0], d[:, 1]) > 1e-9)
+    keep &= _distance(segments[:, 0], d) <= reach
     return Section(segments[keep], flat[keep] / size[keep, None], right, up)
 
 
-def _distance(segments: Floats) -> Floats:
-    """(M,) distance of each segment from the origin."""
-    a, d = segments[:, 0], segments[:, 1] - segments[:, 0]
-    share = np.clip(-np.sum(a * d, axis=1) / np.maximum(np.sum(d * d, axis=1), 1e-300), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(a + share[:, None] * d, axis=1))
+def _distance(a: Floats, d: Floats) -> Floats:
+    """(M,) distance from the origin of each segment from a (M,2) to a + d."""
+    share = np.clip(-np.vecdot(a, d) / np.maximum(np.vecdot(d, d), 1e-300), 0.0, 1.0)
+    nearest = a + share[:, None] * d
+    return np.asarray(np.hypot(nearest[:, 0], nearest[:, 1]))
 
 
 def crossings(section: Section, centre: Floats, radius: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -113,22 +116,17 @@ def crossings(section: Section, centre: Floats, radius: float) -> tuple[Floats, 
     The last is 1 where a turn from x towards y enters the material.
     """
     a, d = section.segments[:, 0] - centre, section.segments[:, 1] - section.segments[:, 0]
-    qa, qb, qc = np.sum(d * d, axis=1), np.sum(a * d, axis=1), np.sum(a * a, axis=1) - radius**2
+    qa, qb, qc = np.vecdot(d, d), np.vecdot(a, d), np.vecdot(a, a) - radius**2
     root = qb * qb - qa * qc
-    hit = root > 0.0
-    at, which = [], []
-    for sign in (-1.0, 1.0):
-        share = (-qb + sign * np.sqrt(np.maximum(root, 0.0))) / qa
-        inside = hit & (share >= 0.0) & (share < 1.0)
-        at.append((a + share[:, None] * d)[inside])
-        which.append(np.flatnonzero(inside))
-    points, index = np.concatenate(at), np.concatenate(which)
+    share = (_BOTH * np.sqrt(np.maximum(root, 0.0)) - qb) / qa
+    inside = (root > 0.0) & (share >= 0.0) & (share < 1.0)
+    index = np.nonzero(inside)[1]
+    points = a[index] + share[inside][:, None] * d[index]
     angle = np.mod(np.arctan2(points[:, 1], points[:, 0]), 2.0 * math.pi)
     order = np.argsort(angle, kind="stable")
     points, index, angle = points[order], index[order], angle[order]
     normals = section.normals[index]
-    turning = np.column_stack([-points[:, 1], points[:, 0]]) / radius
-    enters = np.where(np.sum(normals * turning, axis=1) < 0.0, 1.0, -1.0)
+    enters = np.where(normals[:, 1] * points[:, 0] < normals[:, 0] * points[:, 1], 1.0, -1.0)
     return angle, points + centre, normals, enters
 
 
