@@ -27,11 +27,10 @@ class Raster:
 
     def look(self, cells: npt.NDArray[Any], xy: Floats) -> npt.NDArray[Any]:
         """Values of a raster (H,W) at points (...,2); points outside it read its first cell, which is kept empty."""
-        i = ((xy - self.corner) / self.cell).astype(np.int64)
         height, width = cells.shape
-        inside = np.all((i >= 0) & (i < np.array([width, height])), axis=-1, keepdims=True)
-        i = i * inside
-        return np.asarray(cells[i[..., 1], i[..., 0]])
+        x, y = (((xy[..., k] - self.corner[k]) / self.cell).astype(np.int64) for k in range(2))
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return np.asarray(cells[y * inside, x * inside])
 
 
 def into(X_AB: RigidTransform, p_A: Floats) -> Floats:

@@ -101,8 +101,8 @@ class Line:
         far = nearest == len(self.points)
         nearest = np.where(far, 0, nearest)
         gap = xy - self.points[nearest]
-        along = np.sum(gap * self.tangents[nearest], axis=1)
-        n = np.sum(gap * self.normals[nearest], axis=1)
+        along = np.vecdot(gap, self.tangents[nearest])
+        n = np.vecdot(gap, self.normals[nearest])
         # On the inside of a bend a step along the line is longer than the step of the point.
         along = np.clip(along / np.maximum(1.0 - n * self.curvatures[nearest], 0.3), -2.0 * STEP_M, 2.0 * STEP_M)
         beside = ~far & (((nearest > 0) & (nearest < len(self.points) - 1)) | (np.abs(along) < STEP_M))
@@ -142,21 +142,19 @@ def smoothing_weights(at: Floats, s: Floats, sigma: Floats, width: float) -> Flo
     The Gaussian is `width` m wide, wider where fewer than four values are near; a straight line where they are all on
     one side (an end), so that nothing is extrapolated by its curvature.
     """
-    rows = np.zeros((len(at), len(s)))
-    for k, place in enumerate(at):
-        distance = s - place
-        reach = np.sort(np.abs(distance))
-        h = max(width, float(reach[min(4, len(s) - 1)]) / 1.5)
-        weight = np.exp(-0.5 * np.square(distance / h)) / np.square(sigma)
-        x = distance / h
-        columns = [np.ones(len(s)), x]
-        if np.count_nonzero(x < -0.3) >= 2 and np.count_nonzero(x > 0.3) >= 2 and len(s) >= 5:
-            columns.append(x * x)
-        D = np.column_stack(columns)
-        DW = D.T * weight
-        A = DW @ D
-        A += 1e-9 * np.trace(A) * np.eye(len(A))
-        rows[k] = np.linalg.solve(A, DW)[0]
+    distance = s - at[:, None]
+    near = min(4, len(s) - 1)
+    h = np.maximum(width, np.partition(np.abs(distance), near, axis=1)[:, near] / 1.5)[:, None]
+    x = distance / h
+    weight = np.exp(-0.5 * np.square(x)) / np.square(sigma)
+    curved = (np.sum(x < -0.3, axis=1) >= 2) & (np.sum(x > 0.3, axis=1) >= 2) & (len(s) >= 5)
+    rows = np.zeros(x.shape)
+    for some, degree in ((~curved, 1), (curved, 2)):
+        D = x[some][:, None] ** np.arange(degree + 1)[:, None]
+        DW = D * weight[some][:, None]
+        A = DW @ np.swapaxes(D, 1, 2)
+        A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(degree + 1)
+        rows[some] = np.linalg.solve(A, DW)[:, 0]
     return rows
 
 

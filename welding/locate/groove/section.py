@@ -92,6 +92,7 @@ def fit_section(
     floor = max(sigma, 1e-5)
     weights = np.ones(len(n))
     information = np.eye(4)
+    known = np.diag(1.0 / prior_sigma**2)
     lever = float(np.mean(slopes))
     for step in range(ITERATIONS):
         left = n > x[0]
@@ -101,20 +102,16 @@ def fit_section(
         face = np.where(left, faces[0], faces[1])
         on_wall = wall < face
         residual = z - np.where(on_wall, wall, face)
-        J = np.zeros((len(n), 4))
-        J[:, 0] = np.where(left, -slope, slope)
-        J[:, 1] = 1.0
-        J[:, 2], J[:, 3] = run * left, run * ~left
-        J *= on_wall[:, None]
+        J = np.stack([np.where(left, -slope, slope), np.ones(len(n)), run * left, run * ~left]) * on_wall
         if np.count_nonzero(on_wall) >= 6:
-            spread = 1.4826 * float(np.median(np.abs(residual[on_wall])))
+            spread = 1.4826 * _median(np.abs(residual[on_wall]))
             # The scale shrinks slowly, because the first residuals come from a wrong centre.
             scale = max(min(scale, 3.0 * spread if step > 1 else scale), 2.5 * floor)
         sigma_point = np.where(on_wall, max(scale / 2.5, floor), floor)
         u = residual / (sigma_point * 2.5)
         weights = 1.0 / (1.0 + u * u) ** 2 / sigma_point**2
-        A = J.T @ (J * weights[:, None]) + np.diag(1.0 / prior_sigma**2)
-        b = J.T @ (weights * residual) + (prior - x) / prior_sigma**2
+        A = (J * weights) @ J.T + known
+        b = J @ (weights * residual) + (prior - x) / prior_sigma**2
         for side, edge in enumerate(edges):
             enough = np.count_nonzero(on_wall & (left == (side == 0))) >= ENOUGH
             if edge is None or enough:
@@ -154,12 +151,19 @@ def fit_section(
     )
 
 
+def _median(values: Floats) -> float:
+    """The median of finite numbers; of few in a fifth of numpy.median's time."""
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    part = np.partition(values, (low, high))
+    return float(0.5 * (part[low] + part[high]))
+
+
 def _faces(n: Floats, z: Floats, half: float, sigma: float) -> tuple[float, float]:
     """Height of the face on the left and on the right, 0 where too little of it is in view."""
     heights = []
     for sign in (1.0, -1.0):
         beside = (sign * n > half + 0.5e-3) & (sign * n < half + BAND_M) & (np.abs(z) < max(5.0 * sigma, 0.002))
-        heights.append(float(np.median(z[beside])) if np.count_nonzero(beside) >= 10 else 0.0)
+        heights.append(_median(z[beside]) if np.count_nonzero(beside) >= 10 else 0.0)
     return heights[0], heights[1]
 
 

@@ -58,9 +58,8 @@ def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_
     """The scan's points (N,3) whose rays may meet the part at X_BP or near it."""
     middle = X_BP.multiply(model.center) - scan.eye
     far = float(np.linalg.norm(middle))
-    d = scan.points - scan.eye
-    along = np.clip(d @ middle / far / np.linalg.norm(d, axis=1), -1.0, 1.0)
-    near = scan.points[np.arccos(along) < np.arcsin(min(1.0, (model.radius + reach_m) / far))]
+    sine = min(1.0, (model.radius + reach_m) / far)
+    near = scan.points[scan.sight @ (middle / far) > math.sqrt(1.0 - sine**2)]
     stride = max(1.0, len(near) / MOST_RAYS)
     return np.asarray(near[(np.arange(int(len(near) / stride)) * stride).astype(int)])
 

@@ -65,9 +65,15 @@ def into(X_BP: RigidTransform, p_B: Floats) -> Floats:
     return np.asarray((p_B - X_BP.translation()) @ X_BP.rotation().matrix())
 
 
+def _within(p: Floats, middle: Floats, reach: float) -> npt.NDArray[np.bool_]:
+    """Which points (N,3) lie nearer than `reach` to a point (3,)."""
+    d = p - middle
+    return np.asarray(np.vecdot(d, d) < reach**2)
+
+
 def surface_rows(p: Floats, n: Floats, model: PartModel, gate: float, same: float = SAME_SIDE_COS) -> Equations:
     """Point-to-plane equations of the points p (N,3) in P with normals n (N,3) that lie within `gate` of the surface."""
-    near = np.linalg.norm(p - model.center, axis=1) < model.radius + gate
+    near = _within(p, model.center, model.radius + gate)
     p, n = p[near], n[near]
     q, m = model.closest(p) if len(p) else (p, n)
     away = np.linalg.norm(p - q, axis=1)
@@ -206,7 +212,7 @@ def coarse_fit(
     scan: PreparedScan, model: PartModel, X: RigidTransform, gates: tuple[float, ...]
 ) -> RigidTransform | None:
     """A pose by the coarse points, its gate narrowing; None where they do not touch the part."""
-    near = np.linalg.norm(scan.coarse - X.multiply(model.center), axis=1) < model.radius + 2.0 * gates[0]
+    near = _within(scan.coarse, X.multiply(model.center), model.radius + 2.0 * gates[0])
     points, normals = scan.coarse[near], scan.coarse_normals[near]
     if len(points) > COARSE_POINTS:
         index = (np.arange(COARSE_POINTS) * (len(points) / COARSE_POINTS)).astype(int)
@@ -223,11 +229,12 @@ def coarse_fit(
 def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: float = 0.008) -> Fit | None:
     """The pose by surface and rims from one good to `gate`, with its covariance; None where too few points are near."""
     pitch = scan.pitch_m
-    near = np.linalg.norm(scan.points - X.multiply(model.center), axis=1) < model.radius + 0.02
+    middle, around = X.multiply(model.center), model.radius + 0.02
+    near = _within(scan.points, middle, around)
     points, normals = scan.points[near], scan.normals[near]
     stride = max(1.0, len(points) / MOST_POINTS)
     few = (np.arange(int(len(points) / stride)) * stride).astype(int)
-    every = scan.measured[np.linalg.norm(scan.measured - X.multiply(model.center), axis=1) < model.radius + 0.02]
+    every = scan.measured[_within(scan.measured, middle, around)]
     sigma = 0.5e-3
     surface, rims = None, None
     for g, steps in ((gate, 3), (0.5 * gate, 3), (0.004, 3), (0.002, 6)):

@@ -52,6 +52,12 @@ class PreparedScan:
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     @cached_property
+    def sight(self) -> Floats:
+        """Unit directions (N,3) from the scanner to the points."""
+        d = self.points - self.eye
+        return np.asarray(d / np.linalg.norm(d, axis=1)[:, None])
+
+    @cached_property
     def rays(self) -> cKDTree:
         """The tree of the unit directions from the scanner to the measured points."""
         d = self.measured - self.eye
