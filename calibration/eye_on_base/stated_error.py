@@ -64,12 +64,13 @@ def stated_median_limit(
     medians = np.empty(_DRAWS)
     for first in range(0, _DRAWS, 1000):
         k, n = slice(first, first + 1000), len(observations)
-        shared = np.einsum("nij,kj->kni", J, rng.standard_normal((1000, root.shape[1])) @ root.T)
+        together = (rng.standard_normal((1000, root.shape[1])) @ root.T @ J.reshape(3 * n, -1).T).reshape(1000, n, 3)
         own_sigma = 1e-3 * result.sigma_position_mm * np.ones(n) if scatter_m is None else scatter_m
         sigma = own_sigma * np.sqrt(free / rng.chisquare(free, 1000))[:, None]
         scatter = sigma[:, :, None] * rng.standard_normal((1000, n, 3))
-        noise = np.einsum("nij,knj->kni", fits, rng.standard_normal((1000, n, 3)))
-        medians[k] = np.median(np.linalg.norm(shared + scatter + noise, axis=2), axis=1)
+        noise = np.swapaxes(np.swapaxes(rng.standard_normal((1000, n, 3)), 0, 1) @ np.swapaxes(fits, 1, 2), 0, 1)
+        error = together + scatter + noise
+        medians[k] = np.median(np.sqrt(np.vecdot(error, error)), axis=1)
     limit = 1e3 * float(np.quantile(medians, 1.0 - FALSE_ALARM))
     return limit if floor is None else max(limit, floor)
 

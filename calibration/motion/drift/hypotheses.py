@@ -145,8 +145,9 @@ class DriftFilter:
         V = G @ PG + noise.covariance(rows.covariances[i], H[:, CLOCK]) + np.diag(10.0 * unexplained * self._prior)
         innovation = np.asarray(rows.residuals[i] - G @ self._x[:n])
         L = np.asarray(np.linalg.cholesky(V), dtype=float)
-        w = solve_triangular(L, innovation, lower=True, check_finite=False)
-        D = self._sensitivities(H, G, L, t)
+        whitened = np.column_stack([innovation, PG.T, self._sensitivities(H, G, t)])
+        whitened = np.asarray(solve_triangular(L, whitened, lower=True, check_finite=False))
+        w, K, D = whitened[:, 0], whitened[:, 1 : 1 + n].T, whitened[:, 1 + n :]  # K: P G' L^-T
         excess = float(w @ w) / _INFLUENCE
         if excess > 1.0 and self.favourite is not None:
             # a frame is judged by the hypothesis that it fits better: else those that show a change best would count least
@@ -155,8 +156,7 @@ class DriftFilter:
             excess = min(excess, float(e @ e) / _INFLUENCE)
         if excess > 1.0:
             less = 1.0 / np.sqrt(excess)
-            L, w, D = L / less, w * less, D * less
-        K = solve_triangular(L, PG.T, lower=True, check_finite=False).T  # P G' L^-T
+            w, K, D = w * less, K * less, D * less
         self._accumulate(D, K, w)
         self._x[:n] += K @ w
         P -= K @ K.T
@@ -186,8 +186,8 @@ class DriftFilter:
             G[c, SIZE + c :: _ROWS] = phi
         return G, unexplained
 
-    def _sensitivities(self, H: Array, G: Array, L: Array, t: float) -> Array:
-        """L^-1 (H_k - G F) (5, k SIZE) of all hypotheses; zero for those that stand for no frame."""
+    def _sensitivities(self, H: Array, G: Array, t: float) -> Array:
+        """H_k - G F (5, k SIZE) of all hypotheses; zero for those that stand for no frame."""
         k = len(self.start)
         D = -(G @ self._F[: self._n]).reshape(_ROWS, k, SIZE)
         ramps = self.kind == RAMP
@@ -195,7 +195,7 @@ class DriftFilter:
         D += H[:, None, :] * share[None, :, None]
         # a clock does not creep with the scanner: it may have jumped
         D[:, ramps, CLOCK] += H[:, None, CLOCK] * (self.used[ramps] - share[ramps])
-        return np.asarray(solve_triangular(L, D.reshape(_ROWS, -1), lower=True, check_finite=False))
+        return np.asarray(D.reshape(_ROWS, -1))
 
     def _accumulate(self, D: Array, K: Array, w: Array) -> None:
         on = self.used
