@@ -277,10 +277,20 @@ def _corrected(correction: ScannerCorrection, data: _Data) -> tuple[Array, Array
 
 def _residuals(f: KinematicsFit, data: _Data, X: Array) -> Array:
     """Positions (3 n) m, then what the seen normals lie beside those of the reached poses X (n, 4, 4) (3 n) rad, in the base."""
+    return _beside(*_seen(f, data), data, X)
+
+
+def _seen(f: KinematicsFit, data: _Data) -> tuple[Array, Array]:
+    """Corrected centres (n, 3) m and normals (n, 3) in the base."""
     c, m = _corrected(f.correction, data)
     R = f.X_BC.rotation().matrix()
-    e_p = c @ R.T + f.X_BC.translation() - X[:, :3, 3]
-    e_n = np.where(data.has[:, None], np.cross(X[:, :3, 2], m @ R.T), 0.0)
+    return c @ R.T + f.X_BC.translation(), m @ R.T
+
+
+def _beside(p: Array, normal: Array, data: _Data, X: Array) -> Array:
+    """The residuals of these centres and normals in the base."""
+    e_p = p - X[:, :3, 3]
+    e_n = np.where(data.has[:, None], np.cross(X[:, :3, 2], normal), 0.0)
     return np.concatenate([e_p.ravel(), e_n.ravel()])
 
 
@@ -306,11 +316,14 @@ def _jacobian(f: KinematicsFit, data: _Data, q: Array) -> Array:
     J[: 3 * n, 3:6] = np.tile(np.eye(3), (n, 1))
     turned = -skew(normal) @ skew(m @ R.T)
     J[3 * n :, :3] = np.where(data.has[:, None, None], turned, 0.0).reshape(-1, 3)
-    for j in range(6, 6 + terms + k):
+    for j in range(6, 6 + terms):
         step = np.zeros(6 + terms + k)
-        step[j] = 1e-5 if j < 6 + terms else _STEP
-        ends = [_moved(f, s) for s in (step, -step)]
-        reached = [poses, poses] if j < 6 + terms else [f.errors.moved(q, data.after, e.u) for e in ends]
-        plus, minus = (_residuals(e, data, X) for e, X in zip(ends, reached, strict=True))
-        J[:, j] = (plus - minus) / (2.0 * step[j])
+        step[j] = 1e-5
+        plus, minus = (_residuals(_moved(f, s), data, poses) for s in (step, -step))
+        J[:, j] = (plus - minus) / 2e-5
+    # errors of the arm leave what the scanner saw as it is
+    seen = _seen(_moved(f, np.zeros(6 + terms + k)), data)
+    for j, u in enumerate(_STEP * np.eye(k), 6 + terms):
+        plus, minus = (_beside(*seen, data, f.errors.moved(q, data.after, f.u + s)) for s in (u, -u))
+        J[:, j] = (plus - minus) / (2.0 * _STEP)
     return J

@@ -189,7 +189,7 @@ def test_on_a_curved_surface_torch_height_and_side_both_hold() -> None:
 def test_the_groove_is_found_within_the_plans_error(across: float, high: float) -> None:
     points = straight(0.1)
     plan = SeamCurve.from_points(points + np.array((0.0, across * MM, high * MM)))
-    run = weld(points, replace(NOMINAL, friction=0.35), ServoConfig(), 1, plan=plan, time_limit=8.0)
+    run = weld(points, replace(NOMINAL, friction=0.35), ServoConfig(), 1, plan=plan, time_limit=6.0)
     assert run.phases()[:2] == (Phase.TOUCH, Phase.TRACK)
     i = run.phase.index(Phase.TRACK)
     np.testing.assert_allclose(run.tip[i, 1:], [0.0, SEAT], atol=0.01 * MM)
