@@ -20,6 +20,11 @@ from weldcal.tools.cli.app import app
 from weldcal.tools.studies.profiler.worlds import CLEAN, RADIUS_M, SphereWorld, sphere_trial
 
 
+def some() -> SphereData:
+    """Fourteen of the clean scans: fewer show another radius less clearly, and it must be refused all the same."""
+    return clean()[1].data.without(*range(14, 20))
+
+
 def scans_of(data: SphereData, radius_m: float) -> SphereData:
     return SphereData(data.poses, data.profiles, radius_m)
 
@@ -49,14 +54,14 @@ def test_the_scans_alone_give_the_radius(start: float) -> None:
     ],
 )
 def test_a_radius_that_is_another_spheres_is_refused_with_the_one_the_scans_show(factor: float, sentence: str) -> None:
-    data = clean()[1].data
+    data = some()
     with pytest.raises(RadiusError, match=rf"show a sphere of (20\.0|19\.9)\d mm radius.*{sentence}"):
         check_radius(scans_of(data, factor * RADIUS_M), SIGMAS, None)
 
 
 @pytest.mark.parametrize("factor", [0.97, 1.03])
 def test_a_scanners_scale_error_is_no_other_sphere(factor: float) -> None:
-    check_radius(scans_of(clean()[1].data, factor * RADIUS_M), SIGMAS, None)
+    check_radius(scans_of(some(), factor * RADIUS_M), SIGMAS, None)
 
 
 @pytest.mark.parametrize("model", ["rigid", "auto"])
