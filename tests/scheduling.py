@@ -1,4 +1,4 @@
-"""How the tests are dealt to the processes of pytest-xdist: file by file, what streams to an emulated robot one by one."""
+"""How the tests are dealt to the processes of pytest-xdist: file by file, what streams to an emulated robot or waits for a page one by one."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ STREAMING = (
     *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py", "test_hold_and_go_on.py"),
     "test_wired_cell.py",
 )
+# They wait for a browser, a page or a folder and need next to no processor: beside a stream they leave the cores to what computes.
+WAITING = ("test_dashboard.py", "test_panels.py", "test_folder_scanner.py", "test_tablet_page.py")
+SLEEPING = STREAMING + WAITING
 # They look at the finished demo. A core that is left with them at the end keeps the other waiting.
 DEMO = ("tests/scenario/test_readme.py", "tests/scenario/test_cell.py")
 # Folders whose files take a second or less come last, so that the processes end together.
@@ -21,23 +24,23 @@ MOST_PROCESSES = 4
 
 
 def processes() -> int:
-    """One for each core, and one for the streaming tests, which sleep most of their time."""
+    """One for each core, and one for the tests that sleep most of their time."""
     return min(len(os.sched_getaffinity(0)), MOST_PROCESSES) + 1
 
 
 def order(item: pytest.Item) -> tuple[object, ...]:
-    """Streams first, for they take their time whatever the others do; then what takes longest; short files last."""
+    """What sleeps first, for it takes its time whatever the others do; then what takes longest; short files last."""
     name, room = item.path.name, item.nodeid.split("/")[1]
-    streams = STREAMING.index(name) if name in STREAMING else len(STREAMING)
+    streams = SLEEPING.index(name) if name in SLEEPING else len(SLEEPING)
     late = SHORT[::-1].index(room) + 1 if room in SHORT else 0
     return streams, not item.nodeid.startswith(DEMO), room != "scenario", late
 
 
 class Scheduling(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types
-    """File by file, but all that stream are one file, and all that look at the finished demo."""
+    """File by file, but all that sleep are one file, and all that look at the finished demo."""
 
     def _split_scope(self, nodeid: str) -> str:
         path = nodeid.split("::", 1)[0]
         if path in DEMO:
             return "demo"
-        return "streaming" if path.rsplit("/", 1)[-1] in STREAMING else path
+        return "sleeping" if path.rsplit("/", 1)[-1] in SLEEPING else path
