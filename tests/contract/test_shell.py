@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from tests.places import ROOT
-from tests.scheduling import DEMO, STREAMING, Scheduling, order
+from tests.scheduling import DEMO, SLEEPING, STREAMING, Scheduling, order
 
 COREUTILS = ("sh", "dirname", "readlink", "cksum", "cat", "rm", "mv", "mkdir", "cp", "chmod", "grep", "env", "flock")
 LIBRARIES = {
@@ -279,6 +279,7 @@ def test_what_streams_to_the_emulated_robot_runs_one_by_one_and_first() -> None:
     scheduling = Scheduling.__new__(Scheduling)  # its plugin need not be loaded
     streams = [f"tests/hardware/{name}::test_a" for name in STREAMING]
     assert all((ROOT / path.partition("::")[0]).is_file() for path in streams)
+    assert set(SLEEPING) <= {file.name for file in (ROOT / "tests").rglob("test_*.py")}
     assert len({scheduling._split_scope(test) for test in streams}) == 1
     others = ["tests/hardware/test_emulator_wire.py::test_a", "tests/scenario/test_mounting_cell.py::test_a[b/c.py::d]"]
     assert [scheduling._split_scope(test) for test in others] == [test.partition("::")[0] for test in others]
