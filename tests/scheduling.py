@@ -1,4 +1,4 @@
-"""How the tests are dealt to the processes of pytest-xdist: file by file, what streams to an emulated robot or waits for a page one by one."""
+"""How the tests are dealt to the processes of pytest-xdist: file by file, and what sleeps most of its time one by one."""
 
 from __future__ import annotations
 

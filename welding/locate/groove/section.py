@@ -104,7 +104,7 @@ def fit_section(
         residual = z - np.where(on_wall, wall, face)
         J = np.stack([np.where(left, -slope, slope), np.ones(len(n)), run * left, run * ~left]) * on_wall
         if np.count_nonzero(on_wall) >= 6:
-            spread = 1.4826 * _median(np.abs(residual[on_wall]))
+            spread = 1.4826 * float(np.median(np.abs(residual[on_wall])))
             # The scale shrinks slowly, because the first residuals come from a wrong centre.
             scale = max(min(scale, 3.0 * spread if step > 1 else scale), 2.5 * floor)
         sigma_point = np.where(on_wall, max(scale / 2.5, floor), floor)
@@ -151,19 +151,12 @@ def fit_section(
     )
 
 
-def _median(values: Floats) -> float:
-    """The median of finite numbers; of few in a fifth of numpy.median's time."""
-    low, high = (len(values) - 1) // 2, len(values) // 2
-    part = np.partition(values, (low, high))
-    return float(0.5 * (part[low] + part[high]))
-
-
 def _faces(n: Floats, z: Floats, half: float, sigma: float) -> tuple[float, float]:
     """Height of the face on the left and on the right, 0 where too little of it is in view."""
     heights = []
     for sign in (1.0, -1.0):
         beside = (sign * n > half + 0.5e-3) & (sign * n < half + BAND_M) & (np.abs(z) < max(5.0 * sigma, 0.002))
-        heights.append(_median(z[beside]) if np.count_nonzero(beside) >= 10 else 0.0)
+        heights.append(float(np.median(z[beside])) if np.count_nonzero(beside) >= 10 else 0.0)
     return heights[0], heights[1]
 
 
