@@ -23,6 +23,7 @@ FLAGS = (
     "--no-sandbox",  # tests also run as root in a container
     "--disable-dev-shm-usage",
     "--use-angle=swiftshader",  # WebGL without a graphics card
+    "--disable-gpu-compositing",  # nor does the page need one: its drawing takes a third of the processor
     "--enable-unsafe-swiftshader",
     "--window-size=1280,800",
     "--force-device-scale-factor=1",
