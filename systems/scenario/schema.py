@@ -157,7 +157,7 @@ class WeldingConfig:
     deflection_mm: float | None = None  # delta_d of Eq. 16; null: 2, less in a wide joint
     axial_deflection_mm: float | None = None  # null: 3, more in a wide joint
     clearance_mm: float = 25.0  # height above the seam at which the approach ends
-    seam_length_mm: float | None = None  # arc length of the seam to weld
+    seam_length_mm: float | None = None  # arc length to weld; the groove may go on past it; null: the whole seam
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
 

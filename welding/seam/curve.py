@@ -52,20 +52,29 @@ class SeamFrame(NamedTuple):
 class SeamCurve:
     """An arc-length cubic spline of a seam in one frame, straight beyond both ends.
 
+    The groove may be drawn on past a seam's end: beyond `length` the curve then follows it to the last knot, and is straight after it.
     Curvature is signed: positive where the seam turns towards its left normal (up x tangent).
 
     Attributes:
-        knots: (n+1,) arc lengths in m, from 0 to `length`.
+        knots: (n+1,) arc lengths in m, from 0 to `drawn_m`.
         coefficients: (n, 4, 3) cubic coefficients in m, highest power first, by distance past each knot.
         ups: (n+1, 3) up-normal at each knot, away from the work.
+        end: arc length of the seam's end, m; None: the last knot.
     """
 
     knots: Array
     coefficients: Array
     ups: Array
+    end: float | None = None
 
     @classmethod
-    def from_points(cls, points: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), smoothing: float | None = None) -> Self:
+    def from_points(
+        cls,
+        points: ArrayLike,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        smoothing: float | None = None,
+        length: float | None = None,
+    ) -> Self:
         """The curve through `points` (N,3) m, in the order of travel.
 
         Args:
@@ -73,6 +82,7 @@ class SeamCurve:
             up: (3,), or (N,3) where the surface bends; need not be unit length.
             smoothing: None interpolates; a number is the penalty of a cubic smoothing spline over arc length, in m^3
                 (features much shorter than its fourth root times the fourth root of the spacing are removed).
+            length: where along the points the seam ends, m; None: at the last point.
 
         Raises:
             TooFewSeamPoints, RepeatedSeamPoints, NonFiniteSeamPoints, SeamError: what the points lack.
@@ -94,9 +104,11 @@ class SeamCurve:
         b /= lengths[:, None]
 
         s = np.concatenate([[0.0], np.cumsum(steps)])
+        end = None if length is None or length >= s[-1] else length
         if smoothing is not None and len(p) >= 5:
             p = np.column_stack([make_smoothing_spline(s, p[:, k], lam=smoothing)(s) for k in range(3)])
-            s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+            before, s = s, np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+            end = None if end is None else float(np.interp(end, before, s))
         # Twice: measure the arc length of the spline, place even knots, fit again; its speed is then 1 within 1e-4.
         for _ in range(2):
             curve = CubicSpline(s, np.column_stack([p, b]))
@@ -104,6 +116,7 @@ class SeamCurve:
             middle = 0.5 * (fine[1:] + fine[:-1])
             speed = np.linalg.norm(curve(middle, 1)[:, :3], axis=1)
             arc = np.concatenate([[0.0], np.cumsum(speed * np.diff(fine))])
+            end = None if end is None else float(np.interp(end, fine, arc))
             n = max(len(s) - 1, math.ceil(arc[-1] / _KNOT_M), 3)
             s_even = np.linspace(0.0, arc[-1], n + 1)
             values = curve(np.interp(s_even, arc, fine))
@@ -113,11 +126,16 @@ class SeamCurve:
         tangents = coefficients[:, 2]
         if (np.abs(np.einsum("ij,ij->i", tangents, b[:-1])) > 0.9).any():
             raise SeamError("The up-normal of a seam must be perpendicular to it; here it points along the seam.")
-        return cls(s, coefficients, b)
+        return cls(s, coefficients, b, end)
 
     @property
     def length(self) -> float:
-        """The arc length in m."""
+        """The seam's arc length in m."""
+        return self.drawn_m if self.end is None else self.end
+
+    @property
+    def drawn_m(self) -> float:
+        """The arc length in m up to which the groove is drawn: the seam's own, or more where the groove goes on past its end."""
         return float(self.knots[-1])
 
     def _pieces(self, s: Array) -> tuple[Array, Array, Array]:
@@ -128,7 +146,7 @@ class SeamCurve:
         return index, inside - self.knots[index], s - inside
 
     def position(self, s: ArrayLike) -> Array:
-        """Points (...,3) m at arc lengths s (...) m; straight on beyond the ends."""
+        """Points (...,3) m at arc lengths s (...) m; straight on beyond what is drawn."""
         index, x, beyond = self._pieces(np.asarray(s, dtype=float))
         c, x = self.coefficients[index], x[..., None]
         p = ((c[..., 0, :] * x + c[..., 1, :]) * x + c[..., 2, :]) * x + c[..., 3, :]
@@ -158,7 +176,7 @@ class SeamCurve:
         return np.cross(self.up(s), self.tangent(s))
 
     def curvature(self, s: ArrayLike) -> Array:
-        """Signed in-plane curvature (...) in 1/m, positive to the left; zero beyond the ends."""
+        """Signed in-plane curvature (...) in 1/m, positive to the left; zero beyond what is drawn."""
         index, x, beyond = self._pieces(np.asarray(s, dtype=float))
         c = self.coefficients[index]
         second = 6.0 * c[..., 0, :] * x[..., None] + 2.0 * c[..., 1, :]
@@ -172,7 +190,7 @@ class SeamCurve:
 
     @cached_property
     def _scale(self) -> tuple[float, float]:
-        """(distance between knots, arc length), m."""
+        """(distance between knots, arc length drawn), m."""
         return float(self.knots[1]), float(self.knots[-1])
 
     def frame_numbers(self, s: float) -> FrameNumbers:
@@ -220,14 +238,20 @@ class SeamCurve:
         R, p = X.rotation().matrix(), X.translation()
         coefficients = self.coefficients @ R.T
         coefficients[:, 3] += p
-        return type(self)(self.knots, coefficients, self.ups @ R.T)
+        return type(self)(self.knots, coefficients, self.ups @ R.T, self.end)
 
     def raised(self, height: float, left: float = 0.0) -> Self:
         """The line `height` m above this seam and `left` m to its left, by arc length of its own."""
         n = len(self.knots)
         s = self.knots
         points = self.position(s) + height * self.up(s) + left * self.normal(s)
-        return type(self).from_points(points, self.ups) if n >= 4 else self
+        if n < 4:
+            return self
+        if self.end is None:
+            return type(self).from_points(points, self.ups)
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        length = float(np.interp(self.end, s, np.concatenate([[0.0], np.cumsum(steps)])))
+        return type(self).from_points(points, self.ups, length=length)
 
     def __post_init__(self) -> None:
         for array in (self.knots, self.coefficients, self.ups):

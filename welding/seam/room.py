@@ -47,7 +47,8 @@ def check_room(
     points, _ = mesh.sample(SAMPLES, np.random.default_rng(0))
     points_B = points @ X_BP.rotation().matrix().T + X_BP.translation()
     spans = [span for capsule in capsules if (span := _above_tip(capsule, X_FT)) is not None]
-    for s in np.linspace(0.0, seam.length, max(2, math.ceil(seam.length / STEP_M) + 1)):
+    last = min(seam.drawn_m, seam.length + chord_m)
+    for s in np.linspace(0.0, last, max(2, math.ceil(last / STEP_M) + 1)):
         tip, torch = seam.frame(float(s)), seam.frame(float(s) - chord_m)
         up = unit(tip.up + torch.up, tip.up)
         x = tip.position - torch.position
@@ -66,18 +67,20 @@ def check_room(
 def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:
     """Check that nothing of the part stands in the way of the tip beyond the seam's end and of the torch before its start.
 
-    The tip runs `chord_m` ahead of the torch, straight on where the seam ends; the torch comes from as far behind its start. A wall
-    met at a slant, as that of a curved groove cut short, leads the tip aside, or up and out of the groove. Where it is too high for
-    that, as a web that the seam follows on its hollow side, it stops the tip.
+    The tip runs `chord_m` ahead of the torch, straight on where the groove is drawn no further; the torch comes from as far behind its
+    start. A wall met at a slant, as that of a curved joint cut short, leads the tip aside, or up and out of the groove. Where it is too
+    high for that, as a web that the seam follows on its hollow side, it stops the tip.
 
     Raises:
         NoRoom: with how much of the seam to cut off.
     """
     triangles = mesh.transformed(X_BP).vertices[mesh.triangles]
     needed = chord_m + tip_radius_m
-    for name, s, sign, who in (("end", seam.length, 1.0, "tip"), ("start", 0.0, -1.0, "torch")):
-        frame = seam.frame(s)
-        free = _free_length(triangles, frame, sign, needed, tip_radius_m)
+    for name, s, sign, who in (("end", seam.drawn_m, 1.0, "tip"), ("start", 0.0, -1.0, "torch")):
+        inside = max(0.0, s - seam.length)
+        if inside >= needed:
+            continue
+        free = inside + _free_length(triangles, seam.frame(s), sign, needed - inside, tip_radius_m)
         if free < needed:
             raise NoRoom(
                 f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs {1e3 * needed:.0f} mm there: "

@@ -115,13 +115,14 @@ def watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Weld
         # The arm may still move, and by a stopped clock no frame is ever late.
         text = f"The robot's clock has stood still for {state.clock_stopped_s:.2f} s; check the robot's connection."
         return fault(state, text)
+    # Past the seam's end the tip is not needed: what it feels, or does not, is no reason to stop the torch.
+    needed = state.phase != Phase.FINISH and not (state.phase == Phase.TRACK and state.s_tip > state.s_end)
     if beyond_limit(state, config) and state.phase != Phase.FINISH:
         text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
-        return fault(state, text)
-    # Past the seam's end the tip is not used, so the tag is not needed.
+        return fault(state, text) if needed else _finish(state)
     blind = sample.time - max(state.frame_time, state.started)
-    if state.phase != Phase.FINISH and blind > faults.hidden_s:
-        return fault(state, _blind_sentence(state, sample, blind, faults.hidden_s))
+    if blind > faults.hidden_s and state.phase != Phase.FINISH:
+        return fault(state, _blind_sentence(state, sample, blind, faults.hidden_s)) if needed else _finish(state)
     # Identical readings to the last bit mean one picture repeated with new times.
     if state.same_readings >= faults.frozen_frames:
         text = f"The finger camera repeats one picture ({state.same_readings} identical readings); restart the camera."
@@ -192,6 +193,8 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             assert state.plan_fit is not None
             last = state.plan_fit.curve.nearest(before.measurement.point, state.s_tip)
             low, high = state.s_end - end_window, state.s_end + end_window
+            if _goes_on(state, config):
+                high = state.s_end
             return changed(_finish(state), s_end=clip(last, low, high))
         return changed(
             state,
@@ -223,6 +226,13 @@ def _tip_residual(state: WeldingState) -> Array:
     return np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
 
 
+def _goes_on(state: WeldingState, config: ServoConfig) -> bool:
+    """Whether the seam is cut short of its groove: where it ends was said, and does not have to be felt."""
+    assert state.plan_fit is not None
+    plan = state.plan_fit.plan
+    return plan.drawn_m > plan.length + config.gap.end_window_m
+
+
 def _finish(state: WeldingState) -> WeldingState:
     return changed(state, phase=Phase.FINISH, steer=0.0, felt=0.0, hold=np.full(2, math.nan))
 
@@ -246,10 +256,12 @@ def _weld(
     if state.phase == Phase.COAST and s_tip - state.lost_at > config.gap.coast_m:
         text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
         return _rest(fault(state, text), config)
-    beyond = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0
-    if law.guarded and state.phase != Phase.FINISH and s_tip > state.s_end + beyond:
+    beyond, goes_on = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0, _goes_on(state, config)
+    # A groove that is drawn on past the seam's end is felt on; only a gap there ends the feeling.
+    last = curve.drawn_m if goes_on and state.phase == Phase.TRACK else state.s_end
+    if law.guarded and state.phase != Phase.FINISH and s_tip > last + beyond:
         # Still in contact this far beyond the plan's end: the seam does not end before this point.
-        state = _finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK else state)
+        state = _finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK and not goes_on else state)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
         state = changed(state, hold=off)
 

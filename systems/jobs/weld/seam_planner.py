@@ -37,6 +37,7 @@ from weldcal.welding.servo.touch import touch_start_pose
 
 CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
 CLEAR_OF_PART_M = 0.002
+TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
 HIGHER = (1.0, 2.0, 4.0)  # of the clearance above the seam, until the moves are clear
 
 
@@ -221,7 +222,8 @@ def check_weld_path(
     X_BT = touch_start_pose(seam, planning.config)
     along, q = [planning.q_near, q_above, q_start], q_start
     first = seam.frame(0.0)
-    for s in np.arange(CHECKED_EVERY_M, seam.length, CHECKED_EVERY_M):
+    last = min(seam.drawn_m, seam.length + planning.tool.chord_m)
+    for s in np.arange(CHECKED_EVERY_M, last, CHECKED_EVERY_M):
         at = seam.frame(float(s))
         turn = math.atan2(
             float(np.dot(np.cross(first.tangent, at.tangent), first.up)), float(np.dot(first.tangent, at.tangent))
@@ -268,14 +270,21 @@ class SeamOutOfReach(WeldcalError):
 
 
 def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The path of the seated tip's centre, in B, cut to `length_m` of arc where given."""
+    """The path of the seated tip's centre, in B; the seam ends after `length_m` of arc where given, the path a chord later."""
     seated = workpiece.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
     line = workpiece.seam_P + seated.above_m * workpiece.up_P
-    ups = np.broadcast_to(workpiece.up_P, line.shape)
-    if length_m is not None:
-        line, ups = line[workpiece.arc_length_m <= length_m], ups[workpiece.arc_length_m <= length_m]
     R = X_BP.rotation().matrix()
-    return SeamCurve.from_points(line @ R.T + X_BP.translation(), up=ups @ R.T)
+    ups = np.broadcast_to(workpiece.up_P, line.shape) @ R.T
+    return _cut(line @ R.T + X_BP.translation(), ups, tool, length_m)
+
+
+def _cut(line: NDArray[np.float64], ups: NDArray[np.float64], tool: WeldingTool, length_m: float | None) -> SeamCurve:
+    """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is still in it."""
+    if length_m is None:
+        return SeamCurve.from_points(line, up=ups)
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    used = s <= length_m + TIP_AHEAD * tool.chord_m
+    return SeamCurve.from_points(line[used], up=ups[used], length=length_m)
 
 
 def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_m: float | None = None) -> SeamCurve:
@@ -286,12 +295,7 @@ def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_
     """
     height = tool.tip_radius_m / math.sin(plan.half_angle_rad) - tool.seat_sink_m if above_m is None else above_m
     ups = np.broadcast_to(plan.up, plan.root.shape)
-    line = plan.root + height * ups
-    if length_m is not None:
-        steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-        near = np.concatenate([[0.0], np.cumsum(steps)]) <= length_m + 1e-7
-        line, ups = line[near], ups[near]
-    return SeamCurve.from_points(line, up=ups)
+    return _cut(plan.root + height * ups, ups, tool, length_m)
 
 
 def arm_waypoints(

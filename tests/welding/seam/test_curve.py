@@ -47,6 +47,24 @@ def test_beyond_its_ends_a_seam_goes_straight_on() -> None:
         assert float(seam.curvature(s)) == 0.0
 
 
+def test_a_seam_cut_short_of_its_groove_ends_there_and_the_curve_goes_on() -> None:
+    whole = arc()
+    points = whole.position(np.linspace(0.0, whole.length, 91))
+    cut = SeamCurve.from_points(points, length=0.04)
+    moved = RigidTransform(RollPitchYaw(0.2, -0.1, 0.7), np.array([0.3, 0.1, -0.2]))
+    for seam, radius in ((cut, R), (cut.transformed(moved), R), (cut.raised(0.003, 0.010), R - 0.010)):
+        assert seam.length == pytest.approx(0.04 * radius / R, abs=1e-5)
+        assert seam.drawn_m == pytest.approx(1.5 * radius, abs=1e-5)
+        np.testing.assert_allclose(seam.curvature(np.array([0.03, 0.06])), 1.0 / radius, rtol=1e-2)
+    np.testing.assert_allclose(cut.position(0.07), whole.position(0.07), atol=1e-7)
+    assert SeamCurve.from_points(points, length=0.2).length == pytest.approx(whole.length, abs=1e-7), (
+        "longer than drawn"
+    )
+    smooth = SeamCurve.from_points(points, smoothing=1e-9, length=0.04)
+    assert smooth.length == pytest.approx(0.04, abs=1e-4)
+    assert smooth.drawn_m > 0.08
+
+
 def test_one_frame_says_what_the_vectorised_functions_say() -> None:
     seam = arc()
     for s in (-0.01, 0.0, 0.0213, seam.length, seam.length + 0.02):

@@ -61,11 +61,11 @@ def ring(inner: float, outer: float, low: float, high: float, turn: tuple[float,
     return extrude(np.vstack([inner * rim[::-1], outer * rim])[::-1], low, high)
 
 
-def along_ring(radius: float, lean: float, turn: tuple[float, float]) -> SeamCurve:
+def along_ring(radius: float, lean: float, turn: tuple[float, float], length: float | None = None) -> SeamCurve:
     a = np.linspace(*turn, 60)
     out = np.column_stack([np.cos(a), np.sin(a), 0.0 * a])
     up = lean * out + np.array([0.0, 0.0, 1.0])
-    return SeamCurve.from_points(radius * out + 0.0025 * up, up=up)
+    return SeamCurve.from_points(radius * out + 0.0025 * up, up=up, length=length)
 
 
 @pytest.mark.parametrize(("height", "fits"), [(0.05, False), (0.006, True)])
@@ -78,6 +78,35 @@ def test_a_wall_met_at_a_slant_leads_the_tip_on_only_where_it_can_climb_it(heigh
     with pytest.raises(NoRoom, match="beyond its end"):
         check_ends(web, RigidTransform(), path, TOOL.chord_m, TOOL.tip_radius_m)
     return None
+
+
+def test_a_seam_cut_short_is_followed_round_the_bend_as_far_as_it_is_drawn() -> None:
+    """The web that is in the way straight on is not where the groove's bend is followed for another 64 mm."""
+    web = ring(0.2, 0.21, 0.0, 0.05, (-0.6, 0.6))
+    path = along_ring(0.2, -1.0, (-0.5, 0.47), length=0.1284)
+    check_ends(web, RigidTransform(), path, TOOL.chord_m, TOOL.tip_radius_m)
+
+
+def straight_cut(lean_deg: float, drawn_to: float, length: float) -> SeamCurve:
+    """The corner of plate and web from x = -0.1 to `drawn_to`, of which `length` is welded."""
+    a = np.radians(lean_deg)
+    up = np.array([0.0, -np.sin(a), np.cos(a)])
+    points = np.linspace([-0.1, 0.0, 0.0], [drawn_to, 0.0, 0.0], 60) + 0.0033 * up
+    return SeamCurve.from_points(points, up=up, length=length).transformed(X_BP)
+
+
+def test_a_wall_past_what_is_drawn_is_measured_from_the_seams_end() -> None:
+    part = merge(PLATE, WEB, block((0.07, -0.05, 0.0), (0.075, 0.0, 0.05)))
+    with pytest.raises(NoRoom, match="50 mm beyond its end"):
+        check_ends(part, X_BP, straight_cut(45.0, 0.05, 0.12), TOOL.chord_m, TOOL.tip_radius_m)
+    check_ends(part, X_BP, straight_cut(45.0, 0.05, 0.10), TOOL.chord_m, TOOL.tip_radius_m)
+
+
+def test_the_tool_has_room_for_its_tip_past_the_end_of_a_seam_cut_short() -> None:
+    part = merge(PLATE, block((0.07, 0.0, 0.0), (0.1, 0.01, 0.15)))
+    check_room(part, X_BP, straight_cut(20.0, 0.1, 0.06), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+    with pytest.raises(NoRoom, match=r"does not fit at 1\d\d mm"):
+        check_room(part, X_BP, straight_cut(20.0, 0.1, 0.09), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
 
 
 def test_a_wall_that_bends_away_is_no_obstacle() -> None:

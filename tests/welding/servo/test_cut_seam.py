@@ -1,0 +1,69 @@
+"""A seam cut short of its groove: it ends where it was said to, and the tip stays in the bend before the torch."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.welding.weld_kinematics import Run, weld
+from weldcal.tools.studies.weld.budgets import NOMINAL
+from weldcal.tools.studies.weld.groove import SEAT_M as SEAT
+from weldcal.tools.studies.weld.seams import s_curve
+from weldcal.welding.record.process import path_error
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
+
+CUT_M = 0.085  # just before the S bends: the torch is on the straight while the tip goes round
+CONFIG = ServoConfig()
+LIMIT_M = CONFIG.faults.lateral_m
+POINTS = s_curve()
+
+
+@cache
+def cut(gap: tuple[float, float] | None = None, hidden_s: float | None = None) -> Run:
+    """A weld of the first part of the S, planned 1 mm off."""
+    plan = SeamCurve.from_points(POINTS + np.array([0.6, 0.8, 0.0]) * 1e-3, length=CUT_M)
+    gaps = () if gap is None else (gap,)
+    hidden = (np.inf, np.inf) if hidden_s is None else (hidden_s, np.inf)
+    return weld(POINTS, NOMINAL, CONFIG, seed=2, plan=plan, gaps=gaps, hidden=hidden)
+
+
+def welded(run: Run) -> tuple[float, float, float]:
+    """Where the arc went on and off along the true seam, and the torch's largest error, mm."""
+    error = path_error(run.torch[run.torch_on], SeamCurve.from_points(POINTS).raised(SEAT + CONFIG.clearance_m))
+    return 1e3 * float(error.s[0]), 1e3 * float(error.s[-1]), 1e3 * error.max_m
+
+
+def largest_bend(run: Run) -> float:
+    """The tip's largest deflection across the seam, m."""
+    return max(abs(c.diagnostics.delta_n) for c in run.commands)
+
+
+def test_it_is_felt_on_until_the_torch_is_at_its_end() -> None:
+    run = cut()
+    assert run.phases() == (Phase.TOUCH, Phase.TRACK, Phase.DONE), run.last.reason
+    start, end, most = welded(run)
+    assert start == pytest.approx(0.0, abs=2.0)
+    assert end == pytest.approx(1e3 * CUT_M, abs=2.0), "no further than it was said, though the groove goes on"
+    assert most <= 0.2
+    assert largest_bend(run) < 0.5 * LIMIT_M
+
+
+def test_a_gap_past_its_end_does_not_stop_the_torch() -> None:
+    run = cut(gap=(CUT_M + 0.015, CUT_M + 0.045))
+    assert run.phases() == (Phase.TOUCH, Phase.TRACK, Phase.FINISH, Phase.DONE), run.last.reason
+    _, end, most = welded(run)
+    assert end == pytest.approx(1e3 * CUT_M, abs=2.0)
+    assert most <= 0.2
+
+
+def test_a_tag_hidden_past_its_end_does_not_stop_the_torch() -> None:
+    run = cut()
+    past = next(t for t, c in zip(run.time, run.commands, strict=True) if c.diagnostics.s_tip > CUT_M + 0.005)
+    hidden = cut(hidden_s=float(past))
+    assert hidden.phases() == (Phase.TOUCH, Phase.TRACK, Phase.FINISH, Phase.DONE), hidden.last.reason
+    assert welded(hidden)[1] == pytest.approx(1e3 * CUT_M, abs=2.0)
+    assert welded(hidden)[2] <= 0.2
