@@ -11,13 +11,15 @@ from xdist.scheduler.loadfile import LoadFileScheduling
 STREAMING = (
     *("test_same_job.py", "test_other_jobs.py", "test_fault_matrix.py", "test_station_backends.py"),
     *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py", "test_hold_and_go_on.py"),
-    "test_wired_cell.py",
+    *("test_wired_cell.py", "test_wired_profiler.py"),
 )
 # They wait for a browser, a page or a folder and need next to no processor: beside a stream they leave the cores to what computes.
 WAITING = ("test_dashboard.py", "test_panels.py", "test_folder_scanner.py", "test_tablet_page.py")
 SLEEPING = STREAMING + WAITING
 # They look at the finished demo. A core that is left with them at the end keeps the other waiting.
 DEMO = ("tests/scenario/test_readme.py", "tests/scenario/test_cell.py")
+# They wait for a controller half of their time: not all of them at once with what streams.
+EARLY = ("test_wired_motion.py", "test_emulator_client.py")
 # Folders whose files take a second or less come last, so that the processes end together.
 SHORT = ("models", "contract")
 MOST_PROCESSES = 4
@@ -33,7 +35,7 @@ def order(item: pytest.Item) -> tuple[object, ...]:
     name, room = item.path.name, item.nodeid.split("/")[1]
     streams = SLEEPING.index(name) if name in SLEEPING else len(SLEEPING)
     late = SHORT[::-1].index(room) + 1 if room in SHORT else 0
-    return streams, not item.nodeid.startswith(DEMO), room != "scenario", late
+    return streams, not item.nodeid.startswith(DEMO), name not in EARLY, room != "scenario", late
 
 
 class Scheduling(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types

@@ -1,4 +1,4 @@
-"""The other jobs on an emulated controller: mounting and profiler find what they find in simulation, over the same link."""
+"""Another job on an emulated controller: mounting finds what it finds in simulation, over the same link (the profiler: test_wired_profiler)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from pathlib import Path
 
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.mounting_live import run_mounting_live
-from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.outcomes.options import RunOptions
 
 ROBOT = "emulated"
@@ -15,11 +14,6 @@ FEW_LOOKS = """
 mounting: {travel_deg: 40.0}
 scanner: !RenderedScanner {width: 560, height: 420, exposure_s: 0.02}
 calibration: {minimum_scans: 4, maximum_scans: 4, verification_scans: 1}
-"""
-FEW_PROFILES = """
-profiler_job:
-  stages: [edge]
-  edge: {scans: 8, held_out: 1}
 """
 
 
@@ -38,15 +32,3 @@ def test_a_scanner_on_the_flange_calibrates_itself_on_the_controllers_arm(tmp_pa
     assert error.nees < error.bound  # 99.7 % of its own covariance
     assert error.mm < 0.3
     assert (report.folder / "report.html").is_file()
-
-
-def test_a_profiler_scans_its_edge_with_the_controllers_arm(tmp_path: Path) -> None:
-    live = run_profiler_live(
-        load_scenario("profiler_edge", FEW_PROFILES), options("profiler_edge", tmp_path), lambda *_: None
-    )
-    summary = live.summary()
-    assert summary["state"] == "done", summary.get("reason")
-    assert summary["robot"] == "an emulated controller"
-    assert len(live.state.edge_scans) == 9
-    assert live.outcome.edge is not None
-    assert live.outcome.edge.within_3_sigma
