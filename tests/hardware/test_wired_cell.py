@@ -298,7 +298,7 @@ def test_a_scanner_that_does_not_answer_ends_the_job_by_name(
         reason = held_by(
             played,
             tmp_path / "run",
-            "scan_workpiece",
+            "park",  # not in the midst of a scan, for which the world would wait
             lambda: os.kill(scanner, signal.SIGSTOP),
             f"scanner: !FolderScanner {{{wires}, scan_timeout_s: 2.0}}",
         )
