@@ -11,9 +11,10 @@ from weldcal.welding.numerics import Array, changed, finite, norm
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.refinement import drop_pending
 from weldcal.welding.servo.contact import is_new_frame, with_frame
+from weldcal.welding.servo.faults import fault, watch
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
-from weldcal.welding.servo.step import fault, watch, welding_step
+from weldcal.welding.servo.step import welding_step
 
 RAMP_S = 0.04  # from welding speed to rest
 STILL_S = 0.25  # of rest before the tool counts as standing: the arm lags behind its commands

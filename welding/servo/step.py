@@ -11,7 +11,6 @@ from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.seam.plan_fit import PlanFit
 from weldcal.welding.seam.refinement import drop_pending
 from weldcal.welding.servo.contact import (
-    beyond_limit,
     contact_lost,
     freshness,
     is_new_frame,
@@ -20,13 +19,14 @@ from weldcal.welding.servo.contact import (
     with_point,
     with_progress,
 )
+from weldcal.welding.servo.faults import advance, angles, fault, finish, unlit, watch
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.servo.ignition import start_arc, wait_for_arc, with_arc
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.touch import touch_step
-from weldcal.welding.servo.track import TorchTarget, torch_target
+from weldcal.welding.servo.track import torch_target
 from weldcal.welding.servo.weave import weave_at
 
 _MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
@@ -99,46 +99,6 @@ def _frame_at_tip(state: WeldingState) -> SeamFrame:
     return state.plan_fit.curve.frame(state.s_tip)
 
 
-def fault(state: WeldingState, reason: str) -> WeldingState:
-    """Enter FAULT with a reason and the arc off in this tick; the first fault is kept."""
-    if state.phase == Phase.FAULT:
-        return state
-    return changed(state, phase=Phase.FAULT, reason=reason, torch_on=False, V_stop=state.V, stopped_ticks=0)
-
-
-def watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> WeldingState:
-    """Check the faults of every phase: stopped clock, deflection beyond its limit, hidden tag, frozen camera."""
-    faults = config.faults
-    if state.phase in (Phase.DONE, Phase.FAULT):
-        return state
-    if state.clock_stopped_s > faults.hidden_s:
-        # The arm may still move, and by a stopped clock no frame is ever late.
-        text = f"The robot's clock has stood still for {state.clock_stopped_s:.2f} s; check the robot's connection."
-        return fault(state, text)
-    # Past the seam's end the tip is not needed: what it feels, or does not, is no reason to stop the torch.
-    needed = state.phase != Phase.FINISH and not (state.phase == Phase.TRACK and state.s_tip > state.s_end)
-    if beyond_limit(state, config) and state.phase != Phase.FINISH:
-        text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
-        return fault(state, text) if needed else _finish(state)
-    blind = sample.time - max(state.frame_time, state.started)
-    if blind > faults.hidden_s and state.phase != Phase.FINISH:
-        return fault(state, _blind_sentence(state, sample, blind, faults.hidden_s)) if needed else _finish(state)
-    # Identical readings to the last bit mean one picture repeated with new times.
-    if state.same_readings >= faults.frozen_frames:
-        text = f"The finger camera repeats one picture ({state.same_readings} identical readings); restart the camera."
-        return fault(state, text)
-    return state
-
-
-def _blind_sentence(state: WeldingState, sample: ServoSample, blind_s: float, limit_s: float) -> str:
-    """Why there is no reading: pictures come and do not show the tag, or none came."""
-    newest = sample.deflection
-    without_s = sample.time - max(state.started, -math.inf if newest is None else newest.capture_time)
-    if without_s > limit_s:
-        return f"No picture from the finger camera for {without_s:.2f} s; check its power, its cable and the network."
-    return f"Tag hidden: the finger camera has not seen it for {blind_s:.2f} s; clean the tag and its window."
-
-
 def _touch(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
@@ -195,7 +155,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             low, high = state.s_end - end_window, state.s_end + end_window
             if _goes_on(state, config):
                 high = state.s_end
-            return changed(_finish(state), s_end=clip(last, low, high))
+            return changed(finish(state), s_end=clip(last, low, high))
         return changed(
             state,
             phase=Phase.COAST,
@@ -233,10 +193,6 @@ def _goes_on(state: WeldingState, config: ServoConfig) -> bool:
     return plan.drawn_m > plan.length + config.gap.end_window_m
 
 
-def _finish(state: WeldingState) -> WeldingState:
-    return changed(state, phase=Phase.FINISH, steer=0.0, felt=0.0, hold=np.full(2, math.nan))
-
-
 def _weld(
     state: WeldingState, sample: ServoSample, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
@@ -261,7 +217,7 @@ def _weld(
     last = curve.drawn_m if goes_on and state.phase == Phase.TRACK else state.s_end
     if law.guarded and state.phase != Phase.FINISH and s_tip > last + beyond:
         # Still in contact this far beyond the plan's end: the seam does not end before this point.
-        state = _finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK and not goes_on else state)
+        state = finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK and not goes_on else state)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
         state = changed(state, hold=off)
 
@@ -285,8 +241,8 @@ def _weld(
         omega=motion.omega,
     )
     error = math.hypot(e_n, e_b)
-    state, problem = _advance(state, target.s, sample.time, config)
-    problem = problem or _angles(sample, target, config)
+    state, problem = advance(state, target.s, sample.time, config)
+    problem = problem or angles(sample, target, config)
     if problem is not None and (state.torch_on or state.phase == Phase.COAST):
         return _rest(fault(state, problem), config)
     if state.torch_on and error > config.faults.torch_error_m:
@@ -298,7 +254,7 @@ def _weld(
     burning = lit and target.s < state.s_end
     lit_at = sample.time if burning and not state.torch_on else state.lit_at
     state = changed(state, torch_on=burning, lit_at=lit_at)
-    problem = _unlit(state, target.s, target.s - start, error, config)
+    problem = unlit(state, target.s, target.s - start, error, config)
     if problem is not None:
         return _rest(fault(state, problem), config)
     if target.s >= state.s_end:
@@ -315,48 +271,6 @@ def _weld(
         p_BTorch_target=target.point,
     )
     return _answer(state, motion.V_BT, config, diagnostics)
-
-
-def _unlit(state: WeldingState, s_torch: float, past_start: float, error: float, config: ServoConfig) -> str | None:
-    """Fault sentence where the arc is still not lit so far past the seam's start, or at its end, else None."""
-    if math.isfinite(state.lit_at) or (past_start <= config.torch.ignition_window_m and s_torch < state.s_end):
-        return None
-    return (
-        f"Not welded: {1e3 * past_start:.0f} mm past the seam's start the arc is not lit, because the torch is "
-        f"{1e3 * error:.2f} mm off the seam (limit {1e3 * config.torch.ignition_error_m:.2g} mm); check the plan's start."
-    )
-
-
-def _advance(state: WeldingState, s_torch: float, now: float, config: ServoConfig) -> tuple[WeldingState, str | None]:
-    """Check that the torch advances by half a millimetre in `stall_s`; otherwise return a fault sentence."""
-    faults = config.faults
-    since, s = state.advanced
-    if abs(s_torch - s) > 0.5e-3:
-        return changed(state, advanced=(now, s_torch)), None
-    if now - since <= faults.stall_s:
-        return state, None
-    return (
-        state,
-        f"The torch has stood at {1e3 * s_torch:.0f} mm for {faults.stall_s:.0f} s; check the seam's shape there.",
-    )
-
-
-def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> str | None:
-    """Fault sentence for a work or travel angle beyond its window plus a margin for the plan's error, or None."""
-    R = sample.X_BT.rotation().matrix()
-    margin = math.radians(5.0)
-    travel = math.asin(clip(dot(R[:, 0], target.up), -1.0, 1.0))
-    work = math.asin(clip(dot(R[:, 1], target.up), -1.0, 1.0)) - config.torch.work_angle_rad
-    for name, angle, limit in (
-        ("travel", travel, config.windows.travel_rad),
-        ("work", work, config.windows.work_rad),
-    ):
-        if abs(angle) > limit + margin:
-            return (
-                f"The {name} angle is {math.degrees(angle):.1f} deg, beyond its window of {math.degrees(limit):.0f} deg; "
-                "check the plan's surface."
-            )
-    return None
 
 
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
