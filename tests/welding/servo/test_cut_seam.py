@@ -6,15 +6,18 @@ from functools import cache
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
 from tests.welding.weld_kinematics import Run, weld
 from weldcal.tools.studies.weld.budgets import NOMINAL
 from weldcal.tools.studies.weld.groove import SEAT_M as SEAT
 from weldcal.tools.studies.weld.seams import s_curve
+from weldcal.welding.numerics import changed
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.faults import watch
 from weldcal.welding.servo.settings import ServoConfig
-from weldcal.welding.servo.state import Phase
+from weldcal.welding.servo.state import Phase, ServoSample
 
 CUT_M = 0.085  # just before the S bends: the torch is on the straight while the tip goes round
 CONFIG = ServoConfig()
@@ -52,6 +55,12 @@ def test_it_is_felt_on_until_the_torch_is_at_its_end() -> None:
     assert largest_bend(run) < 0.5 * LIMIT_M
 
 
+def test_a_tip_that_went_straight_on_would_be_bent_too_far_by_the_wall() -> None:
+    whole = SeamCurve.from_points(POINTS)
+    only = SeamCurve.from_points(whole.position(np.linspace(0.0, CUT_M, 60)))
+    assert largest_bend(weld(POINTS, NOMINAL, CONFIG, seed=2, plan=only)) > LIMIT_M
+
+
 def test_a_gap_past_its_end_does_not_stop_the_torch() -> None:
     run = cut(gap=(CUT_M + 0.015, CUT_M + 0.045))
     assert run.phases() == (Phase.TOUCH, Phase.TRACK, Phase.FINISH, Phase.DONE), run.last.reason
@@ -67,3 +76,19 @@ def test_a_tag_hidden_past_its_end_does_not_stop_the_torch() -> None:
     assert hidden.phases() == (Phase.TOUCH, Phase.TRACK, Phase.FINISH, Phase.DONE), hidden.last.reason
     assert welded(hidden)[1] == pytest.approx(1e3 * CUT_M, abs=2.0)
     assert welded(hidden)[2] <= 0.2
+
+
+@pytest.mark.parametrize(("past_mm", "phase"), [(-1.0, Phase.FAULT), (1.0, Phase.FINISH)])
+def test_a_tip_pushed_too_far_is_a_fault_only_where_it_is_needed(past_mm: float, phase: Phase) -> None:
+    run = cut()
+    state, sideways = run.state, np.array([0.0, 1.2 * LIMIT_M, 0.0])
+    assert state.measurement is not None
+    pushed = changed(
+        state,
+        phase=Phase.TRACK,
+        s_tip=CUT_M + 1e-3 * past_mm,
+        s_end=CUT_M,
+        measurement=state.measurement._replace(delta=sideways),
+        frame_time=float(run.time[-1]),
+    )
+    assert watch(pushed, ServoSample(float(run.time[-1]), RigidTransform()), CONFIG).phase == phase
