@@ -37,7 +37,7 @@ from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import ToolShape, WeldingTool
 from weldcal.models.tools.enclosing import shape_mesh
 from weldcal.systems.bodies.textured_board import textured_board
-from weldcal.welding.servo.deformation import TagModel, tag_cells
+from weldcal.welding.finger.deformation import TagModel, tag_cells
 
 STEEL = (0.62, 0.64, 0.67, 1.0)
 DARK = (0.16, 0.18, 0.21, 1.0)

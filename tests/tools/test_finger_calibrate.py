@@ -20,8 +20,8 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.print_board import Board, board_sheet, write_board
-from weldcal.welding.servo.deformation import TagModel, detect_tag, tag_cells
-from weldcal.welding.servo.finger_calibration import calibrate_tip
+from weldcal.welding.finger.calibration import calibrate_tip
+from weldcal.welding.finger.deformation import TagModel, detect_tag, tag_cells
 
 SIZE = (400, 300)
 K = np.array([[443.7, 0.0, 203.9], [0.0, 446.2, 144.6], [0.0, 0.0, 1.0]])

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.print_board import PAPERS, Board, board_sheet, tag_sheet
-from weldcal.welding.servo.deformation import TagModel
+from weldcal.welding.finger.deformation import TagModel
 
 DPI = 600
 PIXELS_PER_MM = DPI / 25.4

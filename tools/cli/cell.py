@@ -51,7 +51,7 @@ def print_board(
     """Write a ChArUco board, or tags, as board.pdf at true scale, with a line of 100 mm to check the print by."""
     from weldcal.models.errors import InputError
     from weldcal.tools.commands import print_board as printing
-    from weldcal.welding.servo.deformation import TagModel
+    from weldcal.welding.finger.deformation import TagModel
 
     board = None
     if kind == "charuco":

@@ -36,7 +36,7 @@ from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.commands.check_robot import state_of
-from weldcal.welding.servo.deformation import TagModel, detect_tag
+from weldcal.welding.finger.deformation import TagModel, detect_tag
 
 LOOKED_AT = tuple(name for name in DEVICES if name not in ("robot", "robot_2"))
 LEAST_FREE_GB = 2.0  # the scans, the log and the recording of a job take less

@@ -19,14 +19,14 @@ from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.commands.print_board import Board
 from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, Tolerance, check_limit
 from weldcal.tools.report.render import render, write_atomic
-from weldcal.welding.servo.deformation import TagModel, TagObservation, deflection_from_tag, detect_tag
-from weldcal.welding.servo.finger_calibration import (
+from weldcal.welding.finger.calibration import (
     Intrinsics,
     TipCalibration,
     calibrate_intrinsics,
     calibrate_tip,
     find_board,
 )
+from weldcal.welding.finger.deformation import TagModel, TagObservation, deflection_from_tag, detect_tag
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 COLUMNS = ("x_mm", "y_mm", "z_mm")

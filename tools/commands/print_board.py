@@ -10,7 +10,7 @@ import yaml
 
 from weldcal.models.errors import InputError
 from weldcal.tools.report.render import write_atomic
-from weldcal.welding.servo.deformation import TagModel, dictionary_named, tag_cells
+from weldcal.welding.finger.deformation import TagModel, dictionary_named, tag_cells
 
 PAPERS = {"A5": (148.0, 210.0), "A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height of papers, mm."""

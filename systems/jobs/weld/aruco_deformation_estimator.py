@@ -14,7 +14,7 @@ from weldcal.systems.background import Answer, Background, Inline, import_module
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, Image, Message, believed_arm
 from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.welding.servo.deformation import TagModel, deflection_from_tag, detect_tag
+from weldcal.welding.finger.deformation import TagModel, deflection_from_tag, detect_tag
 from weldcal.welding.servo.state import DeflectionSample
 
 IMAGES_KEPT = 10  # 1/3 s of images; after a longer gap the servo has stopped

@@ -24,7 +24,7 @@ from weldcal.systems.jobs.weld.aruco_deformation_estimator import (
 )
 from weldcal.systems.messages import Image
 from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.welding.servo.deformation import TagModel, tag_cells
+from weldcal.welding.finger.deformation import TagModel, tag_cells
 
 TAG = TagModel(dictionary=TOOL.tag_dictionary, id=TOOL.tag_id, size_m=TOOL.tag_size_m)
 CAMERA = RenderedFingerCamera().camera()

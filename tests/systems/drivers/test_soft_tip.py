@@ -15,7 +15,7 @@ from weldcal.models.arms.kinematics import kinematics_and_jacobian
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import measure_deformation
-from weldcal.welding.servo.deformation import TagModel
+from weldcal.welding.finger.deformation import TagModel
 
 START_S = 0.05  # where along the straight groove, m
 SPEED_M_S = 0.008

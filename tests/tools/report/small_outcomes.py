@@ -279,7 +279,7 @@ def tablet() -> Made:
 def finger() -> Made:
     """`finger calibrate` with touches."""
     from weldcal.tools.commands.finger_calibrate import FingerReport, finger_page
-    from weldcal.welding.servo.finger_calibration import Intrinsics, TipCalibration
+    from weldcal.welding.finger.calibration import Intrinsics, TipCalibration
 
     camera = Intrinsics(np.diag([900.0, 900.0, 1.0]), np.zeros(5), 640, 480, 0.2, 0.3, 20, 5, 1.0)
     tip = TipCalibration(1.0, 1e-3, None, np.array([0.0, 1e-4, np.nan]), {"x": 900.0}, 2e-5, ("pressed along x only",))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.welding.servo.deformation import TagError, TagLimits, TagModel, deflection_from_tag, detect_tag, tag_cells
+from weldcal.welding.finger.deformation import TagError, TagLimits, TagModel, deflection_from_tag, detect_tag, tag_cells
 
 TAG = TagModel("4X4_50", 7, 0.010)
 K = np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]])

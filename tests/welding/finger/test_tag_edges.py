@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from weldcal.welding.servo.deformation import corners_from_sides
+from weldcal.welding.finger.deformation import corners_from_sides
 
 TRUE = np.array([[140.3, 92.8], [251.1, 101.4], [242.7, 213.9], [131.6, 204.2]])
 CELLS, OVER = 6, 6
