@@ -82,9 +82,12 @@ def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: fl
             continue
         free = inside + _free_length(triangles, seam.frame(s), sign, needed - inside, tip_radius_m)
         if free < needed:
+            off = f"{1e3 * (needed - free) + 1.0:.0f} mm"
+            by_length = name == "end" and seam.end is not None
+            change = f"welding.seam_length_mm {off} smaller" if by_length else f"{name}_mm of the seam {off} larger"
             raise NoRoom(
                 f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs {1e3 * needed:.0f} mm there: "
-                f"set {name}_mm of the seam {1e3 * (needed - free) + 1.0:.0f} mm larger, or weld it from elsewhere."
+                f"set {change}, or weld it from elsewhere."
             )
 
 

@@ -27,8 +27,8 @@ def watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Weld
         # The arm may still move, and by a stopped clock no frame is ever late.
         text = f"The robot's clock has stood still for {state.clock_stopped_s:.2f} s; check the robot's connection."
         return fault(state, text)
-    # Past the seam's end the tip is not needed: what it feels, or does not, is no reason to stop the torch.
-    needed = state.phase != Phase.FINISH and not (state.phase == Phase.TRACK and state.s_tip > state.s_end)
+    # Past the end of a seam cut short the tip is not needed: what it feels, or does not, is no reason to stop the torch.
+    needed = state.phase != Phase.TRACK or state.s_tip <= state.s_end or not goes_on(state, config)
     if beyond_limit(state, config) and state.phase != Phase.FINISH:
         text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
         return fault(state, text) if needed else finish(state)
@@ -49,6 +49,14 @@ def _blind_sentence(state: WeldingState, sample: ServoSample, blind_s: float, li
     if without_s > limit_s:
         return f"No picture from the finger camera for {without_s:.2f} s; check its power, its cable and the network."
     return f"Tag hidden: the finger camera has not seen it for {blind_s:.2f} s; clean the tag and its window."
+
+
+def goes_on(state: WeldingState, config: ServoConfig) -> bool:
+    """Whether the seam is cut short of its groove: where it ends was said, and does not have to be felt."""
+    if state.plan_fit is None:
+        return False
+    plan = state.plan_fit.plan
+    return plan.drawn_m > plan.length + config.gap.end_window_m
 
 
 def finish(state: WeldingState) -> WeldingState:

@@ -19,7 +19,7 @@ from weldcal.welding.servo.contact import (
     with_point,
     with_progress,
 )
-from weldcal.welding.servo.faults import advance, angles, fault, finish, unlit, watch
+from weldcal.welding.servo.faults import advance, angles, fault, finish, goes_on, unlit, watch
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.servo.ignition import start_arc, wait_for_arc, with_arc
 from weldcal.welding.servo.laws import get_law, motion_law
@@ -153,7 +153,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             assert state.plan_fit is not None
             last = state.plan_fit.curve.nearest(before.measurement.point, state.s_tip)
             low, high = state.s_end - end_window, state.s_end + end_window
-            if _goes_on(state, config):
+            if goes_on(state, config):
                 high = state.s_end
             return changed(finish(state), s_end=clip(last, low, high))
         return changed(
@@ -186,13 +186,6 @@ def _tip_residual(state: WeldingState) -> Array:
     return np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
 
 
-def _goes_on(state: WeldingState, config: ServoConfig) -> bool:
-    """Whether the seam is cut short of its groove: where it ends was said, and does not have to be felt."""
-    assert state.plan_fit is not None
-    plan = state.plan_fit.plan
-    return plan.drawn_m > plan.length + config.gap.end_window_m
-
-
 def _weld(
     state: WeldingState, sample: ServoSample, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
@@ -212,12 +205,12 @@ def _weld(
     if state.phase == Phase.COAST and s_tip - state.lost_at > config.gap.coast_m:
         text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
         return _rest(fault(state, text), config)
-    beyond, goes_on = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0, _goes_on(state, config)
+    beyond, cut_short = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0, goes_on(state, config)
     # A groove that is drawn on past the seam's end is felt on; only a gap there ends the feeling.
-    last = curve.drawn_m if goes_on and state.phase == Phase.TRACK else state.s_end
+    last = curve.drawn_m if cut_short and state.phase == Phase.TRACK else state.s_end
     if law.guarded and state.phase != Phase.FINISH and s_tip > last + beyond:
         # Still in contact this far beyond the plan's end: the seam does not end before this point.
-        state = finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK and not goes_on else state)
+        state = finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK and not cut_short else state)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
         state = changed(state, hold=off)
 

@@ -270,7 +270,7 @@ class SeamOutOfReach(WeldcalError):
 
 
 def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The path of the seated tip's centre, in B; the seam ends after `length_m` of arc where given, the path a chord later."""
+    """The path of the seated tip's centre, in B; where `length_m` of arc is given the seam ends there, and the path goes on."""
     seated = workpiece.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
     line = workpiece.seam_P + seated.above_m * workpiece.up_P
     R = X_BP.rotation().matrix()
