@@ -25,7 +25,7 @@ from weldcal.welding.servo.ignition import start_arc, wait_for_arc, with_arc
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
-from weldcal.welding.servo.touch import touch_step
+from weldcal.welding.servo.touch import check_length, touch_step
 from weldcal.welding.servo.track import torch_target
 from weldcal.welding.servo.weave import weave_at
 
@@ -84,8 +84,7 @@ def _begin(state: WeldingState, sample: ServoSample, plan: SeamCurve, config: Se
         tip_line = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan
         # Rest point and torch run along the tip's line, lower by the axial deflection.
         line = tip_line.raised(config.clearance_m) if config.clearance_m else tip_line
-        if tip_line.length < config.touch.arc_m + config.gap.end_window_m:
-            return fault(state, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short for the touch-on.")
+        check_length(tip_line, config)
         check_feasible(line, tool.torch_offset_m, config.weld_speed_m_s, config.windows)
     except (InfeasibleSeam, SeamError) as problem:
         return fault(state, str(problem))

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.welding.numerics import changed, clip, dot, pose, unit
-from weldcal.welding.seam.curve import SeamCurve, SeamFrame
+from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.servo.contact import freshness
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import GainFit, ServoSample, WeldingState
@@ -32,6 +32,19 @@ def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
     height = tool.tip_seat_height_m + tool.tip_drop_m + touch.height_m
     p_BT = frame.position + height * frame.up + touch.offset_m * frame.normal
     return pose(R, p_BT)
+
+
+def check_length(line: SeamCurve, config: ServoConfig) -> None:
+    """Check that the tip's line is long enough to be touched before its end.
+
+    Raises:
+        SeamError: with the least length.
+    """
+    least = config.touch.arc_m + config.gap.end_window_m
+    if line.length < least:
+        raise SeamError(
+            f"The seam is only {1e3 * line.length:.0f} mm long: too short for the touch-on, which needs {1e3 * least:.0f} mm."
+        )
 
 
 def touch_step(

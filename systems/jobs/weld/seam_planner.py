@@ -33,7 +33,7 @@ from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.room import check_ends, check_room
 from weldcal.welding.servo.settings import ServoConfig
-from weldcal.welding.servo.touch import touch_start_pose
+from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
 CLEAR_OF_PART_M = 0.002
@@ -84,9 +84,10 @@ class SeamPlanning:
         """Joint positions of the approach; see arm_waypoints. Beside a high part they are higher above the seam than the clearance.
 
         Raises:
-            WeldcalError: the seam is not feasible, the tool has no room beside the part at X_BP, it is out of reach, or something is in
-                the arm's way.
+            WeldcalError: the seam is too short or not feasible, the tool has no room beside the part at X_BP, it is out of reach, or
+                something is in the arm's way.
         """
+        check_length(seam, self.config)
         if X_BP is not None:
             tool = self.tool
             check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)

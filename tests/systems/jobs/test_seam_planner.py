@@ -93,6 +93,13 @@ def test_a_weld_may_take_only_a_part_of_the_seam() -> None:
     assert tip_seam(STRAIGHT, X_BP, TOOL, 0.060).length == pytest.approx(0.060, abs=1e-3)
 
 
+def test_a_seam_too_short_to_be_touched_is_refused_before_the_arm_goes_there(config: ServoConfig) -> None:
+    planning = SeamPlanning(the_arm(), TOOL, STRAIGHT, X_BP, config, Q_HOME, CLEARANCE_M, 0.001)
+    found = plan_drawn_seam(planning, 1)
+    assert found.seam is None
+    assert "only 1 mm long: too short for the touch-on" in str(found.reason)
+
+
 def test_the_line_lies_on_the_side_of_the_plate_that_is_up() -> None:
     tilted = X_BP @ RigidTransform(RollPitchYaw(0.1, 0.0, 0.0), np.zeros(3))
     assert tip_seam(STRAIGHT, tilted, TOOL, None).frame(0.1).up == pytest.approx(
