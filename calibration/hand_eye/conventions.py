@@ -1,0 +1,308 @@
+"""Decide how two lists of poses are to be read, by relative motions: they must agree for one X, whatever X is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.data.poses.readings import PoseReading
+from weldcal.calibration.geometry.quantiles import f_quantile
+from weldcal.calibration.geometry.se3 import inverse, nearest_rotation
+from weldcal.models.arrays import Array
+
+CHANCE = 1e-6
+"""Chance that the right reading is rejected in favour of a wrong one."""
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
+_PAIRS = 400  # relative motions that are compared
+_KEPT = 0.7  # share of the poses that must agree: the others may be outliers
+_ROTATION_FLOOR = 2e-6  # rad: six printed digits
+_POSITION_FLOOR = 1e-6  # share of the motion's extent: six printed digits
+_NEAR_UNIT = 0.08  # of the logarithm of a factor: attenuation by noise of short motions
+_MOST = 160  # pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
+_SURE_TURN = 2.8  # rad
+_STEPS = 6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Agreement:
+    """How well two lists agree under one reading of each.
+
+    Attributes:
+        robot, camera: the readings.
+        scale: robot units per camera unit that fits best.
+        unit_scale: the nearest ratio of two units, or None where none is near.
+        rotation: rms residual of the rotations, rad, of the poses that agree best.
+        turn: rms angle of the relative motions under these readings, rad.
+        position: rms residual of the positions, in the robot's unit.
+        X, Y: the solution of F X G = Y, positions in the robot's unit.
+        dof: degrees of freedom of each residual.
+    """
+
+    robot: PoseReading
+    camera: PoseReading
+    scale: float
+    unit_scale: float | None
+    rotation: float
+    turn: float
+    position: float
+    X: Array
+    Y: Array
+    dof: int
+
+    @property
+    def cost(self) -> float:
+        """Negative log-likelihood with unknown noise, per pose; a constant left out."""
+        return float(np.log(self.rotation / self.turn) + np.log(self.position))
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """The readings of two lists that the data select.
+
+    Attributes:
+        best: the reading of least residuals.
+        rivals: other readings that the data do not reject and that lead to another result, best first.
+        same: readings that the data do not reject and that lead to the same result.
+        next: the best of the rejected readings; None where there is no other.
+    """
+
+    best: Agreement
+    rivals: tuple[Agreement, ...]
+    same: tuple[Agreement, ...]
+    next: Agreement | None
+
+    @property
+    def determined(self) -> bool:
+        """Whether one result is left."""
+        return not self.rivals
+
+
+def decide(
+    robot: Sequence[PoseReading], camera: Sequence[PoseReading], *, eye_in_hand: bool, changes: bool = True
+) -> Decision:
+    """Compare all readings of two lists of n poses and keep those that the data do not reject.
+
+    With F = X_BF (eye in hand) or its inverse (eye on base) and G = X_CM, F X G = Y for one X and one Y. Pairs of poses give the angle of each
+    relative rotation, which is equal on both sides whatever X is: it selects the notations. A least-squares solution of those
+    that remain gives rotation and position residuals with 3 n - 6 degrees of freedom each. If reading r were right, its squared residuals
+    would exceed those of any other by more than the quantile of F(dof, dof) with probability CHANCE at most: readings beyond it are rejected.
+
+    Args:
+        robot, camera: the candidates, usual ones first.
+        eye_in_hand: the mounting, as stated.
+        changes: whether transposed, left-handed and inverted lists are candidates, too.
+    """
+    notations = _notations(robot, camera)
+    tried = [pair for a, b in notations for pair in _variants(robot[a], camera[b], changes)]
+    return _judge(_agreements(tried, eye_in_hand))
+
+
+def _judge(tried: list[Agreement]) -> Decision:
+    best = min(tried, key=lambda t: t.cost)
+    quantile = f_quantile(1.0 - CHANCE / (2.0 * max(len(tried) - 1, 1)), best.dof, best.dof)
+    limit = float(np.sqrt(quantile))
+    alive, dead = [], []
+    for one in tried:
+        if one is best:
+            continue
+        turn = one.rotation / one.turn * best.turn
+        rejected = turn > limit * best.rotation or one.position > limit * best.position
+        (dead if rejected else alive).append(one)
+    alive.sort(key=lambda t: t.cost)
+    dead.sort(key=lambda t: t.cost)
+    same = [one for one in alive if _same(one, best)]
+    rivals = [one for one in alive if not _same(one, best)]
+    return Decision(best, tuple(rivals), tuple(same), dead[0] if dead else None)
+
+
+def _same(one: Agreement, other: Agreement) -> bool:
+    """Whether two readings lead to the same X and Y within the residuals of the better one."""
+    if abs(np.log(one.scale / other.scale)) > 0.02:
+        return False
+    for U, V in ((one.X, other.X), (one.Y, other.Y)):
+        turn = Rotation.from_matrix(U[:3, :3].T @ V[:3, :3]).magnitude()
+        if turn > 2.0 * other.rotation or np.linalg.norm(U[:3, 3] - V[:3, 3]) > 3.0 * other.position:
+            return False
+    return True
+
+
+def _variants(
+    robot: PoseReading, camera: PoseReading, changes: bool
+) -> list[tuple[PoseReading, PoseReading]]:
+    """The two readings as they are and with one change of one list (inverted: of the robot's; of the camera's it is the same equation)."""
+    found = [(robot, camera)]
+    if changes:
+        found += [(robot.changed(c), camera) for c in ("transposed", "left_handed", "inverse")]
+        found += [(robot, camera.changed(c)) for c in ("transposed", "left_handed")]
+    return found
+
+
+def _notations(robot: Sequence[PoseReading], camera: Sequence[PoseReading]) -> list[tuple[int, int]]:
+    """Index pairs of readings whose relative rotations have equal angles, as far as the data can tell."""
+    n = len(robot[0].X)
+    i, j = _pairs(n, _PAIRS)
+    angles = [
+        np.stack([_relative_angles(one.X[:, :3, :3], i, j) for one in listed]) for listed in (robot, camera)
+    ]
+    gap = np.sort(np.abs(angles[0][:, None, :] - angles[1][None, :, :]), axis=2)
+    kept = gap[:, :, : max(int(_KEPT**2 * len(i)), 3)]
+    sizes = [np.sqrt((one**2).mean(axis=1)) + _ROTATION_FLOOR for one in angles]
+    # relative to the motion: degrees that are radians would make all angles, and their differences, small
+    spread = np.sqrt((kept**2).mean(axis=2)) / np.sqrt(sizes[0][:, None] * sizes[1][None, :]) + _ROTATION_FLOOR
+    dof = max(n - 2, 1)
+    least = spread.min()
+    # angles of n poses share their errors: no more than n - 2 are independent
+    limit = least * float(np.sqrt(f_quantile(1.0 - CHANCE / spread.size, dof, dof)))
+    order = np.argsort(spread, axis=None, kind="stable")
+    found = [(int(k // spread.shape[1]), int(k % spread.shape[1])) for k in order if spread.flat[k] <= limit]
+    return found[:_MOST] if len(found) > 1 else [(int(k // spread.shape[1]), int(k % spread.shape[1])) for k in order[:2]]
+
+
+def _relative_angles(R: Array, i: Array, j: Array) -> Array:
+    chord = np.linalg.norm(R[i] - R[j], axis=(1, 2)) / (2.0 * np.sqrt(2.0))
+    return np.asarray(2.0 * np.arcsin(np.clip(chord, 0.0, 1.0)))
+
+
+def _agreements(tried: list[tuple[PoseReading, PoseReading]], eye_in_hand: bool) -> list[Agreement]:
+    """Solve F X G = Y for each pair of readings; all at once."""
+    F = np.stack([one.X if eye_in_hand else inverse(one.X) for one, _ in tried])
+    G = np.stack([other.X for _, other in tried])
+    n = F.shape[1]
+    kept = max(int(np.ceil(_KEPT * n)), min(n, 5))
+    RX, RY, w = _rotation(F[..., :3, :3], G[..., :3, :3], kept)
+    turned = (F[..., :3, :3] @ (G[..., :3, 3] @ np.swapaxes(RX, 1, 2))[..., None])[..., 0]
+    tX, tY, scale, d = _translation(F, turned, kept, None)
+    # a negative scale is no solution: without its sign the positions do not fit
+    units = [_nearest_unit(abs(float(s))) for s in scale]
+    fixed = np.array([abs(float(s)) if u is None else u for s, u in zip(scale, units, strict=True)])
+    tX, tY, _, d = _translation(F, turned, kept, fixed)
+    extent = np.sqrt(F[..., :3, 3].var(axis=1).sum(axis=1)) + 1e-12
+    turns = [_motion(one) for one in (F[..., :3, :3], G[..., :3, :3])]
+    found = []
+    for k, (one, other) in enumerate(tried):
+        X, Y = np.eye(4), np.eye(4)
+        X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3] = RX[k], tX[k], RY[k], tY[k]
+        agreement = Agreement(
+            robot=one,
+            camera=other,
+            scale=max(abs(float(scale[k])), 1e-12),
+            unit_scale=units[k],
+            rotation=_rms(w[k], kept) + _ROTATION_FLOOR,
+            turn=float(np.sqrt(turns[0][k] * turns[1][k])) + _ROTATION_FLOOR,
+            position=_rms(d[k], kept) + _POSITION_FLOOR * float(extent[k]),
+            X=X,
+            Y=Y,
+            dof=max(3 * kept - 6, 3),
+        )
+        found.append(agreement)
+    return found
+
+
+def _motion(R: Array) -> Array:
+    """Rms angle (m,) of rotations (m, n, 3, 3) relative to their mean, rad."""
+    off = np.swapaxes(nearest_rotation(R.sum(axis=1)), 1, 2)[:, None] @ R
+    chord = np.linalg.norm(off - np.eye(3), axis=(2, 3)) / (2.0 * np.sqrt(2.0))
+    return np.asarray(np.sqrt(((2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))) ** 2).mean(axis=1)))
+
+
+def _rms(e: Array, kept: int) -> float:
+    """Root mean square of the least of the residuals' lengths."""
+    return float(np.sqrt(np.sort((e**2).sum(axis=1))[:kept].mean()))
+
+
+def _weights(size: Array, kept: int) -> Array:
+    """Weights (m, n) that fall where a residual is far beyond those of the poses that agree."""
+    cut = np.sort(size, axis=1)[:, kept - 1 : kept] + 1e-12
+    return np.asarray(np.minimum(1.0, (1.5 * cut / np.maximum(size, 1e-12)) ** 2))
+
+
+def _rotation(F: Array, G: Array, kept: int) -> tuple[Array, Array, Array]:
+    """R_X and R_Y of F R_X G = R_Y and the residuals rad, for (m, n, 3, 3): linear starts, then alternating robust means."""
+    m, n = F.shape[:2]
+    best: tuple[Array, Array, Array, Array] | None = None
+    for R in _starts(F, G):
+        weight = np.ones((m, n))
+        for _ in range(_STEPS):
+            moved = F @ R[:, None] @ G
+            RY = nearest_rotation((weight[..., None, None] * moved).sum(axis=1))
+            back = np.swapaxes(F, 2, 3) @ RY[:, None] @ np.swapaxes(G, 2, 3)
+            R = nearest_rotation((weight[..., None, None] * back).sum(axis=1))
+            off = np.swapaxes(RY, 1, 2)[:, None] @ F @ R[:, None] @ G
+            w = Rotation.from_matrix(off.reshape(-1, 3, 3)).as_rotvec().reshape(m, n, 3)
+            weight = _weights(np.linalg.norm(w, axis=2), kept)
+        value = np.sort((w**2).sum(axis=2), axis=1)[:, :kept].mean(axis=1)
+        if best is None:
+            best = value, R, RY, w
+        else:
+            better = value < best[0]
+            best = tuple(np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                         for new, old in zip((value, R, RY, w), best, strict=True))  # type: ignore[assignment]
+    assert best is not None
+    return best[1], best[2], best[3]
+
+
+def _starts(F: Array, G: Array) -> list[Array]:
+    """Rotations R_X (m, 3, 3) that fit relative rotations best: of the Kronecker form, and of the rotation vectors."""
+    m, n = F.shape[:2]
+    i, j = _pairs(n, 3 * n)
+    P, Q = np.swapaxes(F[:, i], 2, 3) @ F[:, j], G[:, i] @ np.swapaxes(G[:, j], 2, 3)
+    M = np.einsum("mnik,mnjl->mijkl", P, Q, optimize=True).reshape(m, 9, 9)
+    _, vectors = np.linalg.eigh(M + np.swapaxes(M, 1, 2))
+    linear = vectors[:, :, -1].reshape(m, 3, 3)
+    linear = linear * np.sign(np.linalg.det(linear) + 1e-300)[:, None, None]
+    p, q = (Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(m, -1, 3) for R in (P, Q))
+    # near half a turn the sign of the vector is not sure
+    usable = (np.linalg.norm(p, axis=2) < _SURE_TURN) & (np.linalg.norm(q, axis=2) < _SURE_TURN)
+    vectors_ = np.swapaxes(p * usable[..., None], 1, 2) @ q
+    return [nearest_rotation(linear), nearest_rotation(vectors_ + 1e-9 * np.eye(3))]
+
+
+def _pairs(n: int, most: int) -> tuple[Array, Array]:
+    """Indices i < j of pairs of n poses, evenly chosen where there are more than ``most``."""
+    i, j = np.triu_indices(n, 1)
+    if len(i) > most:
+        chosen = np.linspace(0, len(i) - 1, most).round().astype(int)
+        i, j = i[chosen], j[chosen]
+    return i, j
+
+
+def _translation(F: Array, turned: Array, kept: int, scale: Array | None) -> tuple[Array, Array, Array, Array]:
+    """t_X, t_Y (m, 3), the scale (m,) of the camera's positions and the residuals (m, n, 3) of F X G = Y, in F's unit.
+
+    ``turned``: R_F R_X t_G (m, n, 3). ``scale``: fixed, or None to estimate it.
+    """
+    m, n = F.shape[:2]
+    columns = [F[..., :3, :3], np.broadcast_to(-np.eye(3), (m, n, 3, 3))]
+    right = -F[..., :3, 3]
+    if scale is None:
+        columns.append(turned[..., None])
+    else:
+        right = right - scale[:, None, None] * turned
+    A = np.concatenate(columns, axis=3)
+    size = np.maximum(np.abs(A).max(axis=(1, 2)), 1e-30)
+    A = A / size[:, None, None, :]
+    weight = np.ones((m, n))
+    for _ in range(_STEPS):
+        AW = A * weight[..., None, None]
+        H = np.einsum("mnik,mnil->mkl", AW, A)
+        g = np.einsum("mnik,mni->mk", AW, right)
+        x = (np.linalg.pinv(H, rcond=1e-12, hermitian=True) @ g[..., None])[..., 0]
+        d = np.einsum("mnik,mk->mni", A, x) - right
+        weight = _weights(np.linalg.norm(d, axis=2), kept)
+    x = x / size
+    found = x[:, 6] if scale is None else scale
+    return x[:, :3], x[:, 3:6], found, d
+
+
+def _nearest_unit(scale: float) -> float | None:
+    """The ratio of two units of length that is nearest to a scale; None where none is near."""
+    ratios = {a / b for a in UNITS.values() for b in UNITS.values()}
+    near = min(ratios, key=lambda r: abs(np.log(scale / r)))
+    return near if abs(np.log(scale / near)) < _NEAR_UNIT else None
+
+
+def without(listed: Sequence[PoseReading], rows: Sequence[int]) -> list[PoseReading]:
+    """The readings without some rows."""
+    keep = np.setdiff1d(np.arange(len(listed[0].X)), np.asarray(rows, dtype=int))
+    return [replace(one, X=one.X[keep]) for one in listed]
