@@ -1,117 +1,132 @@
-"""Finds positions and rotations among named columns, however robots, loggers and ROS spell them."""
+"""Find the role of a table's columns by their names, however robots, loggers and ROS spell them."""
 
 import re
+from dataclasses import dataclass
 
-import numpy as np
-
-from weldcal.calibration.data.header import PoseForm
-from weldcal.calibration.data.poses.form import poses_from_array
-from weldcal.calibration.data.poses.rotations import notation, rotations, width
-from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.se3 import pose
-from weldcal.models.arrays import Array
-
-_SPELLED = {
-    **{axis: (axis, f"p{axis}", f"t{axis}", f"p_{axis}", f"t_{axis}", f"pos_{axis}", f"position_{axis}", f"translation_{axis}",
-              f"trans_{axis}", f"position.{axis}", f"translation.{axis}", f"xyz.{k}", f"actual_tcp_pose_{k}")
-       for k, axis in enumerate("xyz")},
-    **{f"q{axis}": (f"q{axis}", f"q_{axis}", f"quat_{axis}", f"orientation_{axis}", f"rotation_{axis}", f"orientation.{axis}",
-                    f"rotation.{axis}", f"quaternion.{axis}", f"quaternion_{axis}") for axis in "wxyz"},
-    **{f"r{axis}": (f"r{axis}", f"r_{axis}", f"rvec_{axis}", f"rotvec_{axis}", f"rotation_vector_{axis}", f"rotation_vector.{axis}",
-                    f"actual_tcp_pose_{k + 3}") for k, axis in enumerate("xyz")},
-}  # fmt: skip
-_KNOWN = {spelling: name for name, spellings in _SPELLED.items() for spelling in spellings}
-_EULER = (
-    (("roll", "pitch", "yaw"), "euler_xyz", ""),
-    (("a", "b", "c"), "euler_ZYX", "deg"),  # KUKA
-    (("w", "p", "r"), "euler_xyz", "deg"),  # Fanuc
-)
-_UNIT = re.compile(r"(.+?)[\s_]*[\[(]?\s*(mm|m|deg|rad)\s*[\])]?")
-IDS = ("id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no")
-TIMES = ("time", "%time", "timestamp", "stamp", "t", "time_s", "header.stamp")
+IDS = ("id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no", "sample", "frame", "#", "point", "idx")
+TIMES = ("time", "%time", "timestamp", "stamp", "t", "time_s", "header.stamp", "sec", "secs", "timestamp_s", "time_ns", "timestamp_ns")
+_POSITION = {"position", "pos", "translation", "trans", "t", "p", "tvec", "xyz", "location", "origin", "linear", "coord"}
+_ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad"}
+_VECTOR = {"rvec", "rotvec", "rv", "axisangle", "aa", "rodrigues"}
+_QUATERNION = {"quat", "quaternion", "q"}
+_FILLERS = {"field", "pose", "transform", "transforms0", "vector", "tcp", "data", "actual", "x1"}
+_WHOLE = {"qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o"}
+_EULER_WORDS = (("alpha", "beta", "gamma"), ("phi", "theta", "psi"), ("angle1", "angle2", "angle3"), ("euler1", "euler2", "euler3"))
+_UNIT = re.compile(r"[\[(]\s*([a-zA-Z°]*)\s*[\])]|[_\s](mm|cm|m|in|inch|deg|rad|degrees|radians|°)$")
+_UNITS = {"degrees": "deg", "radians": "rad", "°": "deg", "meter": "m", "metres": "m", "meters": "m", "in": "inch", "degree": "deg"}
 
 
-def plain_names(names: list[str]) -> tuple[list[str], dict[str, str]]:
-    """Column names in this package's spelling (x, y, z, qw ..., rx ..., or as given), and the units that some of them state."""
-    found, units = [], {}
-    for given in names:
-        name, unit = given.strip().lower(), ""
-        stated = _UNIT.fullmatch(name)
-        if _short(name) not in _KNOWN and stated and len(stated[1]) < len(name):
-            name, unit = stated[1].strip(" _"), stated[2]
-        name = _KNOWN.get(_short(name), name)
-        if unit:
-            units[name] = unit
-        found.append(name)
-    return found, units
+@dataclass(frozen=True)
+class Column:
+    """A column that is part of a pose: which list it belongs to, its role in a pose, its unit and its place in the table."""
+
+    prefix: str
+    role: str
+    unit: str
+    index: int
 
 
-def _short(name: str) -> str:
-    return ".".join(name.split(".")[-2:])
+def columns_of(header: list[str]) -> tuple[list[Column], dict[str, int]]:
+    """The columns of poses of a header, and the places of its ids and times.
 
-
-def column_poses(names: list[str], table: Array, form: PoseForm, where: str) -> tuple[Array, str, str]:
-    """Poses (n, 4, 4) in the table's unit, what they were read as, and the unit of length that its header states (or "").
-
-    ``names`` are those of the columns of ``table`` (n, columns), NaN where a cell holds no number.
-
-    Raises:
-        DatasetError: no position, no rotation, or one whose convention is not said.
+    Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector for sure); roll, pitch,
+    yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to m33.
     """
-    plain, units = plain_names(names)
-    grid = {
-        tuple(map(int, m.groups())): k for k, n in enumerate(plain) if (m := re.fullmatch(r"[a-z]*_?([0-4])([0-4])", n))
-    }
-    if len(grid) in (12, 16) and "qw" not in plain:
-        chosen = table[:, [grid[key] for key in sorted(grid)]]
-        return *poses_from_array(chosen, form, where), units.get("x", "")
-    if not {"x", "y", "z"} <= set(plain):
-        raise DatasetError(
-            f"'{where}' names no columns x, y, z; a table of poses has id,x,y,z and qw,qx,qy,qz or rx,ry,rz, or 6, 7 or 16 numbers a row "
-            "without a header."
-        )
-    name, angles, columns = _rotation(plain, units, form, where)
-    cells = table[:, [plain.index(c) for c in ("x", "y", "z", *columns)]]
-    if not np.isfinite(cells).all():
-        row = int(np.flatnonzero(~np.isfinite(cells).all(axis=1))[0])
-        raise DatasetError(f"Row {row + 1} of '{where}' has an empty cell, or one that is not a finite number.")
-    unit = units.get("x", "")
-    if len({units.get(axis, "") for axis in "xyz"}) > 1 or unit not in ("", "m", "mm"):
-        raise DatasetError(f"The columns x, y and z of '{where}' state units that differ or are not m or mm.")
-    said = "UR pose vectors (x, y, z, rotation vector)" if name == "rotation_vector" else f"x, y, z, {name}"
-    return pose(rotations(cells[:, 3:], name, angles, where), cells[:, :3]), said, unit
+    found: list[Column] = []
+    other: dict[str, int] = {}
+    plain = [_unit_of(h.strip().lower()) for h in header]
+    for k, (name, unit) in enumerate(plain):
+        if name in IDS and "id" not in other:
+            other["id"] = k
+            continue
+        if (name in TIMES or name.endswith("header.stamp")) and not _is_t_of_oat(name, [n for n, _ in plain]):
+            if "time" not in other or name.endswith("header.stamp"):
+                other["time"] = k
+            continue
+        for prefix, role in _roles(name):
+            found.append(Column(prefix, role, unit, k))
+            break
+    return _merged(_with_quaternions(_with_euler(found, plain), plain)), other
 
 
-def _rotation(plain: list[str], units: dict[str, str], form: PoseForm, where: str) -> tuple[str, str, tuple[str, ...]]:
-    """Notation, unit of the angles and columns of the rotation."""
-    wanted = notation(form.rotation, "dataset.yaml: poses.rotation")
-    if {"qw", "qx", "qy", "qz"} <= set(plain):
-        if wanted and not wanted.startswith("quaternion"):
-            raise DatasetError(
-                f"'{where}' holds quaternions (qw, qx, qy, qz), and poses.rotation says {wanted}; correct one."
-            )
-        return "quaternion_wxyz", "", ("qw", "qx", "qy", "qz")
-    numbered = next((c for c in (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")) if set(c) <= set(plain)), None)
-    if numbered is not None and not {"rx", "ry", "rz"} <= set(plain):
-        if not wanted.startswith("quaternion"):
-            raise DatasetError(
-                f"The columns {', '.join(numbered)} of '{where}' do not say the order of the quaternion; set 'poses: {{rotation: "
-                "quaternion_wxyz}' or quaternion_xyzw in dataset.yaml."
-            )
-        return wanted, "", numbered
-    if {"rx", "ry", "rz"} <= set(plain):
-        angles = form.angles or (units.get("rx", "") if units.get("rx") in ("deg", "rad") else "")
-        if wanted and width(wanted) != 3:
-            raise DatasetError(f"'{where}' has columns rx, ry, rz, and poses.rotation says {wanted}; correct one.")
-        return wanted or "rotation_vector", angles, ("rx", "ry", "rz")
-    for columns, known, angle in _EULER:
-        if set(columns) <= set(plain):
-            stated = units.get(columns[0], "")
-            return wanted or known, form.angles or (stated if stated in ("deg", "rad") else angle), columns
-    other = [c for c in plain if c not in ("x", "y", "z", *IDS, *TIMES)]
-    if len(other) >= 3 and wanted and width(wanted) == 3:
-        return wanted, form.angles, (other[0], other[1], other[2])
-    raise DatasetError(
-        f"'{where}' lacks columns of a rotation that it names: qw,qx,qy,qz, or rx,ry,rz, or roll,pitch,yaw; other Euler angles need their "
-        "convention, 'poses: {rotation: euler_ZYX}' in dataset.yaml."
-    )
+def _is_t_of_oat(name: str, names: list[str]) -> bool:
+    return name == "t" and {"o", "a"} <= set(names) and "x" in names
+
+
+def _unit_of(name: str) -> tuple[str, str]:
+    found = _UNIT.search(name)
+    if found is None or not name[: found.start()]:
+        return name, ""
+    word = found[1] or found[2] or ""
+    return name[: found.start()].strip(" _"), _UNITS.get(word, word)
+
+
+def _roles(name: str) -> list[tuple[str, str]]:
+    """Prefix and role of a column's name; empty where it has none in a pose."""
+    if name in _WHOLE:
+        return [("", name)]
+    if grid := re.fullmatch(r"(?:(.*)[_.\s])?(?:m|r|t|h|matrix|transform)?[_\s]?([0-4])[_,\s]?([0-4])", name):
+        return [(grid[1] or "", f"m{grid[2]}{grid[3]}")]
+    if numbered := re.fullmatch(r"actual_tcp_pose_([0-5])", name):
+        return [("", ("x", "y", "z", "vx", "vy", "vz")[int(numbered[1])])]
+    tokens = [t for t in re.split(r"[._\s/\[\]()\-:]+", name) if t]
+    if not tokens:
+        return []
+    last, before = tokens[-1], tokens[:-1]
+    if short := re.fullmatch(r"([tpqr]|pos|rot|quat|rvec|tvec|rv)([wxyz])", last):
+        before, last = [*before, short[1]], short[2]
+    if short := re.fullmatch(r"(.*?)(?:_)?([xyz]|q[wxyz]|r[xyz])", last):
+        if short[1] in ("robot", "camera", "cam", "hand", "eye", "ee", "base", "flange", "target", "marker", "board", "gripper", "tool"):
+            before, last = [*before, short[1]], short[2]
+    if last in ("roll", "pitch", "yaw") or re.fullmatch(r"q[0-4]", last):
+        return [(_prefix(before), last)]
+    if last not in ("w", "x", "y", "z"):
+        return []
+    words = set(before)
+    if words & _VECTOR or {"rotation", "vector"} <= words:
+        return [(_prefix(before), f"v{last}")] if last != "w" else []
+    if words & _QUATERNION:
+        return [(_prefix(before), f"q{last}")]
+    if words & _POSITION and last != "w" and not words & {"r"}:
+        return [(_prefix(before), last)]
+    if words & _ROTATION:
+        return [(_prefix(before), f"r{last}")]
+    return [(_prefix(before), last)]
+
+
+def _prefix(words: list[str]) -> str:
+    skipped = _POSITION | _ROTATION | _VECTOR | _QUATERNION | _FILLERS
+    return "_".join(w for w in words if w not in skipped)
+
+
+def _with_quaternions(columns: list[Column], names: list[tuple[str, str]]) -> list[Column]:
+    """Rotation columns x, y, z, w of one list are a quaternion."""
+    four = {c.prefix for c in columns if c.role == "rw"}
+    return [
+        Column(c.prefix, f"q{c.role[1]}", c.unit, c.index) if c.prefix in four and re.fullmatch("r[wxyz]", c.role) else c
+        for c in columns
+    ]
+
+
+def _with_euler(columns: list[Column], names: list[tuple[str, str]]) -> list[Column]:
+    plain = [n for n, _ in names]
+    for words in _EULER_WORDS:
+        if set(words) <= set(plain):
+            columns += [Column("", f"e{k + 1}", names[plain.index(w)][1], plain.index(w)) for k, w in enumerate(words)]
+    if {"o", "a", "t"} <= set(plain) and "x" in plain:
+        columns = [c for c in columns if c.role not in ("o", "a")]
+        columns += [Column("", w, names[plain.index(w)][1], plain.index(w)) for w in "oat"]
+    return columns
+
+
+def _merged(columns: list[Column]) -> list[Column]:
+    """Positions of one prefix and rotations of another are one list where there is one of each."""
+    have: dict[str, set[str]] = {}
+    for c in columns:
+        have.setdefault(c.prefix, set()).add("p" if c.role in "xyz" else "r")
+    positions = [p for p, kinds in have.items() if kinds == {"p"}]
+    rotations = [p for p, kinds in have.items() if kinds == {"r"}]
+    if len(have) == 2 and len(positions) == len(rotations) == 1:
+        return [Column("", c.role, c.unit, c.index) for c in columns]
+    whole = {p for p, kinds in have.items() if kinds == {"p", "r"} or any(c.role.startswith("m") for c in columns if c.prefix == p)}
+    return [c for c in columns if c.prefix in whole] if whole else columns

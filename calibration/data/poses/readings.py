@@ -34,6 +34,8 @@ class PoseNumbers:
         rotation: the notation that the file or the user states; empty where nobody does.
         angles: the stated unit of the angles, deg or rad; empty where nobody states it.
         changes: stated changes, some of CHANGES.
+        usual: the notation that comes first where none is stated; a rotation vector where it is empty.
+        vector: whether three numbers may be a rotation vector (roll, pitch and yaw are none).
     """
 
     source: str
@@ -42,6 +44,8 @@ class PoseNumbers:
     rotation: str = ""
     angles: str = ""
     changes: tuple[str, ...] = ()
+    usual: str = ""
+    vector: bool = True
 
     @property
     def kind(self) -> str:
@@ -97,6 +101,10 @@ def readings(numbers: PoseNumbers) -> list[PoseReading]:
         for change in numbers.changes:
             one = one.changed(change)
         found.append(one)
+    if numbers.usual:
+        found.sort(key=lambda one: not one.form.startswith(numbers.usual))
+    if not found:
+        raise DatasetError(f"'{numbers.source}' has {numbers.kind} rotations, and the form states '{numbers.rotation}'; correct it.")
     return found
 
 
@@ -123,9 +131,13 @@ def _rotations(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
     stated = numbers.rotation
     match numbers.kind:
         case "matrix":
+            if stated not in ("", "matrix"):
+                return
             yield "matrix", "matrices", _matrices(numbers)
         case "quaternion":
-            orders = ("quaternion_xyzw", "quaternion_wxyz") if not stated.startswith("quaternion") else (stated,)
+            if stated and not stated.startswith("quaternion"):
+                return
+            orders = (stated,) if stated else ("quaternion_xyzw", "quaternion_wxyz")
             length = np.linalg.norm(numbers.r, axis=1)
             if not (np.abs(length - 1.0) <= _QUATERNION).all():
                 worst = float(length[np.argmax(np.abs(length - 1.0))])
@@ -158,7 +170,7 @@ def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
     for unit in units:
         v = np.radians(numbers.r) if unit == "deg" else numbers.r
         words = "degrees" if unit == "deg" else "radians"
-        if not stated or stated == "rotation_vector":
+        if stated == "rotation_vector" or (not stated and numbers.vector):
             yield f"rotation_vector,{unit}", f"rotation vectors in {words}", np.asarray(Rotation.from_rotvec(v).as_matrix())
         for form, name, axes, columns in _ANGLES:
             if not stated or stated == form:

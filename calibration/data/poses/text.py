@@ -1,0 +1,349 @@
+"""Find lists of poses in text: tables with or without a header, blocks of numbers, robot programs and what ROS prints."""
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import PurePath
+
+import numpy as np
+
+from weldcal.calibration.data.poses.columns import Column, columns_of
+from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
+from weldcal.calibration.errors import DatasetError
+from weldcal.models.arrays import Array
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_CELL = re.compile(rf"{_NUMBER}|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
+_COMMENT = ("#", "%", "//", "!", ";")
+_UR = re.compile(rf"p\s*\[\s*({_NUMBER}(?:\s*,\s*{_NUMBER}){{5}})\s*\]")
+_UR_SETTINGS = re.compile(r"set_tcp\s*\(|set_payload\s*\(|set_gravity\s*\(|_tcp\s*=")
+_RAPID = re.compile(
+    rf"(?:(\w+)\s*:=\s*)?\[\s*\[({_NUMBER}(?:\s*,\s*{_NUMBER}){{2}})\]\s*,\s*\[({_NUMBER}(?:\s*,\s*{_NUMBER}){{3}})\]"
+)
+_KUKA = re.compile(r"(?:(\w+)\s*=\s*)?\{([^{}]*\bX\b[^{}]*\bA\b[^{}]*)\}", re.IGNORECASE)
+_KUKA_FIELD = re.compile(rf"\b([XYZABC])\s+({_NUMBER})", re.IGNORECASE)
+_FANUC_FIELD = re.compile(rf"\b([XYZWPR])\s*[=:]\s*({_NUMBER})\s*(mm|deg)?", re.IGNORECASE)
+_FANUC_POINT = re.compile(r"\bP\[\s*(\d+)[^\]]*\]\s*\{")
+_TF_P = re.compile(rf"Translation:\s*\[\s*({_NUMBER}(?:\s*,\s*{_NUMBER}){{2}})\s*\]")
+_TF_Q = re.compile(rf"in Quaternion(?:\s*\(xyzw\))?\s*\[\s*({_NUMBER}(?:\s*,\s*{_NUMBER}){{3}})\s*\]")
+_TF_TIME = re.compile(rf"At time\s+({_NUMBER})")
+_NANOSECONDS = 1e14  # a time above it is in nanoseconds
+
+
+def lists_of_text(text: str, name: str) -> list[Listing]:
+    """Every list of poses of a text.
+
+    Args:
+        text: of a table, a program or a log.
+        name: of the file, for messages.
+
+    Raises:
+        DatasetError: it holds no pose, or one that cannot be read; the sentence says what to change.
+    """
+    text = text.lstrip("\ufeff")
+    if re.search(r"IMAGE_ID,\s*QW|two lines of data per image", text):
+        raise DatasetError(
+            f"'{name}' is COLMAP's images.txt: its poses lead from the world to the camera and have no unit of length. Write the inverse "
+            "poses in metres, scaled by a known length, as a table x,y,z,qw,qx,qy,qz."
+        )
+    for program in (_rapid, _kuka, _fanuc, _transforms, _ur):
+        found = program(text, name)
+        if found is not None:
+            return [found]
+    return _numbers(text, name)
+
+
+def _floats(text: str) -> list[float]:
+    return [float(v) for v in re.findall(_NUMBER, text)]
+
+
+def _rapid(text: str, name: str) -> Listing | None:
+    found = _RAPID.findall(text)
+    if not found or "[[" not in text.replace(" ", ""):
+        return None
+    p, q = np.array([_floats(m[1]) for m in found]), np.array([_floats(m[2]) for m in found])
+    return listing_of(name, p, q, rotation="quaternion_wxyz", ids=_unique([m[0] for m in found]), unit="mm", form="ABB robtargets")
+
+
+def _kuka(text: str, name: str) -> Listing | None:
+    rows, ids = [], []
+    for label, body in _KUKA.findall(text):
+        fields = {key.upper(): float(value) for key, value in _KUKA_FIELD.findall(body)}
+        if set("XYZABC") <= set(fields):
+            rows.append([fields[key] for key in "XYZABC"])
+            ids.append(re.sub(r"^X(?=\w)", "", label))
+    if not rows:
+        return None
+    table = np.array(rows)
+    return listing_of(
+        name, table[:, :3], table[:, 3:], rotation="euler_ZYX", angles="deg", ids=_unique(ids), unit="mm", form="KUKA positions"
+    )
+
+
+def _fanuc(text: str, name: str) -> Listing | None:
+    if not re.search(r"\bW\s*[=:]\s*" + _NUMBER + r"\s*deg", text, re.IGNORECASE):
+        return None
+    rows: list[list[float]] = []
+    fields: dict[str, float] = {}
+    for key, value, _ in _FANUC_FIELD.findall(text):
+        fields[key.upper()] = float(value)
+        if set("XYZWPR") <= set(fields):
+            rows.append([fields[k] for k in "XYZWPR"])
+            fields = {}
+    if not rows:
+        return None
+    ids = [f"P{number}" for number in _FANUC_POINT.findall(text)]
+    table = np.array(rows)
+    return listing_of(
+        name, table[:, :3], table[:, 3:], rotation="euler_xyz", angles="deg", ids=_unique(ids) if len(ids) == len(rows) else (),
+        unit="mm", form="Fanuc positions",
+    )  # fmt: skip
+
+
+def _transforms(text: str, name: str) -> Listing | None:
+    p, q, times = _TF_P.findall(text), _TF_Q.findall(text), _TF_TIME.findall(text)
+    if not p or len(p) != len(q):
+        return None
+    at = np.array([float(t) for t in times]) if len(times) == len(p) else None
+    return listing_of(
+        name, np.array([_floats(v) for v in p]), np.array([_floats(v) for v in q]), rotation="quaternion_xyzw", times=at, unit="m",
+        form="transforms of tf2_echo",
+    )  # fmt: skip
+
+
+def _ur(text: str, name: str) -> Listing | None:
+    rows = [
+        _floats(pose)
+        for line in text.splitlines()
+        if not line.lstrip().startswith("#") and not _UR_SETTINGS.search(line)
+        for pose in _UR.findall(line)
+    ]
+    if not rows:
+        return None
+    table = np.array(rows)
+    return listing_of(
+        name, table[:, :3], table[:, 3:], rotation="rotation_vector", angles="rad", unit="m", form="UR poses (x, y, z, rotation vector)"
+    )
+
+
+def _unique(ids: Sequence[str]) -> tuple[str, ...]:
+    named = all(ids) and len(set(ids)) == len(ids)
+    return tuple(ids) if named else ()
+
+
+class _Line:
+    """One line of a table: its cells, and which of them are numbers."""
+
+    def __init__(self, number: int, cells: list[str]) -> None:
+        self.number, self.cells = number, cells
+        self.values = [_value(c) for c in cells]
+
+    @property
+    def numeric(self) -> int:
+        return sum(v is not None for v in self.values)
+
+
+def _value(cell: str) -> float | None:
+    if _CELL.fullmatch(cell):
+        return float(cell)
+    return np.nan if cell == "" else None
+
+
+def _numbers(text: str, name: str) -> list[Listing]:
+    lines, comments = _lines(text)
+    if not lines:
+        raise DatasetError(f"'{name}' is empty.")
+    header = next((k for k, line in enumerate(lines[:40]) if _is_header(line, lines[k + 1 :])), None)
+    if header is not None:
+        return _table(lines[header].cells, lines[header + 1 :], name)
+    rows = [line for line in lines if line.numeric >= 3]
+    if not rows:
+        raise DatasetError(
+            f"'{name}' holds no poses: no row of it has numbers. A table of poses has columns x,y,z with qw,qx,qy,qz or rx,ry,rz, or 6, 7 or "
+            "16 numbers a row."
+        )
+    commented = next((c for c in reversed(comments) if c.number < rows[0].number and len(columns_of(c.cells)[0]) >= 6), None)
+    if commented is not None and len(commented.cells) == len(rows[0].cells):
+        return _table(commented.cells, rows, name)
+    labelled: dict[str, list[_Line]] = defaultdict(list)
+    for row in rows:
+        labelled[str(row.cells[0]).lower() if row.values[0] is None else ""].append(row)
+    if 2 <= len(labelled) <= 3 and "" not in labelled and min(map(len, labelled.values())) >= 3:
+        return [_bare([_tail(r) for r in mine], f"{name}, {label}", ()) for label, mine in labelled.items()]
+    ids = tuple(PurePath(str(r.cells[0])).stem for r in rows) if all(r.values[0] is None for r in rows) else ()
+    return [_bare([_tail(r) for r in rows], name, ids)]
+
+
+def _tail(row: _Line) -> list[float]:
+    """The numbers of a row, without words."""
+    return [v for v in row.values if v is not None]
+
+
+def _bare(rows: list[list[float]], name: str, ids: tuple[str, ...]) -> Listing:
+    n = len(rows[0])
+    uneven = next((k for k, row in enumerate(rows) if len(row) != n), None)
+    if uneven is not None:
+        raise DatasetError(f"'{name}' has {n} numbers in its first row and {len(rows[uneven])} in row {uneven + 1}.")
+    table = np.array(rows)
+    if n == 4 and len(table) % 4 and len(table) % 3 == 0:
+        table = table.reshape(-1, 12)
+    elif n == 9 and not ids:
+        table = _stamped(table)
+    counted = n in (7, 8, 13, 17) and len(table) > 1 and bool((np.diff(table[:, 0]) == 1.0).all())
+    if counted and (n != 7 or not _quaternion_rows(table)):
+        found = listing_of_array(name, table[:, 1:])
+        return replace(found, ids=ids or tuple(str(int(v)) for v in table[:, 0]))
+    found = listing_of_array(name, table)
+    return replace(found, ids=ids) if ids and len(ids) == len(found) else found
+
+
+def _stamped(table: Array) -> Array:
+    """Rows of seconds, nanoseconds and seven numbers as time and seven numbers."""
+    return np.column_stack([table[:, 0] + 1e-9 * table[:, 1], table[:, 2:]])
+
+
+def _quaternion_rows(table: Array) -> bool:
+    return bool(np.abs(np.linalg.norm(table[:, 3:7], axis=1) - 1.0).max() < 1e-2)
+
+
+def _lines(text: str) -> tuple[list[_Line], list[_Line]]:
+    """The lines of a table in cells, and its comments."""
+    plain = re.split(r"\r\n|\n|\r", text)
+    rows = [(k, s) for k, s in enumerate(plain, 1) if s.strip() and not s.lstrip().startswith(_COMMENT)]
+    comments = [(k, s.lstrip().lstrip("#%/!;").strip()) for k, s in enumerate(plain, 1) if s.lstrip().startswith(_COMMENT)]
+    separator = _separator([s for _, s in rows])
+    lines = [_Line(k, _cells(s, separator)) for k, s in rows]
+    return lines, [_Line(k, _cells(s, separator if separator in s else " ")) for k, s in comments if s]
+
+
+def _separator(rows: Sequence[str]) -> str:
+    sample = rows[: min(len(rows), 50)]
+    for mark in (";", "\t"):
+        if sample and sum(mark in s for s in sample) >= 0.8 * len(sample):
+            return mark
+    # commas between blanks are separators; a comma inside of every number is a decimal comma
+    if sample and all(len(re.findall(r"\d,\d", s)) and "." not in s and len(s.split()) > 2 for s in sample[1:] or sample):
+        return " "
+    return "," if any("," in s for s in sample) else " "
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    plain = re.sub(r"[\[\](){}]", " " if separator != "," else "", line) if separator in ", " else line
+    if separator == " ":
+        cells = plain.split()
+    elif separator == ",":
+        cells = [c.strip() for part in [plain] for c in part.split(",")]
+        # blanks may separate numbers, too
+        cells = [word for cell in cells for word in (cell.split() if _all_numbers(cell) else [cell])]
+    else:
+        cells = [c.strip() for c in plain.split(separator)]
+    while len(cells) > 1 and cells[-1] == "":
+        cells.pop()
+    cells = [c.strip().strip("\"'") for c in cells]
+    if separator != ",":
+        cells = [c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c) else c for c in cells]
+    return cells
+
+
+def _all_numbers(cell: str) -> bool:
+    words = cell.split()
+    return len(words) > 1 and all(_CELL.fullmatch(w) for w in words)
+
+
+def _is_header(line: _Line, rest: Sequence[_Line]) -> bool:
+    found, _ = columns_of(line.cells)
+    return len(found) >= 5 and line.numeric <= len(line.cells) // 3 and any(r.numeric >= 5 for r in rest[:5])
+
+
+def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]:
+    columns, other = columns_of(header)
+    again = next((h for h in header if h and [x.lower() for x in header].count(h.lower()) > 1), None)
+    if again is not None:
+        raise DatasetError(f"'{name}' has two columns '{again[:40]}'; keep one.")
+    kept = [r for r in rows if r.numeric]
+    if not kept:
+        raise DatasetError(f"'{name}' has a header and no poses below it.")
+    long = next((r for r in kept if any(c for c in r.cells[len(header) :])), None)
+    if long is not None:
+        raise DatasetError(
+            f"'{name}', line {long.number}: {len(long.cells)} cells, and the header names {len(header)} columns; decimal commas need "
+            "semicolons or tabs between the columns."
+        )
+    table = np.full((len(kept), len(header)), np.nan)
+    for k, row in enumerate(kept):
+        for j, value in enumerate(row.values[: len(header)]):
+            table[k, j] = np.nan if value is None else value
+    ids: tuple[str, ...] = ()
+    if "id" in other:
+        words = [r.cells[other["id"]] if other["id"] < len(r.cells) else "" for r in kept]
+        ids = tuple(PurePath(w).stem or w for w in words)
+        twice = next((i for i in ids if ids.count(i) > 1), None) if len(set(ids)) < len(ids) else None
+        if twice is not None:
+            raise DatasetError(f"'{name}' gives the id '{twice}' twice; keep one row for each pose.")
+    return table_lists(header, table, name, ids)
+
+
+def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...] = ()) -> list[Listing]:
+    """The lists of poses of a table (n, columns) of numbers with named columns.
+
+    Raises:
+        DatasetError: a list has no position or no rotation.
+    """
+    columns, other = columns_of(header)
+    times = table[:, other["time"]] if "time" in other else None
+    if times is not None:
+        times = times * 1e-9 if np.isfinite(times).any() and float(np.nanmax(times)) > _NANOSECONDS else times
+        times = times if np.isfinite(times).all() else None
+    prefixes = sorted({c.prefix for c in columns}, key=[c.prefix for c in columns].index)
+    found = []
+    for prefix in prefixes:
+        mine = [c for c in columns if c.prefix == prefix]
+        label = name if len(prefixes) == 1 else f"{name}, {prefix or 'other'}"
+        found.append(_columns(label, mine, table, ids, times))
+    return found
+
+
+def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...], times: Array | None) -> Listing:
+    at = {c.role: c.index for c in columns}
+    units = {c.role: c.unit for c in columns if c.unit}
+    length = units.get("x", "")
+    if len({units.get(a, "") for a in "xyz"}) > 1:
+        raise DatasetError(f"The columns x, y and z of '{name}' state units that differ; give one unit.")
+    angle = next((u for r, u in units.items() if r not in "xyz" and u in ("deg", "rad")), "")
+
+    def take(*roles: str) -> Array:
+        return table[:, [at[r] for r in roles]]
+
+    grid = sorted(r for r in at if re.fullmatch(r"m\d\d", r))
+    more = {"ids": ids, "times": times, "unit": length}
+    if len(grid) in (12, 16):
+        return listing_of_array(name, take(*grid), **more)
+    if not {"x", "y", "z"} <= set(at):
+        raise DatasetError(f"'{name}' names no columns x, y, z; it has {', '.join(sorted(at))}.")
+    p = take("x", "y", "z")
+    if {"qw", "qx", "qy", "qz"} <= set(at):
+        return listing_of(name, p, take("qw", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more)
+    for numbered in (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")):
+        if set(numbered) <= set(at) and not {"rx", "ry", "rz"} <= set(at):
+            return listing_of(name, p, take(*numbered), form="x, y, z, quaternion", **more)
+    if {"vx", "vy", "vz"} <= set(at):
+        return listing_of(
+            name, p, take("vx", "vy", "vz"), rotation="rotation_vector", angles=angle, form="x, y, z, rotation vector", **more
+        )
+    if {"rx", "ry", "rz"} <= set(at):
+        return listing_of(name, p, take("rx", "ry", "rz"), angles=angle, form="x, y, z, rx, ry, rz", **more)
+    if {"roll", "pitch", "yaw"} <= set(at):
+        return listing_of(
+            name, p, take("roll", "pitch", "yaw"), angles=angle, usual="euler_xyz", vector=False, form="x, y, z, roll, pitch, yaw", **more
+        )
+    for named, form, words in (("abc", "euler_ZYX", "KUKA A, B, C"), ("wpr", "euler_xyz", "Fanuc W, P, R"), ("oat", "euler_ZYZ", "O, A, T")):
+        if set(named) <= set(at):
+            return listing_of(name, p, take(*named), rotation=form, angles=angle or "deg", form=f"x, y, z, {words}", **more)
+    if {"e1", "e2", "e3"} <= set(at):
+        return listing_of(name, p, take("e1", "e2", "e3"), angles=angle, vector=False, form="x, y, z and three angles", **more)
+    raise DatasetError(
+        f"'{name}' has positions and no rotation that it names: add qw,qx,qy,qz, or rx,ry,rz, or roll,pitch,yaw. It names "
+        f"{', '.join(sorted(at))}."
+    )

@@ -1,0 +1,233 @@
+"""Find lists of poses in documents and arrays by name: YAML, JSON, XML, npz and MATLAB files."""
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from weldcal.calibration.data.poses.columns import columns_of
+from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array, looks_like_poses
+from weldcal.calibration.data.poses.names import natural
+from weldcal.calibration.data.poses.text import table_lists
+from weldcal.calibration.errors import DatasetError
+from weldcal.models.arrays import Array
+
+_PARTNERS = {
+    "rotations": "translations", "rotation": "translation", "rots": "trans", "rot": "trans", "rot": "pos", "rvecs": "tvecs", "rvec": "tvec",
+    "orientations": "positions", "orientation": "position", "r": "t", "q": "t",
+}  # fmt: skip
+_NO_POSES = re.compile(
+    r"(?i)^(q|joints?|joint_.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(matrix|coeffs?|distortion)|covariance.*)$"
+)
+_VECTOR = re.compile(r"(?i)(rvec|rotvec|rotation_?vector|axis_?angle|rodrigues)")
+_QUATERNION = re.compile(r"(?i)(^q$|quat|rotation|orientation|wxyz|xyzw)")
+_POSITION = re.compile(r"(?i)^(.*_)?(position|translation|xyz|pos|trans|tvec|t|p|location)$")
+
+
+def lists_of_tree(tree: Any, name: str) -> list[Listing]:
+    """Every list of poses of a tree of mappings, lists and arrays; the key path follows the name.
+
+    Raises:
+        DatasetError: a node has the form of poses and holds none.
+    """
+    return list(_collect(tree, name, ""))
+
+
+def _collect(node: Any, name: str, at: str) -> Iterator[Listing]:
+    label = f"{name}, {at.strip('/')}" if at.strip("/") else name
+    if isinstance(node, np.ndarray):
+        if node.dtype.kind in "fiu" and looks_like_poses(node):
+            yield listing_of_array(label, node)
+        return
+    if isinstance(node, list):
+        yield from _of_list(node, name, at, label)
+    elif isinstance(node, Mapping):
+        yield from _of_mapping(node, name, at, label)
+
+
+def _of_list(node: list[Any], name: str, at: str, label: str) -> Iterator[Listing]:
+    array = _array(node)
+    if array is not None:
+        if looks_like_poses(array):
+            yield listing_of_array(label, array)
+        return
+    if node and all(isinstance(item, Mapping) for item in node):
+        yield from _of_samples(node, name, at, label)
+    elif node and all(isinstance(item, list) and len(item) == 2 for item in node):
+        for k in range(2):
+            yield from _collect([item[k] for item in node], name, f"{at}/{k}")
+
+
+def _of_samples(node: list[Mapping[Any, Any]], name: str, at: str, label: str) -> Iterator[Listing]:
+    """The lists of samples: each sample has a pose of every list, as fields or as an array."""
+    flat = [_flat(item) for item in node]
+    names = list(flat[0])
+    short = next((k for k, row in enumerate(flat) if not set(names) <= set(row)), None)
+    if short is not None and len(flat) > 1:
+        missing = next(n for n in names if n not in flat[short])
+        if columns_of(names)[0]:
+            raise DatasetError(f"Sample {short + 1} of '{label}' has no '{missing}', and the first has.")
+        names = [n for n in names if all(n in row for row in flat)]
+    columns, _ = columns_of(names)
+    if len(columns) >= 6:
+        yield from table_lists(names, np.array([[row[n] for n in names] for row in flat]), label)
+    for key in node[0]:
+        values = [item.get(key) for item in node]
+        if all(isinstance(v, Mapping) for v in values) and not _has_columns(values[0]):
+            yield from _of_samples(values, name, f"{at}/{key}", f"{name}, {at.strip('/')}/{key}".replace(", /", ", "))  # type: ignore[arg-type]
+        elif all(isinstance(v, list | np.ndarray) for v in values) and not _NO_POSES.match(str(key)):
+            arrays = [_array(v) if isinstance(v, list) else v for v in values]
+            if all(a is not None and a.size in (12, 16) for a in arrays):
+                yield listing_of_array(f"{name}, {key}", np.stack([np.asarray(a).reshape(-1, 4) for a in arrays]))
+            elif all(a is not None and a.size in (6, 7) for a in arrays):
+                yield listing_of_array(f"{name}, {key}", np.stack([np.asarray(a).ravel() for a in arrays]))
+    yield from _partners({k: [item.get(k) for item in node] for k in node[0]}, name, at)
+
+
+def _has_columns(node: Any) -> bool:
+    return isinstance(node, Mapping) and len(columns_of(list(_flat(node)))[0]) >= 6
+
+
+def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iterator[Listing]:
+    flat = _flat(node)
+    columns, _ = columns_of(list(flat))
+    direct = [n for n in flat if len({c.prefix for c in columns}) <= 1 or not columns]
+    if len(columns) >= 6 and direct and len({c.prefix for c in columns}) == 1:
+        yield from table_lists(list(flat), np.array([list(flat.values())]), label)
+        return
+    used = set()
+    for listing, keys in _joined(node, name, at):
+        used |= keys
+        yield listing
+    singles: list[tuple[str, Listing]] = []
+    for key, value in node.items():
+        if str(key) in used or _NO_POSES.match(str(key)):
+            continue
+        found = list(_collect(value, name, f"{at}/{key}"))
+        if len(found) == 1 and len(found[0]) == 1:
+            singles.append((str(key), found[0]))
+        else:
+            yield from found
+    yield from _together(singles, name, at)
+
+
+def _together(singles: list[tuple[str, Listing]], name: str, at: str) -> Iterator[Listing]:
+    """Single poses under numbered keys (pose_0, pose_1 ...) as one list each."""
+    groups: dict[str, list[tuple[str, Listing]]] = {}
+    for key, one in singles:
+        groups.setdefault(re.sub(r"\d+", "", key), []).append((key, one))
+    for stem, group in groups.items():
+        if len(group) == 1 or not re.search(r"\d", group[0][0]):
+            yield from (one for _, one in group)
+            continue
+        group.sort(key=lambda g: natural(g[0]))
+        yield stacked([one for _, one in group], f"{name}, {at.strip('/')} {stem}".replace(",  ", ", "), tuple(k for k, _ in group))
+
+
+def stacked(lists: list[Listing], name: str, ids: tuple[str, ...] = ()) -> Listing:
+    """One list of lists of one pose each. Raises DatasetError where they are written in different forms."""
+    first = lists[0].numbers[0]
+    if any(one.numbers[0].kind != first.kind for one in lists):
+        raise DatasetError(f"'{name}' holds poses in different forms; write all in one.")
+    p = np.concatenate([one.numbers[0].p for one in lists])
+    r = np.concatenate([one.numbers[0].r for one in lists])
+    bad = [k for k, one in enumerate(lists) if one.left_out]
+    p[bad] = np.nan
+    units = {one.unit for one in lists}
+    return listing_of(
+        name, p, r, rotation=first.rotation, angles=first.angles, usual=first.usual, vector=first.vector, ids=ids,
+        unit=units.pop() if len(units) == 1 else "", form=lists[0].form,
+    )  # fmt: skip
+
+
+def _joined(node: Mapping[Any, Any], name: str, at: str) -> Iterator[tuple[Listing, set[str]]]:
+    """Rotations and translations that stand under two keys, such as R_gripper2base and t_gripper2base."""
+    lower = {str(k).lower(): str(k) for k in node}
+    for key in node:
+        for word, other in (*_PARTNERS.items(), ("rot", "pos"), ("rotation", "position"), ("quaternions", "positions"), ("quaternion", "position")):
+            k = str(key).lower()
+            if not k.startswith(word) and not k.endswith(word):
+                continue
+            partner = lower.get(other + k[len(word) :]) if k.startswith(word) else lower.get(k[: -len(word)] + other)
+            if partner is None or partner == str(key):
+                continue
+            found = _rotations_and_positions(node[key], node[partner], f"{name}, {(at + '/' + str(key)).strip('/')}", str(key))
+            if found is not None:
+                yield found, {str(key), partner}
+                break
+
+
+def _partners(node: Mapping[Any, Any], name: str, at: str) -> Iterator[Listing]:
+    for listing, _ in _joined(node, name, at):
+        yield listing
+
+
+def _rotations_and_positions(R: Any, t: Any, label: str, key: str) -> Listing | None:
+    turn, at = (v if isinstance(v, np.ndarray) else _array(v) if isinstance(v, list) else None for v in (R, t))
+    if turn is None or at is None or at.size == 0 or at.size % 3 or turn.dtype.kind not in "fiu" or at.dtype.kind not in "fiu":
+        return None
+    p = np.asarray(at, dtype=float)
+    p = p.T if p.ndim == 2 and p.shape[0] == 3 and p.shape[1] != 3 else p.reshape(-1, 3)
+    n = len(p)
+    turn = np.asarray(turn, dtype=float)
+    if turn.ndim == 3 and turn.shape == (3, 3, n) and n != 3:
+        turn = np.moveaxis(turn, 2, 0)
+    if turn.size == 9 * n:
+        return listing_of(label, p, turn.reshape(n, 3, 3), form="rotations and translations")
+    if turn.size == 4 * n:
+        q = turn.T if turn.ndim == 2 and turn.shape[0] == 4 and turn.shape[1] != 4 else turn.reshape(n, 4)
+        return listing_of(label, p, q, form="quaternions and translations")
+    if turn.size == 3 * n:
+        v = turn.T if turn.ndim == 2 and turn.shape[0] == 3 and turn.shape[1] != 3 else turn.reshape(n, 3)
+        sure = "rotation_vector" if _VECTOR.search(key) or key.lower().startswith(("r_", "r")) else ""
+        return listing_of(label, p, v, rotation=sure, form="rotation vectors and translations")
+    return None
+
+
+def _flat(node: Mapping[Any, Any], at: str = "") -> dict[str, float]:
+    """The numbers of a mapping by dotted name; short lists under telling names are spelled out."""
+    out: dict[str, float] = {}
+    for key, value in node.items():
+        path = f"{at}.{key}".strip(".").lower()
+        if isinstance(value, Mapping):
+            out |= _flat(value, path)
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            out[path] = float(value)
+        elif isinstance(value, list | np.ndarray):
+            numbers = value if isinstance(value, np.ndarray) else _array(value)
+            if numbers is not None and numbers.dtype.kind in "fiu":
+                out |= _spelled(path, str(key), np.asarray(numbers, dtype=float).ravel())
+        elif isinstance(value, str):
+            try:
+                out[path] = float(value)
+            except ValueError:
+                continue
+    return out
+
+
+def _spelled(path: str, key: str, numbers: Array) -> dict[str, float]:
+    parent = path.rpartition(".")[0]
+    parent = f"{parent}." if parent else ""
+    if numbers.size == 3 and _POSITION.match(key):
+        return dict(zip((f"{parent}{a}" for a in "xyz"), map(float, numbers), strict=True))
+    if numbers.size == 4 and (order := re.search(r"(wxyz|xyzw)", key.lower())):
+        return dict(zip((f"{parent}q{a}" for a in order[1]), map(float, numbers), strict=True))
+    if numbers.size == 4 and _QUATERNION.search(key):
+        return dict(zip((f"{parent}q{k}" for k in range(4)), map(float, numbers), strict=True))
+    if numbers.size == 3 and _VECTOR.search(key):
+        return dict(zip((f"{parent}rvec_{a}" for a in "xyz"), map(float, numbers), strict=True))
+    if numbers.size == 3 and re.search(r"(?i)(rpy)", key):
+        return dict(zip((f"{parent}{a}" for a in ("roll", "pitch", "yaw")), map(float, numbers), strict=True))
+    if numbers.size == 3 and re.search(r"(?i)(rot|ori|euler|angles?|rxyz)", key):
+        return dict(zip((f"{parent}r{a}" for a in "xyz"), map(float, numbers), strict=True))
+    return {}
+
+
+def _array(value: Any) -> Array | None:
+    """Nested lists of numbers as an array; None where they are none."""
+    try:
+        found = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return found
