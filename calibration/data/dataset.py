@@ -218,7 +218,7 @@ def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str,
     """A dataset from a ROS recording; its clouds stay in memory."""
     form = header.poses or PoseForm()
     found = read_bag(bag, form, robot or header.robot)
-    listed = PoseList(bag.name, found.X, found.ids, found.times, "m", "a ROS recording")
+    listed = PoseList(source=bag.name, X=found.X, ids=found.ids, times=found.times, unit="m", read_as="a ROS recording")
     X, unit = metric_poses(listed, "m" if header.units.poses == AUTO else header.units.poses, form)
     check_reach(X[:, :3, 3], bag, unit)
     recorded = dict(zip(found.ids, found.clouds, strict=True))

@@ -1,12 +1,12 @@
 """Decide how two lists of poses are to be read, by relative motions: they must agree for one X, whatever X is."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.poses.readings import PoseReading
+from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
 from weldcal.calibration.geometry.quantiles import f_quantile
 from weldcal.calibration.geometry.se3 import inverse, nearest_rotation
 from weldcal.models.arrays import Array
@@ -18,6 +18,8 @@ _PAIRS = 400  # relative motions that are compared
 _KEPT = 0.7  # share of the poses that must agree: the others may be outliers
 _ROTATION_FLOOR = 2e-6  # rad: six printed digits
 _POSITION_FLOOR = 1e-6  # share of the motion's extent: six printed digits
+_AGREE = 0.1  # of the motion: beyond it there is no agreement that deserves the name
+_SAME_SCALE = 0.02
 _NEAR_UNIT = 0.08  # of the logarithm of a factor: attenuation by noise of short motions
 _MOST = 160  # pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
 _SURE_TURN = 2.8  # rad
@@ -31,24 +33,40 @@ class Agreement:
     Attributes:
         robot, camera: the readings.
         scale: robot units per camera unit that fits best.
+        scale_sigma: its standard deviation as a share of itself.
         unit_scale: the nearest ratio of two units, or None where none is near.
         rotation: rms residual of the rotations, rad, of the poses that agree best.
         turn: rms angle of the relative motions under these readings, rad.
         position: rms residual of the positions, in the robot's unit.
+        extent: rms distance of the robot's positions from their mean, in its unit.
         X, Y: the solution of F X G = Y, positions in the robot's unit.
+        changes: how many lists are changed beyond what is stated.
         dof: degrees of freedom of each residual.
     """
 
     robot: PoseReading
     camera: PoseReading
     scale: float
+    scale_sigma: float
     unit_scale: float | None
     rotation: float
     turn: float
     position: float
+    extent: float
     X: Array
     Y: Array
     dof: int
+    changes: int = 0
+
+    @property
+    def changed(self) -> bool:
+        """Whether a list is transposed, left-handed or inverted beyond what is stated."""
+        return self.changes > 0
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the residuals are small against the motion."""
+        return self.rotation < _AGREE * self.turn and self.position < _AGREE * self.extent
 
     @property
     def cost(self) -> float:
@@ -100,15 +118,17 @@ def decide(
 
 def _judge(tried: list[Agreement]) -> Decision:
     best = min(tried, key=lambda t: t.cost)
-    quantile = f_quantile(1.0 - CHANCE / (2.0 * max(len(tried) - 1, 1)), best.dof, best.dof)
-    limit = float(np.sqrt(quantile))
+    if best.changed:
+        # a list that need not be changed is not changed
+        plain = [t for t in tried if not t.changed]
+        first = min(plain, key=lambda t: t.cost)
+        if not _rejected(first, best, _limit(best, len(tried))):
+            best, tried = first, plain
+    limit = _limit(best, len(tried))
     alive, dead = [], []
     for one in tried:
-        if one is best:
-            continue
-        turn = one.rotation / one.turn * best.turn
-        rejected = turn > limit * best.rotation or one.position > limit * best.position
-        (dead if rejected else alive).append(one)
+        if one is not best and (best.changed or not one.changed or one.cost < best.cost):
+            (dead if _rejected(one, best, limit) else alive).append(one)
     alive.sort(key=lambda t: t.cost)
     dead.sort(key=lambda t: t.cost)
     same = [one for one in alive if _same(one, best)]
@@ -116,10 +136,27 @@ def _judge(tried: list[Agreement]) -> Decision:
     return Decision(best, tuple(rivals), tuple(same), dead[0] if dead else None)
 
 
+def _limit(best: Agreement, tried: int) -> float:
+    """Ratio of residuals beyond which a reading is rejected."""
+    return float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * max(tried - 1, 1)), best.dof, best.dof)))
+
+
+def _rejected(one: Agreement, best: Agreement, limit: float) -> bool:
+    return one.rotation / one.turn * best.turn > limit * best.rotation or one.position > limit * best.position
+
+
 def _same(one: Agreement, other: Agreement) -> bool:
-    """Whether two readings lead to the same X and Y within the residuals of the better one."""
-    if abs(np.log(one.scale / other.scale)) > 0.02:
+    """Whether two readings have the same rotations, or lead to the same X and Y, within the residuals of the better one."""
+    if abs(np.log(one.scale / other.scale)) > _SAME_SCALE:
         return False
+    gaps = [
+        float(
+            np.sqrt((Rotation.from_matrix(np.swapaxes(U.X[:, :3, :3], 1, 2) @ V.X[:, :3, :3]).magnitude() ** 2).mean())
+        )
+        for U, V in ((one.robot, other.robot), (one.camera, other.camera))
+    ]
+    if max(gaps) <= other.rotation:
+        return True
     for U, V in ((one.X, other.X), (one.Y, other.Y)):
         turn = Rotation.from_matrix(U[:3, :3].T @ V[:3, :3]).magnitude()
         if turn > 2.0 * other.rotation or np.linalg.norm(U[:3, 3] - V[:3, 3]) > 3.0 * other.position:
@@ -127,14 +164,12 @@ def _same(one: Agreement, other: Agreement) -> bool:
     return True
 
 
-def _variants(
-    robot: PoseReading, camera: PoseReading, changes: bool
-) -> list[tuple[PoseReading, PoseReading]]:
-    """The two readings as they are and with one change of one list (inverted: of the robot's; of the camera's it is the same equation)."""
-    found = [(robot, camera)]
+def _variants(robot: PoseReading, camera: PoseReading, changes: bool) -> list[tuple[PoseReading, PoseReading, int]]:
+    """The two readings as they are and with one change of one list ."""
+    found = [(robot, camera, 0)]
     if changes:
-        found += [(robot.changed(c), camera) for c in ("transposed", "left_handed", "inverse")]
-        found += [(robot, camera.changed(c)) for c in ("transposed", "left_handed")]
+        found += [(robot.changed(c), camera, 1) for c in CHANGES]
+        found += [(robot, camera.changed(c), 1) for c in CHANGES]
     return found
 
 
@@ -142,9 +177,7 @@ def _notations(robot: Sequence[PoseReading], camera: Sequence[PoseReading]) -> l
     """Index pairs of readings whose relative rotations have equal angles, as far as the data can tell."""
     n = len(robot[0].X)
     i, j = _pairs(n, _PAIRS)
-    angles = [
-        np.stack([_relative_angles(one.X[:, :3, :3], i, j) for one in listed]) for listed in (robot, camera)
-    ]
+    angles = [np.stack([_relative_angles(one.X[:, :3, :3], i, j) for one in listed]) for listed in (robot, camera)]
     gap = np.sort(np.abs(angles[0][:, None, :] - angles[1][None, :, :]), axis=2)
     kept = gap[:, :, : max(int(_KEPT**2 * len(i)), 3)]
     sizes = [np.sqrt((one**2).mean(axis=1)) + _ROTATION_FLOOR for one in angles]
@@ -156,7 +189,9 @@ def _notations(robot: Sequence[PoseReading], camera: Sequence[PoseReading]) -> l
     limit = least * float(np.sqrt(f_quantile(1.0 - CHANCE / spread.size, dof, dof)))
     order = np.argsort(spread, axis=None, kind="stable")
     found = [(int(k // spread.shape[1]), int(k % spread.shape[1])) for k in order if spread.flat[k] <= limit]
-    return found[:_MOST] if len(found) > 1 else [(int(k // spread.shape[1]), int(k % spread.shape[1])) for k in order[:2]]
+    return (
+        found[:_MOST] if len(found) > 1 else [(int(k // spread.shape[1]), int(k % spread.shape[1])) for k in order[:2]]
+    )
 
 
 def _relative_angles(R: Array, i: Array, j: Array) -> Array:
@@ -164,19 +199,20 @@ def _relative_angles(R: Array, i: Array, j: Array) -> Array:
     return np.asarray(2.0 * np.arcsin(np.clip(chord, 0.0, 1.0)))
 
 
-def _agreements(tried: list[tuple[PoseReading, PoseReading]], eye_in_hand: bool) -> list[Agreement]:
+def _agreements(variants: list[tuple[PoseReading, PoseReading, int]], eye_in_hand: bool) -> list[Agreement]:
     """Solve F X G = Y for each pair of readings; all at once."""
+    tried, changes = [(a, b) for a, b, _ in variants], [c for _, _, c in variants]
     F = np.stack([one.X if eye_in_hand else inverse(one.X) for one, _ in tried])
     G = np.stack([other.X for _, other in tried])
     n = F.shape[1]
     kept = max(int(np.ceil(_KEPT * n)), min(n, 5))
     RX, RY, w = _rotation(F[..., :3, :3], G[..., :3, :3], kept)
     turned = (F[..., :3, :3] @ (G[..., :3, 3] @ np.swapaxes(RX, 1, 2))[..., None])[..., 0]
-    tX, tY, scale, d = _translation(F, turned, kept, None)
+    tX, tY, scale, d, sigma = _translation(F, turned, kept, None)
     # a negative scale is no solution: without its sign the positions do not fit
     units = [_nearest_unit(abs(float(s))) for s in scale]
     fixed = np.array([abs(float(s)) if u is None else u for s, u in zip(scale, units, strict=True)])
-    tX, tY, _, d = _translation(F, turned, kept, fixed)
+    tX, tY, _, d, _ = _translation(F, turned, kept, fixed)
     extent = np.sqrt(F[..., :3, 3].var(axis=1).sum(axis=1)) + 1e-12
     turns = [_motion(one) for one in (F[..., :3, :3], G[..., :3, :3])]
     found = []
@@ -187,12 +223,15 @@ def _agreements(tried: list[tuple[PoseReading, PoseReading]], eye_in_hand: bool)
             robot=one,
             camera=other,
             scale=max(abs(float(scale[k])), 1e-12),
+            scale_sigma=float(sigma[k] / max(abs(float(scale[k])), 1e-12)),
             unit_scale=units[k],
             rotation=_rms(w[k], kept) + _ROTATION_FLOOR,
             turn=float(np.sqrt(turns[0][k] * turns[1][k])) + _ROTATION_FLOOR,
             position=_rms(d[k], kept) + _POSITION_FLOOR * float(extent[k]),
+            extent=float(extent[k]),
             X=X,
             Y=Y,
+            changes=changes[k],
             dof=max(3 * kept - 6, 3),
         )
         found.append(agreement)
@@ -236,8 +275,10 @@ def _rotation(F: Array, G: Array, kept: int) -> tuple[Array, Array, Array]:
             best = value, R, RY, w
         else:
             better = value < best[0]
-            best = tuple(np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-                         for new, old in zip((value, R, RY, w), best, strict=True))  # type: ignore[assignment]
+            best = tuple(
+                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                for new, old in zip((value, R, RY, w), best, strict=True)
+            )  # type: ignore[assignment]
     assert best is not None
     return best[1], best[2], best[3]
 
@@ -267,8 +308,8 @@ def _pairs(n: int, most: int) -> tuple[Array, Array]:
     return i, j
 
 
-def _translation(F: Array, turned: Array, kept: int, scale: Array | None) -> tuple[Array, Array, Array, Array]:
-    """t_X, t_Y (m, 3), the scale (m,) of the camera's positions and the residuals (m, n, 3) of F X G = Y, in F's unit.
+def _translation(F: Array, turned: Array, kept: int, scale: Array | None) -> tuple[Array, Array, Array, Array, Array]:
+    """t_X, t_Y (m, 3), the scale (m,) of the camera's positions, the residuals (m, n, 3) of F X G = Y, in F's unit, and the scale's sigma.
 
     ``turned``: R_F R_X t_G (m, n, 3). ``scale``: fixed, or None to estimate it.
     """
@@ -287,12 +328,15 @@ def _translation(F: Array, turned: Array, kept: int, scale: Array | None) -> tup
         AW = A * weight[..., None, None]
         H = np.einsum("mnik,mnil->mkl", AW, A)
         g = np.einsum("mnik,mni->mk", AW, right)
-        x = (np.linalg.pinv(H, rcond=1e-12, hermitian=True) @ g[..., None])[..., 0]
+        inverted = np.linalg.pinv(H, rcond=1e-12, hermitian=True)
+        x = (inverted @ g[..., None])[..., 0]
         d = np.einsum("mnik,mk->mni", A, x) - right
         weight = _weights(np.linalg.norm(d, axis=2), kept)
     x = x / size
-    found = x[:, 6] if scale is None else scale
-    return x[:, :3], x[:, 3:6], found, d
+    if scale is not None:
+        return x[:, :3], x[:, 3:6], scale, d, np.zeros(m)
+    variance = np.sort((d**2).sum(axis=2), axis=1)[:, :kept].sum(axis=1) / max(3 * kept - 7, 1)
+    return x[:, :3], x[:, 3:6], x[:, 6], d, np.sqrt(np.maximum(variance * inverted[:, 6, 6], 0.0)) / size[:, 6]
 
 
 def _nearest_unit(scale: float) -> float | None:
@@ -300,9 +344,3 @@ def _nearest_unit(scale: float) -> float | None:
     ratios = {a / b for a in UNITS.values() for b in UNITS.values()}
     near = min(ratios, key=lambda r: abs(np.log(scale / r)))
     return near if abs(np.log(scale / near)) < _NEAR_UNIT else None
-
-
-def without(listed: Sequence[PoseReading], rows: Sequence[int]) -> list[PoseReading]:
-    """The readings without some rows."""
-    keep = np.setdiff1d(np.arange(len(listed[0].X)), np.asarray(rows, dtype=int))
-    return [replace(one, X=one.X[keep]) for one in listed]

@@ -1,37 +1,34 @@
-"""Reads pose pairs from npz, CSV and JSON files and from the samples of easy_handeye2 and MoveIt."""
+"""Read pose pairs: npz, tables, documents and samples of other tools, with corners and joint angles where a file has them."""
 
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.listing import Listing
+from weldcal.calibration.data.poses.lists import folder_lists, read_lists
 from weldcal.calibration.data.poses.names import mounting_name
-from weldcal.calibration.data.poses.storage import is_storage
-from weldcal.calibration.data.poses.two_lists import pairs_of_document, pairs_of_folder, pairs_of_tree
+from weldcal.calibration.data.poses.storage import read_tree
+from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.data.tables import read_rows
-from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
+from weldcal.calibration.errors import DatasetError, InconsistentPoses
+from weldcal.calibration.hand_eye.conventions import UNITS
+from weldcal.calibration.hand_eye.importing import StatedForms, import_pairs
 from weldcal.calibration.hand_eye.mountings import chain, get_mounting
-from weldcal.calibration.hand_eye.solve import as_poses
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
-from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import file_size
 from weldcal.models.limits import LARGEST_NUMBER
 
-_NAMES = {
-    "robot": ("A", "robot", "X_BF", "X_base_gripper"), "camera": ("B", "camera", "X_CM", "X_camera_target"),
-    "robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL"),
-}  # fmt: skip
-_WHO = ("robot", "camera", "robot2", "link")
+_MORE = {"robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL")}
+_EXTRAS = ("X_true", "img", "obj", "K", "dist", "q")
 _JOINTS = tuple(f"q{i}" for i in range(1, 10))
-LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
-_LONGEST_TURN = 7.0  # rad: a whole turn and a little
-_NEAR_M = 0.02  # nor are both this near: a file in metres that is said to be in millimetres
-_FAR_M = 20.0  # no arm and no camera on one reach this far: the numbers are not metres
+LENGTHS = UNITS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +36,8 @@ class PosePairs:
     """Pose pairs in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE
     of a second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
     published answer where there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where
-    given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given."""
+    given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how each list was
+    understood; ``notes``: sentences about it; ``ids``: names of the rows, or empty."""
 
     source: str
     robot: Array
@@ -53,6 +51,9 @@ class PosePairs:
     K: Array | None = None
     dist: Array | None = None
     q: Array | None = None
+    reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    ids: tuple[str, ...] = ()
 
     @property
     def has_corners(self) -> bool:
@@ -75,11 +76,20 @@ class PosePairs:
         return self.camera
 
 
-def read_pairs(path: Path, *, mounting: str | None = None, length: str | None = None) -> PosePairs:
-    """Read a file of pose pairs; the kind is told by its ending and its contents.
+def read_pairs(
+    path: Path, *, mounting: str | None = None, length: str | None = None, stated: StatedForms | None = None
+) -> PosePairs:
+    """Read pose pairs from a file or folder of any form of docs/datasets.md.
 
-    ``mounting`` says what the file does not (and must not contradict it); ``length`` is the unit of its positions (m, mm,
-    cm; m where not said). Raises DatasetError with one sentence, InputError for poses that are no poses.
+    Args:
+        path: the file or folder.
+        mounting: what the file does not state (and must not contradict).
+        length: the unit of all positions (m, mm, cm, inch) where the file does not state it; else the robot's follows from its reach and the
+            camera's from the ratio of the motions.
+        stated: forms and names of the two lists, where the user states them.
+
+    Raises:
+        DatasetError: the file cannot be read; InconsistentPoses: the data do not select one reading.
     """
     path = Path(path)
     if path.is_dir() and (path / "pairs.npz").exists():
@@ -88,112 +98,224 @@ def read_pairs(path: Path, *, mounting: str | None = None, length: str | None = 
     if length is not None and length not in LENGTHS:
         raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}.")
     try:
-        return _read(path, mounting, length)
-    except DatasetError:
+        return _read(path, mounting, length, stated or StatedForms())
+    except (DatasetError, InconsistentPoses):
         raise
     except InputError as e:
-        raise DatasetError(_named(path, str(e))) from e
+        raise DatasetError(str(e) if path.name in str(e) else f"'{path.name}': {e}") from e
     except MemoryError:
         raise DatasetError(f"'{path.name}' needs more memory than there is: give fewer pairs.") from None
 
 
-def _named(path: Path, sentence: str) -> str:
-    return sentence if path.name in sentence else f"'{path.name}': {sentence}"
+def _read(path: Path, mounting: str | None, length: str | None, stated: StatedForms) -> PosePairs:
+    lists, raw = _contents(path)
+    more: dict[str, Listing] = {}
+    for who, names in _MORE.items():
+        found = next((one for one in lists if re.split(r"[/,\s]+", one.name)[-1] in names), None)
+        if found is not None:
+            more[who] = found
+            lists = [one for one in lists if one is not found]
+    mode = _mode(path, raw, mounting, "robot2" in more)
+    unit = _word(path, raw, "unit")
+    if unit and length and unit != length:
+        raise DatasetError(
+            f"'{path.name}' states lengths in {unit}, and the command states {length}; correct one of them."
+        )
+    if unit and unit not in LENGTHS:
+        raise DatasetError(f"'{path.name}' states lengths in '{unit}'; use {', '.join(LENGTHS)}.")
+    if mode == "eye_on_base" and any(re.search(r"(tracking|optical)$", one.name) for one in lists):
+        stated = replace(
+            stated, robot=replace(stated.robot, frame="base_in_flange")
+        )  # easy_handeye then stores the base in the hand
+    stated = _stated_in(path, raw, replace(stated, unit=unit or length or stated.unit))
+    found_pairs = import_pairs(lists, path.name, mode, stated)
+    rows_r, rows_c = found_pairs.rows
+    arrays: dict[str, Array | None] = {}
+    for key in _EXTRAS:
+        value = raw.get(key)
+        arrays[key] = None if value is None else _array(path, key, value)
+    for key, rows, count in (("q", rows_r, found_pairs.counts[0]), ("img", rows_c, found_pairs.counts[1])):
+        listed = arrays[key]
+        if listed is not None:
+            if len(listed) != count:
+                raise DatasetError(f"'{path.name}' holds {len(listed)} rows of {key} for {count} poses.")
+            arrays[key] = listed[rows]
+    others: dict[str, Array] = {}
+    for who, one in more.items():
+        X = one.readings[0].X.copy()
+        X[:, :3, 3] *= found_pairs.metres
+        if len(X) != found_pairs.counts[0] and (who != "link" or len(X) != 1):
+            raise DatasetError(f"'{path.name}' holds {found_pairs.counts[0]} robot poses and {len(X)} {who} poses.")
+        others[who] = X if len(X) == 1 and who == "link" else X[rows_r]
+    return PosePairs(
+        source=path.name,
+        robot=found_pairs.robot,
+        camera=found_pairs.camera,
+        mode=mode,
+        robot2=others.get("robot2"),
+        link=others.get("link"),
+        reading=found_pairs.reading,
+        notes=found_pairs.notes,
+        ids=found_pairs.ids,
+        **arrays,
+    )
 
 
-def _read(path: Path, mounting: str | None, length: str | None) -> PosePairs:
+def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
+    """The lists of poses of a file or folder, and what else it states: mode, unit, corners, joint angles."""
     if path.is_dir():
-        return _finished(path, pairs_of_folder(path), mounting, length)
+        description = path / "dataset.yaml"
+        raw = read_tree(description) if description.is_file() else {}
+        raw = raw if isinstance(raw, dict) else {}
+        units = raw.get("units")
+        lists = folder_lists(path)
+        if len(lists) == 1 and any(p.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp") for p in path.rglob("*")):
+            raise DatasetError(
+                _pictures(path, sum(p.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp") for p in path.rglob("*")))
+            )
+        if not lists:
+            raise DatasetError(_no_lists(path))
+        return lists, {
+            "mode": raw.get("configuration"), "unit": units.get("poses") if isinstance(units, dict) else None, "poses": raw.get("poses")
+        }  # fmt: skip
     file_size(path)
     ending = path.suffix.lower()
-    if ending == ".npz":
-        raw = _npz(path)
-    elif ending in (".bag", ".db3", ".mcap"):
+    if ending in (".bag", ".db3", ".mcap"):
         raise DatasetError(
             f"'{path.name}' is a ROS recording: write the robot's and the camera's poses as robot.csv and camera.csv into a folder "
             "(rostopic echo -p, or ros2 topic echo --csv) and give that folder."
         )
-    elif ending in (".npy", ".mat", ".pkl"):
-        raise DatasetError(f"'{path.name}' cannot be read: give npz, CSV, JSON, or samples of easy_handeye2 or MoveIt.")
-    elif ending in (".csv", ".txt"):
-        raw = _csv(path)
-    else:
-        raw = _document(path)
-    return _finished(path, raw, mounting, length)
-
-
-def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str | None) -> PosePairs:
-    said = _said(path, raw, "mode")
-    said = mounting_name(said) if said else said  # other tools' words
-    if said and mounting and said != mounting:
+    if ending in (".pkl", ".pickle"):
         raise DatasetError(
-            f"'{path.name}' states the mounting {said}, and the command states {mounting}; correct one of them."
+            f"'{path.name}' is a pickle, which may run code: save the two arrays with numpy.savez(file, robot=..., camera=...)."
         )
-    mode = mounting or said or ("co_manipulation" if raw.get("robot2") is not None else None)
+    if ending == ".npz":
+        arrays = read_npz(path)
+        if "hand" in arrays and "eye" in arrays:
+            raise DatasetError(
+                f"'{path.name}' holds two streams of poses, not pairs: bring them to one clock and write pairs, A and B (n, 4, 4)."
+            )
+        raw = {k: arrays[k] for k in _EXTRAS if k in arrays}
+        raw["mode"], raw["unit"] = (
+            next((str(_scalar(arrays[k])) for k in keys if k in arrays and np.size(arrays[k]) == 1), "")
+            for keys in (("mode", "configuration"), ("unit",))
+        )
+        return lists_of_tree({k: v for k, v in arrays.items() if k not in raw}, path.name), raw
+    if ending in (".yml", ".yaml", ".json", ".xml", ".samples", ".calib"):
+        tree = read_tree(path)
+        raw = (
+            {k: tree[k] for k in (*_EXTRAS, "mode", "configuration", "unit") if k in tree}
+            if isinstance(tree, dict)
+            else {}
+        )
+        parameters = tree.get("parameters") if isinstance(tree, dict) else None
+        kind = parameters.get("calibration_type") if isinstance(parameters, dict) else None
+        raw["mode"] = raw.get("mode") or raw.pop("configuration", None) or kind
+        samples = tree.get("samples", tree.get("poses")) if isinstance(tree, dict) else tree
+        if isinstance(samples, list) and samples and all(isinstance(one, dict) and "q" in one for one in samples):
+            raw["q"] = [one["q"] for one in samples]
+        lists = lists_of_tree(tree, path.name)
+        if len(lists) == 1 and len(lists[0]) == 1:
+            raise DatasetError(
+                f"'{path.name}' holds one pose: it looks like the result of a calibration, and samples are needed. Give the file of the "
+                "samples, or judge this result on them with 'weldcal verify'."
+            )
+        return lists, raw
+    lists = read_lists(path)
+    raw = {}
+    if ending in (".csv", ".txt", ".tsv") and len(lists) > 1 and any("," in one.name for one in lists):
+        raw = _joint_columns(path)
+    return lists, raw
+
+
+def _pictures(folder: Path, n: int) -> str:
+    return (
+        f"'{folder.name}' holds {n} pictures and no camera poses: name the board in them, for example --board chessboard:9x6:25 (inner "
+        "corners and the side of a square in mm)."
+    )
+
+
+def _no_lists(folder: Path) -> str:
+    names = sorted(p.name for p in folder.rglob("*") if p.is_file())
+    pictures = [n for n in names if n.lower().endswith((".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"))]
+    if pictures:
+        return _pictures(folder, len(pictures))
+    closed = next((n for n in names if n.lower().endswith(".zdf")), None)
+    if closed is not None:
+        return (
+            f"'{folder.name}' holds Zivid captures ({closed}), a closed format: put the board's pose in each capture into camera01.yaml ... "
+            "(4 x 4, from Zivid's detectCalibrationBoard), or scan the bare flange and use weldcal calibrate."
+        )
+    return (
+        f"'{folder.name}' holds no poses: give robot.csv and camera.csv, folders robot/ and camera/ with one file per pose, or one file with "
+        "both lists. Scans of a flange with poses go to 'weldcal calibrate'."
+    )
+
+
+def _joint_columns(path: Path) -> dict[str, Any]:
+    try:
+        names, rows = read_rows(path)
+    except InputError:
+        return {}
+    joints = [name for name in _JOINTS if name in names]
+    if len(joints) < 5:
+        return {}
+    try:
+        return {"q": [[float(row[name]) for name in joints] for row in rows]}
+    except ValueError as e:
+        raise DatasetError(f"A joint angle of '{path.name}' is not a number: {e}.") from e
+
+
+def _scalar(value: Array) -> object:
+    word = np.ravel(value)[0]
+    return word.decode("utf-8", "replace") if isinstance(word, bytes) else word
+
+
+def _mode(path: Path, raw: dict[str, Any], mounting: str | None, two_robots: bool) -> str:
+    found = _word(path, raw, "mode")
+    found = mounting_name(found) if found else found  # other tools' words
+    if found and mounting and found != mounting:
+        raise DatasetError(
+            f"'{path.name}' states the mounting {found}, and the command states {mounting}; correct one of them."
+        )
+    mode = mounting or found or ("co_manipulation" if two_robots else None)
     if mode is None:
         raise DatasetError(
             f"'{path.name}' does not say where the camera is; add --mounting eye_in_hand or eye_on_base."
         )
     get_mounting(mode)
-    unit = _said(path, raw, "unit")
-    if unit and length and unit != length:
-        raise DatasetError(
-            f"'{path.name}' states lengths in {unit}, and the command states {length}; correct one of them."
-        )
-    scale = LENGTHS.get(unit or length or "m")
-    if scale is None:
-        raise DatasetError(f"'{path.name}' states lengths in '{unit}'; use {', '.join(LENGTHS)}.")
-    poses: dict[str, Array | None] = {}
-    for key, name in (("robot", "robot"), ("camera", "camera"), ("robot2", "second robot"), ("link", "arm link")):
-        if raw.get(key) is None:
-            poses[key] = None
-            continue
-        X = as_poses(_array(path, name, raw[key]), name)
-        if len(X) and float(np.abs(X[:, :3, 3]).max()) > LARGEST_NUMBER:
-            raise DatasetError(f"A position of the {name} of '{path.name}' is beyond {LARGEST_NUMBER:g}.")
-        X[:, :3, 3] *= scale
-        poses[key] = X
-    robot, camera = poses["robot"], poses["camera"]
-    if robot is None or camera is None:
-        raise DatasetError(f"'{path.name}' holds no pairs of robot and camera poses.")
-    for listed, name in ((camera, "camera"), (poses["robot2"], "second robot"), (poses["link"], "arm link")):
-        if listed is not None and len(listed) != len(robot) and (name != "arm link" or len(listed) != 1):
-            raise DatasetError(f"'{path.name}' holds {len(robot)} robot poses and {len(listed)} {name} poses.")
-    if len(robot) == 0:
-        raise DatasetError(f"'{path.name}' holds no pairs of robot and camera poses.")
-    far = {n: float(np.median(np.linalg.norm(X[:, :3, 3], axis=1))) for X, n in ((robot, "robot"), (camera, "camera"))}
-    for name, distance in far.items():
-        if distance > _FAR_M:
-            other = min(far.values())
-            action = f"the others {other:.2g} m: bring both to one unit"
-            if other > 1e-2 * distance:
-                action = "if they are millimetres, add --unit mm"
-            raise DatasetError(f"The {name} positions of '{path.name}' are {distance:.0f} m away, as metres; {action}.")
-    if scale != 1.0 and max(far.values()) < _NEAR_M:
-        raise DatasetError(
-            f"The positions of '{path.name}' are {1e3 * max(far.values()):.2g} mm away, as {unit or length}: they look like metres; "
-            "correct the unit."
-        )
-    if raw.get("inverted") and mode == "eye_on_base":  # easy_handeye2 then stores the base in the hand
-        robot = inverse(robot)
-    X_true = raw.get("X_true")
-    return PosePairs(
-        source=path.name,
-        robot=robot,
-        camera=camera,
-        mode=mode,
-        robot2=poses["robot2"],
-        link=poses["link"],
-        X_true=None if X_true is None else _array(path, "X_true", X_true),
-        **{k: None if raw.get(k) is None else _array(path, k, raw[k]) for k in ("img", "obj", "K", "dist", "q")},
-    )
+    return mode
 
 
-def _said(path: Path, raw: dict[str, Any], key: str) -> str | None:
+def _word(path: Path, raw: dict[str, Any], key: str) -> str | None:
     value = raw.get(key) or None
     if value is not None and not isinstance(value, str):
         raise DatasetError(f"'{path.name}' must name its {key} by a word.")
     return value
+
+
+def _stated_in(path: Path, raw: dict[str, Any], stated: StatedForms) -> StatedForms:
+    """What dataset.yaml states of the two lists, below what the command states."""
+    forms = raw.get("poses")
+    if not isinstance(forms, dict):
+        return stated
+    for who in ("robot", "camera"):
+        given = forms.get(who)
+        if not isinstance(given, dict):
+            continue
+        known = ("rotation", "angles", "frame", "file")
+        wrong = next((k for k in given if k not in known), None)
+        if wrong is not None:
+            raise DatasetError(
+                f"'{path.name}/dataset.yaml': poses.{who} has no key '{str(wrong)[:40]}'; use {', '.join(known)}."
+            )
+        words = {k: str(v) for k, v in given.items()}
+        own = getattr(stated, who)
+        if own == PoseForm():
+            stated = replace(stated, **{who: PoseForm(**words)})
+        if words.get("file"):
+            stated = replace(stated, **{f"{who}_poses": words["file"]})
+    return stated
 
 
 def _array(path: Path, name: str, value: Any) -> Array:
@@ -208,179 +330,3 @@ def _array(path: Path, name: str, value: Any) -> Array:
     if float(np.nanmax(np.abs(out), initial=0.0)) > LARGEST_NUMBER:
         raise DatasetError(f"'{name}' of '{path.name}' holds numbers beyond {LARGEST_NUMBER:g}.")
     return out
-
-
-def _npz(path: Path) -> dict[str, Any]:
-    raw = read_npz(path)
-    out: dict[str, Any] = {k: raw[k] for k in ("X_true", "img", "obj", "K", "dist", "q") if k in raw}
-    for key, known in _NAMES.items():
-        out[key] = next((raw[name] for name in known if name in raw), None)
-    out["mode"], out["unit"] = _word(raw, "mode", "configuration"), _word(raw, "unit")
-    if "hand" in raw and "eye" in raw and out["robot"] is None:
-        raise DatasetError(
-            f"'{path.name}' holds two streams of poses, not pairs: bring them to one clock and write pairs, A and B (n, 4, 4)."
-        )
-    if out["robot"] is None or out["camera"] is None:
-        two = pairs_of_tree({k: v.astype(float) for k, v in raw.items() if v.dtype.kind in "fiu"}, path.name)
-        if two is not None:
-            return out | two
-        raise DatasetError(
-            f"'{path.name}' has no arrays A and B (n, 4, 4): A = pose of the flange in the base, B = of the target in the camera."
-        )
-    return out
-
-
-def _word(raw: dict[str, Array], *keys: str) -> str:
-    """A word of an npz: a string, bytes, or an array that holds one of them."""
-    value = next((raw[k] for k in keys if k in raw), None)
-    if value is None or np.size(value) != 1:
-        return ""
-    word = np.ravel(value)[0]
-    return word.decode("utf-8", "replace") if isinstance(word, bytes) else str(word)
-
-
-def _csv(path: Path) -> dict[str, Any]:
-    try:
-        names, rows = read_rows(path)
-    except InputError as e:
-        raise DatasetError(str(e)) from e
-    if not names:
-        raise DatasetError(f"'{path.name}' is empty.")
-    wanted = "robot_x,robot_y,robot_z,robot_qw,robot_qx,robot_qy,robot_qz,camera_x, ... camera_qz"
-    if not any(n.startswith("robot_") for n in names):
-        raise DatasetError(f"The first line of '{path.name}' must name its columns: {wanted} (or _rx,_ry,_rz).")
-    if not rows:
-        raise DatasetError(f"'{path.name}' has a header and no samples.")
-    mine = [n for n in names if n.split("_")[0] in _WHO or n in _JOINTS]
-    try:
-        table = np.array([[float(row[n]) if row[n] else np.nan for n in mine] for row in rows])
-    except ValueError as e:
-        raise DatasetError(f"'{path.name}' holds something that is not a number: {e}.") from e
-    names = mine
-    out: dict[str, Any] = {}
-    for who in _WHO:
-        if f"{who}_x" in names:
-            out[who] = _columns(path, names, table, who)
-    joints = [names.index(q) for q in _JOINTS if q in names]
-    if joints:
-        out["q"] = table[:, joints]
-    return out
-
-
-def _columns(path: Path, names: list[str], table: Array, who: str) -> Array:
-    def column(*suffixes: str) -> Array | None:
-        keys = [f"{who}_{s}" for s in suffixes]
-        return table[:, [names.index(k) for k in keys]] if all(k in names for k in keys) else None
-
-    p = column("x", "y", "z")
-    q, r = column("qw", "qx", "qy", "qz"), column("rx", "ry", "rz")
-    if p is None or (q is None and r is None):
-        raise DatasetError(
-            f"'{path.name}' lacks {who}_x, _y, _z with {who}_qw, _qx, _qy, _qz or {who}_rx, _ry, _rz (rad)."
-        )
-    cells = np.hstack([v for v in (p, q if q is not None else r) if v is not None])
-    if not np.isfinite(cells).all():
-        bad = int(np.flatnonzero(~np.isfinite(cells).all(axis=1))[0])
-        raise DatasetError(
-            f"'{path.name}' has an empty or non-finite cell in the {who} columns, first in sample {bad}."
-        )
-    if q is None and np.linalg.norm(np.asarray(r), axis=1).max() > _LONGEST_TURN:
-        raise DatasetError(
-            f"The rotation vectors {who}_rx, _ry, _rz of '{path.name}' are up to {np.linalg.norm(np.asarray(r), axis=1).max():.0f} long, "
-            "more than a whole turn: they look like degrees; write radians."
-        )
-    turned = _from_quaternions(path, q) if q is not None else exp_rotation(np.asarray(r))
-    return pose(turned, p)
-
-
-def _from_quaternions(path: Path, q: Array) -> Array:
-    length = np.linalg.norm(q, axis=1)
-    if not (np.abs(length - 1.0) <= 1e-2).all():
-        raise DatasetError(
-            f"A quaternion of '{path.name}' has length {float(length[np.argmax(np.abs(length - 1))]):.3f}, not 1."
-        )
-    return np.asarray(Rotation.from_quat(q, scalar_first=True).as_matrix())
-
-
-def _document(path: Path) -> dict[str, Any]:
-    if path.suffix.lower() == ".xml" or is_storage(path):
-        two = pairs_of_document(path)
-        if two is None:
-            raise DatasetError(
-                f"'{path.name}' holds no two lists of poses: name its nodes R_gripper2base, t_gripper2base, R_target2cam and t_target2cam, or "
-                "A and B."
-            )
-        return two
-    document = read_document(path)
-    out: dict[str, Any] = {}
-    samples: Any = document
-    if isinstance(document, dict):
-        parameters = document.get("parameters")
-        parameters = parameters if isinstance(parameters, dict) else {}
-        out["mode"] = document.get("configuration") or document.get("mode") or parameters.get("calibration_type") or ""
-        out["unit"] = document.get("unit") or ""
-        out["X_true"] = document.get("X_true")
-        if "A" in document and "B" in document:
-            more = {"robot2": document.get("C"), "q": document.get("q")}
-            return out | {"robot": document["A"], "camera": document["B"]} | more
-        samples = document.get("samples", document.get("poses"))
-    if not isinstance(samples, list) or not samples:
-        two = pairs_of_document(path)
-        if two is not None:
-            return out | two
-        raise DatasetError(f"'{path.name}' holds no list of samples.")
-    first = samples[0]
-    if isinstance(first, list) and len(first) == 2:  # MoveIt's own test data: pairs without names
-        samples = [{"robot": s[0], "camera": s[1]} if isinstance(s, list) and len(s) == 2 else s for s in samples]
-        first = samples[0]
-    if isinstance(first, dict) and "effector_wrt_world" in first:  # MoveIt: 16 numbers, row by row
-        robot, camera = "effector_wrt_world", "object_wrt_sensor"
-    elif isinstance(first, dict) and "robot" in first and "tracking" in first:  # easy_handeye2
-        robot, camera = "robot", "tracking"
-        out["inverted"] = True
-    elif (
-        isinstance(first, dict) and "robot" in first and "optical" in first
-    ):  # easy_handeye2, as it keeps them in memory
-        robot, camera = "robot", "optical"
-        out["inverted"] = True
-    else:
-        robot, camera = "robot", "camera"
-    for key, name in (("robot", robot), ("camera", camera), ("robot2", "robot2"), ("link", "link")):
-        if isinstance(first, dict) and name in first:
-            out[key] = np.array([_one(path, s, name, i) for i, s in enumerate(samples)])
-    if isinstance(first, dict) and "q" in first:
-        out["q"] = [_joints(path, s, i) for i, s in enumerate(samples)]
-    return out
-
-
-def _joints(path: Path, sample: Any, index: int) -> Any:
-    if not isinstance(sample, dict) or "q" not in sample:
-        raise DatasetError(f"Sample {index} of '{path.name}' has no joint angles 'q', and the first has.")
-    return sample["q"]
-
-
-def _one(path: Path, sample: Any, name: str, index: int) -> Array:
-    """A pose in any of the ways people write one."""
-    try:
-        value = sample[name]
-        if isinstance(value, dict):
-            value = value.get("transform", value)
-        if isinstance(value, dict):
-            p = value.get("translation", value.get("position", value.get("xyz")))
-            q = value.get("rotation", value.get("orientation", value.get("quaternion_wxyz", value.get("wxyz"))))
-            p = [p[k] for k in "xyz"] if isinstance(p, dict) else p
-            # a list without names is wxyz here only where its key says so
-            if isinstance(q, dict):
-                q = [q[k] for k in "wxyz"]
-            elif "quaternion_wxyz" not in value and "wxyz" not in value:
-                raise InputError("the order of its quaternion is not said (name it quaternion_wxyz)")
-            at = np.array(p, dtype=float)
-            if at.shape != (3,):
-                raise InputError("its position is not three numbers")
-            return pose(_from_quaternions(path, np.array([q], dtype=float))[0], at)
-        return np.array(value, dtype=float).reshape(4, 4)
-    except DatasetError:
-        raise
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, InputError) as e:
-        why = f": {e}" if isinstance(e, InputError) else ""
-        raise DatasetError(f"Sample {index} of '{path.name}' has no pose '{name}' that can be read{why}.") from e

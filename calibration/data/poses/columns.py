@@ -3,17 +3,110 @@
 import re
 from dataclasses import dataclass
 
-IDS = ("id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no", "sample", "frame", "#", "point", "idx")
-TIMES = ("time", "%time", "timestamp", "stamp", "t", "time_s", "header.stamp", "sec", "secs", "timestamp_s", "time_ns", "timestamp_ns")
-_POSITION = {"position", "pos", "translation", "trans", "t", "p", "tvec", "xyz", "location", "origin", "linear", "coord"}
+IDS = (
+    "id",
+    "name",
+    "pose",
+    "scan",
+    "file",
+    "filename",
+    "image",
+    "cloud",
+    "label",
+    "index",
+    "nr",
+    "no",
+    "sample",
+    "frame",
+    "#",
+    "point",
+    "idx",
+)
+TIMES = (
+    "time",
+    "%time",
+    "timestamp",
+    "stamp",
+    "t",
+    "time_s",
+    "header.stamp",
+    "sec",
+    "secs",
+    "timestamp_s",
+    "time_ns",
+    "timestamp_ns",
+)
+_POSITION = {
+    "position",
+    "pos",
+    "translation",
+    "trans",
+    "t",
+    "p",
+    "tvec",
+    "xyz",
+    "location",
+    "origin",
+    "linear",
+    "coord",
+}
 _ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad"}
 _VECTOR = {"rvec", "rotvec", "rv", "axisangle", "aa", "rodrigues"}
 _QUATERNION = {"quat", "quaternion", "q"}
 _FILLERS = {"field", "pose", "transform", "transforms0", "vector", "tcp", "data", "actual", "x1"}
-_WHOLE = {"qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o"}
-_EULER_WORDS = (("alpha", "beta", "gamma"), ("phi", "theta", "psi"), ("angle1", "angle2", "angle3"), ("euler1", "euler2", "euler3"))
+_OWNERS = (
+    "robot",
+    "camera",
+    "cam",
+    "hand",
+    "eye",
+    "ee",
+    "base",
+    "flange",
+    "target",
+    "marker",
+    "board",
+    "gripper",
+    "tool",
+)
+_WHOLE = {
+    "qw",
+    "qx",
+    "qy",
+    "qz",
+    "q0",
+    "q1",
+    "q2",
+    "q3",
+    "q4",
+    "roll",
+    "pitch",
+    "yaw",
+    "a",
+    "b",
+    "c",
+    "w",
+    "p",
+    "r",
+    "o",
+}
+_EULER_WORDS = (
+    ("alpha", "beta", "gamma"),
+    ("phi", "theta", "psi"),
+    ("angle1", "angle2", "angle3"),
+    ("euler1", "euler2", "euler3"),
+)
 _UNIT = re.compile(r"[\[(]\s*([a-zA-Z°]*)\s*[\])]|[_\s](mm|cm|m|in|inch|deg|rad|degrees|radians|°)$")
-_UNITS = {"degrees": "deg", "radians": "rad", "°": "deg", "meter": "m", "metres": "m", "meters": "m", "in": "inch", "degree": "deg"}
+_UNITS = {
+    "degrees": "deg",
+    "radians": "rad",
+    "°": "deg",
+    "meter": "m",
+    "metres": "m",
+    "meters": "m",
+    "in": "inch",
+    "degree": "deg",
+}
 
 
 @dataclass(frozen=True)
@@ -75,9 +168,8 @@ def _roles(name: str) -> list[tuple[str, str]]:
     last, before = tokens[-1], tokens[:-1]
     if short := re.fullmatch(r"([tpqr]|pos|rot|quat|rvec|tvec|rv)([wxyz])", last):
         before, last = [*before, short[1]], short[2]
-    if short := re.fullmatch(r"(.*?)(?:_)?([xyz]|q[wxyz]|r[xyz])", last):
-        if short[1] in ("robot", "camera", "cam", "hand", "eye", "ee", "base", "flange", "target", "marker", "board", "gripper", "tool"):
-            before, last = [*before, short[1]], short[2]
+    if (short := re.fullmatch(r"(.+?)([xyz]|q[wxyz]|r[xyz])", last)) and short[1] in _OWNERS:
+        before, last = [*before, short[1]], short[2]
     if last in ("roll", "pitch", "yaw") or re.fullmatch(r"q[0-4]", last):
         return [(_prefix(before), last)]
     if last not in ("w", "x", "y", "z"):
@@ -103,7 +195,9 @@ def _with_quaternions(columns: list[Column], names: list[tuple[str, str]]) -> li
     """Rotation columns x, y, z, w of one list are a quaternion."""
     four = {c.prefix for c in columns if c.role == "rw"}
     return [
-        Column(c.prefix, f"q{c.role[1]}", c.unit, c.index) if c.prefix in four and re.fullmatch("r[wxyz]", c.role) else c
+        Column(c.prefix, f"q{c.role[1]}", c.unit, c.index)
+        if c.prefix in four and re.fullmatch("r[wxyz]", c.role)
+        else c
         for c in columns
     ]
 
@@ -128,5 +222,9 @@ def _merged(columns: list[Column]) -> list[Column]:
     rotations = [p for p, kinds in have.items() if kinds == {"r"}]
     if len(have) == 2 and len(positions) == len(rotations) == 1:
         return [Column("", c.role, c.unit, c.index) for c in columns]
-    whole = {p for p, kinds in have.items() if kinds == {"p", "r"} or any(c.role.startswith("m") for c in columns if c.prefix == p)}
+    whole = {
+        p
+        for p, kinds in have.items()
+        if kinds == {"p", "r"} or any(c.role.startswith("m") for c in columns if c.prefix == p)
+    }
     return [c for c in columns if c.prefix in whole] if whole else columns

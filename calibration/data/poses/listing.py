@@ -73,7 +73,9 @@ class Listing:
             if not rotation or _fits(one, rotation)
         )
         if not numbers:
-            held = {"matrix": "matrices", "quaternion": "quaternions", "vector": "three numbers a rotation"}[self.numbers[0].kind]
+            held = {"matrix": "matrices", "quaternion": "quaternions", "vector": "three numbers a rotation"}[
+                self.numbers[0].kind
+            ]
             raise DatasetError(f"'{self.name}' holds {held}, and {option} states {rotation}; correct one of them.")
         return replace(self, numbers=numbers)
 
@@ -99,7 +101,9 @@ def listing_of(
     Raises:
         DatasetError: no row holds a pose, or a number is too large.
     """
-    return _listing(name, [(np.asarray(p, dtype=float), np.asarray(r, dtype=float))], rotation, angles, usual, vector, **more)
+    return _listing(
+        name, [(np.asarray(p, dtype=float), np.asarray(r, dtype=float))], rotation, angles, usual, vector, **more
+    )
 
 
 def listing_of_array(name: str, values: Array, **more: object) -> Listing:
@@ -124,7 +128,11 @@ def listing_of_array(name: str, values: Array, **more: object) -> Listing:
     times = next((t for kind, _, _, t in found if kind == least and t is not None), None)
     if times is not None and more.get("times") is None:
         more["times"] = times
-    form = {_MATRIX: "4 x 4 matrices", _QUATERNION: "x, y, z, quaternion", _VECTOR: "x, y, z and three numbers of a rotation"}[least]
+    form = {
+        _MATRIX: "4 x 4 matrices",
+        _QUATERNION: "x, y, z, quaternion",
+        _VECTOR: "x, y, z and three numbers of a rotation",
+    }[least]
     return _listing(name, chosen, "", "", "", True, **({"form": form} | more))
 
 
@@ -132,7 +140,9 @@ def looks_like_poses(values: Array) -> bool:
     """Whether an array has a shape and numbers that only poses have."""
     v = np.asarray(values, dtype=float)
     kinds = [kind for kind, *_ in _meanings(v)] if v.size else []
-    return bool(kinds) and (min(kinds) < _VECTOR or v.shape[-1] == 6 or v.shape == (6, 1) or (v.ndim == 2 and v.shape[0] == 6))
+    return bool(kinds) and (
+        min(kinds) < _VECTOR or v.shape[-1] == 6 or v.shape == (6, 1) or (v.ndim == 2 and v.shape[0] == 6)
+    )
 
 
 def _meanings(v: Array) -> Iterator[tuple[int, Array, Array, Array | None]]:
@@ -196,7 +206,9 @@ def _of_matrices(M: Array) -> Iterator[tuple[int, Array, Array, None]]:
 
 def _orthonormal(R: Array) -> bool:
     R = R[np.isfinite(R).all(axis=(1, 2)) & (np.abs(R).max(axis=(1, 2)) > 0.0)]
-    return bool(len(R)) and float(np.median(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)))) <= _ORTHONORMAL
+    return (
+        bool(len(R)) and float(np.median(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)))) <= _ORTHONORMAL
+    )
 
 
 def _unit(q: Array) -> bool:
@@ -226,9 +238,7 @@ def _listing(
         r[rows] = np.eye(3) if r.ndim == 3 else [1.0, 0.0, 0.0, 0.0] if r.shape[1] == 4 else 0.0
         if float(max(np.abs(p).max(), np.abs(r).max())) > LARGEST_NUMBER:
             raise DatasetError(f"'{name}' holds numbers beyond {LARGEST_NUMBER:g}.")
-        numbers.append(
-            PoseNumbers(source=name, p=p, r=r, rotation=rotation, angles=angles, usual=usual, vector=vector)
-        )
+        numbers.append(PoseNumbers(source=name, p=p, r=r, rotation=rotation, angles=angles, usual=usual, vector=vector))
     return Listing(name=name, numbers=tuple(numbers), left_out=tuple(left_out), **more)  # type: ignore[arg-type]
 
 
@@ -237,7 +247,11 @@ def _without_pose(meanings: Sequence[tuple[Array, Array]]) -> list[tuple[int, st
     p, r = meanings[0]
     flat = np.concatenate([p, r.reshape(len(r), -1)], axis=1)
     missing = ~np.isfinite(flat).all(axis=1)
-    empty = np.abs(r.reshape(len(r), -1)).max(axis=1) == 0.0 if r.ndim == 3 or r.shape[1] == 4 else np.abs(flat).max(axis=1) == 0.0
+    empty = (
+        np.abs(r.reshape(len(r), -1)).max(axis=1) == 0.0
+        if r.ndim == 3 or r.shape[1] == 4
+        else np.abs(flat).max(axis=1) == 0.0
+    )
     still = np.abs(p).max(axis=1) == 0.0
     if r.ndim == 3:
         still &= (r == np.eye(3)).all(axis=(1, 2))

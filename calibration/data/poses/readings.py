@@ -1,7 +1,7 @@
 """Enumerate the plausible readings of a list of poses: notation of the rotation, unit and order of its numbers, transposition."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -77,6 +77,11 @@ class PoseReading:
         return PoseReading(f"{self.form},{change}", f"{self.words}, {words}", apply_change(self.X, change))
 
 
+def pick(listed: Sequence[PoseReading], rows: Array) -> list[PoseReading]:
+    """The readings of some rows."""
+    return [replace(one, X=one.X[rows]) for one in listed]
+
+
 def apply_change(X: Array, change: str) -> Array:
     """Poses (n, 4, 4) with one of CHANGES applied."""
     if change == "inverse":
@@ -104,7 +109,9 @@ def readings(numbers: PoseNumbers) -> list[PoseReading]:
     if numbers.usual:
         found.sort(key=lambda one: not one.form.startswith(numbers.usual))
     if not found:
-        raise DatasetError(f"'{numbers.source}' has {numbers.kind} rotations, and the form states '{numbers.rotation}'; correct it.")
+        raise DatasetError(
+            f"'{numbers.source}' has {numbers.kind} rotations, and the form states '{numbers.rotation}'; correct it."
+        )
     return found
 
 
@@ -156,7 +163,11 @@ def _matrices(numbers: PoseNumbers) -> Array:
     mirrored = np.linalg.det(R) < 0.0
     if off.max() > _ORTHOGONAL or mirrored.any():
         bad = int(np.argmax(np.where(mirrored, np.inf, off)))
-        why = "is mirrored (its determinant is -1)" if mirrored[bad] else "is no rotation (its columns must have length 1)"
+        why = (
+            "is mirrored (its determinant is -1)"
+            if mirrored[bad]
+            else "is no rotation (its columns must have length 1)"
+        )
         raise DatasetError(f"The 3 x 3 part of matrix {bad + 1} of '{numbers.source}' {why}.")
     return R if off.max() < 1e-12 else nearest_rotation(R)
 
@@ -171,7 +182,11 @@ def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
         v = np.radians(numbers.r) if unit == "deg" else numbers.r
         words = "degrees" if unit == "deg" else "radians"
         if stated == "rotation_vector" or (not stated and numbers.vector):
-            yield f"rotation_vector,{unit}", f"rotation vectors in {words}", np.asarray(Rotation.from_rotvec(v).as_matrix())
+            yield (
+                f"rotation_vector,{unit}",
+                f"rotation vectors in {words}",
+                np.asarray(Rotation.from_rotvec(v).as_matrix()),
+            )
         for form, name, axes, columns in _ANGLES:
             if not stated or stated == form:
                 R = np.asarray(Rotation.from_euler(axes, v[:, columns]).as_matrix())
@@ -191,9 +206,7 @@ def _angle_readings() -> tuple[tuple[str, str, str, list[int]], ...]:
     for axes in _CARDAN:
         if axes not in ("xyz", "zyx"):  # the same as fixed xyz and moving XYZ
             columns = ["xyz".index(a) for a in axes]
-            found.append(
-                (f"fixed_axes_{axes}", f"turns about x, y, z in the order {', '.join(axes)}", axes, columns)
-            )
+            found.append((f"fixed_axes_{axes}", f"turns about x, y, z in the order {', '.join(axes)}", axes, columns))
     return tuple(found)
 
 

@@ -1,25 +1,28 @@
 """Finds the file or folder that holds the poses, reads it by its form, and gives flange poses X_BF in metres."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
-from weldcal.calibration.data.poses.columns import plain_names
-from weldcal.calibration.data.poses.form import PoseList, poses_from_array
+from weldcal.calibration.data.poses.columns import columns_of
+from weldcal.calibration.data.poses.form import PoseList
+from weldcal.calibration.data.poses.listing import Listing
+from weldcal.calibration.data.poses.lists import ENDINGS as READ
+from weldcal.calibration.data.poses.lists import read_lists, whose
 from weldcal.calibration.data.poses.names import natural, number_of
-from weldcal.calibration.data.poses.storage import ENDINGS, read_storage
-from weldcal.calibration.data.poses.table import read_table
+from weldcal.calibration.data.poses.readings import pick
+from weldcal.calibration.data.poses.trees import stacked
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-TABLES = (".csv", ".txt", ".tsv", ".script")
-READ = (*TABLES, *ENDINGS, ".npy", ".npz")
-"""Endings of files that may hold poses."""
+FLANGES = ("tool0", "flange", "tool0_controller", "wrist_3_link", "ee_link", "link_6", "panda_link8", "fr3_link8")
+"""Frames that arms' descriptions call their flange, the likeliest first."""
+BASES = ("base", "base_link", "world")
 _STEMS = (
     "poses",
     "robot_poses",
@@ -62,14 +65,17 @@ def find_poses(folder: Path) -> Path | tuple[Path, ...] | None:
 
 
 def is_plain(path: Path) -> bool:
-    """Whether a table is in this package's own form: a header with id, x, y, z and no other notation than a quaternion's."""
+    """Whether a table is in this package's own form: a header with id, x, y, z, qw, qx, qy, qz, without units."""
+    if path.suffix.lower() != ".csv":
+        return False
     try:
         names, _ = read_rows(path)
     except InputError:
         return True  # its reader says what is wrong, and where
-    plain, units = plain_names(names)
-    other = {"rx", "roll", "q0", "q1", "a", "p", "m00", "r11"} & set(plain)
-    return "id" in names and not units and not other and not any("." in n for n in names) and len(names) < 17
+    columns, _ = columns_of(names)
+    roles = {c.role for c in columns}
+    own = {"x", "y", "z", "qw", "qx", "qy", "qz"}
+    return "id" in names and roles <= own and not any(c.unit for c in columns) and not any("." in n for n in names)
 
 
 def files_of_poses(folder: Path) -> tuple[Path, ...]:
@@ -88,58 +94,59 @@ def _files(folder: Path) -> list[Path]:
 def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
     """The poses of a file, or of one file per pose. Raises DatasetError, one sentence that says what to change."""
     if isinstance(source, tuple):
-        lists = [read_poses(path, form) for path in source]
-        many = next((p for p, found in zip(source, lists, strict=True) if len(found.X) != 1), None)
+        lists = [read_lists(path) for path in source]
+        many = next((p for p, found in zip(source, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
         if many is not None:
             raise DatasetError(
                 f"'{many.name}' holds more than one pose, and there are {len(source)} such files; give one or the other."
             )
-        units = {found.unit for found in lists}
         name = f"{source[0].name} ... {source[-1].name}"
-        return PoseList(
-            name, np.concatenate([found.X for found in lists]), tuple(p.stem for p in source), None,
-            units.pop() if len(units) == 1 else "", f"one file per pose, {lists[0].read_as}",
-        )  # fmt: skip
-    ending = source.suffix.lower()
-    try:
-        if ending in TABLES:
-            return read_table(source, form)
-        if ending in ENDINGS:
-            return read_storage(source, form)
-        if ending == ".npy":
-            X, said = poses_from_array(_numbers(source, read_npy(source)), form, source.name)
-            return PoseList(source.name, X, (), None, "", said)
-        if ending == ".npz":
-            return _archive(source, form)
-    except DatasetError:
-        raise
-    except InputError as e:
-        raise DatasetError(str(e)) from e
-    raise DatasetError(f"'{source.name}' is no file of poses that can be read; known are {', '.join(READ)}.")
+        found = stacked([one[0] for one in lists], name, tuple(p.stem for p in source))
+        found = replace(found, form=f"one file per pose, {found.form}")
+    else:
+        found = _robots(read_lists(source), source.name, form)
+    found = found.stated(replace(form, frame="flange_in_base"), "dataset.yaml: poses.rotation")
+    good = found.good
+    readings = tuple(pick(found.readings, np.flatnonzero(good)))
+    ids = tuple(i for i, keep in zip(found.ids, good, strict=True) if keep) if found.ids else ()
+    return PoseList(
+        source=found.name,
+        X=readings[0].X,
+        ids=ids,
+        times=None if found.times is None else found.times[good],
+        unit=found.unit,
+        read_as=found.form if len(readings) == 1 else f"{found.form}, {readings[0].words}",
+        readings=readings,
+        left_out=tuple((found.ids[k] if found.ids else f"row {k + 1}", why) for k, why in found.left_out),
+    )
 
 
-def _numbers(path: Path, value: Array) -> Array:
-    if value.dtype.kind not in "fiu":
-        raise DatasetError(f"'{path.name}' holds words, not numbers.")
-    return np.asarray(value, dtype=float)
-
-
-def _archive(path: Path, form: PoseForm) -> PoseList:
-    arrays = {k: np.asarray(v, dtype=float) for k, v in read_npz(path).items() if v.dtype.kind in "fiu"}
-    names = ("X_BF", "poses", "robot", "A", "X_base_gripper", "T_base_flange", "base_T_flange")
-    name = next((n for n in names if n in arrays), None)
-    if name is None and {"R", "t"} <= set(arrays):
-        R, t = arrays["R"], arrays["t"].reshape(-1, 3)
-        if R.shape == (len(t), 3, 3):
-            arrays, name = {"R": np.concatenate([R, t[:, :, None]], axis=2)}, "R"
-    if name is None and len(arrays) == 1:
-        name = next(iter(arrays))
-    if name is None:
-        raise DatasetError(
-            f"'{path.name}' holds the arrays {', '.join(arrays) or 'none'}; call the one with the poses X_BF."
+def _robots(lists: list[Listing], name: str, form: PoseForm) -> Listing:
+    """The list of the flange's poses among those of a file: the only one, the one of the flange's frame, or the one that names the robot."""
+    if len(lists) == 1:
+        return lists[0]
+    frames = {tuple(one.name.rpartition(", ")[2].split(" to ")): one for one in lists if " to " in one.name}
+    if frames:
+        flanges = [form.flange_frame] if form.flange_frame else list(FLANGES)
+        bases = (
+            [form.base_frame]
+            if form.base_frame
+            else sorted({k[0] for k in frames}, key=lambda b: BASES.index(b) if b in BASES else 99)
         )
-    X, said = poses_from_array(arrays[name], form, path.name)
-    return PoseList(path.name, X, (), None, "", said)
+        for flange in flanges:
+            for base in bases:
+                if (base, flange) in frames:
+                    return frames[base, flange]
+        pairs = ", ".join(f"{a} to {b}" for a, b in list(frames)[:6])
+        raise DatasetError(
+            f"'{name}' holds the transforms {pairs}, none from the base to the flange; set poses.base_frame and poses.flange_frame in "
+            "dataset.yaml, or record the pose topic of the driver."
+        )
+    mine = [one for one in lists if whose(one.name) == "robot"]
+    if len(mine) == 1:
+        return mine[0]
+    known = ", ".join(repr(one.name) for one in lists[:6])
+    raise DatasetError(f"'{name}' holds several lists of poses: {known}. Keep the one of the flange in the base.")
 
 
 def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str]:

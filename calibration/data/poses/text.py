@@ -64,7 +64,9 @@ def _rapid(text: str, name: str) -> Listing | None:
     if not found or "[[" not in text.replace(" ", ""):
         return None
     p, q = np.array([_floats(m[1]) for m in found]), np.array([_floats(m[2]) for m in found])
-    return listing_of(name, p, q, rotation="quaternion_wxyz", ids=_unique([m[0] for m in found]), unit="mm", form="ABB robtargets")
+    return listing_of(
+        name, p, q, rotation="quaternion_wxyz", ids=_unique([m[0] for m in found]), unit="mm", form="ABB robtargets"
+    )
 
 
 def _kuka(text: str, name: str) -> Listing | None:
@@ -78,7 +80,14 @@ def _kuka(text: str, name: str) -> Listing | None:
         return None
     table = np.array(rows)
     return listing_of(
-        name, table[:, :3], table[:, 3:], rotation="euler_ZYX", angles="deg", ids=_unique(ids), unit="mm", form="KUKA positions"
+        name,
+        table[:, :3],
+        table[:, 3:],
+        rotation="euler_ZYX",
+        angles="deg",
+        ids=_unique(ids),
+        unit="mm",
+        form="KUKA positions",
     )
 
 
@@ -124,7 +133,13 @@ def _ur(text: str, name: str) -> Listing | None:
         return None
     table = np.array(rows)
     return listing_of(
-        name, table[:, :3], table[:, 3:], rotation="rotation_vector", angles="rad", unit="m", form="UR poses (x, y, z, rotation vector)"
+        name,
+        table[:, :3],
+        table[:, 3:],
+        rotation="rotation_vector",
+        angles="rad",
+        unit="m",
+        form="UR poses (x, y, z, rotation vector)",
     )
 
 
@@ -164,7 +179,9 @@ def _numbers(text: str, name: str) -> list[Listing]:
             f"'{name}' holds no poses: no row of it has numbers. A table of poses has columns x,y,z with qw,qx,qy,qz or rx,ry,rz, or 6, 7 or "
             "16 numbers a row."
         )
-    commented = next((c for c in reversed(comments) if c.number < rows[0].number and len(columns_of(c.cells)[0]) >= 6), None)
+    commented = next(
+        (c for c in reversed(comments) if c.number < rows[0].number and len(columns_of(c.cells)[0]) >= 6), None
+    )
     if commented is not None and len(commented.cells) == len(rows[0].cells):
         return _table(commented.cells, rows, name)
     labelled: dict[str, list[_Line]] = defaultdict(list)
@@ -212,7 +229,9 @@ def _lines(text: str) -> tuple[list[_Line], list[_Line]]:
     """The lines of a table in cells, and its comments."""
     plain = re.split(r"\r\n|\n|\r", text)
     rows = [(k, s) for k, s in enumerate(plain, 1) if s.strip() and not s.lstrip().startswith(_COMMENT)]
-    comments = [(k, s.lstrip().lstrip("#%/!;").strip()) for k, s in enumerate(plain, 1) if s.lstrip().startswith(_COMMENT)]
+    comments = [
+        (k, s.lstrip().lstrip("#%/!;").strip()) for k, s in enumerate(plain, 1) if s.lstrip().startswith(_COMMENT)
+    ]
     separator = _separator([s for _, s in rows])
     lines = [_Line(k, _cells(s, separator)) for k, s in rows]
     return lines, [_Line(k, _cells(s, separator if separator in s else " ")) for k, s in comments if s]
@@ -224,7 +243,9 @@ def _separator(rows: Sequence[str]) -> str:
         if sample and sum(mark in s for s in sample) >= 0.8 * len(sample):
             return mark
     # commas between blanks are separators; a comma inside of every number is a decimal comma
-    if sample and all(len(re.findall(r"\d,\d", s)) and "." not in s and len(s.split()) > 2 for s in sample[1:] or sample):
+    if sample and all(
+        len(re.findall(r"\d,\d", s)) and "." not in s and len(s.split()) > 2 for s in sample[1:] or sample
+    ):
         return " "
     return "," if any("," in s for s in sample) else " "
 
@@ -258,10 +279,18 @@ def _is_header(line: _Line, rest: Sequence[_Line]) -> bool:
 
 
 def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]:
-    columns, other = columns_of(header)
+    _, other = columns_of(header)
     again = next((h for h in header if h and [x.lower() for x in header].count(h.lower()) > 1), None)
     if again is not None:
         raise DatasetError(f"'{name}' has two columns '{again[:40]}'; keep one.")
+    child = next((k for k, h in enumerate(header) if h.lower().endswith("child_frame_id")), None)
+    if child is not None:
+        parent = next((k for k, h in enumerate(header) if h.lower().endswith("frame_id") and k != child), child)
+        plain = [h if k not in (child, parent) else "" for k, h in enumerate(header)]
+        frames: dict[str, list[_Line]] = defaultdict(list)
+        for row in rows:
+            frames[f"{row.cells[parent].strip('/')} to {row.cells[child].strip('/')}"].append(row)
+        return [one for key, mine in frames.items() for one in _table(plain, mine, f"{name}, {key}")]
     kept = [r for r in rows if r.numeric]
     if not kept:
         raise DatasetError(f"'{name}' has a header and no poses below it.")
@@ -324,25 +353,48 @@ def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...
         raise DatasetError(f"'{name}' names no columns x, y, z; it has {', '.join(sorted(at))}.")
     p = take("x", "y", "z")
     if {"qw", "qx", "qy", "qz"} <= set(at):
-        return listing_of(name, p, take("qw", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more)
+        return listing_of(
+            name, p, take("qw", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more
+        )
     for numbered in (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")):
         if set(numbered) <= set(at) and not {"rx", "ry", "rz"} <= set(at):
             return listing_of(name, p, take(*numbered), form="x, y, z, quaternion", **more)
     if {"vx", "vy", "vz"} <= set(at):
         return listing_of(
-            name, p, take("vx", "vy", "vz"), rotation="rotation_vector", angles=angle, form="x, y, z, rotation vector", **more
+            name,
+            p,
+            take("vx", "vy", "vz"),
+            rotation="rotation_vector",
+            angles=angle,
+            form="x, y, z, rotation vector",
+            **more,
         )
     if {"rx", "ry", "rz"} <= set(at):
         return listing_of(name, p, take("rx", "ry", "rz"), angles=angle, form="x, y, z, rx, ry, rz", **more)
     if {"roll", "pitch", "yaw"} <= set(at):
         return listing_of(
-            name, p, take("roll", "pitch", "yaw"), angles=angle, usual="euler_xyz", vector=False, form="x, y, z, roll, pitch, yaw", **more
+            name,
+            p,
+            take("roll", "pitch", "yaw"),
+            angles=angle,
+            usual="euler_xyz",
+            vector=False,
+            form="x, y, z, roll, pitch, yaw",
+            **more,
         )
-    for named, form, words in (("abc", "euler_ZYX", "KUKA A, B, C"), ("wpr", "euler_xyz", "Fanuc W, P, R"), ("oat", "euler_ZYZ", "O, A, T")):
+    for named, form, words in (
+        ("abc", "euler_ZYX", "KUKA A, B, C"),
+        ("wpr", "euler_xyz", "Fanuc W, P, R"),
+        ("oat", "euler_ZYZ", "O, A, T"),
+    ):
         if set(named) <= set(at):
-            return listing_of(name, p, take(*named), rotation=form, angles=angle or "deg", form=f"x, y, z, {words}", **more)
+            return listing_of(
+                name, p, take(*named), rotation=form, angles=angle or "deg", form=f"x, y, z, {words}", **more
+            )
     if {"e1", "e2", "e3"} <= set(at):
-        return listing_of(name, p, take("e1", "e2", "e3"), angles=angle, vector=False, form="x, y, z and three angles", **more)
+        return listing_of(
+            name, p, take("e1", "e2", "e3"), angles=angle, vector=False, form="x, y, z and three angles", **more
+        )
     raise DatasetError(
         f"'{name}' has positions and no rotation that it names: add qw,qx,qy,qz, or rx,ry,rz, or roll,pitch,yaw. It names "
         f"{', '.join(sorted(at))}."

@@ -14,7 +14,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 
 _PARTNERS = {
-    "rotations": "translations", "rotation": "translation", "rots": "trans", "rot": "trans", "rot": "pos", "rvecs": "tvecs", "rvec": "tvec",
+    "rotations": "translations", "rotation": "translation", "rots": "trans", "rot": "trans", "rvecs": "tvecs", "rvec": "tvec",
     "orientations": "positions", "orientation": "position", "r": "t", "q": "t",
 }  # fmt: skip
 _NO_POSES = re.compile(
@@ -122,7 +122,11 @@ def _together(singles: list[tuple[str, Listing]], name: str, at: str) -> Iterato
             yield from (one for _, one in group)
             continue
         group.sort(key=lambda g: natural(g[0]))
-        yield stacked([one for _, one in group], f"{name}, {at.strip('/')} {stem}".replace(",  ", ", "), tuple(k for k, _ in group))
+        yield stacked(
+            [one for _, one in group],
+            f"{name}, {at.strip('/')} {stem}".replace(",  ", ", "),
+            tuple(k for k, _ in group),
+        )
 
 
 def stacked(lists: list[Listing], name: str, ids: tuple[str, ...] = ()) -> Listing:
@@ -145,14 +149,22 @@ def _joined(node: Mapping[Any, Any], name: str, at: str) -> Iterator[tuple[Listi
     """Rotations and translations that stand under two keys, such as R_gripper2base and t_gripper2base."""
     lower = {str(k).lower(): str(k) for k in node}
     for key in node:
-        for word, other in (*_PARTNERS.items(), ("rot", "pos"), ("rotation", "position"), ("quaternions", "positions"), ("quaternion", "position")):
+        for word, other in (
+            *_PARTNERS.items(),
+            ("rot", "pos"),
+            ("rotation", "position"),
+            ("quaternions", "positions"),
+            ("quaternion", "position"),
+        ):
             k = str(key).lower()
             if not k.startswith(word) and not k.endswith(word):
                 continue
             partner = lower.get(other + k[len(word) :]) if k.startswith(word) else lower.get(k[: -len(word)] + other)
             if partner is None or partner == str(key):
                 continue
-            found = _rotations_and_positions(node[key], node[partner], f"{name}, {(at + '/' + str(key)).strip('/')}", str(key))
+            found = _rotations_and_positions(
+                node[key], node[partner], f"{name}, {(at + '/' + str(key)).strip('/')}", str(key)
+            )
             if found is not None:
                 yield found, {str(key), partner}
                 break
@@ -165,7 +177,14 @@ def _partners(node: Mapping[Any, Any], name: str, at: str) -> Iterator[Listing]:
 
 def _rotations_and_positions(R: Any, t: Any, label: str, key: str) -> Listing | None:
     turn, at = (v if isinstance(v, np.ndarray) else _array(v) if isinstance(v, list) else None for v in (R, t))
-    if turn is None or at is None or at.size == 0 or at.size % 3 or turn.dtype.kind not in "fiu" or at.dtype.kind not in "fiu":
+    if (
+        turn is None
+        or at is None
+        or at.size == 0
+        or at.size % 3
+        or turn.dtype.kind not in "fiu"
+        or at.dtype.kind not in "fiu"
+    ):
         return None
     p = np.asarray(at, dtype=float)
     p = p.T if p.ndim == 2 and p.shape[0] == 3 and p.shape[1] != 3 else p.reshape(-1, 3)

@@ -1,0 +1,280 @@
+"""Read every list of poses of a file or folder, whatever its form, and find the robot's and the camera's among them."""
+
+import re
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from weldcal.calibration.data.poses.listing import Listing, listing_of_array
+from weldcal.calibration.data.poses.names import natural, number_of
+from weldcal.calibration.data.poses.storage import read_tree
+from weldcal.calibration.data.poses.text import lists_of_text
+from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
+from weldcal.calibration.errors import DatasetError
+from weldcal.models.array_files import read_npy, read_npz
+from weldcal.models.errors import InputError
+from weldcal.models.files import file_size, read_text
+from weldcal.models.limits import MOST_CELLS
+
+TEXT = (
+    ".csv",
+    ".txt",
+    ".tsv",
+    ".script",
+    ".urscript",
+    ".dat",
+    ".src",
+    ".ls",
+    ".mod",
+    ".prg",
+    ".tum",
+    ".log",
+    ".asc",
+    ".urp",
+    ".sys",
+)
+TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib")
+ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
+ENDINGS = (*TEXT, *TREES, *ARRAYS)
+"""Endings of files that may hold poses."""
+_OWN = ("dataset.yaml", "readme.txt", "notes.txt", "requirements.txt")
+_INVERSE = re.compile(r"(?i)base2(gripper|ee|hand|tool|flange)|cam(era)?2(target|board|marker|object|chess\w*)")
+_CAMERA = re.compile(
+    r"(?i)(target|board|marker|object|chess|pattern|tag|camera|(^|[^a-z])cam([^a-z]|$)|cam\d|eye|optical|sensor|tracking|cpo|(^|[^a-z])b([^a-z]|$)|x_cm|aruco)"
+)
+_ROBOT = re.compile(
+    r"(?i)(robot|hand|gripper|(^|[^a-z])ee([^a-z]|$)|ee2|2ee|effector|flange|tcp|tool|arm|fpe|(^|[^a-z])a([^a-z]|$)|x_bf|base_t|t_base|o_t_ee|(^|[^a-z])pos(es?)?([^a-z]|$))"
+)
+
+
+def read_lists(path: Path) -> list[Listing]:
+    """Every list of poses of one file.
+
+    Raises:
+        DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
+    """
+    try:
+        file_size(path)
+        ending = path.suffix.lower()
+        if ending == ".npz":
+            return lists_of_tree(dict(read_npz(path)), path.name)
+        if ending == ".npy":
+            return [listing_of_array(path.name, _numbers(path, read_npy(path)))]
+        if ending == ".mat":
+            return lists_of_tree(_matlab(path), path.name)
+        if ending == ".xlsx":
+            return _workbook(path)
+        if ending in TREES:
+            return lists_of_tree(read_tree(path), path.name)
+        return lists_of_text(read_text(path), path.name)
+    except DatasetError:
+        raise
+    except InputError as problem:
+        raise DatasetError(str(problem)) from problem
+
+
+def folder_lists(folder: Path) -> list[Listing]:
+    """Every list of poses of a folder: of its files, and of files with one pose each (pos01.yaml, pos02.yaml ...), one level deep.
+
+    Raises:
+        DatasetError: a file that should hold poses cannot be read.
+    """
+    groups: dict[tuple[str, str], list[Path]] = {}
+    for place in (folder, *sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith((".", "_")))):
+        label = "" if place == folder else place.name
+        for path in sorted((p for p in place.iterdir() if _may_hold_poses(p)), key=lambda p: natural(p.name)):
+            stem = re.sub(r"\d+$", "", path.stem) if number_of(path.stem) is not None else path.stem
+            groups.setdefault((label, f"{stem}{path.suffix.lower()}"), []).append(path)
+    found = []
+    for (label, _), files in groups.items():
+        found += _group(files, label)
+    return found
+
+
+def _may_hold_poses(path: Path) -> bool:
+    return (
+        path.is_file()
+        and path.suffix.lower() in ENDINGS
+        and path.name.lower() not in _OWN
+        and not path.name.startswith((".", "_"))
+    )
+
+
+def _group(files: list[Path], label: str) -> list[Listing]:
+    """The lists of one file, or one list of many files with a pose each."""
+    prefix = f"{label}/" if label else ""
+    if len(files) == 1:
+        return [_renamed(one, prefix) for one in read_lists(files[0])]
+    lists = [read_lists(path) for path in files]
+    many = next((p for p, found in zip(files, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
+    if many is not None:
+        if all(len(found) == 1 for found in lists):
+            return [_renamed(found[0], prefix) for found in lists]
+        raise DatasetError(
+            f"'{many.name}' does not hold one pose, as the {len(files) - 1} files beside it do; give one pose a file."
+        )
+    name = f"{prefix}{files[0].name} ... {files[-1].name}"
+    return [stacked([found[0] for found in lists], name, tuple(p.stem for p in files))]
+
+
+def _renamed(listing: Listing, prefix: str) -> Listing:
+    return replace(listing, name=prefix + listing.name) if prefix else listing
+
+
+def two_lists(
+    lists: list[Listing], source: str, robot: str | None = None, camera: str | None = None
+) -> tuple[Listing, Listing]:
+    """The robot's and the camera's list among those of a source.
+
+    Args:
+        robot, camera: part of the name of the list that holds them, as the user states it.
+
+    Raises:
+        DatasetError: a stated name is in none or several lists, or the names do not tell which list is whose.
+    """
+    known = ", ".join(repr(one.name) for one in lists[:8]) or "none"
+    chosen: dict[str, Listing] = {}
+    for who, key in (("robot", robot), ("camera", camera)):
+        if key is None:
+            continue
+        match = [one for one in lists if _key(one.name) == key] or [one for one in lists if key in one.name]
+        if len(match) != 1:
+            raise DatasetError(f"--{who}-poses {key} names {len(match)} of the lists of '{source}': {known}.")
+        chosen[who] = match[0]
+    rest = [one for one in lists if one not in chosen.values()]
+    for who in ("robot", "camera"):
+        if who not in chosen:
+            mine = [one for one in rest if whose(one.name) == who]
+            if len(mine) == 1:
+                chosen[who] = mine[0]
+    rest = [one for one in lists if one not in chosen.values()]
+    if len(chosen) == 1 and len(rest) == 1:
+        chosen["robot" if "camera" in chosen else "camera"] = rest[0]
+    if len(chosen) == 2:
+        return chosen["robot"], chosen["camera"]
+    missing = " and ".join(f"the {who}'s" for who in ("robot", "camera") if who not in chosen)
+    if not lists:
+        raise DatasetError(
+            f"'{source}' holds no poses that can be read: give one list of the robot's and one of the camera's poses."
+        )
+    if len(lists) == 1:
+        raise DatasetError(
+            f"'{source}' holds one list of poses, {known}, and two are needed: the robot's and the camera's. Put both into one folder as "
+            "robot.csv and camera.csv, or name them."
+        )
+    raise DatasetError(
+        f"The names of the lists of '{source}' do not tell {missing} poses: {known}. Name them with --robot-poses and --camera-poses."
+    )
+
+
+def _key(name: str) -> str:
+    return re.split(r"[/,\s]+", name)[-1]
+
+
+def whose(name: str) -> str:
+    """Whose list a name says it is: the robot's, the camera's, or empty."""
+    for part in (_key(name), *reversed(re.split(r"[/,]+", name))):
+        plain = re.sub(r"(?i)^(r|rot|rotation|rvecs?|t|x|h)_", "", part.strip())
+        if re.search(r"(?i)wrt_world|wrt_base", plain):
+            return "robot"
+        if re.search(r"(?i)wrt_(sensor|camera)", plain):
+            return "camera"
+        robot, camera = bool(_ROBOT.search(plain)), bool(_CAMERA.search(plain))
+        if re.search(r"(?i)hand_?eye", plain):
+            continue
+        if robot != camera:
+            return "robot" if robot else "camera"
+        if robot and camera:
+            return "camera" if re.search(r"(?i)(target|board|marker|object|chess|pattern|tag)", plain) else ""
+    return ""
+
+
+def named_inverse(listing: Listing) -> bool:
+    """Whether a list's name says that it holds the inverse poses, such as R_base2gripper."""
+    return _INVERSE.search(_key(listing.name)) is not None
+
+
+def together(robot: Listing, camera: Listing, near_s: float = 0.05) -> tuple[np.ndarray, np.ndarray, str]:
+    """Rows of both lists that belong together, and how: by numbers in their names, in order, or by time.
+
+    Raises:
+        DatasetError: they do not pair.
+    """
+    numbers = [[number_of(i) for i in one.ids] for one in (robot, camera)]
+    if all(numbers) and all(None not in one and len(set(one)) == len(one) for one in numbers):
+        common = sorted(set(numbers[0]) & set(numbers[1]))  # type: ignore[type-var]
+        if len(common) < min(len(robot), len(camera)) and not common:
+            raise DatasetError(
+                f"No row of '{robot.name}' has the number of a row of '{camera.name}'; number both alike."
+            )
+        if set(numbers[0]) != set(numbers[1]) and len(common) < 3:
+            alone = sorted(set(numbers[0]) ^ set(numbers[1]))[:5]  # type: ignore[type-var]
+            raise DatasetError(
+                f"The poses {', '.join(map(str, alone))} have no partner of the same number; add or remove them."
+            )
+        if common:
+            rows = [np.array([one.index(k) for k in common]) for one in numbers]
+            return rows[0], rows[1], "by the numbers in their names"
+    if len(robot) == len(camera):
+        return np.arange(len(robot)), np.arange(len(camera)), "in order"
+    if robot.times is None or camera.times is None:
+        raise DatasetError(
+            f"'{robot.name}' holds {len(robot)} poses and '{camera.name}' holds {len(camera)}; without times or numbers they pair in order, "
+            "one for one: remove what has no partner."
+        )
+    gap = np.abs(camera.times[:, None] - robot.times[None, :])
+    nearest = gap.argmin(axis=1)
+    keep = gap.min(axis=1) <= near_s
+    if not keep.any():
+        raise DatasetError(
+            f"No pose of '{robot.name}' is within {near_s:g} s of a pose of '{camera.name}'; bring both to one clock."
+        )
+    return nearest[keep], np.flatnonzero(keep), "by time"
+
+
+def _numbers(path: Path, value: Any) -> Any:
+    if value.dtype.kind not in "fiu":
+        raise DatasetError(f"'{path.name}' holds words, not numbers.")
+    return value.astype(float)
+
+
+def _matlab(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    try:
+        found = loadmat(path, simplify_cells=True)
+    except NotImplementedError as problem:
+        raise DatasetError(f"'{path.name}' is a MATLAB 7.3 file: save it with save('{path.name}', '-v7').") from problem
+    except Exception as problem:  # scipy raises many kinds for a damaged file
+        raise DatasetError(f"'{path.name}' cannot be read as a MATLAB file ({type(problem).__name__}).") from problem
+    return {k: v for k, v in found.items() if not k.startswith("__")}
+
+
+def _workbook(path: Path) -> list[Listing]:
+    try:
+        from openpyxl import load_workbook
+    except ImportError as problem:
+        raise DatasetError(
+            f"'{path.name}' is an Excel file: save each sheet as CSV, or install the extra 'excel' (pip install openpyxl)."
+        ) from problem
+    try:
+        book = load_workbook(path, read_only=True, data_only=True)
+        sheets = {
+            sheet.title: "\n".join(
+                ";".join("" if cell is None else str(cell) for cell in row)
+                for row in sheet.iter_rows(max_row=MOST_CELLS, values_only=True)
+            )
+            for sheet in book.worksheets
+        }
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as problem:
+        raise DatasetError(
+            f"'{path.name}' cannot be read as an Excel file ({type(problem).__name__}); save it as CSV."
+        ) from problem
+    found = []
+    for title, text in sheets.items():
+        if text.strip():
+            found += lists_of_text(text, f"{path.name}, {title}" if len(sheets) > 1 else path.name)
+    return found

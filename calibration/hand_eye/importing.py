@@ -1,0 +1,332 @@
+"""Import pairs of robot and camera poses: find the two lists, pair their rows, and let the data choose how they are read."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.listing import Listing
+from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
+from weldcal.calibration.data.poses.readings import PoseReading, pick
+from weldcal.calibration.errors import DatasetError, InconsistentPoses
+from weldcal.calibration.hand_eye.conventions import UNITS, Agreement, Decision, decide
+from weldcal.models.arrays import Array
+
+_MOST_COMPARED = 60  # poses that decide the reading: more do not make it surer
+_FEWEST = 4  # with fewer pairs the data decide nothing
+_SHIFTS = (1, -1, 2, -2, 3, -3)
+_DISTINCT = 1e-7  # of a rotation matrix, and of the extent of positions
+_MILLIMETRES_FROM, _METRES_TO = 80.0, 10.0  # median distances of a robot's poses from its base, in mm and m
+_NEAREST_M, _FARTHEST_M = 0.02, 20.0
+_SCALE_SIGMA = 4.0
+_LEAST_SCALE = 0.1  # of the logarithm: a factor that is nearer to a unit is a matter of the result, which names it
+
+
+@dataclass(frozen=True)
+class StatedForms:
+    """What the user states of the two lists: form and name of each, and the unit of lengths of both."""
+
+    robot: PoseForm = field(default_factory=PoseForm)
+    camera: PoseForm = field(default_factory=PoseForm)
+    robot_poses: str | None = None
+    camera_poses: str | None = None
+    unit: str | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImportedPairs:
+    """Pairs of poses, (n, 4, 4) each, in metres, and how they were understood.
+
+    Attributes:
+        robot, camera: X_BF and X_CM.
+        reading: for each list its file, form, unit, reading and the rows left out.
+        notes: sentences for the reader.
+        ids: names of the rows that are left, (n) or empty.
+        rows: rows (from 0) of the robot's and of the camera's list that were paired.
+        counts: rows of both lists.
+        metres: of the robot's unit of length.
+    """
+
+    robot: Array
+    camera: Array
+    reading: Mapping[str, Mapping[str, object]]
+    notes: tuple[str, ...]
+    ids: tuple[str, ...]
+    rows: tuple[Array, Array]
+    counts: tuple[int, int]
+    metres: float
+
+
+def import_pairs(lists: list[Listing], source: str, mounting: str, stated: StatedForms) -> ImportedPairs:
+    """The pairs of two lists of poses, each read as the data and the user's statements say.
+
+    Args:
+        lists: those of the source.
+        source: the file or folder, for messages.
+        mounting: eye_in_hand or eye_on_base.
+        stated: what the user states.
+
+    Raises:
+        DatasetError: a list is missing, the rows do not pair, a unit cannot be told.
+        InconsistentPoses: several readings agree with the data and differ in the result, or one factor scales the camera's positions.
+    """
+    robot, camera = two_lists(lists, source, stated.robot_poses, stated.camera_poses)
+    robot = robot.stated(_with_name(robot, stated.robot), "--robot-form")
+    camera = camera.stated(_with_name(camera, stated.camera), "--camera-form")
+    rows_r, rows_c, how = together(robot, camera)
+    keep = robot.good[rows_r] & camera.good[rows_c]
+    notes = _left_out(robot, rows_r, ~keep) + _left_out(camera, rows_c, ~keep)
+    rows_r, rows_c = rows_r[keep], rows_c[keep]
+    n = len(rows_r)
+    if n == 0:
+        raise DatasetError(f"'{source}' holds no pair of poses: each row lacks the robot's or the camera's pose.")
+    a, b = [pick(one, rows) for one, rows in ((robot.readings, rows_r), (camera.readings, rows_c))]
+    _check_motion(a[0], robot, "robot")
+    _check_motion(b[0], camera, "camera")
+    known = mounting in ("eye_in_hand", "eye_on_base")
+    decision, shift = _decided(a, b, mounting == "eye_in_hand", n) if known else (None, 0)
+    if decision is None:
+        A, B = a[0], b[0]
+        if len(a) > 1 or len(b) > 1:
+            notes.append(
+                f"{n} pairs do not show how the poses are written; they were read as {A.words} and {B.words}. State it with --robot-form and "
+                "--camera-form."
+            )
+        units = _units(A, B, robot, camera, None, stated, source)
+    else:
+        best = decision.best
+        _require_one(decision, source, mounting)
+        A, B = [
+            next(r for r in _changed(listed, one) if r.form == one.form)
+            for listed, one in ((a, best.robot), (b, best.camera))
+        ]
+        notes += _sentences(decision, robot, camera, shift)
+        units = _units(A, B, robot, camera, best, stated, source)
+    if shift:
+        A, B = (
+            replace(A, X=A.X[max(shift, 0) : n + min(shift, 0)]),
+            replace(B, X=B.X[max(-shift, 0) : n + min(-shift, 0)]),
+        )
+        rows_r, rows_c = rows_r[max(shift, 0) : n + min(shift, 0)], rows_c[max(-shift, 0) : n + min(-shift, 0)]
+    reading = {
+        who: {
+            "file": listing.name,
+            "form": listing.form,
+            "unit": unit,
+            "reading": one.form,
+            "rows": len(listing),
+            "left_out": [f"row {row + 1}: {why}" for row, why in listing.left_out],
+        }
+        for who, listing, one, unit in (("robot", robot, A, units[0][1]), ("camera", camera, B, units[1][1]))
+    }
+    if how == "by time" or (shift and how):
+        notes.append(f"The rows were paired {how}.")
+    metric = [_metric(one.X, factor) for one, (factor, _) in zip((A, B), units, strict=True)]
+    ids = robot.ids or camera.ids
+    rows = rows_r if robot.ids else rows_c
+    return ImportedPairs(
+        robot=metric[0],
+        camera=metric[1],
+        reading=reading,
+        notes=tuple(notes),
+        ids=tuple(ids[k] for k in rows) if ids else (),
+        rows=(rows_r, rows_c),
+        counts=(len(robot), len(camera)),
+        metres=units[0][0],
+    )
+
+
+def _with_name(listing: Listing, form: PoseForm) -> PoseForm:
+    """The stated form, inverted where the list's name says so."""
+    return replace(form, frame="base_in_flange") if named_inverse(listing) and form.frame == "flange_in_base" else form
+
+
+def _metric(X: Array, factor: float) -> Array:
+    out = X.copy()
+    out[:, :3, 3] *= factor
+    return out
+
+
+def _changed(listed: list[PoseReading], wanted: PoseReading) -> list[PoseReading]:
+    """The readings, and the wanted one's changes applied to them all."""
+    found = list(listed)
+    for change in ("transposed", "left_handed", "inverse"):
+        if wanted.form.endswith(f",{change}"):
+            found += [one.changed(change) for one in listed if f"{one.form},{change}" == wanted.form]
+    return found
+
+
+def _left_out(listing: Listing, rows: Array, out: Array) -> list[str]:
+    reasons = dict(listing.left_out)
+    found = [(int(r), reasons[int(r)]) for r in rows[out] if int(r) in reasons]
+    if not found:
+        return []
+    which = ", ".join(listing.ids[r] if listing.ids else str(r + 1) for r, _ in found[:8])
+    return [f"'{listing.name}': row{'s' if len(found) > 1 else ''} {which} left out. {found[0][1]}"]
+
+
+def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
+    """Refuses a list whose poses are all one. Raises InconsistentPoses."""
+    X = reading.X
+    if len(X) > 1 and float(np.abs(X - X[0]).max()) <= _DISTINCT * max(float(np.abs(X[:, :3, 3]).max()), 1.0):
+        raise InconsistentPoses(
+            f"The {who} has the same pose in all {len(X)} rows of '{listing.name}': it does not change while the other list does. Check that "
+            "each sample stores the present pose."
+        )
+
+
+def _decided(a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int) -> tuple[Decision | None, int]:
+    """The decision, and by how many rows the camera's list is shifted; None where the data decide nothing."""
+    if n < _FEWEST:
+        return None, 0
+    some = np.unique(np.linspace(0, n - 1, min(n, _MOST_COMPARED)).round().astype(int))
+    found = decide(pick(a, some), pick(b, some), eye_in_hand=eye_in_hand)
+    if found.best.agrees:
+        return found, 0
+    best, by = found, 0
+    for shift in _SHIFTS:
+        if n - abs(shift) < max(_FEWEST, 6):
+            continue
+        rows = np.arange(n - abs(shift))[:_MOST_COMPARED]
+        one = decide(pick(a, rows + max(shift, 0)), pick(b, rows + max(-shift, 0)), eye_in_hand=eye_in_hand)
+        if one.best.agrees and one.best.cost < best.best.cost:
+            best, by = one, shift
+    return (best, by) if best.best.agrees or len(a) > 1 or len(b) > 1 else (None, 0)
+
+
+def _require_one(decision: Decision, source: str, mounting: str) -> None:
+    """Refuses readings that agree equally and differ in the result. Raises InconsistentPoses."""
+    best = decision.best
+    other = "eye_on_base" if mounting == "eye_in_hand" else "eye_in_hand"
+    if not best.agrees:
+        if decision.rivals or best.changed:
+            runner = decision.rivals[0] if decision.rivals else best
+            raise InconsistentPoses(
+                f"The poses of '{source}' contradict each other in every known reading. Best: {_pair_words(best)}, "
+                f"{_residual(best)}; then {_pair_words(runner)}, {_residual(runner)}. Check that row k of both lists is of the same moment, "
+                f"or state the forms with --robot-form and --camera-form."
+            )
+        return
+    if best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
+        raise InconsistentPoses(
+            f"The poses of '{source}' contradict each other as given ({mounting}), and agree ({_residual(best)}) in three ways that the data "
+            f"cannot tell apart: the camera is mounted {other} (--mounting {other}), the robot poses are inverted (--robot-form "
+            f"{_option(best.robot, 'inverse')}), or the camera poses are inverted (--camera-form {_option(best.camera, 'inverse')}). State "
+            "the one that is true."
+        )
+    if decision.rivals:
+        rival = decision.rivals[0]
+        raise InconsistentPoses(
+            f"The poses of '{source}' agree in more than one reading, and the results differ: {_pair_words(best)} ({_residual(best)}), or "
+            f"{_pair_words(rival)} ({_residual(rival)}). State the right one: {_options(best)}, or {_options(rival)}."
+        )
+
+
+def _option(reading: PoseReading, change: str) -> str:
+    plain = reading.form.removesuffix(f",{change}")
+    return f"{plain},{change}"
+
+
+def _options(one: Agreement) -> str:
+    return f"--robot-form {one.robot.form} --camera-form {one.camera.form}"
+
+
+def _pair_words(one: Agreement) -> str:
+    return f"robot as {one.robot.words}, camera as {one.camera.words}"
+
+
+def _residual(one: Agreement) -> str:
+    share = 100.0 * one.position / max(one.extent, 1e-12)
+    return f"residuals {np.degrees(one.rotation):.3g} degrees and {share:.2g} % of the motion"
+
+
+def _sentences(decision: Decision, robot: Listing, camera: Listing, shift: int) -> list[str]:
+    """What was chosen where there was a choice."""
+    best, found = decision.best, []
+    chosen = [
+        f"{who} poses read as {one.words}"
+        for who, one, listing in (("robot", best.robot, robot), ("camera", best.camera, camera))
+        if len(listing.readings) > 1 or one.form != listing.readings[0].form
+    ]
+    if chosen:
+        text = "; ".join(chosen)
+        text = text[0].upper() + text[1:] + f": {_residual(best)}"
+        if decision.same:
+            text += "; another reading is the same for these poses"
+        elif decision.next is not None:
+            text += f"; the next best reading leaves {_residual(decision.next).removeprefix('residuals ')}"
+        found.append(text + ".")
+    if shift:
+        later = "later" if shift > 0 else "earlier"
+        found.append(
+            f"The camera's rows belong to robot poses {abs(shift)} row{'s' if abs(shift) > 1 else ''} {later}: they were shifted."
+        )
+    return found
+
+
+def _units(
+    A: PoseReading,
+    B: PoseReading,
+    robot: Listing,
+    camera: Listing,
+    best: Agreement | None,
+    stated: StatedForms,
+    source: str,
+) -> tuple[tuple[float, str], tuple[float, str]]:
+    """Metres for the units of the robot's and of the camera's positions, with the units' names.
+
+    Stated units win. Else the robot's follows from its reach, and the camera's from the ratio of the motions.
+    """
+    words = [robot.unit or stated.unit or "", camera.unit or stated.unit or ""]
+    for listing in (robot, camera):
+        if listing.unit and stated.unit and listing.unit != stated.unit:
+            raise DatasetError(
+                f"'{listing.name}' states lengths in {listing.unit}, and --unit states {stated.unit}; correct one of them."
+            )
+    median = float(np.median(np.linalg.norm(A.X[:, :3, 3], axis=1)))
+    if not words[0]:
+        if median > _MILLIMETRES_FROM:
+            words[0] = "mm"
+        elif median <= _METRES_TO:
+            words[0] = "m"
+        else:
+            raise DatasetError(
+                f"The robot positions of '{source}' have a median of {median:.3g} from the base: that is neither metres nor millimetres of an "
+                "arm. State the unit with --unit m, mm, cm or inch."
+            )
+    unit_r = UNITS[words[0]]
+    if median * unit_r > _FARTHEST_M or (words[0] != "m" and median * unit_r < _NEAREST_M):
+        raise DatasetError(
+            f"The robot positions of '{source}' have a median of {median * unit_r:.3g} m from the base, in {words[0]}; correct --unit."
+        )
+    ratio = None
+    if best is not None and best.agrees and best.scale_sigma * _SCALE_SIGMA < _LEAST_SCALE:
+        ratio = best.scale * unit_r  # metres per camera unit
+    if not words[1]:
+        words[1] = _camera_unit(ratio, words[0], B, source)
+    elif ratio is not None and abs(np.log(ratio / UNITS[words[1]])) > max(
+        _LEAST_SCALE, _SCALE_SIGMA * best.scale_sigma
+    ):  # type: ignore[union-attr]
+        _refuse_scale(ratio, words[1], source)
+    return (unit_r, words[0]), (UNITS[words[1]], words[1])
+
+
+def _camera_unit(ratio: float | None, robot: str, B: PoseReading, source: str) -> str:
+    if ratio is None:
+        far = float(np.median(np.linalg.norm(B.X[:, :3, 3], axis=1)))
+        return "mm" if far > _MILLIMETRES_FROM else "m" if far <= _METRES_TO else robot
+    near = min(UNITS, key=lambda u: abs(np.log(ratio / UNITS[u])))
+    if abs(np.log(ratio / UNITS[near])) > _LEAST_SCALE:
+        _refuse_scale(ratio, "m", source)
+    return near
+
+
+def _refuse_scale(ratio: float, unit: str, source: str) -> None:
+    factor = ratio / UNITS[unit]
+    squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
+    raise InconsistentPoses(
+        f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g} (from {unit} to the right length): "
+        f"the size of the board's squares or of the marker is wrong by that factor{squares}, or they have another unit. Correct the size, "
+        f"or multiply the positions by {factor:.4g}."
+    )
