@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from weldcal.calibration.data.header import PoseForm
-from weldcal.calibration.data.poses.table import BASES, FLANGES
+from weldcal.calibration.data.poses.names import BASES, FLANGES
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.models.arms.chain import chain_poses, load_chain

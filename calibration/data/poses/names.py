@@ -17,6 +17,11 @@ MOUNTINGS = {
 """This package's names of the two usual mountings, and other tools' words for them."""
 
 
+FLANGES = ("tool0", "flange", "tool0_controller", "wrist_3_link", "ee_link", "link_6", "panda_link8", "fr3_link8")
+"""Frames that arms' descriptions call their flange, the likeliest first."""
+BASES = ("base", "base_link", "world")
+
+
 def mounting_name(word: str) -> str:
     """A mounting's name in this package ("Eye-to-Hand" is eye_on_base); an unknown word comes back in lower case."""
     plain = re.sub(r"[\s\-]+", "_", word.strip()).lower()

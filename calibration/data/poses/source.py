@@ -11,7 +11,7 @@ from weldcal.calibration.data.poses.form import PoseList
 from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import ENDINGS as READ
 from weldcal.calibration.data.poses.lists import read_lists, whose
-from weldcal.calibration.data.poses.names import natural, number_of
+from weldcal.calibration.data.poses.names import BASES, FLANGES, natural, number_of
 from weldcal.calibration.data.poses.readings import pick
 from weldcal.calibration.data.poses.trees import stacked
 from weldcal.calibration.data.tables import read_rows
@@ -20,9 +20,6 @@ from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-FLANGES = ("tool0", "flange", "tool0_controller", "wrist_3_link", "ee_link", "link_6", "panda_link8", "fr3_link8")
-"""Frames that arms' descriptions call their flange, the likeliest first."""
-BASES = ("base", "base_link", "world")
 _STEMS = (
     "poses",
     "robot_poses",
