@@ -19,8 +19,8 @@ from weldcal.systems.cell import build_cell as build
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.commands.demo import run_procedure
 from weldcal.tools.commands.hand_eye import solve_pairs
-from weldcal.tools.commands.procedures import run_procedure
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.outcomes.calibration import CalibrationReport, VerifyReport
 from weldcal.tools.report.run import RunOptions

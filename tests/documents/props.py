@@ -25,7 +25,7 @@ from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.mesh import extrude
 from weldcal.models.scanners import get_scanner
 from weldcal.models.tools.loading import WELDING
-from weldcal.tools.scenarios.new_cell import write_cell
+from weldcal.tools.commands.cell.new import write_cell
 from weldcal.tools.studies.touch.world import touch_world
 
 # An angle bracket of plates 10 mm thick; lengths in mm. Its inner corner is the longest concave edge.

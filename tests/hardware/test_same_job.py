@@ -16,8 +16,8 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import run_scenario
-from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.commands.run import chosen_robot
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions

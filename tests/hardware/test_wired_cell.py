@@ -25,7 +25,7 @@ from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import Emulator
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions

@@ -27,8 +27,8 @@ from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Truth
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.demo import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.commands.run import JobRun
+from weldcal.tools.commands.weld import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import calibration_error, weld_outcome
 from weldcal.tools.studies.cell.study import figures

@@ -25,7 +25,7 @@ from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.procedures import RUNNERS, kind_of
+from weldcal.tools.commands.demo import RUNNERS, kind_of
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.report.profiler_live import ProfilerLive
 from weldcal.tools.report.run import RunOptions

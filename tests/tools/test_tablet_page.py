@@ -19,7 +19,7 @@ from tests.browser import Browser
 from tests.places import ROOT
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.tablet.page.serve import LARGEST_CSV, TabletServer, open_server, page, tablet_host
+from weldcal.tools.commands.tablet.serve import LARGEST_CSV, TabletServer, open_server, page, tablet_host
 
 PAGE = ROOT / "tools/commands/tablet/page/tablet.html"
 WIDTH, HEIGHT = 1000, 700

@@ -23,9 +23,9 @@ from weldcal.models.result_files import require_whole
 from weldcal.systems.cell import Cell
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.dataset_case import dataset_case
-from weldcal.tools.commands.record import RECORDING
-from weldcal.tools.commands.replay import replay
-from weldcal.tools.commands.run_files import SCANS, SUMMARY, live_case
+from weldcal.tools.commands.replay import replay_recording
+from weldcal.tools.commands.run import RECORDING
+from weldcal.tools.commands.weld import SCANS, SUMMARY, live_case
 from weldcal.tools.commands.weld_causes import weld_causes
 from weldcal.tools.outcomes.doctor import DoctorReport, worded
 from weldcal.welding.record.weld_log import CSV_NAME, load_weld_log
@@ -120,7 +120,7 @@ def _recorded(path: Path, progress: Progress) -> Diagnosis:
             cases.append(case)
         reasons.append(cell.job.command(root).reason or "")
 
-    replay(path, progress, look)
+    replay_recording(path, progress, look)
     found = diagnose(cases[0]) if cases else Diagnosis((), 0, float("nan"))
     return _both(found, weld_causes(None, reasons[0]))
 

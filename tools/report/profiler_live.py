@@ -33,6 +33,26 @@ from weldcal.tools.report.run import RunOptions, robot_timing
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 
+WITHIN_MM = 0.3
+_NO_KEY = "No scenario key states the error that is allowed: compare it with what your job allows."
+_COLUMNS = {
+    "seed": "seed",
+    "state": "",
+    "edge_error_mm": "edge, mm",
+    "edge_sigma_mm": "sigma",
+    "edge_nees": "NEES",
+    "sphere_error_mm": "sphere, mm",
+    "sphere_sigma_mm": "sigma",
+    "sphere_nees": "NEES",
+    "largest_sigmas": "largest",
+    "sphere_tip_error_mm": "tip, mm",
+    "torch_mean_mm": "torch, mm",
+    "torch_max_mm": "at most",
+}
+RUST, GREY, GREEN = "#c4622d", "#9aa3ab", "#4b7f52"
+PARTS = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
+_COLOURS = {"edge": OURS, "sphere": RUST}
+
 JOINT_3_SIGMA = chi2_quantile(chi2_share(9.0, 1), 6)  # 20.06
 
 
@@ -146,10 +166,6 @@ def live_outcome(run: Run[AddedProfilerJob]) -> LiveOutcome:
 def _off(p: Array, line: SeamCurve) -> PathOutcome:
     error = path_error(p, line)
     return PathOutcome(error.s, error.lateral, error.height)
-
-
-WITHIN_MM = 0.3
-_NO_KEY = "No scenario key states the error that is allowed: compare it with what your job allows."
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,22 +362,6 @@ def seeds_report(
     )
 
 
-_COLUMNS = {
-    "seed": "seed",
-    "state": "",
-    "edge_error_mm": "edge, mm",
-    "edge_sigma_mm": "sigma",
-    "edge_nees": "NEES",
-    "sphere_error_mm": "sphere, mm",
-    "sphere_sigma_mm": "sigma",
-    "sphere_nees": "NEES",
-    "largest_sigmas": "largest",
-    "sphere_tip_error_mm": "tip, mm",
-    "torch_mean_mm": "torch, mm",
-    "torch_max_mm": "at most",
-}
-
-
 def _poses(o: LiveOutcome) -> dict[str, PoseOutcome]:
     return {n: p for n in ("edge", "sphere") if (p := getattr(o, n)) is not None}
 
@@ -383,11 +383,6 @@ def _row(name: str, p: PoseOutcome) -> tuple[str, ...]:
 
 def _shown(value: object) -> str:
     return fixed(value, 2) if isinstance(value, float) else "–" if value is None else str(value)
-
-
-RUST, GREY, GREEN = "#c4622d", "#9aa3ab", "#4b7f52"
-PARTS = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
-_COLOURS = {"edge": OURS, "sphere": RUST}
 
 
 def sigmas_picture(poses: Mapping[str, Sequence[PoseOutcome]]) -> bytes:

@@ -297,7 +297,7 @@ def tablet() -> Made:
 
 def finger() -> Made:
     """`finger calibrate` with touches."""
-    from weldcal.tools.commands.finger_calibrate import FingerReport, finger_page
+    from weldcal.tools.commands.cell.finger import FingerReport, finger_page
     from weldcal.welding.finger.calibration import Intrinsics, TipCalibration
 
     camera = Intrinsics(np.diag([900.0, 900.0, 1.0]), np.zeros(5), 640, 480, 0.2, 0.3, 20, 5, 1.0)

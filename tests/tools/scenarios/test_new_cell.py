@@ -11,7 +11,7 @@ from pydrake.common.yaml import yaml_load
 
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario, scenario_names
-from weldcal.tools.scenarios.new_cell import SCHEMA, write_cell
+from weldcal.tools.commands.cell.new import SCHEMA, write_cell
 
 
 @pytest.mark.parametrize("name", scenario_names())

@@ -18,8 +18,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario, ToolFile
 from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
-from weldcal.tools.cli.scenarios import edge_numbers
-from weldcal.tools.scenarios.new_cell import OwnPart, write_cell
+from weldcal.tools.commands.cell.new import OwnPart, edge_numbers, write_cell
 
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])  # an L, mm
 

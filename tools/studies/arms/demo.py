@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.commands.demo import run_demo
+from weldcal.tools.commands.weld import run_demo
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import csv_text

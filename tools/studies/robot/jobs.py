@@ -14,7 +14,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
-from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.run import RunOptions
