@@ -21,6 +21,7 @@ from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.jobs.weld.settings import job_plan
 from weldcal.systems.motion.clear_moves import clear_poses
+from weldcal.systems.person import Person
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
@@ -360,6 +361,16 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
     write_result(result, JobRun(found, None, "simulated"))
     assert result.summary()["state"] == "held"
     assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_a_run_that_is_held_at_once_has_completed_nothing() -> None:
+    person, shares = Person(), []
+    person.end()
+    cell = build_cell(load_scenario("straight_groove", TOLD), person=person)
+    found = run_cell(cell, lambda stage, share: shares.append(share))
+    assert found.held
+    assert max(shares) < 0.05
+    assert JobRun(found, None, "simulated").share(0.985) == shares[-1]
 
 
 def test_an_error_in_the_run_lets_go_of_the_robot() -> None:

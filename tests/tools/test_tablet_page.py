@@ -21,7 +21,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.tablet.serve import LARGEST_CSV, TabletServer, open_server, page, tablet_host
 
-PAGE = ROOT / "tools/commands/tablet/page/tablet.html"
+PAGE = ROOT / "tools/commands/tablet/tablet.html"
 WIDTH, HEIGHT = 1000, 700
 PX_PER_MM = 4.0
 

@@ -87,6 +87,10 @@ class JobRun:
     robot: str
     live: LiveView | None = None
 
+    def share(self, done: float) -> float:
+        """The completed share while results are written: ``done`` of a completed run; a held one keeps what it had reached."""
+        return self.run.share if self.run.held else done
+
     @property
     def cell(self) -> Cell[Any]:
         """The cell that ran."""

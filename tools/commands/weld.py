@@ -97,7 +97,7 @@ def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = n
         InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
     """
     finished = run_job(scenario, options, progress, "")
-    progress("measure and write", 0.985)
+    progress("measure and write", finished.share(0.985))
     result = measure(finished.run, options, finished.robot)
     write_result(result, finished)
     return result

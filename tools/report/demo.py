@@ -370,7 +370,8 @@ def _process(result: DemoResult) -> list[tuple[str, str]]:
 def _timing(result: DemoResult) -> list[tuple[str, ...]]:
     """Simulated and wall seconds per phase, phases of one name added up."""
     phases = result.run.phases
-    ends = [*phases[1:], ("", float(result.run.root.get_time()), result.run.wall_seconds)]
+    # a run that is ended before its first phase has none
+    ends = [*phases, ("", float(result.run.root.get_time()), result.run.wall_seconds)][1:]
     total: dict[str, list[float]] = {}
     for (name, t0, w0), (_, t1, w1) in zip(phases, ends, strict=True):
         spent = total.setdefault(phase_words(name), [0.0, 0.0])

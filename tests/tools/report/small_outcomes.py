@@ -194,7 +194,7 @@ def mounting() -> Made:
     return report.first, mounting_report(report, None)
 
 
-def _demo(estimate: Any, *, held: bool) -> Made:
+def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
     sequencer = SimpleNamespace(
         GetMyContextFromRoot=lambda root: root, job_state=lambda context: SimpleNamespace(warnings=("A remark.",))
     )
@@ -206,6 +206,8 @@ def _demo(estimate: Any, *, held: bool) -> Made:
     )
     if held:
         run.held, run.reason = True, "The tag was lost."
+    if not begun:
+        run.phases = []
     status = CalibrationStatus(
         11, 10, tuple(OBSERVATIONS), (("p77", "No ring."),), estimate, 9e-5,
         history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)), verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
@@ -222,6 +224,11 @@ def demo() -> Made:
 def held() -> Made:
     """`demo` that was held before it had a pose."""
     return _demo(None, held=True)
+
+
+def unbegun() -> Made:
+    """`demo` that the operator ended before its first phase."""
+    return _demo(None, held=True, begun=False)
 
 
 RECORD = ProfilerRecord("sphere, affine", X.rotation().matrix(), np.array([0.03, -0.07, 0.16]), COVARIANCE)
@@ -317,6 +324,6 @@ def finger() -> Made:
 PAGES: dict[str, Callable[[], Made]] = {
     made.__name__: made
     for made in (
-        calibrate, verify, motion, monitor, hand_eye, mounting, demo, held, profiler, seam, profiler_live, tablet, finger,
+        calibrate, verify, motion, monitor, hand_eye, mounting, demo, held, unbegun, profiler, seam, profiler_live, tablet, finger,
     )
 }  # fmt: skip

@@ -72,7 +72,7 @@ def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progres
         InputError, RobotRefused: see run_job; nothing has been written or moved. A held run also returns a result.
     """
     finished = run_job(scenario, options, progress, "profiler_job")
-    progress("measure and write", 0.97)
+    progress("measure and write", finished.share(0.97))
     live = ProfilerLive(options, finished.run, live_outcome(finished.run), finished.robot)
     write_live(live, finished)
     return live

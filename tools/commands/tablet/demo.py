@@ -91,7 +91,7 @@ def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress)
     """
     finished = run_job(scenario, options, progress, "tablet")
     run = finished.run
-    progress("calibrate and write", 0.96)
+    progress("calibrate and write", finished.share(0.96))
     options.out.mkdir(parents=True, exist_ok=True)
     demo = TabletDemo(options, run, finished.robot)
     if not run.held:
