@@ -175,7 +175,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
         write_scans(path / f"cell_{k}" / f"2026-0{m}", 6, 10 * k + m) for k in (1, 2) for m in (1, 2)
     ],
     "my_result": _calibration,
-    "my_cell": lambda path: write_cell(path, "s_groove"),
+    "my_cell": lambda path: write_cell(path, "s_groove")[0],
     "short.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "short_cell.yaml": lambda path: path.write_text(f"extends: my_cell/cell.yaml\n{SHORT_JOB}", encoding="utf-8"),
     "short_wired.yaml": lambda path: path.write_text(f"extends: wired_s_groove\n{SHORT_WIRED}", encoding="utf-8"),

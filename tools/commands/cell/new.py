@@ -66,12 +66,11 @@ FILES = {
     "ros": "tool_pose.csv  X_BF of each scan as 'rostopic echo -p' prints it, in the order of clouds/",
     "mcap": "recording/     a ROS 2 recording: PointCloud2 and PoseStamped",
 }
-CELL, SCHEMA = "cell.yaml", "cell.schema.json"
+CELL, UNFINISHED, SCHEMA = "cell.yaml", "unfinished.yaml", "cell.schema.json"
 WIDTH = 120
 LEFT_OUT = ("extends", "visualization")
 HEAD = """# yaml-language-server: $schema={schema}
-# A cell of your own. It runs as it is, in simulation:
-#   weldcal demo --scenario {path}
+{state}
 # A key behind a `#` has its default: remove the `#` to change it. Positions are in the robot's base, in metres; `rpy_deg` are roll,
 # pitch and yaw about fixed axes. All keys: docs/scenario.md. With real devices: docs/your_cell.md, and
 #   weldcal check-cell {path}
@@ -82,6 +81,14 @@ OPEN_ABOVE = 0.3  # z of the joint's bisector
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
 PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
+
+
+RUNS = """# A cell of your own. It runs as it is, in simulation:
+#   weldcal demo --scenario {path}"""
+CANNOT_WELD = """# A cell of your own, unfinished: the arm cannot weld the seam of its part yet.
+# {reason}
+# Change seams or pose_guess of the workpiece, then run it in simulation:
+#   weldcal demo --scenario {path}"""
 
 
 @command("new", common=("seed", "json", "debug"), short_help="Write a cell or a dataset of your own to start from.")
@@ -116,8 +123,16 @@ def new(
     else:
         numbers = tuple(edge_numbers(edges))
         own = None if part is None else OwnPart(part, numbers, joint)
-        written = write_cell(folder, base, own, WELDING if tool else None)
+        written, reason = write_cell(folder, base, own, WELDING if tool else None)
         following = f"weldcal demo --scenario {written}"
+        if reason:
+            assert part is not None
+            problem = (
+                f"The arm cannot weld {part.name} in any of the poses that were tried: {reason} "
+                f"Choose other edges from weldcal part {part} and give --edges, or change {written}."
+            )
+            summary = {"state": "unfinished", "reason": problem, "written": str(written)}
+            return Outcome(summary, values={"written": str(written)}, problem=problem)
     summary = {"state": "done", "written": str(written), "next": following}
     return Outcome(summary, values={"written": str(written), "next": following})
 
@@ -163,8 +178,12 @@ class OwnPart:
     joint: str | None = None
 
 
-def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path | None = None) -> Path:
-    """Write cell.yaml and its JSON schema into a folder, with a part and a tool of one's own, and return the path of cell.yaml.
+def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path | None = None) -> tuple[Path, str]:
+    """Write cell.yaml and its JSON schema into a folder, with a part and a tool of one's own.
+
+    Returns:
+        The path of cell.yaml, and "". Where the arm can weld the part's seam in no pose that was tried: the path of
+        unfinished.yaml, and the reason in the pose that came nearest.
 
     Raises:
         InputError: there is one already, `base` is no scenario, or the part cannot be used.
@@ -180,15 +199,23 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     if tool is not None:
         add_tool(scenario, folder, tool)
     write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
-    _write(path, scenario)
-    if part is not None and scenario.workpiece is not None and (place := weldable_place(load_scenario(str(path)))):
-        scenario.workpiece.pose_guess = place
-        _write(path, scenario)
-    return path
+    unfinished = folder / UNFINISHED
+    if part is not None:
+        assert scenario.workpiece is not None
+        _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
+        scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)))
+        if reason:
+            words = "\n# ".join(textwrap.wrap(reason, WIDTH - 2))
+            _write(unfinished, scenario, CANNOT_WELD.format(reason=words, path=unfinished))
+            return unfinished, reason
+    _write(path, scenario, RUNS.format(path=path))
+    unfinished.unlink(missing_ok=True)
+    return path, ""
 
 
-def _write(path: Path, scenario: Scenario) -> None:
-    write_atomic(path, HEAD.format(schema=SCHEMA, path=path) + "".join(_parts(scenario)))
+def _write(path: Path, scenario: Scenario, state: str) -> None:
+    head = HEAD.format(schema=SCHEMA, path=path, state=state)
+    write_atomic(path, head + "".join(_parts(scenario)))
 
 
 def _parts(scenario: Scenario) -> Iterator[str]:
@@ -251,32 +278,49 @@ def add_part(scenario: Scenario, folder: Path, part: Path, edges: list[int], joi
     shutil.copyfile(part, folder / part.name)
 
 
-def weldable_place(scenario: Scenario) -> PoseConfig | None:
-    """The first of some poses on the table in which the arm can weld the seams of a scenario's part; None where there is none."""
+def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
+    """The first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
+
+    Where there is none: the scenario's own pose, and the reason of the try in which the most seams could be welded.
+    """
+    assert scenario.workpiece is not None
+    own = scenario.workpiece.pose_guess
     try:
         station = make_station(scenario, 0)
-    except WeldcalError:
-        return None  # a run says why
+    except WeldcalError as error:
+        return own, str(error)
+    nearest = (-1, "")
     try:
         part = station.cad
         if not isinstance(part, Part) or station.tool is None:
-            return None
+            return (
+                own,
+                "Only a part from a file and a welding tool can be planned. Choose another scenario with --from.",
+            )
         seams = [numbered(part, k) for k in range(seam_count(part))]
         line = np.concatenate([seam.seam_P for seam in seams])
         for middle in (0.5 * part.mesh.bounds.sum(axis=0), 0.5 * (line.min(axis=0) + line.max(axis=0))):
             for turn in TURNS_DEG:
                 guess = _standing(part.mesh, turn, middle, scenario)
-                if all(_weldable(scenario, station, k, seam, guess) for k, seam in enumerate(seams)):
-                    return guess
+                welded, reason = _first_refusal(scenario, station, seams, guess)
+                if not reason:
+                    return guess, ""
+                if welded > nearest[0]:
+                    nearest = welded, reason
     finally:
         station.close()
-    return None
+    return own, nearest[1]
 
 
-def _weldable(scenario: Scenario, station: Station, number: int, part: WeldPart, guess: PoseConfig) -> bool:
-    config = servo_config(scenario, station, number)
-    planning = dc.replace(seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose())
-    return plan_drawn_seam(planning, 0).seam is not None
+def _first_refusal(scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig) -> tuple[int, str]:
+    """The number of seams before the first that the arm cannot weld with the part in a pose, and why; all, and "" for none."""
+    for number, part in enumerate(seams):
+        config = servo_config(scenario, station, number)
+        planning = dc.replace(seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose())
+        reason = plan_drawn_seam(planning, 0).reason
+        if reason is not None:
+            return number, reason
+    return len(seams), ""
 
 
 def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:
