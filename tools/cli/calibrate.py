@@ -16,7 +16,7 @@ from weldcal.tools.cli.options import (
     option,
     switch,
 )
-from weldcal.tools.cli.runs import run_options
+from weldcal.tools.commands.run import run_options
 
 
 @command(

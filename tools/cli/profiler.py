@@ -60,7 +60,7 @@ def edge(
     from weldcal.tools.commands.profiler.files import read_profiler_file
     from weldcal.tools.commands.profiler.noise import Sigmas
     from weldcal.tools.commands.profiler.results import finish_edge
-    from weldcal.tools.outcomes.first_screen import check_limit
+    from weldcal.tools.report.first_screen import check_limit
 
     check_limit(limit_mm)
     given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
@@ -97,7 +97,7 @@ def sphere(
     from weldcal.tools.commands.profiler.calibrate import calibrate_sphere
     from weldcal.tools.commands.profiler.noise import Sigmas
     from weldcal.tools.commands.profiler.results import finish_sphere
-    from weldcal.tools.outcomes.first_screen import check_limit
+    from weldcal.tools.report.first_screen import check_limit
 
     check_limit(limit_mm)
     sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
@@ -130,7 +130,7 @@ def compensate(
     from weldcal.calibration.profiler.sphere.model import SphereSigmas
     from weldcal.tools.commands.profiler.calibrate import calibrate_compensate
     from weldcal.tools.commands.profiler.results import finish_sphere
-    from weldcal.tools.outcomes.first_screen import check_limit
+    from weldcal.tools.report.first_screen import check_limit
 
     check_limit(limit_mm)
     data, measured = _sphere(call, file, unit, dataset, trial, radius, touches, tip)
@@ -156,7 +156,7 @@ def seam(
     """Map both edges and the root of a V-groove from raw profiles into the base frame, as seam.csv."""
     from weldcal.tools.commands.profiler.files import read_profiler_file
     from weldcal.tools.commands.profiler.seam import finish_seam, map_seam
-    from weldcal.tools.outcomes.first_screen import check_limit
+    from weldcal.tools.report.first_screen import check_limit
 
     check_limit(limit_mm)
     folder = call.folder("profiler", file.stem)

@@ -20,7 +20,7 @@ def replay(
     """
     from weldcal.tools.commands.record import RECORDING
     from weldcal.tools.commands.replay import replay as run_replay
-    from weldcal.tools.outcomes.poses import pose_rows
+    from weldcal.tools.report.first_screen import pose_rows
 
     found = run_replay(recording / RECORDING if recording.is_dir() else recording, call.progress)
     summary = found.summary()

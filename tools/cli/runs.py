@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -16,9 +16,7 @@ from weldcal.tools.cli.options import (
     command,
     option,
 )
-
-if TYPE_CHECKING:
-    from weldcal.tools.report.run import RunOptions
+from weldcal.tools.commands.run import run_options
 
 DEMO_SCENARIO = "s_groove"
 RECORDED = (*LIVE, "record")
@@ -58,25 +56,6 @@ def tablet_demo(call: Call, scenario: ScenarioOption = "tablet", record: RecordO
 
 
 @command(
-    "hand-eye live", short_help="Calibrate a scanner live in any mounting.", options=LIVE, defaults={"browser": False}
-)
-def hand_eye_live(
-    call: Call,
-    scenario: Annotated[
-        str, typer.Argument(metavar="SCENARIO", help="A scenario with a mounting section, by name or path.")
-    ] = "eye_in_hand",
-    record: RecordOption = False,
-) -> Outcome:
-    """Calibrate a scanner live in any mounting: it scans the robot's flange, its foot, or a second arm's flange."""
-    from weldcal.systems.scenario.loading import load_scenario
-    from weldcal.tools.commands.mounting_live import run_mounting_live
-
-    options = run_options(call, "hand-eye", scenario, recording=record)
-    result = run_mounting_live(load_scenario(scenario), options, call.progress)
-    return Outcome(result.summary(), text=result.text(), first=result.first)
-
-
-@command(
     "profiler live",
     short_help="Calibrate a profiler on the arm and follow a seam.",
     options=LIVE,
@@ -102,13 +81,6 @@ def profiler_live(
         return Outcome(run_profiler_seeds(loaded, options, runs, call.progress))
     found = run_profiler_live(loaded, options, call.progress)
     return Outcome(found.summary(), first=found.first)
-
-
-def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:
-    """The options of a run; its folder is named after the command and the scenario."""
-    from weldcal.tools.report.run import RunOptions
-
-    return RunOptions(scenario=scenario, out=call.folder(command, scenario), seed=call.seed, **{**call.live, **more})
 
 
 def _named_once(name: str | None, scenario: str, preset: str) -> str:

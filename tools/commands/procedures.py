@@ -15,7 +15,7 @@ from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.commands.touch_live import run_touches
-from weldcal.tools.outcomes.first_screen import FirstScreen
+from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.run import RunOptions
 
 

@@ -22,6 +22,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.viewer.kept import free_unused
 from weldcal.systems.viewer.live import LiveView
 from weldcal.tools import console
+from weldcal.tools.cli.options import Call
 from weldcal.tools.commands.record import RunRecorder
 from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.dashboard.facts import facts_of
@@ -29,6 +30,11 @@ from weldcal.tools.dashboard.recording import with_overlay
 from weldcal.tools.dashboard.source import DashboardSource
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
+
+
+def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:
+    """The options of a run; its folder is named after the command and the scenario."""
+    return RunOptions(scenario=scenario, out=call.folder(command, scenario), seed=call.seed, **{**call.live, **more})
 
 
 @dataclass(frozen=True, eq=False)

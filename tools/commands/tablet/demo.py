@@ -17,7 +17,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
 from weldcal.tools.commands.tablet.files import write_visit
-from weldcal.tools.outcomes.first_screen import FirstScreen
+from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import NO_KEY, run_screen, visit_report
