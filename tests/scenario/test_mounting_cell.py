@@ -26,7 +26,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import kind_of
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.run import JobRun
-from weldcal.tools.outcomes.mounting import MountingReport
+from weldcal.tools.report.mounting import MountingReport
 from weldcal.tools.report.run import RunOptions
 
 # few poses near home, a coarse image, a controller at a quarter of its rate: seconds instead of a minute

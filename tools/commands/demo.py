@@ -24,7 +24,7 @@ from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, ru
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.commands.touch import run_touches
 from weldcal.tools.commands.weld import run_calibration_live, run_scenario
-from weldcal.tools.outcomes.first_screen import FirstScreen
+from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 

@@ -25,7 +25,7 @@ from weldcal.systems.recording.values import array, decode
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command
 from weldcal.tools.commands.run import RECORDING
-from weldcal.tools.outcomes.poses import pose_rows
+from weldcal.tools.report.first_screen import pose_rows
 
 IDENTICAL, DIFFERS = "identical", "differs"
 

@@ -14,8 +14,10 @@ from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
-from weldcal.tools.outcomes.calibration import error_summary
-from weldcal.tools.outcomes.first_screen import (
+from weldcal.tools.report import plots_weld
+from weldcal.tools.report.calibration import error_summary
+from weldcal.tools.report.first_screen import (
+    SCANNER,
     Expected,
     Findings,
     FirstScreen,
@@ -23,11 +25,10 @@ from weldcal.tools.outcomes.first_screen import (
     ShownPose,
     Tolerance,
     refused_note,
+    work_point_error,
     work_point_expected,
 )
-from weldcal.tools.outcomes.monitor import drift_document
-from weldcal.tools.outcomes.poses import SCANNER, work_point_error
-from weldcal.tools.report import plots_weld
+from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, svg
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.models.arrays import Array
-from weldcal.tools.outcomes.first_screen import (
+from weldcal.tools.report.first_screen import (
     Expected,
     Findings,
     FirstScreen,
@@ -20,8 +20,8 @@ from weldcal.tools.outcomes.first_screen import (
     Tolerance,
     expected_error,
     point_covariance,
+    radius_95,
 )
-from weldcal.tools.outcomes.poses import radius_95
 from weldcal.tools.report.pictures import OURS, error_bars, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 

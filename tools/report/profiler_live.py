@@ -16,7 +16,7 @@ from weldcal.systems.jobs.profiler.estimates import pose_sigmas
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.runner import Run
-from weldcal.tools.outcomes.first_screen import (
+from weldcal.tools.report.first_screen import (
     Expected,
     Findings,
     FirstScreen,
@@ -24,8 +24,8 @@ from weldcal.tools.outcomes.first_screen import (
     ShownPose,
     Tolerance,
     point_covariance,
+    radius_95,
 )
-from weldcal.tools.outcomes.poses import radius_95
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.profiler_file import WORDS
 from weldcal.tools.report.render import fixed, render

@@ -25,31 +25,19 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.systems.messages import CalibrationStatus, VerificationResult
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.outcomes.calibration import (
-    CARE,
-    CalibrationReport,
-    PoseError,
-    Verdict,
-    VerifyReport,
-    error_summary,
-)
-from weldcal.tools.outcomes.first_screen import NO_TOLERANCE, FirstScreen
-from weldcal.tools.outcomes.hand_eye import HandEyeReport, MethodRow
-from weldcal.tools.outcomes.monitor import MonitorReport
-from weldcal.tools.outcomes.motion import MotionReport
-from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.report.calibration import calibration_report
+from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
-from weldcal.tools.report.hand_eye import hand_eye_report
-from weldcal.tools.report.monitor import monitor_page
-from weldcal.tools.report.motion_calibration import motion_report
-from weldcal.tools.report.mounting import mounting_report
+from weldcal.tools.report.first_screen import CARE, NO_TOLERANCE, FirstScreen
+from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
+from weldcal.tools.report.monitor import MonitorReport, monitor_page
+from weldcal.tools.report.motion_calibration import MotionReport, motion_report
+from weldcal.tools.report.mounting import MountingReport, mounting_report
 from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report, seam_report
 from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, ProfilerLive, live_report
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
-from weldcal.tools.report.verify import verify_report
+from weldcal.tools.report.verify import PoseError, Verdict, VerifyReport, verify_report
 
 Made = tuple[FirstScreen, str]
 OUT = Path("result")

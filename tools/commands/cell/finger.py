@@ -19,7 +19,7 @@ from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
 from weldcal.tools.commands.cell.board import Board
-from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, Tolerance, check_limit
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, Tolerance, check_limit
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.welding.finger.calibration import (
     Intrinsics,

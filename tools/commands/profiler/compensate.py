@@ -27,7 +27,7 @@ from weldcal.tools.commands.profiler.result import (
     with_warnings,
 )
 from weldcal.tools.commands.profiler.sphere import finish_sphere, read_sphere
-from weldcal.tools.outcomes.first_screen import check_limit
+from weldcal.tools.report.first_screen import check_limit
 
 
 @command("profiler compensate", short_help="Calibrate by the published sphere method.")

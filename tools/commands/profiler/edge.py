@@ -39,7 +39,7 @@ from weldcal.tools.commands.profiler.result import (
     widened,
     with_warnings,
 )
-from weldcal.tools.outcomes.first_screen import check_limit
+from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.profiler_file import ProfilerFile
 
 FAR_FROM_EDGE_MM = 1.0

@@ -20,8 +20,8 @@ from weldcal.tools.commands.profiler.result import (
     outcome_of,
     with_warnings,
 )
-from weldcal.tools.outcomes.first_screen import check_limit
 from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.profiler_file import ProfilerSeam, middle_error_mm, seam_report
 from weldcal.tools.report.render import write_atomic
 

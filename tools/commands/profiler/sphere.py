@@ -44,7 +44,7 @@ from weldcal.tools.commands.profiler.result import (
     widened,
     with_warnings,
 )
-from weldcal.tools.outcomes.first_screen import check_limit
+from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.profiler_file import ProfilerFile
 
 POORLY = 1.5  # reduced chi-square from which another convention of the poses is tried

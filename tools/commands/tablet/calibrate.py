@@ -21,7 +21,7 @@ from weldcal.calibration.tablet.wrist.fit import WristFit, fit_wrist
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
 from weldcal.tools.commands.tablet.planar import NAMES, ManyVisits, best_model, error_figures, fit_many, fit_visit
-from weldcal.tools.outcomes.first_screen import NO_TOLERANCE, FirstScreen, check_limit
+from weldcal.tools.report.first_screen import NO_TOLERANCE, FirstScreen, check_limit
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tablet import Shown, calibration_report, marked_picture, tablet_screen
 

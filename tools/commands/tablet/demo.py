@@ -27,8 +27,8 @@ from weldcal.tools.cli.options import (
 )
 from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
-from weldcal.tools.outcomes.first_screen import FirstScreen
 from weldcal.tools.report.files import mappings_csv
+from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import NO_KEY, run_screen, visit_report

@@ -18,9 +18,9 @@ from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
 from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.outcomes.calibration import error_summary
-from weldcal.tools.outcomes.first_screen import FirstScreen
+from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.files import mappings_csv
+from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.report.tablet import Page, visits_screen
