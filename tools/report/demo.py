@@ -123,7 +123,7 @@ class DemoResult:
                 0,
                 f"X_BC applies to corrected scanner points: multiply every point, in metres, by {estimate.scanner.formula}.",
             )
-        found = Findings(against, tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
+        found = Findings(against=against, tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
         return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())
 

@@ -29,7 +29,7 @@ from weldcal.tools.report.pictures import GREY, OURS, TRUTH, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class MotionReport:
     """The estimate, the records written, and the folder. ``dropped``: frames of the recording that no estimate used."""
 
@@ -137,7 +137,14 @@ def motion_screen(
         tolerance = Tolerance(f"the {what},", larger, limit_mm, "--limit-mm")
     notes = refused_note(refused, len(p_C) + len(refused), "frames")
     concerns = (*r.warnings, *r.unobservable)
-    found = Findings(against, tolerance, no_tolerance, len(held), concerns, notes)
+    found = Findings(
+        against=against,
+        tolerance=tolerance,
+        no_tolerance=no_tolerance,
+        unseen=len(held),
+        concerns=concerns,
+        notes=notes,
+    )
     if tolerance is not None and not tolerance.met:
         after = Next("Record a longer motion, with more turns, or scans at rest: plan it first.", "weldcal plan-motion")
     elif r.symbol == "X_BC":
@@ -158,8 +165,8 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
     before, after = report.along_rms_mm
     facts = [
         ("clock used", f"{clock.kind}. {clock.reason}"),
-        ("offset, ms", f"{_ms(clock.offset_s)} ± {_ms(clock.sigma_s)} (one sigma)"),
-        ("jitter of single frames, ms", _ms(clock.jitter_s)),
+        ("offset, ms", f"{_ms_text(clock.offset_s)} ± {_ms_text(clock.sigma_s)} (one sigma)"),
+        ("jitter of single frames, ms", _ms_text(clock.jitter_s)),
     ]
     if clock.kind == DEVICE and clock.drift is not None and clock.drift_sigma is not None:
         facts += [
@@ -167,7 +174,7 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
             ("device time of the offset, s", fixed(clock.reference_s, 3)),
         ]
     if clock.rolling_s is not None:
-        facts.append(("rolling time per unit of y/z, ms", f"{_ms(clock.rolling_s)} ± {_ms(clock.rolling_sigma_s)}"))
+        facts.append(("rolling time per unit of y/z, ms", f"{_ms_text(clock.rolling_s)} ± {_ms_text(clock.rolling_sigma_s)}"))
     return render(
         "motion_calibration.html.j2",
         dataset=dataset,
@@ -196,7 +203,7 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
     )
 
 
-def _ms(seconds: float | None) -> str:
+def _ms_text(seconds: float | None) -> str:
     return fixed(None if seconds is None else 1e3 * seconds, 3)
 
 

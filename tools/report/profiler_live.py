@@ -224,7 +224,9 @@ class ProfilerLive:
             if any(not p.within_3_sigma for p in known)
             else []
         )
-        found_all = Findings(against, tolerance, _NO_KEY, unseen, concerns)
+        found_all = Findings(
+            against=against, tolerance=tolerance, no_tolerance=_NO_KEY, unseen=unseen, concerns=concerns
+        )
         if held:
             after = Next("Settle the reason, then run the job again.")
         else:

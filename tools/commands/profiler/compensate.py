@@ -100,5 +100,12 @@ def calibrate_compensate(
         "centre_after_mm": off(best.rotation, best.translation),
         "wrong_sides": list(published.wrong_sides(R, t, centers, translated)),
     }
-    name, pose = "sphere, linear and compensated", (best.rotation, best.translation)
-    return ProfilerRecord(name, *pose, tip=felt.tip, figures=found, data_sha256=file.digest), found
+    record = ProfilerRecord(
+        method="sphere, linear and compensated",
+        rotation=best.rotation,
+        translation=best.translation,
+        tip=felt.tip,
+        figures=found,
+        data_sha256=file.digest,
+    )
+    return record, found

@@ -120,8 +120,14 @@ def calibrate_edge(
             found["warnings"] = [
                 f"The points lie {found['mean_distance_mm']:.1f} mm from one edge on average. Scan one edge only, and check unit and poses."
             ]
-        pose = linear.rotation, linear.translation
-        return ProfilerRecord("edge, linear", *pose, figures=found, data_sha256=file.digest), found
+        record = ProfilerRecord(
+            method="edge, linear",
+            rotation=linear.rotation,
+            translation=linear.translation,
+            figures=found,
+            data_sha256=file.digest,
+        )
+        return record, found
     if not sigmas.stated and "sigma" in file.arrays:
         robot, x, z = (float(v) for v in file.arrays["sigma"])
         sigmas = Sigmas(robot, x, z)

@@ -146,8 +146,8 @@ def sphere_data(
     if q is not None:
         check_number(poses, (len(q),), "joint vectors q")
     return SphereData(
-        poses[np.array(kept)], profiles, radius, felt, tip if felt is not None else None, table,
-        None if q is None else q[kept], file.arrays.get("touch_q"),
+        poses=poses[np.array(kept)], profiles=profiles, radius_m=radius, touches=felt, tip=tip if felt is not None else None, arm=table,
+        q=None if q is None else q[kept], touch_q=file.arrays.get("touch_q"),
     )  # fmt: skip
 
 
@@ -187,7 +187,7 @@ def calibrate_sphere(
         raise InputError(f"The model is one of {', '.join(MODELS)}, not '{model}'.")
     s = SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m)
     found: dict[str, Any] = {"scans": len(data.poses), "touches": 0 if data.touches is None else len(data.touches)}
-    scans = SphereData(data.poses, data.profiles, data.radius_m)
+    scans = SphereData(poses=data.poses, profiles=data.profiles, radius_m=data.radius_m)
     rigid = _rigid(scans, s)
     check_radius(scans, s, rigid)
     _refuse_inverse_poses(scans, rigid, s)
@@ -264,7 +264,9 @@ def _warnings(e: SphereEstimate, data: SphereData, s: SphereSigmas) -> list[str]
 
 
 def _without_arm(data: SphereData) -> SphereData:
-    return SphereData(data.poses, data.profiles, data.radius_m, data.touches, data.tip)
+    return SphereData(
+        poses=data.poses, profiles=data.profiles, radius_m=data.radius_m, touches=data.touches, tip=data.tip
+    )
 
 
 def finish_sphere(
