@@ -16,10 +16,9 @@ from weldcal.systems.jobs.job import Phases
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.commands.demo import measure
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.report.demo import demo_report
+from weldcal.tools.commands.weld import measure
+from weldcal.tools.report.demo import DemoResult, demo_report
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.perfect_world import perfect
 
 KNOCK_MM = [0.0, 1.2, 0.9]

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Mapping
 
 from weldcal.calibration.doctor.diagnose import diagnose
+from weldcal.tools.commands.doctor import worded
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.outcomes.doctor import worded
 from weldcal.tools.studies.doctor.world import CAUSES, clean
 from weldcal.tools.studies.output import markdown_table
 
