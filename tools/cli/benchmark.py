@@ -63,7 +63,8 @@ def part_welds(
     ] = 0.4,
 ) -> Outcome:
     """Weld twelve parts in four joints in the simulated cell, each from its STEP file, and measure the torch's error."""
-    from weldcal.tools.studies.part_welds.study import Trial, run_part_welds
+    from weldcal.tools.studies.part_welds.study import run_part_welds
+    from weldcal.tools.worlds.parts.cells import Trial
 
     trial = Trial.of(located_by, seam_mm, refine, arm_mm)
     folder = call.folder("benchmark", "part-welds")
@@ -249,7 +250,8 @@ def arms(
 ) -> Outcome:
     """Run the demo, scaled to the reach, on UR3e, UR5e, UR10e, UR16e, UR20 and UR30; the scenarios are written too."""
     from weldcal.models.robots import get_robot
-    from weldcal.tools.studies.arms.demo import ARMS, arms_table, run_arms
+    from weldcal.tools.studies.arms.demo import arms_table, run_arms
+    from weldcal.tools.worlds.scaled_arms import ARMS
 
     chosen = [get_robot(name).name for name in names] if names else list(ARMS)
     summary, rows = run_arms(call.farm(call.folder("benchmark", "arms")), chosen, call.seed, seam, robot)

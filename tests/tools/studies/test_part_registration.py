@@ -10,8 +10,8 @@ import pytest
 from pydrake.math import RigidTransform
 
 from weldcal.tools.studies.parts import study
-from weldcal.tools.studies.parts.scenes import scan_scene, subject
 from weldcal.tools.studies.parts.study import NEES_BOUND, run_registration_study
+from weldcal.tools.worlds.parts.scenes import scan_scene, subject
 from weldcal.welding.locate.part.result import PartRegistration
 
 pytest.importorskip("OCP")

@@ -12,9 +12,8 @@ from weldcal.tools.farm.run import Farm
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.arms.scaled import arm_scenario
+from weldcal.tools.worlds.scaled_arms import arm_scenario
 
-ARMS = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "ur30")
 COLUMNS = (
     "arm", "state", "n_scans", "X_BC_error_mm", "X_BC_error_deg", "X_BC_error_at_work_mm", "plan_mean_mm", "plan_max_mm",
     "torch_mean_mm", "torch_max_mm", "reason",

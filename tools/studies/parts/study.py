@@ -23,9 +23,9 @@ from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.part_welds.step_parts import PARTS
-from weldcal.tools.studies.parts.scenes import PartScene, Subject, scan_scene, subject
 from weldcal.tools.studies.parts.subjects import REFUSALS
+from weldcal.tools.worlds.parts.scenes import PartScene, Subject, scan_scene, subject
+from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.locate.part.locating import locate_part
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_part

@@ -10,8 +10,8 @@ import numpy as np
 
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh, revolve
-from weldcal.tools.studies.parts.scenes import block, subject
-from weldcal.tools.studies.seam_planning.scenes import box
+from weldcal.tools.worlds.parts.plates import box
+from weldcal.tools.worlds.parts.scenes import block, subject
 from weldcal.welding.locate.part.result import AmbiguousPart, PartNotFound
 
 

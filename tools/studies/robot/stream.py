@@ -25,7 +25,7 @@ from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.robot.faults import LOADED
+from weldcal.tools.worlds.robot.fault_run import LOADED
 
 RATE_HZ = 125.0
 READ_S = 0.002

@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.spatial import cKDTree
 
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.bent_plate import bend
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
-from weldcal.tools.studies.seam_planning.scenes import Scene, box, scan_part
+from weldcal.tools.worlds.parts.plates import Scene, box, scan_part, sideways
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
-from weldcal.welding.locate.planes import Floats, into
+from weldcal.welding.locate.planes import Floats
 
 WIDEST_PX = 824
 SHAPES = ("straight", "s", "l", "corner", "bent")  # l: corner radius 20 mm; corner: 4 mm; bent: s over 200 mm
@@ -52,17 +51,6 @@ class Trial(Plan):
 
     preset: str
     shape: str
-
-
-def sideways(points_B: Floats, part: Workpiece, X_BP: RigidTransform) -> tuple[Floats, Floats]:
-    """Signed distances (N,) of points from the true root line, in the plate's face to the left, and in height, m."""
-    p = into(X_BP, points_B)
-    nearest = np.asarray(cKDTree(part.seam_P).query(p)[1])
-    up = np.broadcast_to(part.up_P, part.seam_P.shape)[nearest]
-    left = np.cross(up, part.tangents_P[nearest])
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    gap = p - part.seam_P[nearest]
-    return np.sum(gap * left, axis=1), np.sum(gap * up, axis=1)
 
 
 def part_for(preset: str, shape: str) -> Workpiece:

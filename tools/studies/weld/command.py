@@ -7,13 +7,14 @@ from dataclasses import astuple, fields
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.weld.metrics import RunMetrics
-from weldcal.tools.studies.weld.plant import COLUMNS, PHASES, StudyRun
 from weldcal.tools.studies.weld.report import study_report
 from weldcal.tools.studies.weld.results import Study, StudyOptions
-from weldcal.tools.studies.weld.rows import COMPARED, Case, get_rows
+from weldcal.tools.studies.weld.rows import COMPARED, get_rows
 from weldcal.tools.studies.weld.study import CaseResult, measure_row, run_cases
 from weldcal.tools.studies.weld.turns import CHORDS, TURNS, TurnResult, run_turn
+from weldcal.tools.worlds.weld.case import Case
+from weldcal.tools.worlds.weld.metrics import RunMetrics
+from weldcal.tools.worlds.weld.plant import COLUMNS, PHASES, StudyRun
 
 COMPARED_SEEDS = 3
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from weldcal.tools.report.plots_weld import WeldTrace
-from weldcal.tools.studies.weld.plant import PHASES, StudyRun
+from weldcal.tools.worlds.weld.plant import PHASES, StudyRun
 from weldcal.welding.record.process import path_error, speed_along
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.servo.settings import ServoConfig

@@ -10,8 +10,9 @@ from weldcal.tools.studies.output import print_note, print_table
 from weldcal.tools.studies.targets import verdict
 from weldcal.tools.studies.weld.plots import weld_trace
 from weldcal.tools.studies.weld.results import Study
-from weldcal.tools.studies.weld.study import CaseResult, RowResult, study_config
+from weldcal.tools.studies.weld.study import CaseResult, RowResult
 from weldcal.tools.studies.weld.turns import TurnResult
+from weldcal.tools.worlds.weld.case import study_config
 
 FIGURE_NAMES = {
     "mean_mm": "torch, mean", "max_mm": "torch, largest", "space_mm": "torch in space, largest",

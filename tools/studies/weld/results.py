@@ -3,11 +3,11 @@
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from weldcal.tools.studies.weld.metrics import RunMetrics
-from weldcal.tools.studies.weld.plant import StudyRun
-from weldcal.tools.studies.weld.rows import Case
 from weldcal.tools.studies.weld.study import CaseResult, RowResult
 from weldcal.tools.studies.weld.turns import TurnResult
+from weldcal.tools.worlds.weld.case import Case
+from weldcal.tools.worlds.weld.metrics import RunMetrics
+from weldcal.tools.worlds.weld.plant import StudyRun
 
 
 @dataclass(frozen=True)

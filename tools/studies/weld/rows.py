@@ -3,36 +3,11 @@
 from dataclasses import dataclass
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.weld.budgets import BUDGETS, Budget
+from weldcal.tools.worlds.weld.case import Case
 
 
 class UnknownRow(InputError):
     """No row of the study has this name."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One weld to be repeated over the seeds: seam, budget, chord m, torch speed m/s, gaps (from, to) m, law."""
-
-    seam: str
-    budget: str = "nominal"
-    chord_m: float = 0.060
-    speed_m_s: float = 0.008
-    gaps: tuple[tuple[float, float], ...] = ()
-    law: str = "guarded"
-
-    @property
-    def errors(self) -> Budget:
-        """The error budget by its name."""
-        return BUDGETS[self.budget]
-
-    @property
-    def name(self) -> str:
-        """Short and unique: also the name of its CSV files."""
-        parts = [self.seam, f"d{1e3 * self.chord_m:.0f}"]
-        parts += [f"{1e3 * self.speed_m_s:.0f}mms"] if self.speed_m_s != 0.008 else []
-        parts += [f"gap{1e3 * (b - a):.0f}" for a, b in self.gaps]
-        return "-".join([*parts, self.budget, *([self.law] if self.law != "guarded" else [])])
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,15 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from weldcal.tools.console import Progress
-from weldcal.tools.studies.weld.metrics import RunMetrics, judge
-from weldcal.tools.studies.weld.plant import StudyRun, simulate
-from weldcal.tools.studies.weld.rows import Case, Row, Target
-from weldcal.tools.studies.weld.seams import get_seam
-from weldcal.welding.seam.feasibility import SeamWindows
-from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.tools.studies.weld.rows import Row, Target
+from weldcal.tools.worlds.weld.case import Case, run_case
+from weldcal.tools.worlds.weld.metrics import RunMetrics
+from weldcal.tools.worlds.weld.plant import StudyRun
 
 
 @dataclass(frozen=True)
@@ -75,34 +73,6 @@ class RowResult:
     def met(self) -> bool:
         """Whether every weld was completed and every target met."""
         return self.completed == self.runs and all(r.met for r in self.reached)
-
-
-def study_config(case: Case) -> ServoConfig:
-    """The servo's settings for a case: everything at its default but chord, speed, law and the touch-on calibration.
-
-    The paper's laws watch neither the torch's place nor its angles, so these are set wide open: they are to show what they do.
-    """
-    config = ServoConfig(
-        tool=ToolGeometry(torch_offset_m=case.chord_m),
-        touch=TouchConfig(calibrate_gain=True, zero_frames=30, feel_start=True),
-        weld_speed_m_s=case.speed_m_s,
-        law=case.law,
-    )
-    if case.law == "guarded":
-        return config
-    open_wide = SeamWindows(travel_rad=math.pi, work_rad=math.pi)
-    return replace(
-        config,
-        torch=replace(config.torch, ignition_error_m=1.0),
-        faults=replace(config.faults, torch_error_m=1.0),
-        windows=open_wide,
-    )
-
-
-def run_case(case: Case, seed: int) -> tuple[StudyRun, RunMetrics]:
-    """One weld and its figures."""
-    run = simulate(get_seam(case.seam), case.errors, study_config(case), seed, case.gaps)
-    return run, judge(run, case.speed_m_s, case.chord_m, case.gaps)
 
 
 def hold_against(target: Target, cases: Iterable[CaseResult]) -> Reached:

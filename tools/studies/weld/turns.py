@@ -4,12 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from weldcal.tools.studies.weld.budgets import NOMINAL
-from weldcal.tools.studies.weld.metrics import judge
-from weldcal.tools.studies.weld.plant import simulate
-from weldcal.tools.studies.weld.rows import Case
-from weldcal.tools.studies.weld.seams import TrueSeam, get_seam
-from weldcal.tools.studies.weld.study import study_config
+from weldcal.tools.worlds.weld.budgets import NOMINAL
+from weldcal.tools.worlds.weld.case import Case, study_config
+from weldcal.tools.worlds.weld.metrics import judge
+from weldcal.tools.worlds.weld.plant import simulate
+from weldcal.tools.worlds.weld.seams import TrueSeam, get_seam
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import assess_seam, split_seam
 

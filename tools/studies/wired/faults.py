@@ -12,7 +12,7 @@ from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.output import markdown_table
-from weldcal.tools.studies.wired.fault_run import DEVICES, FAULTS, PHASES, Happening, run_job
+from weldcal.tools.worlds.robot.wired_job import DEVICES, FAULTS, PHASES, Happening, run_job
 
 SEAM_MM = 20.0
 COLUMNS = (

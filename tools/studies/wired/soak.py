@@ -17,7 +17,7 @@ from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.output import markdown_table
-from weldcal.tools.studies.wired.fault_run import DEVICES, FAULTS, OF_THE_CONTROLLER, PHASES, Happening, run_job
+from weldcal.tools.worlds.robot.wired_job import DEVICES, FAULTS, OF_THE_CONTROLLER, PHASES, Happening, run_job
 
 SEAM_MM = 20.0
 CALIBRATES = 0.25  # share of the cycles

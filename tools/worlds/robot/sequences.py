@@ -8,8 +8,8 @@ import numpy as np
 
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.tools.studies.robot.bench import Bench
-from weldcal.tools.studies.robot.cases import RUNNING, STOP, Action, Case
+from weldcal.tools.worlds.robot.bench import Bench
+from weldcal.tools.worlds.robot.cases import RUNNING, STOP, Action, Case
 
 SEEN_S = 1.2  # a fault that must stop the arm is reported by then
 ANY_REPAIR = tuple({action.name: action for case in RUNNING for action in case.repair}.values())

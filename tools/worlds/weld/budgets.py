@@ -7,8 +7,8 @@ import numpy as np
 from pydrake.math import RotationMatrix
 from scipy.ndimage import gaussian_filter1d
 
-from weldcal.tools.studies.weld.seams import TrueSeam
-from weldcal.tools.studies.weld.unknowns import NOTHING_UNKNOWN, Unknowns
+from weldcal.tools.worlds.weld.seams import TrueSeam
+from weldcal.tools.worlds.weld.unknowns import NOTHING_UNKNOWN, Unknowns
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from scipy.spatial import cKDTree
 
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
 from weldcal.models.workpieces.plate import Workpiece
+from weldcal.welding.locate.planes import Floats, into
 
 TABLE_M = 1.4
 SLANT_RAD = 0.1  # of the scanner against the vertical, at most
@@ -21,8 +22,8 @@ SLANT_RAD = 0.1  # of the scanner against the vertical, at most
 class Scene:
     """A scan p_BS (H,W,3) m, NaN where nothing was measured, and the true pose."""
 
-    cloud_B: NDArray[np.float64]
-    eye_B: NDArray[np.float64]
+    cloud_B: Floats
+    eye_B: Floats
     X_BP: RigidTransform
     part: Workpiece
 
@@ -38,7 +39,7 @@ def table() -> TriMesh:
     return box(TABLE_M, TABLE_M, 0.02).transformed(RigidTransform([0.6, 0.0, -0.02]))
 
 
-def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> RigidTransform:
+def looking_at(eye: Floats, target: Floats) -> RigidTransform:
     """X_BC of a camera at `eye` (3,) that looks at `target` (3,), image rows along x of the base as near as can be."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 1.0, 0.0])
@@ -46,7 +47,7 @@ def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> RigidTr
     return RigidTransform(RotationMatrix(np.column_stack([x, np.cross(z, x), z])), eye)
 
 
-def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset, seed: int) -> NDArray[np.float64]:
+def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset, seed: int) -> Floats:
     """What the scanner at X_BC sees of meshes given in base, its noise included: (H,W,3) m in base."""
     import open3d
 
@@ -103,3 +104,14 @@ def scan_part(
     X_BC = RigidTransform(X_BC.rotation() @ RotationMatrix.MakeZRotation(rng.uniform(-0.3, 0.3)), eye)
     cloud = cast([part.mesh.transformed(X), table(), *others], X_BC, scanner, seed)
     return Scene(cloud, eye, X, part)
+
+
+def sideways(points_B: Floats, part: Workpiece, X_BP: RigidTransform) -> tuple[Floats, Floats]:
+    """Signed distances (N,) of points from the true root line, in the plate's face to the left, and in height, m."""
+    p = into(X_BP, points_B)
+    nearest = np.asarray(cKDTree(part.seam_P).query(p)[1])
+    up = np.broadcast_to(part.up_P, part.seam_P.shape)[nearest]
+    left = np.cross(up, part.tangents_P[nearest])
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    gap = p - part.seam_P[nearest]
+    return np.sum(gap * left, axis=1), np.sum(gap * up, axis=1)

@@ -163,7 +163,7 @@ class Bench:
     def start_elsewhere(self) -> list[int]:
         """As `start`, with link and commands in a process of their own, which can be killed; that process's children."""
         self.emulator.do("reset_checker")
-        command = [sys.executable, "-m", "weldcal.tools.studies.robot.bench", self.host]
+        command = [sys.executable, "-m", "weldcal.tools.worlds.robot.bench", self.host]
         self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self.cruise()
         self._workers = worker_of(self._child.pid)

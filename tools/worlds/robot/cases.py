@@ -10,7 +10,7 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.tools.studies.robot.bench import OUTPUT, Bench
+from weldcal.tools.worlds.robot.bench import OUTPUT, Bench
 
 STOP, GO, GO_OR_STOP, REFUSE = "stop", "go on", "go on or stop", "refuse"
 REST_S = 0.3

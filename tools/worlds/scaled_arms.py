@@ -9,6 +9,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 
+ARMS = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "ur30")
 REFERENCE = "ur10e"
 HOME_DEG = (190.0, -120.0, 135.0, -105.0, -90.0, 90.0)
 PART_X_M, SCANNER_Z_M, SEAM_MM = 0.65, 0.95, 300.0

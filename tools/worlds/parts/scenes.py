@@ -17,8 +17,8 @@ from weldcal.models.scanners import ScannerPreset
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.seams import DrawnSeam
-from weldcal.tools.studies.part_welds.step_parts import PARTS
-from weldcal.tools.studies.seam_planning.scenes import box, cast, looking_at, table
+from weldcal.tools.worlds.parts.plates import box, cast, looking_at, table
+from weldcal.tools.worlds.parts.step_parts import PARTS
 
 Floats = NDArray[np.float64]
 MIDDLE = np.array([0.6, 0.0, 0.0])

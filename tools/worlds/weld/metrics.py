@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.tools.studies.weld.plant import PHASES, StudyRun
+from weldcal.tools.worlds.weld.plant import PHASES, StudyRun
 from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics
 from weldcal.welding.seam.chord_map import chord_map

@@ -5,7 +5,7 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from weldcal.tools.studies.weld.groove import DRAWN, Wedge
+from weldcal.tools.worlds.weld.groove import DRAWN, Wedge
 
 Range = tuple[float, float]
 _NONE = (0.0, 0.0)

@@ -1,0 +1,1 @@
+"""Simulated parts, cells and robots that tests and studies share."""
