@@ -117,7 +117,9 @@ def build_app() -> typer.Typer:
         root.add_typer(group, name=name)
     for command in COMMANDS:
         *parents, name = command.title.split(" ")
-        (groups[parents[0]] if parents else root).command(name, short_help=command.short_help)(command.function)
+        (groups[parents[0]] if parents else root).command(name, short_help=command.short_help, hidden=command.hidden)(
+            command.function
+        )
     return root
 
 

@@ -164,11 +164,15 @@ class Call:
 
 @dataclass(frozen=True)
 class Command:
-    """A function as Typer takes it, with its full name ("benchmark cell") and its line in the list of commands."""
+    """A function as Typer takes it, with its full name ("benchmark cell") and its line in the list of commands.
+
+    A hidden command is an old name: it runs, and no list of commands shows it.
+    """
 
     title: str
     function: Callable[..., None]
     short_help: str | None
+    hidden: bool = False
 
 
 LARGEST_OPTION = 1e6

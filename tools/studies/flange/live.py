@@ -22,7 +22,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.outcomes.weld import calibration_error
 from weldcal.tools.report.pictures import svg
-from weldcal.tools.studies.perfect_world import perfect
+from weldcal.tools.worlds.perfect_world import perfect
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from weldcal.tools.farm.run import Farm
 from weldcal.tools.farm.work import FAILED
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.touch.world import touch_world
+from weldcal.tools.worlds.touch import touch_world
 
 
 def judge_worlds(seeds: list[int]) -> Mapping[str, object]:
