@@ -21,8 +21,8 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.commands.procedures import RUNNERS
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.demo import DemoResult
+from weldcal.tools.report.run import RunOptions
 
 SEED = 5  # its planned poses lie near each other
 # The first 30 mm of the S groove, calibrated from as few scans as there may be; the scanner has noise and no other error, and the

@@ -17,9 +17,8 @@ from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.demo import measure
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.report.demo import demo_report
+from weldcal.tools.report.demo import DemoResult, demo_report
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.worlds.perfect_world import perfect
 
 KNOCK_MM = [0.0, 1.2, 0.9]

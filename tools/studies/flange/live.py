@@ -20,8 +20,8 @@ from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.outcomes.weld import calibration_error
 from weldcal.tools.report.pictures import svg
+from weldcal.tools.report.weld import calibration_error
 from weldcal.tools.worlds.perfect_world import perfect
 
 

@@ -12,8 +12,8 @@ from weldcal.tools.commands.demo import run_calibration_live
 from weldcal.tools.commands.touch_live import run_touches, touching
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.farm.work import FAILED
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import write_json
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.worlds.touch import touch_world
 
 
