@@ -18,7 +18,7 @@ from weldcal.tools.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from weldcal.tools.outcomes.options import RunOptions
+    from weldcal.tools.report.run import RunOptions
 
 DEMO_SCENARIO = "s_groove"
 RECORDED = (*LIVE, "record")
@@ -44,7 +44,9 @@ def weld(call: Call, scenario: ScenarioOption = "straight_groove") -> Outcome:
     return Outcome(found.summary(), first=found.first)
 
 
-@command("tablet demo", options=LIVE, defaults={"browser": False})
+@command(
+    "tablet demo", short_help="Run the tablet calibration in a scenario.", options=LIVE, defaults={"browser": False}
+)
 def tablet_demo(call: Call, scenario: ScenarioOption = "tablet", record: RecordOption = False) -> Outcome:
     """Run the tablet calibration: look, touch each landmark, calibrate, compare with the truth."""
     from weldcal.systems.scenario.loading import load_scenario
@@ -55,7 +57,9 @@ def tablet_demo(call: Call, scenario: ScenarioOption = "tablet", record: RecordO
     return Outcome(found.summary(), first=found.first)
 
 
-@command("hand-eye live", options=LIVE, defaults={"browser": False})
+@command(
+    "hand-eye live", short_help="Calibrate a scanner live in any mounting.", options=LIVE, defaults={"browser": False}
+)
 def hand_eye_live(
     call: Call,
     scenario: Annotated[
@@ -72,7 +76,12 @@ def hand_eye_live(
     return Outcome(result.summary(), text=result.text(), first=result.first)
 
 
-@command("profiler live", options=LIVE, defaults={"browser": False})
+@command(
+    "profiler live",
+    short_help="Calibrate a profiler on the arm and follow a seam.",
+    options=LIVE,
+    defaults={"browser": False},
+)
 def profiler_live(
     call: Call,
     name: ScenarioArgument = None,
@@ -97,7 +106,7 @@ def profiler_live(
 
 def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:
     """The options of a run; its folder is named after the command and the scenario."""
-    from weldcal.tools.outcomes.options import RunOptions
+    from weldcal.tools.report.run import RunOptions
 
     return RunOptions(scenario=scenario, out=call.folder(command, scenario), seed=call.seed, **{**call.live, **more})
 

@@ -1,1 +1,1 @@
-"""Simulated parts, cells and robots that tests and studies share."""
+"""Simulated parts, rigs, scans and recordings with a known truth, for tests and studies."""

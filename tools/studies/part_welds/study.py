@@ -10,9 +10,9 @@ import numpy as np
 from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.demo import run_scenario
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.worlds.parts.cells import Trial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
 

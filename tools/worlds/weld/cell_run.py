@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.weld import FeltSeam, felt_seam
+from weldcal.tools.report.demo import DemoResult
+from weldcal.tools.report.weld import FeltSeam, felt_seam
 
 
 @dataclass(frozen=True)
