@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from weldcal.tools.studies.seam_planning import benchmark as seam_planning
+from weldcal.tools.studies.parts import planning
 
 
 def test_the_table_of_the_benchmark_counts_refusals_and_states_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(seam_planning, "SHAPES", ("s",))
-    summary, rows = seam_planning.run_seam_planning_benchmark(tmp_path, 1, 50, ["azure_kinect"], troubles=False)
+    monkeypatch.setattr(planning, "SHAPES", ("s",))
+    summary, rows = planning.run_seam_planning_benchmark(tmp_path, 1, 50, ["azure_kinect"], troubles=False)
     assert summary["trials"] == 2
     assert set(rows) == {"azure_kinect cad", "azure_kinect cloud"}
     with (tmp_path / "trials.csv").open() as table_file:

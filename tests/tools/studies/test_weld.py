@@ -14,9 +14,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.weld.rows import ROWS, Target, UnknownRow, get_rows
-from weldcal.tools.studies.weld.study import CaseResult, hold_against
-from weldcal.tools.studies.weld.turns import run_turn
+from weldcal.tools.studies.weld.rows import ROWS, CaseResult, Target, UnknownRow, get_rows, hold_against, run_turn
 from weldcal.tools.worlds.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, planned_seam, roughness
 from weldcal.tools.worlds.weld.case import Case, run_case, study_config
 from weldcal.tools.worlds.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, Tip

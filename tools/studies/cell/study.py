@@ -2,7 +2,9 @@
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -11,10 +13,12 @@ from weldcal.systems.cell import build_cell
 from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.loading import scenario_names
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.commands.demo import known_camera, measure
 from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import fixed, write_atomic
 from weldcal.tools.report.run import RunOptions
+from weldcal.tools.studies.harness import MISSED
 from weldcal.tools.studies.output import print_note, print_table
 from weldcal.tools.studies.targets import Target, print_targets
 from weldcal.tools.worlds.weld.cell_run import CellRun, figures
@@ -179,3 +183,20 @@ def print_cell_study(study: CellStudy) -> None:
     ]
     print_targets(f"Law: {study.options.law}", targets)
     print_note(f"written to {study.options.folder}")
+
+
+@command("reproduce cell", short_help="Weld in the whole simulated cell.")
+def cell(
+    call: Call,
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each scenario.", min=1)] = 3,
+    scenarios: Annotated[str, option("--scenarios", "NAMES", "Scenarios, separated by commas.")] = "s_groove,l_groove",
+    seam_mm: Annotated[
+        float | None, option("--seam-mm", "MM", "Weld only this length; default: all.", min=10.0)
+    ] = None,
+    law: Annotated[str, option("--law", "NAME", "Steering law, for comparison.")] = "guarded",
+) -> Outcome:
+    """Weld in the whole simulated cell, with contact and rendered tag: seam points, torch and real-time factor."""
+    folder = call.folder("reproduce", "cell")
+    names = tuple(name.strip() for name in scenarios.split(",") if name.strip())
+    study = run_cell_study(CellStudyOptions(folder, names, seeds, call.seed, seam_mm, law), call.progress)
+    return Outcome(study.summary(), {}, text=partial(print_cell_study, study), problem="" if study.met else MISSED)

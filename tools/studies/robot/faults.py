@@ -5,14 +5,21 @@ from collections.abc import Callable
 from collections.abc import Sequence as Several
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import FARM, Call, command, option
+from weldcal.tools.cli.options import Outcome as Printed
+from weldcal.tools.cli.subject import one_of
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.robot.jobs import jobs
+from weldcal.tools.studies.robot.stream import stream
+from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING, Case
 from weldcal.tools.worlds.robot.fault_run import Outcome, run_case
@@ -124,3 +131,32 @@ def _cell(value: object) -> str:
     if isinstance(value, tuple | list):
         return "; ".join(map(str, value))
     return "" if value is None else str(value)
+
+
+@command(
+    "benchmark robot-faults",
+    short_help="Inject every fault of the robot link while moving.",
+    hidden=True,
+    options=("address",),
+)
+def faults(
+    call: Call,
+    sequences: Annotated[int, option("--sequences", "N", "Number of random fault sequences.", min=0)] = 20,
+    seconds: Annotated[float, option("--seconds", "S", "Length of each.", min=1.0)] = 60.0,
+) -> Printed:
+    """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say why."""
+    result = run_fault_benchmark(
+        call.folder("benchmark", "robot-faults"),
+        address=call.given["address"],
+        sequences=sequences,
+        seconds=seconds,
+        seed=call.seed,
+        progress=call.progress,
+    )
+    return Printed(result.summary(), rows={outcome.name: outcome.line for outcome in result.outcomes})
+
+
+@command("benchmark robot", short_help="Measure the robot link and the cell by wire.", options=("address", *FARM))
+@one_of("stream", stream=stream, faults=faults, jobs=jobs, wired_faults=wired_faults, soak=soak)
+def robot(call: Call) -> None:
+    """Measure the robot link and the cell by wire: periods of commands, faults, lateness in whole jobs, and long runs."""

@@ -1,18 +1,21 @@
 """Welds the made parts in the simulated cell, each from its STEP file and its seam's CSV, and scores the torch."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.cli.subject import one_of
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
+from weldcal.tools.studies.parts.planning import planning
+from weldcal.tools.studies.parts.registration import registration
 from weldcal.tools.worlds.parts.cells import Trial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
 
@@ -83,3 +86,34 @@ def _summed(rows: list[dict[str, object]]) -> dict[str, object]:
         "worst_torch_max_mm": float(np.nanmax(most)) if np.isfinite(most).any() else None,
         "parts": [{key: row.get(key) for key in COLUMNS if key in row} for row in rows],
     }
+
+
+@command("benchmark part-welds", short_help="Weld twelve parts in four joints from STEP files.", hidden=True)
+def welds(
+    call: Call,
+    part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
+    runs: Annotated[int, option("--runs", "N", "Welds of each part, seeds from --seed on.", min=1)] = 1,
+    located_by: Annotated[
+        str, option("--located-by", "WORD", "Where the part's pose is from: scan or drawing.")
+    ] = "scan",
+    seam_mm: Annotated[
+        float | None, option("--seam-mm", "MM", "Weld only so much of each seam.", show_default="all of it")
+    ] = None,
+    refine: Annotated[
+        str,
+        option("--refine", "KIND", "Calibrate each cell first and refine it: none (not calibrated), joints or links."),
+    ] = "none",
+    arm_mm: Annotated[
+        float, option("--arm-mm", "MM", "How far the true flange is from the reported one (rms).", min=0.0, max=5.0)
+    ] = 0.4,
+) -> Outcome:
+    """Weld twelve parts in four joints in the simulated cell, each from its STEP file, and measure the torch's error."""
+    trial = Trial.of(located_by, seam_mm, refine, arm_mm)
+    folder = call.folder("benchmark", "part-welds")
+    return Outcome(run_part_welds(folder, part, range(call.seed, call.seed + runs), trial, call.progress))
+
+
+@command("benchmark parts", short_help="Measure how parts are found, planned and welded.")
+@one_of("welds", welds=welds, registration=registration, seam_planning=planning)
+def parts(call: Call) -> None:
+    """Measure how parts are found in a scan, how their seams are planned, and how they are welded, against the truth."""

@@ -1,14 +1,12 @@
 """Registers parts from simulated scans and scores each pose: right within its covariance, refused by name, or wrong."""
 
-from __future__ import annotations
-
 import math
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +16,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from weldcal.models.errors import WeldcalError
-from weldcal.models.mesh import TriMesh
+from weldcal.models.mesh import TriMesh, revolve
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.parts.subjects import REFUSALS
-from weldcal.tools.worlds.parts.scenes import PartScene, Subject, scan_scene, subject
+from weldcal.tools.worlds.parts.plates import box
+from weldcal.tools.worlds.parts.scenes import PartScene, Subject, block, scan_scene, subject
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.locate.part.locating import locate_part
 from weldcal.welding.locate.part.model import PartModel
@@ -148,6 +147,47 @@ def _scanned(mesh: TriMesh, rng: np.random.Generator) -> TriMesh:
     return TriMesh(corners + error, np.asarray(fine.triangles, dtype=np.int64))
 
 
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """What lies in the scene, what is looked for, and the error with the words that must name why."""
+
+    there: TriMesh
+    looked_for: TriMesh
+    error: type[WeldcalError]
+    words: str
+    twice: bool = False
+
+
+def sphere(radius: float) -> TriMesh:
+    """A ball standing on z = 0, m."""
+    a = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 33)
+    return revolve(np.column_stack([radius * np.cos(a) * (np.abs(a) < 1.57), radius * (1.0 + np.sin(a))]), 64)
+
+
+def pipe(radius: float, wall: float, height: float) -> TriMesh:
+    """A pipe standing on z = 0, m."""
+    inner = radius - wall
+    return revolve(np.array([[inner, 0.0], [radius, 0.0], [radius, height], [inner, height], [inner, 0.0]]), 72)
+
+
+def _scaled(mesh: TriMesh, factor: float) -> TriMesh:
+    return TriMesh(mesh.vertices * factor, mesh.triangles)
+
+
+REFUSALS: dict[str, Callable[[], Refusal]] = {
+    "plain plate": lambda: Refusal(box(0.2, 0.12, 0.012), box(0.2, 0.12, 0.012), AmbiguousPart, "turning it about its"),
+    "plain pipe": lambda: Refusal(
+        pipe(0.05, 0.005, 0.09), pipe(0.05, 0.005, 0.09), AmbiguousPart, "free to turn about its z axis|looks the same"
+    ),
+    "sphere": lambda: Refusal(sphere(0.05), sphere(0.05), AmbiguousPart, "free to turn about its|looks the same"),
+    "two alike": lambda: Refusal(block(), block(), AmbiguousPart, "Two places in the scan", twice=True),
+    "another part": lambda: Refusal(block(), subject("lap").mesh, PartNotFound, "part"),
+    "another length": lambda: Refusal(box(0.2, 0.12, 0.03), box(0.26, 0.12, 0.03), PartNotFound, "part"),
+    "wrong unit": lambda: Refusal(block(), _scaled(block(), 25.4), PartNotFound, "part"),
+    "not there": lambda: Refusal(box(0.03, 0.03, 0.02), block(), PartNotFound, "part"),
+}
+
+
 def run_refusal(name: str, seed: int) -> dict[str, object]:
     """A subject that must be refused: right when it is, by the error and the words that name why; a row of COLUMNS."""
     case = REFUSALS[name]()
@@ -232,3 +272,17 @@ def _summed(rows: list[dict[str, object]]) -> dict[str, object]:
         "cpu_s_median": float(np.median(cpu)) if len(cpu) else None,
         "cpu_s_max": float(cpu.max()) if len(cpu) else None,
     }
+
+
+@command("benchmark part-registration", short_help="Register twelve parts from STEP files in their scans.", hidden=True)
+def registration(
+    call: Call,
+    part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
+    scenes: Annotated[int, option("--scenes", "N", "Scenes with clutter, without a guess.", min=0)] = 40,
+    plans: Annotated[int, option("--plans", "N", "Plans of each part's seam, seeds from --seed on.", min=0)] = 3,
+    refusals: Annotated[int, option("--refusals", "N", "Scenes of each subject that must be refused.", min=0)] = 3,
+) -> Outcome:
+    """Register twelve parts from STEP files in simulated scans, plan their seams, and compare both with the truth."""
+    folder = call.folder("benchmark", "part-registration")
+    first, second, third = (range(call.seed, call.seed + count) for count in (scenes, plans, refusals))
+    return Outcome(run_registration_study(folder, first, second, third, part, call.progress))

@@ -1,21 +1,25 @@
-"""Calibrate and weld cycles by wire for minutes or hours with random faults: memory, stuck processes, names, motion and arc."""
+"""Faults of the devices by wire, in each phase of the job, and long runs with random ones: memory, names, motion and arc."""
 
 import ctypes
+import dataclasses as dc
 import gc
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from scipy import stats
 
-from weldcal.models.errors import WeldcalError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
 from weldcal.tools.studies.output import markdown_table
 from weldcal.tools.worlds.robot.wired_job import DEVICES, FAULTS, OF_THE_CONTROLLER, PHASES, Happening, run_job
 
@@ -211,3 +215,108 @@ def _table(found: Mapping[str, object]) -> str:
         rows.append((f"memory: {name}", f"{m['first_mb']:.0f} to {m['last_mb']:.0f} MB, {slope}"))
     rows += [("wrong", text) for text in found["wrong"]]  # type: ignore[attr-defined]
     return markdown_table(("what", "value"), rows)
+
+
+@command("benchmark soak", short_help="Calibrate and weld by wire for an hour with faults.", hidden=True)
+def soak(
+    call: Call,
+    minutes: Annotated[float, option("--minutes", "M", "How long new cycles begin.", min=0.1)] = 60.0,
+) -> Outcome:
+    """Calibrate and weld by wire again and again with random faults: memory, stuck processes, faults by name, motion and arc."""
+    summary, table = run_soak(call.folder("benchmark", "soak"), minutes, call.seed, call.progress)
+    return Outcome(summary, text=table)
+
+
+FAULT_COLUMNS = (
+    "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s", "named_after_s", "moved", "arc_s", "wall_s", "problems",
+)  # fmt: skip
+TIMES = ("torch_off_after_s", "rest_after_s", "named_after_s")
+
+
+def one_world(device: str, phase: str, seed: int, folder: str) -> Mapping[str, object]:
+    """Every fault of a device in a phase, one job each, in one world: rows of FAULT_COLUMNS."""
+    host = f"127.{40 + DEVICES.index(device)}.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
+    with wired_world(Path(folder) / "world", host, seed, SEAM_MM, bridged=True) as world:
+        return {"rows": [_row(world, Path(folder), seed, Happening(device, fault, phase)) for fault in FAULTS]}
+
+
+def _row(world: WiredWorld, folder: Path, seed: int, happening: Happening) -> dict[str, object]:
+    calibrates = happening.phase == "calibrate"
+    try:
+        return run_job(world, folder / happening.fault, seed, calibrates=calibrates, happening=happening)
+    except WeldcalError as problem:  # the job did not begin: what the fault before it has left
+        return dict.fromkeys(FAULT_COLUMNS, "") | dc.asdict(happening) | {"state": "failed", "problems": [str(problem)]}
+
+
+def fault_cases(folder: Path, seed: int, devices: Sequence[str] = (), phases: Sequence[str] = ()) -> Cases:
+    """One world for each device and phase, or for those that are chosen.
+
+    Raises:
+        InputError: there is no such device or phase.
+    """
+    for given, known in ((devices, DEVICES), (phases, tuple(PHASES))):
+        if unknown := [name for name in given if name not in known]:
+            raise InputError(f"There is no '{unknown[0]}' here: choose of {', '.join(known)}.")
+    return {
+        f"{device}, {phase}": {
+            "device": device,
+            "phase": phase,
+            "seed": seed,
+            "folder": str(folder.absolute() / f"{device}_{phase}".replace(" ", "_")),
+        }
+        for device in devices or DEVICES
+        for phase in phases or PHASES
+    }
+
+
+def _faults(found: Results) -> Figures:
+    rows = [row for result in found.values() for row in result.get("rows", ())]
+    wrong = [f"{r['device']} {r['fault']} in {r['phase']}: {'; '.join(r['problems'])}" for r in rows if r["problems"]]
+    wrong += [f"{name}: {result['reason']}" for name, result in found.items() if "rows" not in result]
+    return {
+        "state": "failed" if wrong else "done", "faults": len(rows), "held_by_name": sum(r["state"] == "held" for r in rows),
+        "done_while_silent": sum(r["state"] == "done" for r in rows), "wrong": wrong, "rows": rows,
+        **({"reason": wrong[0]} if wrong else {}),
+    }  # fmt: skip
+
+
+def _fault_rows(figures: Figures) -> Iterable[Row]:
+    for r in figures["rows"]:
+        times = (_seconds(r[name]) for name in TIMES)
+        verdict = "; ".join(r["problems"]) or "as required"
+        yield str(r["device"]), str(r["fault"]), str(r["phase"]), str(r["state"]), *times, verdict, str(r["reason"])
+
+
+def _seconds(value: object) -> str:
+    return "" if value in (None, "") else f"{float(str(value)):.2f}"
+
+
+WIRED_FAULTS = Study(
+    name="wired-faults",
+    what="Every device by wire killed, frozen, delayed by 2 s and sending garbage, in every phase of the job.",
+    case=one_world,
+    figures=_faults,
+    header=("device", "fault", "phase", "job", "torch off s", "arm at rest s", "named s", "verdict", "reason"),
+    rows=_fault_rows,
+)
+
+
+@command(
+    "benchmark wired-faults",
+    short_help="Disturb each device by wire in each phase of the job.",
+    hidden=True,
+    options=FARM,
+)
+def wired_faults(
+    call: Call,
+    devices: Annotated[list[str] | None, option("--device", "NAME", "Only this device; repeat for more.")] = None,
+    phases: Annotated[list[str] | None, option("--phase", "NAME", "Only this phase; repeat for more.")] = None,
+) -> Outcome:
+    """Kill, freeze and delay each device by wire, and let it send garbage, in each phase: the arm must stop, and the job say why."""
+    folder = call.folder("benchmark", "wired-faults")
+    found = WIRED_FAULTS.run(call.farm(folder), fault_cases(folder, call.seed, devices or (), phases or ()))
+    write_atomic(
+        folder / "faults.csv",
+        csv_text(FAULT_COLUMNS, ([r.get(n, "") for n in FAULT_COLUMNS] for r in found.figures["rows"])),
+    )
+    return Outcome(found.figures, text=found.markdown())

@@ -1,19 +1,24 @@
-"""Trials of seam planning in random poses: every scanner preset, and hard cases."""
+"""Plans seams from one scan, by drawing and from the cloud alone: every scanner preset in random poses, and hard cases."""
 
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh
-from weldcal.models.scanners import get_scanner
+from weldcal.models.scanners import SCANNERS, get_scanner
 from weldcal.models.workpieces.bent_plate import bend
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
+from weldcal.tools.report.files import records_csv
+from weldcal.tools.report.render import write_atomic
 from weldcal.tools.worlds.parts.plates import Scene, box, scan_part, sideways
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
@@ -277,3 +282,67 @@ def trouble_rows(trials: list[TroubleTrial]) -> dict[str, str]:
         right = f"{sum(t.ok for t in mine)} as they have to be"
         rows[f"{name}, {method}"] = f"{len(done)} of {len(mine)} planned, {right}{error_text(done)}"
     return rows
+
+
+def run_seam_planning_benchmark(
+    out: Path,
+    runs: int = 2,
+    seed: int = 0,
+    presets: list[str] | None = None,
+    progress: Progress = no_progress,
+    *,
+    full: bool = False,
+    troubles: bool = True,
+) -> tuple[dict[str, object], dict[str, str]]:
+    """Every preset, shape and method over `runs` held-out poses: trials.csv in `out`, and the rows of the table.
+
+    full: images as wide as the scanner has them. troubles: occlusion, clutter and wrong workpieces as well (troubles.csv).
+    """
+    presets = list(SCANNERS) if presets is None else presets
+    trials: list[Trial] = []
+    total = len(presets) * len(SHAPES) * runs
+    for preset in presets:
+        for shape in SHAPES:
+            for k in range(runs):
+                number = FIRST_HELD_OUT + seed + k
+                scene = scan(preset, shape, number, None if full else WIDEST_PX)
+                trials += [run_trial(scene, preset, shape, number, method) for method in METHODS]
+                progress("planning", len(trials) / (len(METHODS) * total))
+                write_atomic(out / "trials.csv", records_csv(trials, COLUMNS))
+    rows = summary_rows(trials)
+    if troubles:
+        cases = run_troubles(runs, FIRST_HELD_OUT + seed)
+        write_atomic(out / "troubles.csv", records_csv(cases, TROUBLE_COLUMNS))
+        rows |= trouble_rows(cases)
+    done = [t for t in trials if not t.refused]
+    summary: dict[str, object] = {
+        "state": "done",
+        "trials": len(trials),
+        "planned": len(done),
+        "worst_mm": max((t.worst_mm for t in done), default=math.nan),
+        "most_seconds": max((t.seconds for t in trials), default=math.nan),
+    }
+    return summary, rows
+
+
+@command("benchmark seam-planning", short_help="Measure the error of a seam planned from one scan.", hidden=True)
+def planning(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Random poses of each part.", min=1)] = 2,
+    preset: Annotated[
+        list[str] | None, option("--preset", "NAME", "A scanner; repeat for more.", show_default="all")
+    ] = None,
+    full: Annotated[
+        bool, switch("--full-resolution", "Images of the scanner's full width, not 824 pixels at most.")
+    ] = False,
+    troubles: Annotated[
+        bool, switch("--troubles/--no-troubles", "Also test occlusion, clutter and wrong workpieces.")
+    ] = True,
+) -> Outcome:
+    """Measure the error of a seam planned from one scan, with and without a drawing, for each scanner."""
+    folder = call.folder("benchmark", "seam-planning")
+    names = [get_scanner(name).name for name in preset] if preset else None
+    summary, rows = run_seam_planning_benchmark(
+        folder, runs, call.seed, names, call.progress, full=full, troubles=troubles
+    )
+    return Outcome(summary, rows=rows)
