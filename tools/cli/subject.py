@@ -21,7 +21,7 @@ class _Parameter(NamedTuple):
     @property
     def flag(self) -> str:
         """The option's name on the command line; "" for an argument."""
-        return "" if isinstance(self.info, ArgumentInfo) else str(self.info.param_decls[0])
+        return "" if isinstance(self.info, ArgumentInfo) else str((self.info.param_decls or (self.info.default,))[0])
 
 
 def one_of(first: str, **studies: Command) -> Callable[[Body], Body]:
