@@ -1,7 +1,8 @@
 """Coverage of the stated 95 % regions: shares of simulated calibrations whose regions hold the truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,7 +20,10 @@ from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.calibration.planning.observability import check_diversity
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import svg
+from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.worlds import warped_scanner
 from weldcal.tools.worlds.flange_frames import facing
 
@@ -211,3 +215,33 @@ def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Cov
     return Coverage(
         poses, runs, float(pose), float(point), float(np.mean(stated) / np.mean(true)), corrected=True, warped=True
     )
+
+
+def _coverage_rows(f: Figures) -> Iterable[Row]:
+    for s in f["studies"]:
+        kind = "of another model" if s["warped"] else "corrected" if s["corrected"] else "exact"
+        shares = (f"{100 * s[key]:.1f} %" for key in ("pose", "point"))
+        yield str(s["poses"]), kind, *shares, fixed(s["held_out_over_true"])
+
+
+HONESTY = Study(
+    name="flange-honesty",
+    what="How often stated 95 % regions hold the truth, and the ratio of held-out to true errors.",
+    figures=lambda results: results["all"],
+    header=("scans", "scanner", "X_BC inside", "work point inside", "held-out over true error"),
+    rows=_coverage_rows,
+    numbers=3,
+)
+
+
+@command("benchmark flange-honesty", short_help="Measure how often stated 95 % regions hold the truth.", hidden=True)
+def honesty(
+    call: Call, runs: Annotated[int, option("--runs", "N", "Number of calibrations of each size.", min=10)] = 500
+) -> Outcome:
+    """Measure how often the stated 95 % regions contain the truth, and the ratio of held-out to true errors."""
+    folder = HONESTY.folder(call)
+    studies = [study_coverage(n, runs, call.seed, call.progress) for n in (5, 6, 8, 12, 20)]
+    studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
+    studies.append(study_warped(12, max(10, runs // 5), call.progress))
+    write_atomic(folder / "coverage.svg", coverage_picture(studies))
+    return HONESTY.measured({"all": {"studies": [vars(s) for s in studies]}}, folder).outcome()
