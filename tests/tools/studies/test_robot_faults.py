@@ -10,7 +10,9 @@ from weldcal.tools.worlds.robot.fault_run import Outcome
 
 
 def test_a_wrong_result_fails_the_study_and_is_named() -> None:
-    wrong = Outcome("nothing", STOP, "stopped", "", "", problems=("not at rest within 0.3 s",))
+    wrong = Outcome(
+        name="nothing", must=STOP, did="stopped", fault="", sentence="", problems=("not at rest within 0.3 s",)
+    )
     summary = FaultReport([wrong], [], Path()).summary()
     assert summary["state"] == "failed"
     assert summary["wrong"] == [{"id": "nothing", "reason": "not at rest within 0.3 s"}]

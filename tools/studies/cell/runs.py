@@ -31,7 +31,7 @@ def run_cell_benchmark(out: Path, seed: int = 0, progress: Progress = no_progres
     """
     scenario = load_scenario("s_groove")
     scenario.welding.seam_length_mm = SEAM_MM
-    result = run_scenario(scenario, RunOptions("s_groove", out, seed, recording=False), progress)
+    result = run_scenario(scenario, RunOptions(scenario="s_groove", out=out, seed=seed, recording=False), progress)
     run, camera = result.run, scenario.finger_camera
     pixels = f"{getattr(camera, 'width', 0)} x {getattr(camera, 'height', 0)}"
     return {
@@ -59,7 +59,7 @@ WORST = (
 
 def run_seed(scenario: str, folder: str, seed: int) -> Mapping[str, object]:
     """Run one demo in its own folder, without a recording; its JSON object."""
-    return run_demo(RunOptions(scenario, Path(folder), seed, recording=False)).summary()
+    return run_demo(RunOptions(scenario=scenario, out=Path(folder), seed=seed, recording=False)).summary()
 
 
 def _worst(rows: Iterable[Mapping[str, object]], names: Iterable[str]) -> dict[str, float]:
@@ -106,7 +106,7 @@ def run_arm(arm: str, folder: str, seed: int, seam_mm: float, robot: str | None)
     """Write an arm's scenario into its folder and run the demo there; its row of COLUMNS."""
     scenario = Path(folder) / f"{arm}.yaml"
     write_atomic(scenario, arm_scenario(arm, seam_mm))
-    options = RunOptions(str(scenario), Path(folder), seed, recording=False, robot=robot)
+    options = RunOptions(scenario=str(scenario), out=Path(folder), seed=seed, recording=False, robot=robot)
     try:
         found = run_demo(options).summary()
     except WeldcalError as error:

@@ -124,7 +124,7 @@ def weld_once(name: str, seed: int, options: CellStudyOptions, progress: Progres
     watch = PhaseCpu(progress)
     run = run_cell(build_cell(scenario, seed), watch.progress)
     watch.progress("", 1.0)
-    result = measure(run, RunOptions(name, options.folder, seed, recording=False))
+    result = measure(run, RunOptions(scenario=name, out=options.folder, seed=seed, recording=False))
     lasted = sum(b[1] - a[1] for a, b in zip(run.phases, run.phases[1:], strict=False) if a[0] == "weld")
     cpu = watch.seconds.get("weld", np.nan) / lasted if lasted else np.nan
     return figures(result, name, options.law, seed, cpu)

@@ -55,7 +55,7 @@ def run_part_welds(
         def shown(stage: str, share: float, k: int = k, name: str = name) -> None:
             progress(f"{name}: {stage}", (k + share) / len(runs))
 
-        options = RunOptions(str(cell), folder / f"seed{seed}", seed, recording=False)
+        options = RunOptions(scenario=str(cell), out=folder / f"seed{seed}", seed=seed, recording=False)
         result = run_scenario(trial.scenario(cell), options, shown)
         result.run.raise_if_interrupted()
         summary = result.summary()

@@ -208,7 +208,7 @@ def _job(described: Any, out: Path, name: str, seed: int) -> JobTiming:
     q_home = np.deg2rad(described.home_deg)
     kinematics = None if described.kinematics is None else Path(described.kinematics)
     with emulator_process(q=q_home.tolist(), kinematics=kinematics) as controller:
-        options = RunOptions(name, out, seed, robot=controller.host, pace=1.0, recording=False)
+        options = RunOptions(scenario=name, out=out, seed=seed, robot=controller.host, pace=1.0, recording=False)
         try:
             result = run_scenario(described, options)
         except WeldcalError as error:  # the start was refused

@@ -9,7 +9,7 @@ from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.weld import FeltSeam, felt_seam
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CellRun:
     """One weld. Lengths in mm: seam points sideways and in height against where the tool's numbers say a seated tip is
     felt (sd about a smooth line through themselves, and mean); torch against the true line, sideways and in space; its speed's
@@ -39,13 +39,13 @@ def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: 
     run, weld = result.run, result.weld
     felt: FeltSeam | None = felt_seam(run.cell, run.root)
     if weld is None or weld.error is None or weld.speed is None or felt is None:
-        return CellRun(name, law, seed, False, run.reason or "nothing was welded")
+        return CellRun(scenario=name, law=law, seed=seed, completed=False, reason=run.reason or "nothing was welded")
     return CellRun(
-        name,
-        law,
-        seed,
-        not run.held,
-        run.reason or "",
+        scenario=name,
+        law=law,
+        seed=seed,
+        completed=not run.held,
+        reason=run.reason or "",
         point_sd_mm=1e3 * scatter(felt.lateral),
         point_spread_mm=1e3 * float(felt.lateral.std()),
         point_offset_mm=1e3 * float(felt.lateral.mean()),
