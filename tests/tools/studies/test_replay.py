@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.commands.record import RECORDING
+from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.studies.cell import replays
 from weldcal.tools.studies.cell.replays import KINDS, REPLAYS, Kind, replay_cases

@@ -20,9 +20,9 @@ from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
-from weldcal.tools.commands.demo import run_scenario
-from weldcal.tools.commands.record import RECORDING
-from weldcal.tools.commands.replay import IDENTICAL, replay
+from weldcal.tools.commands.replay import IDENTICAL, replay_recording
+from weldcal.tools.commands.run import RECORDING
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.cell.process import X_BC, wired_world
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 from weldcal.tools.report.demo import DemoResult
@@ -74,7 +74,7 @@ def record_and_replay(kind: str, seed: int, folder: str) -> Mapping[str, object]
     summary = run.summary()
     path = out / RECORDING
     size = path.stat().st_size
-    found = replay(path).summary()
+    found = replay_recording(path).summary()
     if found["state"] == IDENTICAL:
         path.unlink()
     return {

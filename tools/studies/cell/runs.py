@@ -13,7 +13,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of
-from weldcal.tools.commands.demo import run_demo, run_scenario
+from weldcal.tools.commands.weld import run_demo, run_scenario
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.render import fixed, write_atomic
 from weldcal.tools.report.run import RunOptions

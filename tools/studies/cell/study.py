@@ -14,7 +14,7 @@ from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.loading import scenario_names
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.commands.demo import known_camera, measure
+from weldcal.tools.commands.weld import known_camera, measure
 from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import fixed, write_atomic
 from weldcal.tools.report.run import RunOptions

@@ -10,7 +10,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of
-from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions

@@ -10,7 +10,7 @@ from weldcal.calibration.refinement.refined import PLAIN
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import known_camera
+from weldcal.tools.commands.weld import known_camera
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.worlds.parts.step_parts import MadePart
 
