@@ -174,7 +174,9 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
             ("device time of the offset, s", fixed(clock.reference_s, 3)),
         ]
     if clock.rolling_s is not None:
-        facts.append(("rolling time per unit of y/z, ms", f"{_ms_text(clock.rolling_s)} ± {_ms_text(clock.rolling_sigma_s)}"))
+        facts.append(
+            ("rolling time per unit of y/z, ms", f"{_ms_text(clock.rolling_s)} ± {_ms_text(clock.rolling_sigma_s)}")
+        )
     return render(
         "motion_calibration.html.j2",
         dataset=dataset,
