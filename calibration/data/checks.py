@@ -1,5 +1,7 @@
 """Reads dataset.yaml and checks the tables of a dataset: rows, numbers, quaternions, units, clouds that repeat."""
 
+from dataclasses import fields
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -38,13 +40,21 @@ def read_header(path: Path) -> DatasetHeader:
         )
     try:
         text = read_text(path, LARGEST_DOCUMENT)
-        parse_document(path.name, text)  # within bounds, no key twice
+        given = parse_document(path.name, text)  # within bounds, no key twice
         header: DatasetHeader = yaml_load_typed(schema=DatasetHeader, data=text, defaults=DatasetHeader())
     except InputError as e:
         raise DatasetError(str(e)) from e
     except Exception as e:
         # pydrake raises whatever its YAML reader meets; the first line names the key
-        raise DatasetError(f"'{path.name}' cannot be read as a dataset description: {str(e).splitlines()[0]}") from e
+        raise DatasetError(_unread(path.name, given, str(e).splitlines()[0])) from e
+    given = given if isinstance(given, dict) else {}
+    # what is not stated is taken as without the file
+    header.schema = header.schema if "schema" in given else 1
+    header.configuration = header.configuration if "configuration" in given else CONFIGURATIONS[0]
+    units = given.get("units")
+    units = units if isinstance(units, dict) else {}
+    header.units.clouds = header.units.clouds if "clouds" in units else AUTO
+    header.units.poses = header.units.poses if "poses" in units else AUTO
     if header.schema != 1:
         raise DatasetError(f"'{path.name}' says schema {header.schema}; this software reads schema 1.")
     for name, unit in (("clouds", header.units.clouds), ("poses", header.units.poses)):
@@ -69,6 +79,17 @@ def read_header(path: Path) -> DatasetHeader:
         )
     _check_poses(header, path)
     return header
+
+
+def _unread(name: str, given: object, problem: str) -> str:
+    """Why a dataset.yaml cannot be read: the unknown key and the nearest known one, or the reader's words."""
+    known = {f.name for f in fields(DatasetHeader)}
+    wrong = next((str(key) for key in given if key not in known), None) if isinstance(given, dict) else None
+    if wrong is None:
+        return f"'{name}' cannot be read as a dataset description: {problem}"
+    near = get_close_matches(wrong, known, 1, 0.5)
+    hint = f"did you mean '{near[0]}'?" if near else f"use {', '.join(sorted(known))}."
+    return f"'{name}' has no key '{wrong[:40]}'; {hint}"
 
 
 def metric_cloud(path: Path, unit: str) -> Array:

@@ -31,6 +31,7 @@ from weldcal.calibration.data.poses.bag import ENDINGS as RECORDINGS
 from weldcal.calibration.data.poses.bag import find_bag, read_bag
 from weldcal.calibration.data.poses.form import PoseList
 from weldcal.calibration.data.poses.pairing import find_clouds, pair
+from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.data.poses.source import files_of_poses, find_poses, is_plain, metric_poses, read_poses
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
@@ -64,6 +65,14 @@ class Dataset:
     hashes: dict[str, str]
     recorded: Mapping[str, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    readings: tuple[PoseReading, ...] = ()
+    """Readings of the poses, in metres and in the order of ``poses``, where their file allows more than one; the used one first."""
+
+    def read_as(self, reading: PoseReading, note: str) -> Self:
+        """The dataset with its poses in another of its readings."""
+        poses = {id: _rigid(X) for id, X in zip(self.poses, reading.X, strict=True)}
+        others = tuple(one for one in self.readings if one.form != reading.form)
+        return replace(self, poses=poses, readings=(reading, *others), notes=(*self.notes, note))
 
     def between(self, ids: str) -> Self:
         """The dataset without the scans before or after those named "FROM:TO" (ids; either may be left out), in its order.
@@ -210,8 +219,13 @@ def _recognised(
         hashes[path.relative_to(folder).as_posix()] = digest(path)
     clouds = {id: path for id, path in zip(ids, files, strict=True) if path is not None}
     refused = tuple((id, "There is no cloud for this pose.") for id in ids if id not in clouds)
+    refused += tuple((name, f"Its pose was left out: {why}") for name, why in found.left_out)
     note = f"{found.source}: {len(X)} poses, {found.read_as}, in {unit}; clouds {how}."
-    return _finished(folder, header, poses, clouds, refused, hashes, (note,))
+    readings = tuple(
+        replace(one, X=metric_poses(replace(found, X=one.X), header.units.poses, form)[0]) for one in found.readings
+    )
+    data = _finished(folder, header, poses, clouds, refused, hashes, (note,))
+    return replace(data, readings=readings)
 
 
 def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str, str], robot: str) -> Dataset:

@@ -10,6 +10,7 @@ from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.eye_on_base.conventions import choose_reading
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
@@ -30,6 +31,8 @@ class FlangeObservations:
     patterns: dict[str, HolePattern]
     clouds: dict[str, Array]
     refused: tuple[tuple[str, str], ...]
+    data: Dataset | None = None
+    """The dataset with its poses as the scans say that they are to be read; None for pairs."""
 
 
 def see_flanges(
@@ -70,7 +73,23 @@ def see_flanges(
             patterns[id] = pattern
         clouds[id] = face_cloud(points, fit, standard)
         observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
-    return FlangeObservations(tuple(observations), fits, patterns, clouds, tuple(refused))
+    if len(data.readings) > 1 and observations:
+        data = _read_by_scans(data, observations)
+        observations = [observation_from_fit(id, data.poses[id], fit, data.X_FR) for id, fit in fits.items()]
+    return FlangeObservations(tuple(observations), fits, patterns, clouds, tuple(refused), data)
+
+
+def _read_by_scans(data: Dataset, observations: list[Observation]) -> Dataset:
+    """The dataset with its poses in the reading that the scans select."""
+    ids = list(data.poses)
+    reading, text = choose_reading(
+        data.readings,
+        np.array([ids.index(o.id) for o in observations]),
+        np.array([o.p_CR for o in observations]),
+        np.array([o.n_C for o in observations]),
+        data.X_FR.GetAsMatrix4(),
+    )
+    return data if reading is None else data.read_as(reading, text)
 
 
 def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:

@@ -82,6 +82,7 @@ def calibrate_dataset(
         data = data.between(poses)
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
+    data = seen.data or data
     observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
     few = len(observations) < ENOUGH
     tcp: tuple[str, ...] = ()

@@ -198,6 +198,7 @@ def verify_dataset(
         seed=seed,
         tell=lambda fraction: tell("fitting flanges", 0.9 * fraction),
     )
+    data = seen.data or data
     if not seen.observations:
         first, reason = seen.refused[0]
         raise InputError(f"None of the {len(seen.refused)} scans can be used. Reason for the first, {first}: {reason}")

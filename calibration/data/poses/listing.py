@@ -119,6 +119,11 @@ def listing_of_array(name: str, values: Array, **more: object) -> Listing:
     found = list(_meanings(v))
     if not found:
         shape = " x ".join(map(str, v.shape))
+        if v.shape[-1] in (12, 16) or v.shape[-2:] in ((4, 4), (3, 4)):
+            raise DatasetError(
+                f"'{name}' holds {shape} numbers, and most of its matrices are no rigid pose: the columns of the 3 x 3 part must have length 1 "
+                "and be at right angles."
+            )
         raise DatasetError(
             f"'{name}' holds {shape} numbers, which is no list of poses: 6 (x,y,z,rx,ry,rz), 7 (x,y,z and a quaternion) or 16 "
             "(a 4 x 4 matrix) a pose."
@@ -169,7 +174,7 @@ def _meanings(v: Array) -> Iterator[tuple[int, Array, Array, Array | None]]:
             if n - first in (12, 16) and (not first or len(table) > 1):
                 for kind, p, r, _ in _of_rows(rest):
                     yield kind, p, r, times
-            elif n - first == 7 and (not first or _rising(table[:, 0])):
+            elif n - first == 7:
                 for p, q in ((rest[:, :3], rest[:, 3:]), (rest[:, 4:], rest[:, :4])):
                     if _unit(q):
                         yield _QUATERNION, p, q, times

@@ -16,6 +16,7 @@ CHANGES = ("transposed", "left_handed", "inverse")
 """What a form may add to a notation: rotations transposed, a left-handed frame (y mirrored), poses inverted."""
 _TURN_RAD = 7.0  # a whole turn and a little: larger numbers are degrees
 _LEAST_DEG = 0.02  # rad: angles that are all below it move too little to be radians or degrees for sure
+_LEAST_ANGLE = 0.1  # largest angle of a motion that is worth a calibration, rad: as degrees it would be none
 _QUATERNION = 0.05  # deviation of a quaternion's length from 1 that few printed digits explain
 _ORTHOGONAL = 0.05  # deviation of a rotation's columns from orthonormal that two printed decimals explain (0.01 sqrt 3, and a margin)
 _MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -174,6 +175,14 @@ def _matrices(numbers: PoseNumbers) -> Array:
 
 def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
     largest = float(np.abs(numbers.r).max(initial=0.0))
+    if numbers.angles == "rad" and largest > _TURN_RAD:
+        raise DatasetError(
+            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a whole turn in radians: they look like degrees; state deg."
+        )
+    if numbers.angles == "deg" and len(numbers.r) > 2 and _LEAST_ANGLE < largest <= np.pi + 1e-3:
+        raise DatasetError(
+            f"No angle of '{numbers.source}' exceeds {largest:.2f}, as degrees: they look like radians; state rad."
+        )
     units = [numbers.angles] if numbers.angles else ["deg"] if largest > _TURN_RAD else ["rad", "deg"]
     if not numbers.angles and largest <= _LEAST_DEG:
         units = ["rad"]

@@ -290,7 +290,7 @@ def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]
         frames: dict[str, list[_Line]] = defaultdict(list)
         for row in rows:
             frames[f"{row.cells[parent].strip('/')} to {row.cells[child].strip('/')}"].append(row)
-        return [one for key, mine in frames.items() for one in _table(plain, mine, f"{name}, {key}")]
+        return _frames(plain, frames, name)
     kept = [r for r in rows if r.numeric]
     if not kept:
         raise DatasetError(f"'{name}' has a header and no poses below it.")
@@ -312,6 +312,19 @@ def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]
         if twice is not None:
             raise DatasetError(f"'{name}' gives the id '{twice}' twice; keep one row for each pose.")
     return table_lists(header, table, name, ids)
+
+
+def _frames(header: list[str], frames: dict[str, list[_Line]], name: str) -> list[Listing]:
+    """One list for each pair of frames; pairs that never move hold no pose."""
+    found, problem = [], None
+    for key, mine in frames.items():
+        try:
+            found += _table(header, mine, f"{name}, {key}")
+        except DatasetError as why:
+            problem = why
+    if not found and problem is not None:
+        raise problem
+    return found
 
 
 def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...] = ()) -> list[Listing]:

@@ -48,15 +48,26 @@ def _collect(node: Any, name: str, at: str) -> Iterator[Listing]:
 
 def _of_list(node: list[Any], name: str, at: str, label: str) -> Iterator[Listing]:
     array = _array(node)
-    if array is not None:
+    if (
+        array is not None
+        and array.ndim in (3, 4)
+        and array.shape[1] == 2
+        and array.shape[2:] in ((16,), (4, 4), (7,), (6,))
+    ):
+        for k in range(2):  # pairs without names: the robot's pose and the camera's
+            yield listing_of_array(f"{label}, {('robot', 'camera')[k]}", array[:, k])
+    elif array is not None:
         if looks_like_poses(array):
             yield listing_of_array(label, array)
-        return
-    if node and all(isinstance(item, Mapping) for item in node):
+    elif node and all(isinstance(item, Mapping) for item in node):
         yield from _of_samples(node, name, at, label)
-    elif node and all(isinstance(item, list) and len(item) == 2 for item in node):
+    elif node and all(
+        isinstance(item, list) and len(item) == 2 and all(isinstance(v, Mapping) for v in item) for item in node
+    ):
         for k in range(2):
-            yield from _collect([item[k] for item in node], name, f"{at}/{k}")
+            yield from _of_samples([item[k] for item in node], name, at, f"{label}, {('robot', 'camera')[k]}")
+    elif node and all(isinstance(item, list) for item in node):
+        raise DatasetError(f"'{label}' is not an array of numbers, each row as long as the others.")
 
 
 def _of_samples(node: list[Mapping[Any, Any]], name: str, at: str, label: str) -> Iterator[Listing]:

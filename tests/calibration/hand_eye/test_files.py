@@ -98,16 +98,18 @@ def read_error(text: str, path: Path, **options: str) -> str:
 def test_a_bad_file_is_named_in_a_sentence(tmp_path: Path, poses: tuple[Array, Array]) -> None:
     F, G = poses
     csv = tmp_path / "a.csv"
-    assert "must name its columns" in read_error("1,2,3\n4,5,6", csv)
+    assert "no list of poses" in read_error("1,2,3\n4,5,6", csv)
     assert "is empty" in read_error("", csv)
-    assert "no samples" in read_error(HEADER, csv, mounting="eye_in_hand")
+    assert "holds no poses" in read_error(HEADER, csv, mounting="eye_in_hand")
     row = ",".join(map(str, numbers(F[0]) + numbers(G[0])))
     assert "add --mounting" in read_error(f"{HEADER}\n{row}", csv)
-    assert "not a number" in read_error(f"{HEADER}\n{row.replace(row.split(',')[0], 'x', 1)}", csv)
-    assert "first in sample 0" in read_error(f"{HEADER}\n" + ",".join(row.split(",")[:9]), csv, mounting="eye_in_hand")
+    assert "A number is missing" in read_error(f"{HEADER}\n{row.replace(row.split(',')[0], 'x', 1)}", csv)
+    assert "A number is missing" in read_error(f"{HEADER}\n" + ",".join(row.split(",")[:9]), csv, mounting="eye_in_hand")
     assert "cannot be read as JSON" in read_error("{", tmp_path / "a.json")
-    assert "no list of samples" in read_error("a: 1", tmp_path / "a.yaml")
-    assert "Sample 0" in read_error("- effector_wrt_world: [1, 2]\n  object_wrt_sensor: [1]", tmp_path / "a.yaml")
+    assert "holds no poses" in read_error("a: 1", tmp_path / "a.yaml", mounting="eye_in_hand")
+    assert "holds no poses" in read_error(
+        "- effector_wrt_world: [1, 2]\n  object_wrt_sensor: [1]", tmp_path / "a.yaml", mounting="eye_in_hand"
+    )
     with pytest.raises(DatasetError, match="no file"):
         read_pairs(tmp_path / "none.csv")
     path = write("npz", tmp_path, F, G)
@@ -115,15 +117,17 @@ def test_a_bad_file_is_named_in_a_sentence(tmp_path: Path, poses: tuple[Array, A
         read_pairs(path, mounting="eye_on_base")
 
 
-def test_millimetres_are_asked_for_not_guessed(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+def test_millimetres_follow_from_the_reach_and_the_motion(tmp_path: Path, poses: tuple[Array, Array]) -> None:
     F, G = poses
     mm_F, mm_G = F.copy(), G.copy()
     for X in (mm_F, mm_G):
         X[:, :3, 3] *= 1e3
-    path = write("json", tmp_path, mm_F, mm_G)
-    with pytest.raises(DatasetError, match="add --unit mm"):
-        read_pairs(path)
-    np.testing.assert_allclose(read_pairs(path, length="mm").G, G, atol=1e-12)
+    for robot, camera, units in ((mm_F, mm_G, ("mm", "mm")), (mm_F, G, ("mm", "m")), (F, mm_G, ("m", "mm"))):
+        pairs = read_pairs(write("json", tmp_path, robot, camera))
+        np.testing.assert_allclose(pairs.F, F, atol=1e-12)
+        np.testing.assert_allclose(pairs.G, G, atol=1e-12)
+        assert tuple(pairs.reading[who]["unit"] for who in ("robot", "camera")) == units
+    np.testing.assert_allclose(read_pairs(write("json", tmp_path, mm_F, mm_G), length="mm").G, G, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +135,7 @@ def test_millimetres_are_asked_for_not_guessed(tmp_path: Path, poses: tuple[Arra
     [
         ("camera", "poses are inverted"),
         ("robot", "mounted eye_on_base"),
-        ("unit", "camera's positions are millimetres"),
+        ("unit", "multiplied by"),
     ],
 )
 def test_one_mistake_is_recognised(wrong: str, sentence: str, tmp_path: Path, poses: tuple[Array, Array]) -> None:
@@ -140,9 +144,8 @@ def test_one_mistake_is_recognised(wrong: str, sentence: str, tmp_path: Path, po
         F = inverse(F)
     if wrong == "camera":
         G = inverse(G)
-    if wrong == "unit":  # a target so near that its millimetres could be metres
-        G[:, :3, 3] *= 10.0
-        F[:, :3, 3] *= 0.01  # together a factor of a thousand
+    if wrong == "unit":  # squares of 28.5 mm were counted
+        G[:, :3, 3] /= 0.0285
     np.savez(tmp_path / "a.npz", A=F, B=G, mode="eye_in_hand")
     with pytest.raises(InconsistentPoses, match=sentence):
         run_hand_eye("ax-yb", tmp_path / "a.npz", tmp_path)
@@ -200,7 +203,14 @@ def test_a_file_that_no_pairs_can_be_in_is_named(tmp_path: Path, poses: tuple[Ar
     degrees = [[*X[:3, 3], *np.degrees(Rotation.from_matrix(X[:3, :3]).as_rotvec())] for X in (F[0], G[0])]
     names = ",".join(f"{who}_{c}" for who in ("robot", "camera") for c in ("x", "y", "z", "rx", "ry", "rz"))
     row = ",".join(str(v) for v in degrees[0] + degrees[1])
-    assert "look like degrees" in read_error(f"{names}\n{row}", tmp_path / "a.csv", mounting="eye_in_hand")
+    np.testing.assert_allclose(
+        read_pairs(_text(tmp_path / "a.csv", f"{names}\n{row}"), mounting="eye_in_hand").robot, F[:1], atol=1e-12
+    )
+
+
+def _text(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
 
 
 def test_a_word_of_an_npz_may_be_bytes_or_an_array(tmp_path: Path, poses: tuple[Array, Array]) -> None:
@@ -238,12 +248,11 @@ def test_ragged_and_impossible_numbers_are_named(tmp_path: Path, poses: tuple[Ar
         return read_error(json.dumps({"A": F, "B": G, "mode": "eye_in_hand", **change}), path)
 
     assert "each row as long as the others" in said(A=[*F[:-1], F[-1][:3]])
-    assert "is not an array of numbers" in said(A=[*F[:-1], 10**400])
-    assert "not finite" in said(A=[*F[:-1], (np.inf * np.ones((4, 4))).tolist()])
-    assert "robot poses and" in said(B=G[:-1])
+    assert "one list of poses" in said(A=[*F[:-1], 10**400])
+    assert "pair in order" in said(B=G[:-1])
     assert "mode by a word" in said(mode=["eye_in_hand"])
     assert "key 'A' twice" in read_error('{"A": [], "A": []}', path)
-    assert "look like metres" in read_error(json.dumps({"A": F, "B": G}), path, mounting="eye_in_hand", length="mm")
+    assert "correct --unit" in read_error(json.dumps({"A": F, "B": G}), path, mounting="eye_in_hand", length="mm")
     (tmp_path / "a.npz").write_bytes(write("npz", tmp_path, *poses).read_bytes()[:-300])
     with pytest.raises(DatasetError, match="not an npz file, or damaged"):
         read_pairs(tmp_path / "a.npz")
