@@ -174,15 +174,15 @@ def _roles(name: str) -> list[tuple[str, str]]:
         return [(_prefix(before), last)]
     if last not in ("w", "x", "y", "z"):
         return []
-    words = set(before)
-    if words & _VECTOR or {"rotation", "vector"} <= words:
+    if set(before) & _VECTOR or {"rotation", "vector"} <= set(before):
         return [(_prefix(before), f"v{last}")] if last != "w" else []
-    if words & _QUATERNION:
-        return [(_prefix(before), f"q{last}")]
-    if words & _POSITION and last != "w" and not words & {"r"}:
-        return [(_prefix(before), last)]
-    if words & _ROTATION:
-        return [(_prefix(before), f"r{last}")]
+    for word in before:  # the first word that names a quantity decides: p_RS_R_x is a position
+        if word in _QUATERNION:
+            return [(_prefix(before), f"q{last}")]
+        if word in _POSITION and last != "w":
+            return [(_prefix(before), last)]
+        if word in _ROTATION:
+            return [(_prefix(before), f"r{last}")]
     return [(_prefix(before), last)]
 
 

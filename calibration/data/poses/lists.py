@@ -41,6 +41,7 @@ ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
 ENDINGS = (*TEXT, *TREES, *ARRAYS)
 """Endings of files that may hold poses."""
 _OWN = ("dataset.yaml", "readme.txt", "notes.txt", "requirements.txt")
+_CLOUDS = ("clouds", "pointclouds", "point_clouds", "scans", "ply", "pcd")
 _INVERSE = re.compile(r"(?i)base2(gripper|ee|hand|tool|flange)|cam(era)?2(target|board|marker|object|chess\w*)")
 _CAMERA = re.compile(
     r"(?i)(target|board|marker|object|chess|pattern|tag|camera|(^|[^a-z])cam([^a-z]|$)|cam\d|eye|optical|sensor|tracking|cpo|(^|[^a-z])b([^a-z]|$)|x_cm|aruco)"
@@ -88,9 +89,17 @@ def folder_lists(folder: Path) -> list[Listing]:
         for path in sorted((p for p in place.iterdir() if _may_hold_poses(p)), key=lambda p: natural(p.name)):
             stem = re.sub(r"\d+$", "", path.stem) if number_of(path.stem) is not None else path.stem
             groups.setdefault((label, f"{stem}{path.suffix.lower()}"), []).append(path)
-    found = []
+    found: list[Listing] = []
+    problem: DatasetError | None = None
     for (label, _), files in groups.items():
-        found += _group(files, label)
+        if label.lower() in _CLOUDS:
+            continue
+        try:
+            found += _group(files, label)
+        except DatasetError as why:
+            problem = problem or why
+    if len(found) < 2 and problem is not None:
+        raise problem
     return found
 
 
