@@ -194,7 +194,7 @@ def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> Cel
     else:
         reason, then = _smaller_signs(newest, usual_mm)
         state = LOOK if reason else FINE
-    return Cell(name, datasets, state, reason, then, since, trend)
+    return Cell(name=name, datasets=datasets, state=state, reason=reason, next=then, since=since, trend=trend)
 
 
 def _smaller_signs(newest: Checked, usual_mm: float) -> tuple[str, str]:

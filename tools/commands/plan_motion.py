@@ -54,9 +54,15 @@ def plan_motion(
     """
 
     found = plan_motions(
-        scenario, call.folder("plan-motion", scenario), streams=stream or (), calibration=calibration, seconds=seconds,
-        device=device_clock, seed=call.seed, progress=call.progress,
-    )  # fmt: skip
+        scenario,
+        call.folder("plan-motion", scenario),
+        streams=stream or (),
+        calibration=calibration,
+        seconds=seconds,
+        device=device_clock,
+        seed=call.seed,
+        progress=call.progress,
+    )
     rows = {str(p["name"]): _line(p) for p in found["motions"]}  # type: ignore[attr-defined]
     return Outcome(found, values={"written to": found["written_to"]}, rows=rows)
 
@@ -66,7 +72,7 @@ def _line(p: dict[str, float | None]) -> str:
     return ", ".join("open" if p[k] is None else f"{p[k]:.{digits}f} {unit}" for k, unit, digits in shown)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Planned:
     """A motion and what it is expected to tell, one sigma; infinite where it shows nothing. ``cost_mm`` is the error of a point on a
     part in motion. ``corners_deg`` are the joint angles of a cube's corners, empty for a stream."""
@@ -108,9 +114,12 @@ def plan_motions(
     best = found[0]
     out.mkdir(parents=True, exist_ok=True)
     result: dict[str, object] = {
-        "state": "done", "best": _plain(best), "motions": [_plain(p) for p in found], "device_times": device,
+        "state": "done",
+        "best": _plain(best),
+        "motions": [_plain(p) for p in found],
+        "device_times": device,
         "seconds": None if streams else seconds,
-    }  # fmt: skip
+    }
     write_json(out / "plan.json", result)
     if best.corners_deg:
         speed = (loaded.part(MotionJob) or MotionJob()).speed_m_s
@@ -157,7 +166,13 @@ def _of_cubes(
 def _planned(name: str, told: Expected, corners: tuple[tuple[float, ...], ...] = ()) -> Planned:
     cost = float(np.hypot(told.work_m, _SPEED_M_S * told.offset_s))
     return Planned(
-        name, 1e3 * told.work_m, float(np.degrees(told.turn_rad)), 1e3 * told.offset_s, told.shared, 1e3 * cost, corners
+        name=name,
+        error_mm=1e3 * told.work_m,
+        rotation_deg=float(np.degrees(told.turn_rad)),
+        clock_offset_ms=1e3 * told.offset_s,
+        shared=told.shared,
+        cost_mm=1e3 * cost,
+        corners_deg=corners,
     )
 
 

@@ -55,7 +55,7 @@ def error_summary(values: Array) -> dict[str, float]:
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Algorithm1Outcome:
     """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive to.
 
@@ -82,7 +82,7 @@ class Algorithm1Outcome:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CalibrationReport:
     """The result of `weldcal calibrate`: the estimate, the records written, and the folder. ``observations`` include the
     scanner correction where one was accepted; ``notes`` say in which form the dataset was read; ``limit_mm`` is the error that the

@@ -44,7 +44,7 @@ class Checked:
         return self.verification is not None and self.verification.get("verdict") == DO_NOT
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Cell:
     """A cell with its datasets in order, oldest first, and what follows from them: VISIT, LOOK or FINE, why, and what to do."""
 

@@ -29,7 +29,7 @@ from weldcal.tools.report.pictures import GREY, OURS, TRUTH, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MotionReport:
     """The estimate, the records written, and the folder. ``dropped``: frames of the recording that no estimate used."""
 
@@ -158,8 +158,8 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
     before, after = report.along_rms_mm
     facts = [
         ("clock used", f"{clock.kind}. {clock.reason}"),
-        ("offset, ms", f"{_ms(clock.offset_s)} ± {_ms(clock.sigma_s)} (one sigma)"),
-        ("jitter of single frames, ms", _ms(clock.jitter_s)),
+        ("offset, ms", f"{_ms_text(clock.offset_s)} ± {_ms_text(clock.sigma_s)} (one sigma)"),
+        ("jitter of single frames, ms", _ms_text(clock.jitter_s)),
     ]
     if clock.kind == DEVICE and clock.drift is not None and clock.drift_sigma is not None:
         facts += [
@@ -167,7 +167,9 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
             ("device time of the offset, s", fixed(clock.reference_s, 3)),
         ]
     if clock.rolling_s is not None:
-        facts.append(("rolling time per unit of y/z, ms", f"{_ms(clock.rolling_s)} ± {_ms(clock.rolling_sigma_s)}"))
+        facts.append(
+            ("rolling time per unit of y/z, ms", f"{_ms_text(clock.rolling_s)} ± {_ms_text(clock.rolling_sigma_s)}")
+        )
     return render(
         "motion_calibration.html.j2",
         dataset=dataset,
@@ -196,7 +198,7 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
     )
 
 
-def _ms(seconds: float | None) -> str:
+def _ms_text(seconds: float | None) -> str:
     return fixed(None if seconds is None else 1e3 * seconds, 3)
 
 

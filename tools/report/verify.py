@@ -55,7 +55,7 @@ class Verdict:
         return {USE: "good", DO_NOT: "bad"}.get(self.verdict, "warn")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class VerifyReport:
     """The result of a verification. ``observations`` include the scanner correction where the result has one."""
 

@@ -65,9 +65,21 @@ def calibrate() -> Made:
     counts = np.arange(4, 10)
     curve = Convergence(counts, *(1e-4 * np.ones((2, len(counts))) for _ in range(3)))
     report = CalibrationReport(
-        RESULT, ESTIMATE, tuple(OBSERVATIONS), None, {}, (("p99", "No flange was found."),), (), None, curve,
-        error_summary(np.array([0.2])), 1.0, OUT, ("Add a pose near (1, 2, 3).",), limit_mm=2.0,
-    )  # fmt: skip
+        result=RESULT,
+        estimate=ESTIMATE,
+        observations=tuple(OBSERVATIONS),
+        scanner=None,
+        fits={},
+        refused=(("p99", "No flange was found."),),
+        outliers=(),
+        algorithm1=None,
+        convergence=curve,
+        k_fold_mm=error_summary(np.array([0.2])),
+        seconds=1.0,
+        out=OUT,
+        advice=("Add a pose near (1, 2, 3).",),
+        limit_mm=2.0,
+    )
     return report.first, calibration_report(report, dataset="scans")
 
 
@@ -76,8 +88,18 @@ def verify() -> Made:
     poses = tuple(PoseError(o.id, 0.1 + 0.01 * k, 0.02, k < 3) for k, o in enumerate(OBSERVATIONS))
     verdict = Verdict(CARE, 0.4, "The median error is within the limit. But: something.")
     report = VerifyReport(
-        RESULT, None, tuple(OBSERVATIONS), {}, poses, (("p99", "Empty."),), ("Take new scans.",), {}, OUT, verdict, "given"
-    )  # fmt: skip
+        result=RESULT,
+        correction=None,
+        observations=tuple(OBSERVATIONS),
+        fits={},
+        poses=poses,
+        refused=(("p99", "Empty."),),
+        warnings=("Take new scans.",),
+        hashes={},
+        out=OUT,
+        verdict=verdict,
+        source="given",
+    )
     return report.first, verify_report(report, dataset="others")
 
 
@@ -91,14 +113,31 @@ def motion() -> Made:
         X_BC=RESULT.X_BC,
         clock=ScannerClock("arrival", 0.03, 1e-4, 1e-3, 0.0, reason="There is no other."),
         start=SimpleNamespace(delays=np.linspace(0.0, 0.1, 20), rms_m=1e-3 * np.ones(20), delay_s=0.03),
-        inliers=np.ones(n, bool), capture=np.linspace(0.0, 3.0, n), residual_m=values[0], along_m=values[1], before_m=values[2],
+        inliers=np.ones(n, bool),
+        capture=np.linspace(0.0, 3.0, n),
+        residual_m=values[0],
+        along_m=values[1],
+        before_m=values[2],
         held_out_m=values[3],
-    )  # fmt: skip
+    )
     frames = ObservedFrames(
-        tuple(map(str, range(n))), np.linspace(0.0, 3.0, n), None, p_C, np.tile([0.0, 0.0, 1.0], (n, 1)),
-        np.tile(1e-9 * np.eye(3), (n, 1, 1)), 1e-3 * np.ones(n),
-    )  # fmt: skip
-    report = MotionReport(RESULT, cast(Any, estimate), frames, (("31", "No flange."),), (), 1.0, OUT)
+        tuple(map(str, range(n))),
+        np.linspace(0.0, 3.0, n),
+        None,
+        p_C,
+        np.tile([0.0, 0.0, 1.0], (n, 1)),
+        np.tile(1e-9 * np.eye(3), (n, 1, 1)),
+        1e-3 * np.ones(n),
+    )
+    report = MotionReport(
+        result=RESULT,
+        estimate=cast(Any, estimate),
+        frames=frames,
+        refused=(("31", "No flange."),),
+        outliers=(),
+        seconds=1.0,
+        out=OUT,
+    )
     return report.first, motion_report(report, dataset="moving")
 
 
@@ -107,20 +146,52 @@ def monitor() -> Made:
     n = 60
     rng = np.random.default_rng(0)
     event = DriftEvent(
-        MOVED, 2.0, 0.05, 2.3, np.array([1e-3, 0.0, 0.0]), np.zeros(3), COVARIANCE, X, "translation", 80.0, 30.0,
+        MOVED,
+        2.0,
+        0.05,
+        2.3,
+        np.array([1e-3, 0.0, 0.0]),
+        np.zeros(3),
+        COVARIANCE,
+        X,
+        "translation",
+        80.0,
+        30.0,
         "the scanner or the base has moved",
-    )  # fmt: skip
+    )
     clock = SimpleNamespace(
         clock=SimpleNamespace(kind="arrival"), delay_s=0.1, sigma_s=1e-3, jitter_s=1e-3, source="recording"
     )
     watched = SimpleNamespace(
-        ids=tuple(map(str, range(n))), rows=SimpleNamespace(times=np.linspace(0.0, 4.0, n)),
-        residuals=1e-4 * rng.standard_normal((n, 3)), tilts=1e-4 * rng.standard_normal((n, 2)),
-        before=1e-3 * rng.standard_normal((n, 3)), offsets=1e-3 * rng.standard_normal(n), gross=np.zeros(n, bool),
-        statistic=np.linspace(1.0, 80.0, n), threshold=30.0, events=(event,), X_BC=X, covariance=COVARIANCE, since_s=2.0,
-        clock=clock, noise=SimpleNamespace(jitter_s=1e-3), dropped=(("q", "No flange: 3"),), rms_m=2e-4, rms_after_m=1e-4,
-    )  # fmt: skip
-    report = MonitorReport(cast(Any, watched), RESULT, None, event.cause, 1e-3, (), 1.0, OUT)
+        ids=tuple(map(str, range(n))),
+        rows=SimpleNamespace(times=np.linspace(0.0, 4.0, n)),
+        residuals=1e-4 * rng.standard_normal((n, 3)),
+        tilts=1e-4 * rng.standard_normal((n, 2)),
+        before=1e-3 * rng.standard_normal((n, 3)),
+        offsets=1e-3 * rng.standard_normal(n),
+        gross=np.zeros(n, bool),
+        statistic=np.linspace(1.0, 80.0, n),
+        threshold=30.0,
+        events=(event,),
+        X_BC=X,
+        covariance=COVARIANCE,
+        since_s=2.0,
+        clock=clock,
+        noise=SimpleNamespace(jitter_s=1e-3),
+        dropped=(("q", "No flange: 3"),),
+        rms_m=2e-4,
+        rms_after_m=1e-4,
+    )
+    report = MonitorReport(
+        watched=cast(Any, watched),
+        calibration=RESULT,
+        recalibrated=None,
+        cause=event.cause,
+        false_alarms_per_hour=1e-3,
+        warnings=(),
+        seconds=1.0,
+        out=OUT,
+    )
     return report.first, monitor_page(report, recording="moving")
 
 
@@ -140,7 +211,14 @@ def hand_eye() -> Made:
     comparison = (MethodRow("weldcal", 0.01, 0.1), MethodRow("TSAI", float("nan"), float("nan")))
     mounting = get_mounting("eye_in_hand")
     report = HandEyeReport(
-        _hand_eye(), mounting, comparison, None, (), 0.1, advice="Like sample 3, turned.", folder=OUT
+        result=_hand_eye(),
+        mounting=mounting,
+        comparison=comparison,
+        next_pose=None,
+        files=(),
+        seconds=0.1,
+        advice="Like sample 3, turned.",
+        folder=OUT,
     )
     return report.first, hand_eye_report(report, "samples.npz", "ab" * 32)
 
@@ -152,9 +230,16 @@ def _run(name: str, **job: Any) -> Any:
     context = SimpleNamespace(get_time=lambda: 10.0)
     cell = SimpleNamespace(scenario=scenario, job=SimpleNamespace(**job))
     return SimpleNamespace(
-        cell=cell, root=context, held=False, reason=None, clock=None, seconds=10.0, wall_seconds=5.0,
-        phases=[("start", 0.0, 0.0), ("scan_pose", 1.0, 0.5), ("done", 9.0, 4.5)], timing=lambda: timing,
-    )  # fmt: skip
+        cell=cell,
+        root=context,
+        held=False,
+        reason=None,
+        clock=None,
+        seconds=10.0,
+        wall_seconds=5.0,
+        phases=[("start", 0.0, 0.0), ("scan_pose", 1.0, 0.5), ("done", 9.0, 4.5)],
+        timing=lambda: timing,
+    )
 
 
 class LiveMounting(MountingReport):
@@ -174,9 +259,15 @@ def mounting() -> Made:
         mounting=get_mounting("eye_in_hand"), scanner=scanner, known=(), configuration="eye_in_hand", two=False
     )
     status = SimpleNamespace(
-        sequence=9, seen=(), refused=(("pose3", "No circle."),), sigma_work_m=2e-5, history=((4, 4e-5), (9, 2e-5)),
-        held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),), next_best=None, message="",
-    )  # fmt: skip
+        sequence=9,
+        seen=(),
+        refused=(("pose3", "No circle."),),
+        sigma_work_m=2e-5,
+        history=((4, 4e-5), (9, 2e-5)),
+        held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),),
+        next_best=None,
+        message="",
+    )
     run = _run("eye_in_hand", scene=scene, truth={}, status=lambda root: status)
     report = LiveMounting(run, _hand_eye(), OUT, 5.0)
     return report.first, mounting_report(report, None)
@@ -195,9 +286,15 @@ def _demo(estimate: Any, *, held: bool) -> Made:
     if held:
         run.held, run.reason = True, "The tag was lost."
     status = CalibrationStatus(
-        11, 10, tuple(OBSERVATIONS), (("p77", "No ring."),), estimate, 9e-5,
-        history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)), verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
-    )  # fmt: skip
+        11,
+        10,
+        tuple(OBSERVATIONS),
+        (("p77", "No ring."),),
+        estimate,
+        9e-5,
+        history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)),
+        verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
+    )
     result = DemoResult(options=RunOptions("calibrate_only", OUT), run=run, status=status, calibration=None, weld=None)
     return result.first, demo_report(result, demo_pictures(result), recording=True)
 
@@ -274,9 +371,17 @@ def tablet() -> Made:
     n = 9
     covariance = COVARIANCE.tolist()
     result = TabletResult(
-        "wrist", {"x": 0.1}, covariance, [0.1] * n, [0.2 + 0.01 * k for k in range(n)], X, covariance, [0.0, 0.0, 0.15],
-        (1e-9 * np.eye(3)).tolist(), data_sha256={"touches.csv": "ab" * 32},
-    )  # fmt: skip
+        "wrist",
+        {"x": 0.1},
+        covariance,
+        [0.1] * n,
+        [0.2 + 0.01 * k for k in range(n)],
+        X,
+        covariance,
+        [0.0, 0.0, 0.15],
+        (1e-9 * np.eye(3)).tolist(),
+        data_sha256={"touches.csv": "ab" * 32},
+    )
     grid = 0.05 * np.array([(i, j) for i in range(3) for j in range(3)], dtype=float)
     shown = Shown(grid, 1e-4 * random_poses(n, np.random.default_rng(1))[:, :2, 3], tuple(map(str, range(n))))
     first = tablet_screen(result, np.zeros(0), 0.5, NO_TOLERANCE)
@@ -305,6 +410,18 @@ def finger() -> Made:
 PAGES: dict[str, Callable[[], Made]] = {
     made.__name__: made
     for made in (
-        calibrate, verify, motion, monitor, hand_eye, mounting, demo, held, profiler, seam, profiler_live, tablet, finger,
+        calibrate,
+        verify,
+        motion,
+        monitor,
+        hand_eye,
+        mounting,
+        demo,
+        held,
+        profiler,
+        seam,
+        profiler_live,
+        tablet,
+        finger,
     )
-}  # fmt: skip
+}
