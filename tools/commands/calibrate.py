@@ -233,12 +233,12 @@ def calibrate_dataset(
             refine,
             data,
             Plain(
-                observations,
-                tuple(corrected),
-                seen.patterns,
-                estimate,
-                None if scanner is None else scanner.accepted,
-                correct_scanner and not few,
+                observations=observations,
+                corrected=tuple(corrected),
+                patterns=seen.patterns,
+                estimate=estimate,
+                correction=None if scanner is None else scanner.accepted,
+                correct_scanner=correct_scanner and not few,
             ),
             robot or data.header.robot,
             kinematics,
@@ -425,16 +425,18 @@ def _pose_records(
         tilt, held_tilt = (float(np.degrees(t[k])) for t in (estimate.tilt_residuals_rad, estimate.held_out.tilt_rad))
         records.append(
             PoseRecord(
-                o.id,
-                bool(estimate.inliers[k]),
-                reasons.pop(o.id, ""),
-                float(1e3 * estimate.position_residuals_m[k]),
-                float(1e3 * estimate.held_out.position_m[k]) if np.isfinite(estimate.held_out.position_m[k]) else None,
-                tilt if np.isfinite(tilt) else None,
-                held_tilt if np.isfinite(held_tilt) else None,
+                id=o.id,
+                used=bool(estimate.inliers[k]),
+                reason=reasons.pop(o.id, ""),
+                residual_mm=float(1e3 * estimate.position_residuals_m[k]),
+                held_out_mm=float(1e3 * estimate.held_out.position_m[k])
+                if np.isfinite(estimate.held_out.position_m[k])
+                else None,
+                tilt_deg=tilt if np.isfinite(tilt) else None,
+                held_out_tilt_deg=held_tilt if np.isfinite(held_tilt) else None,
             )
         )
-    return (*records, *(PoseRecord(i, False, t) for i, t in reasons.items()))
+    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 
 
 def _centres_csv(observations: list[Observation]) -> str:

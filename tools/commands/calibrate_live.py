@@ -7,10 +7,10 @@ import typer
 from weldcal.systems.jobs.discovery import job_of
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import MOTION, Call, Outcome, command, option
-from weldcal.tools.commands.demo import run_calibration_live
 from weldcal.tools.commands.motion_live import run_motion_live
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.run import run_options
+from weldcal.tools.commands.weld import run_calibration_live
 
 
 @command(

@@ -177,15 +177,15 @@ def _records(
     reasons = dict(refused)
     records = []
     for k, id in enumerate(frames.ids):
-        values = (
-            1e3 * estimate.residual_m[k],
-            1e3 * estimate.held_out_m[k],
-            np.degrees(estimate.tilt_rad[k]),
-            np.degrees(estimate.held_out_tilt_rad[k]),
-        )
-        numbers = [float(v) if np.isfinite(v) else None for v in values]
-        records.append(PoseRecord(id, bool(estimate.inliers[k]), reasons.pop(id, ""), *numbers))
-    return (*records, *(PoseRecord(i, False, t) for i, t in reasons.items()))
+        values = {
+            "residual_mm": 1e3 * estimate.residual_m[k],
+            "held_out_mm": 1e3 * estimate.held_out_m[k],
+            "tilt_deg": np.degrees(estimate.tilt_rad[k]),
+            "held_out_tilt_deg": np.degrees(estimate.held_out_tilt_rad[k]),
+        }
+        numbers = {key: float(v) if np.isfinite(v) else None for key, v in values.items()}
+        records.append(PoseRecord(id=id, used=bool(estimate.inliers[k]), reason=reasons.pop(id, ""), **numbers))
+    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 
 
 def _centres_csv(frames: ObservedFrames, estimate: MotionEstimate) -> str:

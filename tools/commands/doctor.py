@@ -25,9 +25,9 @@ from weldcal.systems.cell import Cell
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import LOOK, Call, FlangeOption, Outcome, command
 from weldcal.tools.commands.dataset_case import dataset_case
-from weldcal.tools.commands.record import RECORDING
-from weldcal.tools.commands.replay import replay
-from weldcal.tools.commands.run_files import SCANS, SUMMARY, live_case
+from weldcal.tools.commands.replay import replay_recording
+from weldcal.tools.commands.run import RECORDING
+from weldcal.tools.commands.weld import SCANS, SUMMARY, live_case
 from weldcal.tools.commands.weld_causes import weld_causes
 from weldcal.welding.record.signs import WORN
 from weldcal.welding.record.weld_log import CSV_NAME, load_weld_log
@@ -394,7 +394,7 @@ def _recorded(path: Path, progress: Progress) -> Diagnosis:
             cases.append(case)
         reasons.append(cell.job.command(root).reason or "")
 
-    replay(path, progress, look)
+    replay_recording(path, progress, look)
     found = diagnose(cases[0]) if cases else Diagnosis((), 0, float("nan"))
     return _both(found, weld_causes(None, reasons[0]))
 

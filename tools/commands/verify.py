@@ -139,7 +139,7 @@ def _by_touch(call: Call, result: Path, touches: Path) -> Outcome:
 
 
 def _touched_live(call: Call, result: Path, scenario: str, robot: str, points: int) -> Outcome:
-    from weldcal.tools.commands.touch_live import run_touches, touching
+    from weldcal.tools.commands.touch import run_touches, touching
     from weldcal.tools.report.first_screen import DO_NOT
     from weldcal.tools.report.run import RunOptions
 

@@ -46,11 +46,16 @@ COVARIANCE = np.diag([1e-4] * 3 + [5e-5] * 3) ** 2
 OBSERVATIONS = make_observations(10, 3)
 ESTIMATE = estimate_eye_on_base(OBSERVATIONS, SolveConfig(hypotheses=40))
 RESULT = CalibrationResult(
-    ESTIMATE.X_BC,
-    ESTIMATE.covariance,
-    error_summary(1e3 * ESTIMATE.held_out.position_m),
-    {"median": 0.01, "p95": 0.03},
-    tuple(PoseRecord(o.id, True, "", 0.1, 0.2, 0.01, 0.02) for o in OBSERVATIONS),
+    X_BC=ESTIMATE.X_BC,
+    covariance=ESTIMATE.covariance,
+    held_out_mm=error_summary(1e3 * ESTIMATE.held_out.position_m),
+    tilt_deg={"median": 0.01, "p95": 0.03},
+    poses=tuple(
+        PoseRecord(
+            id=o.id, used=True, reason="", residual_mm=0.1, held_out_mm=0.2, tilt_deg=0.01, held_out_tilt_deg=0.02
+        )
+        for o in OBSERVATIONS
+    ),
     warnings=("A <warning> of this calibration.",),
     robot="ur10e",
     flange="iso9409-1-50-4-m6",
@@ -111,7 +116,9 @@ def motion() -> Made:
     p_C = np.array([o.p_CR for o in make_observations(n, 1)])
     estimate = SimpleNamespace(
         X_BC=RESULT.X_BC,
-        clock=ScannerClock("arrival", 0.03, 1e-4, 1e-3, 0.0, reason="There is no other."),
+        clock=ScannerClock(
+            kind="arrival", offset_s=0.03, sigma_s=1e-4, jitter_s=1e-3, reference_s=0.0, reason="There is no other."
+        ),
         start=SimpleNamespace(delays=np.linspace(0.0, 0.1, 20), rms_m=1e-3 * np.ones(20), delay_s=0.03),
         inliers=np.ones(n, bool),
         capture=np.linspace(0.0, 3.0, n),
@@ -121,13 +128,13 @@ def motion() -> Made:
         held_out_m=values[3],
     )
     frames = ObservedFrames(
-        tuple(map(str, range(n))),
-        np.linspace(0.0, 3.0, n),
-        None,
-        p_C,
-        np.tile([0.0, 0.0, 1.0], (n, 1)),
-        np.tile(1e-9 * np.eye(3), (n, 1, 1)),
-        1e-3 * np.ones(n),
+        ids=tuple(map(str, range(n))),
+        arrival=np.linspace(0.0, 3.0, n),
+        device=None,
+        p_C=p_C,
+        n_C=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        covariance=np.tile(1e-9 * np.eye(3), (n, 1, 1)),
+        normal_sigma=1e-3 * np.ones(n),
     )
     report = MotionReport(
         result=RESULT,
@@ -146,18 +153,18 @@ def monitor() -> Made:
     n = 60
     rng = np.random.default_rng(0)
     event = DriftEvent(
-        MOVED,
-        2.0,
-        0.05,
-        2.3,
-        np.array([1e-3, 0.0, 0.0]),
-        np.zeros(3),
-        COVARIANCE,
-        X,
-        "translation",
-        80.0,
-        30.0,
-        "the scanner or the base has moved",
+        kind=MOVED,
+        time_s=2.0,
+        time_sigma_s=0.05,
+        found_s=2.3,
+        translation_m=np.array([1e-3, 0.0, 0.0]),
+        rotation_rad=np.zeros(3),
+        covariance=COVARIANCE,
+        X_BC_after=X,
+        model="translation",
+        statistic=80.0,
+        threshold=30.0,
+        cause="the scanner or the base has moved",
     )
     clock = SimpleNamespace(
         clock=SimpleNamespace(kind="arrival"), delay_s=0.1, sigma_s=1e-3, jitter_s=1e-3, source="recording"
@@ -273,7 +280,7 @@ def mounting() -> Made:
     return report.first, mounting_report(report, None)
 
 
-def _demo(estimate: Any, *, held: bool) -> Made:
+def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
     sequencer = SimpleNamespace(
         GetMyContextFromRoot=lambda root: root, job_state=lambda context: SimpleNamespace(warnings=("A remark.",))
     )
@@ -285,17 +292,21 @@ def _demo(estimate: Any, *, held: bool) -> Made:
     )
     if held:
         run.held, run.reason = True, "The tag was lost."
+    if not begun:
+        run.phases = []
     status = CalibrationStatus(
-        11,
-        10,
-        tuple(OBSERVATIONS),
-        (("p77", "No ring."),),
-        estimate,
-        9e-5,
+        sequence=11,
+        calibration_scans=10,
+        observations=tuple(OBSERVATIONS),
+        refused=(("p77", "No ring."),),
+        estimate=estimate,
+        predicted_error_m=9e-5,
         history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)),
         verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
     )
-    result = DemoResult(options=RunOptions("calibrate_only", OUT), run=run, status=status, calibration=None, weld=None)
+    result = DemoResult(
+        options=RunOptions(scenario="calibrate_only", out=OUT), run=run, status=status, calibration=None, weld=None
+    )
     return result.first, demo_report(result, demo_pictures(result), recording=True)
 
 
@@ -309,7 +320,17 @@ def held() -> Made:
     return _demo(None, held=True)
 
 
-RECORD = ProfilerRecord("sphere, affine", X.rotation().matrix(), np.array([0.03, -0.07, 0.16]), COVARIANCE)
+def unbegun() -> Made:
+    """`demo` that the operator ended before its first phase."""
+    return _demo(None, held=True, begun=False)
+
+
+RECORD = ProfilerRecord(
+    method="sphere, affine",
+    rotation=X.rotation().matrix(),
+    translation=np.array([0.03, -0.07, 0.16]),
+    covariance=COVARIANCE,
+)
 
 
 def profiler() -> Made:
@@ -361,7 +382,7 @@ def profiler_live() -> Made:
         curve=None,
         torch=None,
     )
-    live = ProfilerLive(RunOptions("profiler_edge", OUT), run, outcome)
+    live = ProfilerLive(RunOptions(scenario="profiler_edge", out=OUT), run, outcome)
     page = live_report(live.summary(), outcome, cast(Any, state), run, first=live.first, recording=False)
     return live.first, page
 
@@ -371,15 +392,15 @@ def tablet() -> Made:
     n = 9
     covariance = COVARIANCE.tolist()
     result = TabletResult(
-        "wrist",
-        {"x": 0.1},
-        covariance,
-        [0.1] * n,
-        [0.2 + 0.01 * k for k in range(n)],
-        X,
-        covariance,
-        [0.0, 0.0, 0.15],
-        (1e-9 * np.eye(3)).tolist(),
+        model="wrist",
+        parameters={"x": 0.1},
+        covariance=covariance,
+        residual_mm=[0.1] * n,
+        leave_one_out_mm=[0.2 + 0.01 * k for k in range(n)],
+        X_FC=X,
+        X_FC_covariance=covariance,
+        p_FP_m=[0.0, 0.0, 0.15],
+        p_FP_covariance=(1e-9 * np.eye(3)).tolist(),
         data_sha256={"touches.csv": "ab" * 32},
     )
     grid = 0.05 * np.array([(i, j) for i in range(3) for j in range(3)], dtype=float)
@@ -390,11 +411,29 @@ def tablet() -> Made:
 
 def finger() -> Made:
     """`finger calibrate` with touches."""
-    from weldcal.tools.commands.finger_calibrate import FingerReport, finger_page
+    from weldcal.tools.commands.cell.finger import FingerReport, finger_page
     from weldcal.welding.finger.calibration import Intrinsics, TipCalibration
 
-    camera = Intrinsics(np.diag([900.0, 900.0, 1.0]), np.zeros(5), 640, 480, 0.2, 0.3, 20, 5, 1.0)
-    tip = TipCalibration(1.0, 1e-3, None, np.array([0.0, 1e-4, np.nan]), {"x": 900.0}, 2e-5, ("pressed along x only",))
+    camera = Intrinsics(
+        K=np.diag([900.0, 900.0, 1.0]),
+        distortion=np.zeros(5),
+        width=640,
+        height=480,
+        rms_px=0.2,
+        held_out_px=0.3,
+        used=20,
+        held_out=5,
+        focal_sigma_px=1.0,
+    )
+    tip = TipCalibration(
+        scale=1.0,
+        scale_sigma=1e-3,
+        rotation_deg=None,
+        seat_m=np.array([0.0, 1e-4, np.nan]),
+        stiffness_N_per_m={"x": 900.0},
+        held_out_m=2e-5,
+        unknown=("pressed along x only",),
+    )
     report = FingerReport(
         camera=camera,
         tip=tip,
@@ -418,6 +457,7 @@ PAGES: dict[str, Callable[[], Made]] = {
         mounting,
         demo,
         held,
+        unbegun,
         profiler,
         seam,
         profiler_live,

@@ -16,7 +16,7 @@ from weldcal.tools.report.render import inline_svg
 
 VERDICTS = {"calibrate": CARE, "verify": CARE, "monitor": DO_NOT, "hand_eye": CARE, "demo": CARE, "held": DO_NOT}
 VERDICTS |= {"profiler": DO_NOT, "seam": CARE, "tablet": USE, "finger": CARE, "mounting": USE, "profiler_live": CARE}
-VERDICTS |= {"motion": CARE}
+VERDICTS |= {"motion": CARE, "unbegun": DO_NOT}
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.commands.record import RECORDING
+from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.studies.replay import overhead, study

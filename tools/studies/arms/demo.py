@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.commands.demo import run_demo
+from weldcal.tools.commands.weld import run_demo
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import csv_text
@@ -25,7 +25,7 @@ def run_arm(arm: str, folder: str, seed: int, seam_mm: float, robot: str | None)
     """Write an arm's scenario into its folder and run the demo there; its row of COLUMNS."""
     scenario = Path(folder) / f"{arm}.yaml"
     write_atomic(scenario, arm_scenario(arm, seam_mm))
-    options = RunOptions(str(scenario), Path(folder), seed, recording=False, robot=robot)
+    options = RunOptions(scenario=str(scenario), out=Path(folder), seed=seed, recording=False, robot=robot)
     try:
         found = run_demo(options).summary()
     except WeldcalError as error:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.tools.commands.demo import run_demo
+from weldcal.tools.commands.weld import run_demo
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import csv_text
@@ -21,7 +21,7 @@ COLUMNS = (
 
 def run_seed(scenario: str, folder: str, seed: int) -> Mapping[str, object]:
     """One demo in its own folder, without a recording; its JSON object."""
-    return run_demo(RunOptions(scenario, Path(folder), seed, recording=False)).summary()
+    return run_demo(RunOptions(scenario=scenario, out=Path(folder), seed=seed, recording=False)).summary()
 
 
 def run_seeds(scenario: str, farm: Farm, seeds: range) -> dict[str, object]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.run import RunOptions
 
 SEAM_MM = 100.0
@@ -18,7 +18,7 @@ def run_cell_benchmark(out: Path, seed: int = 0, progress: Progress = no_progres
     """
     scenario = load_scenario("s_groove")
     scenario.welding.seam_length_mm = SEAM_MM
-    options = RunOptions("s_groove", out, seed, recording=False)
+    options = RunOptions(scenario="s_groove", out=out, seed=seed, recording=False)
     result = run_scenario(scenario, options, progress)
     run = result.run
     camera = scenario.finger_camera

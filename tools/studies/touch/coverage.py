@@ -8,8 +8,8 @@ import numpy as np
 
 from weldcal.calibration.touch.judge import judge_touches
 from weldcal.systems.runner import no_progress
-from weldcal.tools.commands.demo import run_calibration_live
-from weldcal.tools.commands.touch_live import run_touches, touching
+from weldcal.tools.commands.touch import run_touches, touching
+from weldcal.tools.commands.weld import run_calibration_live
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.farm.work import FAILED
 from weldcal.tools.report.files import write_json

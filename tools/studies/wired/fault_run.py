@@ -12,7 +12,7 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.wall_clock import Lateness, WallClock
-from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.cell.process import WiredWorld
 from weldcal.tools.emulators.ur.process import Emulator
 from weldcal.tools.report.run import RunOptions
@@ -89,7 +89,7 @@ def run_job(
     with world.control() as controller:
         before = controller.ask(check="summary")
         with _thrown(world, happening, stage, thrown):
-            result = run_scenario(scenario, RunOptions("wired", folder, seed, recording=False), watch)
+            result = run_scenario(scenario, RunOptions(scenario="wired", out=folder, seed=seed, recording=False), watch)
         result.run.raise_if_interrupted()
         ended = time.monotonic()
         held = result.state != "done"

@@ -1,23 +1,45 @@
-"""`weldcal check-robot`: prints the pre-flight checks as a table or as JSON."""
+"""weldcal check-robot: the pre-flight checks of a controller, as a table or as JSON."""
 
 import shutil
 import textwrap
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import typer
 
+from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
-from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight
+from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.host_timing import measure_host
+from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.commands.robots import robot_at
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option
+from weldcal.tools.commands.run import robot_at
 
 WIDEST = 100
 MARKS = {"ok": typer.colors.GREEN, "to change": typer.colors.RED, "not checked": typer.colors.YELLOW}
+
+
+@command("check-robot", common=LOOK, short_help="Check whether a robot is ready. Nothing moves.")
+def check_robot(
+    call: Call,
+    host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")],
+    scenario: Annotated[
+        str | None,
+        option("--scenario", "NAME", "Compare arm and payload with this scenario's; without it, the welding tool's."),
+    ] = None,
+    arm: Annotated[str, option("--arm", "NAME", "The arm, where no scenario is given: ur3e, ur5e, ur20 ...")] = "ur10e",
+) -> Outcome:
+    """Check whether a robot and this computer are ready: what is right and what to change. Nothing moves or is written."""
+    nominal = nominal_arm(load_scenario(scenario)) if scenario is not None else load_arm(arm)
+    report = with_host(preflight(host, nominal=nominal, load=expected_load(host, scenario)))
+    problem = "" if report.first_problem is None else report.first_problem.operator_action
+    return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
 
 
 def expected_load(host: str, name: str | None) -> ExpectedLoad:

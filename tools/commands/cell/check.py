@@ -1,16 +1,17 @@
-"""`weldcal check-cell`: looks at every device of a scenario, moves nothing, and says of each what to change."""
+"""weldcal check-cell: looks at every device of a scenario and says what to do. Nothing moves."""
 
 import dataclasses as dc
 import inspect
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
@@ -27,15 +28,17 @@ from weldcal.systems.drivers.sensors.wired_camera import WiredFingerCamera
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.errors import RobotUnreachable
-from weldcal.systems.drivers.ur.readiness.preflight import Check, preflight
+from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.host_timing import measure_host
 from weldcal.systems.jobs.weld.settings import feature_standard, plan_poses
 from weldcal.systems.scenario.arm import nominal_arm
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.commands.check_robot import state_of
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command
+from weldcal.tools.commands.robot.check import emit_table, state_of
 from weldcal.welding.finger.deformation import TagModel, detect_tag
 
 LOOKED_AT = tuple(name for name in DEVICES if name not in ("robot", "robot_2"))
@@ -43,6 +46,21 @@ LEAST_FREE_GB = 2.0  # the scans, the log and the recording of a job take less
 BLURRED_PX = 4.0  # of the tag's edges from black to white
 LONGEST_LOOK_S = 3.0  # of a simulated sensor
 _FIRST = Path()
+
+
+@command("check-cell", common=LOOK, short_help="Check every device of a scenario. Nothing moves.")
+def check_cell(
+    call: Call,
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Name of a scenario, or path of its YAML file.")],
+) -> Outcome:
+    """Look at robot, scanner, finger camera, torch output and computer: each is ok, or what to do. Nothing moves."""
+    report = look_at_cell(load_scenario(scenario), scenario, progress=call.progress)
+    rows = tuple(
+        check if device == check.name else replace(check, name=f"{device.replace('_', ' ')}: {check.name}")
+        for device, check in report.rows
+    )
+    table = Preflight(host=report.name, checks=rows)
+    return Outcome(report.summary(), text=partial(emit_table, table), problem=report.first_problem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +98,7 @@ class CellReport:
         }
 
 
-def check_cell(
+def look_at_cell(
     scenario: Scenario, name: str, seed: int = 0, progress: Callable[[str, float], None] | None = None
 ) -> CellReport:
     """Look at the robot, then at each sensor, at the torch's output and at this computer.

@@ -1,11 +1,16 @@
 """weldcal emulate-cell: the physical world of a cell as a process, behind the wires of its devices."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from weldcal.tools.cli.options import Call, command, option
+from weldcal.tools.emulators.cell.world import run_world
+from weldcal.tools.report.render import write_atomic
+
+WIRED = "wired_"
 
 
 @command("emulate-cell", common=("seed", "debug"), short_help="Play a cell's hardware on loopback.")
@@ -25,15 +30,21 @@ def emulate_cell(
     parent: Annotated[int | None, option("--parent", "PID", "End when this process ends.")] = None,
 ) -> None:
     """Play robot, scanner, finger camera, torch and workpiece of a cell on loopback, until it is interrupted."""
-    from weldcal.tools.commands.emulate_cell import emulate
+    world = scenario.removeprefix(WIRED)
 
-    emulate(
-        scenario,
-        cell,
+    def write(found: dict[str, object]) -> None:
+        """Keep the truth file: what the world knows, whenever that has changed."""
+        if truth is not None:
+            write_atomic(truth, json.dumps({"scenario": world, "seed": call.seed} | found, indent=1) + "\n")
+
+    known = cell or f"{WIRED}{Path(world).stem}"
+    run_world(
+        world,
+        known,
         call.seed,
-        truth=truth,
+        write=write,
+        ready=lambda s: typer.echo(f"ready: {s}"),
         pace=pace,
         control_port=control_port,
         parent=parent,
-        ready=lambda s: typer.echo(f"ready: {s}"),
     )

@@ -1,10 +1,11 @@
-"""`weldcal finger calibrate`: intrinsics from pictures of a board, tag, seat and stiffness from touches on a known plate."""
+"""weldcal finger calibrate: the finger camera, its tag and the soft tip, from pictures."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 import yaml
 from numpy.typing import NDArray
 
@@ -16,7 +17,8 @@ from weldcal.models.images import read_grey_image
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.models.tools.loading import WELDING, load_tool
-from weldcal.tools.commands.print_board import Board
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
+from weldcal.tools.commands.cell.board import Board
 from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, Tolerance, check_limit
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.welding.finger.calibration import (
@@ -32,6 +34,42 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 COLUMNS = ("x_mm", "y_mm", "z_mm")
 FORCES = ("fx_n", "fy_n", "fz_n")
 _NO_TOUCHES = "Only the camera is calibrated: without touches nothing says how exactly the tip is measured."
+
+
+@command("finger calibrate", short_help="Calibrate the finger camera, its tag and the soft tip.")
+def finger_calibrate(
+    call: Call,
+    folder: Annotated[Path, typer.Argument(metavar="PICTURES", help="Folder of pictures of the board, png or jpg.")],
+    board: Annotated[Path, option("--board", "FILE", "board.yaml of the printed board, from print-board.")],
+    touches: Annotated[
+        Path | None, option("--touches", "FILE", "Table of touches on a plate: picture, x_mm, y_mm, z_mm, forces.")
+    ] = None,
+    tool: Annotated[
+        Path | None,
+        option("--tool", "FILE", "Tool file of the tool that carries the tag.", show_default="the welding tool"),
+    ] = None,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Calibrate the finger: intrinsics from pictures of the board; tag, seat and stiffness from touches on a known plate."""
+    report = calibrate_finger(folder, board, touches, call.folder("finger-calibrate", folder.name), tool, limit_mm)
+    found = report.document()
+    camera = found["camera"]
+    values = {
+        "focal length": f"{camera['fx']:.2f}, {camera['fy']:.2f} px, +- {camera['focal_sigma_px']:.2f}",
+        "principal point": f"{camera['cx']:.2f}, {camera['cy']:.2f} px",
+        "reprojection": f"{camera['rms_px']:.3f} px, on held-out pictures {camera['held_out_px']:.3f} px",
+        "pictures": f"{camera['pictures']} used, {camera['held_out_pictures']} held out, {len(report.without_board)} without the board",
+    }
+    if report.tip is not None:
+        tag, tip = found["tag"], found["tip"]
+        values |= {
+            "tag": f"{tag['size_mm']:.3f} mm, +- {tag['sigma_mm']:.3f}",
+            "seat": ", ".join("-" if v is None else f"{v:.3f}" for v in tip["seat_mm"]) + " mm",
+            "touches": f"held-out error {tip['held_out_mm']:.3f} mm",
+            "open": " ".join(tip["unknown"]) or "nothing",
+        }
+    summary = {"state": "done", "out": str(call.written), "without_board": list(report.without_board), **found}
+    return Outcome(summary, values=values, first=report.first)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

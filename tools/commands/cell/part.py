@@ -1,8 +1,10 @@
-"""`weldcal part`: the edges of a part as a table, as JSON and as a picture with their numbers."""
+"""weldcal part: the edges of a part as a table, as JSON and as a picture with their numbers."""
 
 import io
 import math
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -13,7 +15,9 @@ from numpy.typing import NDArray
 
 from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh
+from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.shape import PartEdge, PartShape
+from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import fixed, render, write_atomic
 
@@ -22,6 +26,21 @@ COLOURS = {"concave": "#c2281f", "convex": "#2b5fc4", "boundary": "#b37400"}
 MOST_DRAWN = 20_000  # triangles of a picture
 MOST_NUMBERED = 60  # convex edges with a number in the picture
 VIEWS = ((32.0, -60.0), (32.0, 120.0))  # elevation, azimuth
+
+
+@command("part", common=RESULT, short_help="List the edges of a part's file that can be welded.")
+def part(
+    call: Call,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A STEP, STL, OBJ or PLY file.", show_default=False)],
+    units: Annotated[
+        str | None, option("--units", "UNIT", "mm, m or inch.", show_default="the STEP file's own, mm for a mesh")
+    ] = None,
+) -> Outcome:
+    """List the edges of a part with their numbers, for workpiece.seams in a scenario, and draw them."""
+    shape = read_shape(file, units)
+    folder = call.folder("part", file.name)
+    write_part(shape, folder)
+    return Outcome(as_json(shape, folder), text=partial(emit_table, shape, folder))
 
 
 def candidates(shape: PartShape) -> list[PartEdge]:

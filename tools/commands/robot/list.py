@@ -1,20 +1,15 @@
-"""weldcal robots, check-robot and emulate-ur: the known robots, the state of a real one, and an emulated controller."""
-
-from __future__ import annotations
+"""weldcal robots: the known robots and the sources of their data."""
 
 import math
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from weldcal.models.robots import ROBOTS, Robot, get_robot
 from weldcal.tools import console
-from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option
-
-if TYPE_CHECKING:
-    from weldcal.models.robots import Robot
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command
 
 
 @command("robots", common=LOOK, short_help="List the known robots and their data.")
@@ -25,63 +20,9 @@ def robots(
     ] = "",
 ) -> Outcome:
     """List the known robots: flange by ISO 9409-1, payload, reach, joint limits and the sources of the data."""
-    from weldcal.models.robots import ROBOTS, get_robot
-
     chosen = [get_robot(name)] if name else list(ROBOTS.values())
     summary = {"state": "done", "robots": [_row(robot) for robot in chosen]}
     return Outcome(summary, text=partial(_print_one, chosen[0]) if name else partial(_print_all, chosen))
-
-
-@command("check-robot", common=LOOK, short_help="Check whether a robot is ready. Nothing moves.")
-def check_robot(
-    call: Call,
-    host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")],
-    scenario: Annotated[
-        str | None,
-        option("--scenario", "NAME", "Compare arm and payload with this scenario's; without it, the welding tool's."),
-    ] = None,
-    arm: Annotated[str, option("--arm", "NAME", "The arm, where no scenario is given: ur3e, ur5e, ur20 ...")] = "ur10e",
-) -> Outcome:
-    """Check whether a robot and this computer are ready: what is right and what to change. Nothing moves or is written."""
-    from weldcal.models.arms.kinematics import load_arm
-    from weldcal.systems.drivers.ur.readiness.preflight import preflight
-    from weldcal.systems.scenario.arm import nominal_arm
-    from weldcal.systems.scenario.loading import load_scenario
-    from weldcal.tools.commands.check_robot import as_json, emit_table, expected_load, with_host
-
-    nominal = nominal_arm(load_scenario(scenario)) if scenario is not None else load_arm(arm)
-    report = with_host(preflight(host, nominal=nominal, load=expected_load(host, scenario)))
-    problem = "" if report.first_problem is None else report.first_problem.operator_action
-    return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
-
-
-@command("emulate-ur", common=("seed", "debug"), short_help="Run an emulated UR controller on loopback.")
-def emulate_ur(
-    call: Call,
-    polyscope: Annotated[str, option("--polyscope", "VERSION", "Controller version: 5.12, 5.21, 10.7 ...")] = "5.21",
-    arm: Annotated[str, option("--arm", "NAME", "The arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")] = "ur10e",
-    kinematics: Annotated[Path | None, option("--kinematics", "FILE", "A robot's factory calibration.")] = None,
-    host: Annotated[str, option("--host", "ADDRESS", "Loopback address 127.x.y.z.")] = "127.0.0.1",
-    control_port: Annotated[
-        int, option("--control-port", "PORT", "Port that takes injected faults, as JSON lines.")
-    ] = 30090,
-    pace: Annotated[float, option("--pace", "P", "Speed relative to real time, 0.05 to 1.")] = 1.0,
-    lockstep: Annotated[float, option("--lockstep", "S", "Seconds for which time waits for a late client.")] = 0.0,
-) -> None:
-    """Run a UR controller on loopback that executes the URScript it is sent, until it is interrupted."""
-    from weldcal.tools.emulators.ur.main import run_emulator
-
-    run_emulator(
-        host=host,
-        control_port=control_port,
-        polyscope=polyscope,
-        robot=arm,
-        kinematics=kinematics,
-        pace=pace,
-        lockstep=lockstep,
-        seed=call.seed,
-        ready=typer.echo,
-    )
 
 
 def _row(robot: Robot) -> Mapping[str, object]:

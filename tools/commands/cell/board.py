@@ -1,14 +1,17 @@
-"""`weldcal print-board`: ChArUco boards and sheets of tags as PDF at true scale, with a line of 100 mm to check the print."""
+"""weldcal print-board: a calibration board or tags as PDF at true scale."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+import typer
 import yaml
 
 from weldcal.models.errors import InputError
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.finger.deformation import TagModel, dictionary_named, tag_cells
 
@@ -18,9 +21,41 @@ MARGIN_MM, RULER_MM, FOOT_MM = 12.0, 100.0, 34.0
 POINTS_PER_MM = 72.0 / 25.4
 QUIET = 0.25  # white margin around a tag, of its side: OpenCV needs one of its cells
 NOTE = "Print at 100 %, not fitted to the page. This line is 100 mm long: measure it."
-
 Rectangle = tuple[float, float, float, float]
 """x, y of the lower left corner, width, height, mm."""
+
+
+@command("print-board", short_help="Write a calibration board or tags as PDF at true scale.")
+def print_board(
+    call: Call,
+    kind: Annotated[str, typer.Argument(metavar="[KIND]", help="charuco (a board) or tags.")] = "charuco",
+    columns: Annotated[int, option("--columns", "N", "Squares of the board across.")] = 8,
+    rows: Annotated[int, option("--rows", "N", "Squares of the board down.")] = 6,
+    square_mm: Annotated[float, option("--square-mm", "MM", "Side of a square.")] = 4.0,
+    marker_mm: Annotated[float, option("--marker-mm", "MM", "Side of a marker in a square.")] = 3.0,
+    ids: Annotated[str, option("--ids", "N,N...", "Numbers of the tags.")] = "7",
+    size_mm: Annotated[float, option("--size-mm", "MM", "Black side of a tag.")] = 10.0,
+    copies: Annotated[int, option("--copies", "N", "Copies of each tag.", min=1, max=500)] = 6,
+    dictionary: Annotated[
+        str, option("--dictionary", "NAME", "Markers: 4X4_50, 5X5_50, APRILTAG_36h11 ...")
+    ] = "4X4_50",
+    paper: Annotated[str, option("--paper", "NAME", "A5, A4, A3 or letter.")] = "A4",
+) -> Outcome:
+    """Write a ChArUco board, or tags, as board.pdf at true scale, with a line of 100 mm to check the print by."""
+    board = None
+    if kind == "charuco":
+        board = Board(columns, rows, square_mm, marker_mm, dictionary)
+        sheet = board_sheet(board, paper)
+    elif kind == "tags":
+        words = ids.split(",")
+        if not all(word.strip().isdigit() for word in words):
+            raise InputError(f"--ids must be whole numbers with commas between, not '{ids}'.")
+        tags = [TagModel(dictionary, int(word), 1e-3 * size_mm) for word in words for _ in range(copies)]
+        sheet = tag_sheet(tags, paper)
+    else:
+        raise InputError(f"There is no board of the kind '{kind}': use charuco or tags.")
+    written = write_board(call.folder("print-board", kind), sheet, board)
+    return Outcome({"state": "done", "kind": kind, **written, "note": NOTE})
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Serves the page to a tablet under an unguessable path and receives its touches as a CSV file; on loopback by default."""
+"""weldcal tablet serve: serves the page to a tablet under an unguessable path and receives its touches as a CSV file."""
 
 import errno
 import ipaddress
@@ -9,18 +9,38 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import is_loopback, own_address
+from weldcal.tools.cli.options import Call, check_writable, command, option
 from weldcal.tools.report.render import write_atomic
 
 LARGEST_CSV = 1_000_000
 FIRST_COLUMNS = "landmark,time_utc,"
 
 
+@command("tablet serve", short_help="Serve the target page to a tablet.", common=("debug",))
+def serve(
+    call: Call,
+    host: Annotated[
+        str, option("--host", "ADDRESS", "Address to listen on; 0.0.0.0 admits the whole network.")
+    ] = "127.0.0.1",
+    port: Annotated[int, option("--port", "PORT", "Port; 0 takes any free one.")] = 8077,
+    out: Annotated[Path, option("--out", "FOLDER", "Folder for the touches that the tablet sends.")] = Path(
+        "weldcal-out/tablet"
+    ),
+) -> None:
+    """Serve the target page to a tablet until interrupted: landmarks at true scale, touches to a tenth of a pixel."""
+    check_writable(out)
+    run_server(host, port, out, typer.echo)
+
+
 def page() -> str:
     """The page: one self-contained HTML text."""
-    return files("weldcal.tools.commands.tablet.page").joinpath("tablet.html").read_text(encoding="utf-8")
+    return files("weldcal.tools.commands.tablet").joinpath("tablet.html").read_text(encoding="utf-8")
 
 
 class TabletServer(ThreadingHTTPServer):
