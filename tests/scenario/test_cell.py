@@ -32,7 +32,7 @@ from weldcal.tools.commands.run import JobRun
 from weldcal.tools.commands.weld import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import calibration_error, weld_outcome
-from weldcal.tools.studies.cell.study import figures
+from weldcal.tools.worlds.weld.cell_run import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.
@@ -363,13 +363,13 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
     assert (tmp_path / "run" / "report.html").exists()
 
 
-def test_a_run_that_is_held_at_once_has_completed_nothing() -> None:
+def test_a_held_run_keeps_the_share_that_it_had_reached() -> None:
     person, shares = Person(), []
     person.end()
     cell = build_cell(load_scenario("straight_groove", TOLD), person=person)
     found = run_cell(cell, lambda stage, share: shares.append(share))
     assert found.held
-    assert max(shares) < 0.05
+    assert max(shares) < 0.5
     assert JobRun(found, None, "simulated").share(0.985) == shares[-1]
 
 
