@@ -111,7 +111,8 @@ def _check(key: str, name: str, number: float) -> None:
     if not math.isfinite(number):
         raise InputError(f"{key} must be finite, not {number}.")
     if abs(number) > largest(name):
-        raise InputError(f"{key} is {number:g}; the largest possible size is {largest(name):g}.")
+        bound = f"at most {largest(name):g}" if number > 0.0 else f"at least {-largest(name):g}"
+        raise InputError(f"{key} is {number:g}; it may be {bound}.")
     if name in POSITIVE and number <= 0.0:
         raise InputError(f"{key} must be a positive number, not {number:g}.")
     if name in NOT_NEGATIVE and number < 0.0:

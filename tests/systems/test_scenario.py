@@ -383,7 +383,7 @@ def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
         ("calibration: {verification_scans: -1}", "calibration.verification_scans must not be negative"),
         ("welding: {seam_length_mm: -5}", "welding.seam_length_mm must be a positive number"),
         ("welding: {speed_mm_s: fast}", "at 'welding'"),
-        ("scanner: !RenderedScanner {width: 20000}", "scanner.width is 20000; the largest possible size is 4096"),
+        ("scanner: !RenderedScanner {width: 20000}", "scanner.width is 20000; it may be at most 4096"),
         ("scanner: !RenderedScanner {width: '1,5'}", "at 'scanner': invalid literal for int"),
         ("scanner: !RenderedScanner {width: 1.5}", "at 'scanner': Expected a"),
         ("visualization: {recording_fps: 1.0e+9}", "visualization.recording_fps is 1e+09"),
