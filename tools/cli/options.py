@@ -172,7 +172,7 @@ class Command:
 
     title: str
     function: Callable[..., None]
-    body: Callable[..., Any]
+    body: "Body"
 
 
 LARGEST_OPTION = 1e6

@@ -1,6 +1,7 @@
 """`weldcal calibrate`: estimates X_BC and its uncertainty from a folder of scans, and writes exports and a report."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -119,7 +120,7 @@ def calibrate(
         ),
     ] = None,
     limit_mm: LimitOption = None,
-) -> Outcome:
+) -> Outcome | Mapping[str, object] | None:
     """Calibrate a scanner from a folder of flange scans and robot poses, or live in a scenario."""
     if (dataset is None) == (scenario is None):
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
@@ -128,18 +129,15 @@ def calibrate(
             raise typer.BadParameter("--poses, --refine and --kinematics are for a dataset; omit them with --scenario")
         if limit_mm is not None:
             raise typer.BadParameter("--limit-mm is for a dataset; a scenario states calibration.required_error_mm")
-        live: Outcome = other_command("calibrate-live").body(call, scenario, robot=robot)
-        return live
+        return other_command("calibrate-live").body(call, scenario, robot=robot)
     assert dataset is not None
     if is_motion(dataset):
         if poses is not None or axis_turn is not None or refine is not None:
             raise typer.BadParameter(
                 "--poses, --refine and --axis-turn are for scans at rest; omit them with a recording in motion"
             )
-        moving: Outcome = other_command("calibrate-motion").body(
-            call, dataset, robot=robot, flange=flange, centres=centres, limit_mm=limit_mm
-        )
-        return moving
+        moving = other_command("calibrate-motion").body
+        return moving(call, dataset, robot=robot, flange=flange, centres=centres, limit_mm=limit_mm)
     report = calibrate_dataset(
         dataset,
         call.folder("calibrate", dataset.resolve().name),
