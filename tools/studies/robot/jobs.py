@@ -113,7 +113,7 @@ def run_jobs(
         seed: of the first.
         load: busy programs beside.
         seam_mm: length of the seam to weld; the scenario's where None.
-        progress: told which job runs.
+        progress: gets the job that runs.
     """
     found = []
     overrides = "" if seam_mm is None else f"welding: {{seam_length_mm: {seam_mm}}}"
