@@ -17,8 +17,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.jobs.mounting.calibrator import solve_mounting
 from weldcal.systems.jobs.mounting.job import mounting_scene
-from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
-from weldcal.systems.jobs.mounting.procedure import MountingProcedure
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario

@@ -17,10 +17,8 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.plan import plan_touches
-from weldcal.systems.jobs.profiler.planning_context import PlanningContext
-from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure
-from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.jobs.profiler.plan import PlanningContext, plan_touches
+from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario

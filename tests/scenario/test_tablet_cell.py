@@ -14,8 +14,8 @@ from pydrake.systems.analysis import Simulator
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
-from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
-from weldcal.systems.jobs.tablet.planning import plan_tablet
+from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.job import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory

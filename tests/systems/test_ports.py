@@ -56,30 +56,28 @@ from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigi
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
 from weldcal.systems.drivers.ur.touch_probe import ProbeInput, Touches, UrTouchProbeInput
-from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
-from weldcal.systems.jobs.motion.collector import MotionCollector
-from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord, MotionState
-from weldcal.systems.jobs.motion.procedure import MotionProcedure
-from weldcal.systems.jobs.motion.recorder import MotionRecorder
+from weldcal.systems.jobs.motion.collector import MotionCalibrator, MotionCollector, MotionRecorder
+from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProcedure, MotionRecord, MotionState
 from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
 from weldcal.systems.jobs.mounting.job import mounting_scene
-from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
-from weldcal.systems.jobs.mounting.procedure import MountingProcedure
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.planning_context import PlanningContext
-from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure
-from weldcal.systems.jobs.profiler.robot_error import RobotError
-from weldcal.systems.jobs.profiler.state import ProfilerState
-from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
-from weldcal.systems.jobs.tablet.planning import plan_tablet
+from weldcal.systems.jobs.profiler.job import RobotError
+from weldcal.systems.jobs.profiler.plan import PlanningContext
+from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
+from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.job import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletProcedure, TabletState
-from weldcal.systems.jobs.touch.config import TouchConfig
-from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchPlanner, TouchPlanning
+from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchConfig, TouchPlanner, TouchPlanning
 from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
-from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
-from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig, IterativeCalibrator
+from weldcal.systems.jobs.weld.iterative_calibrator import (
+    CalibrationPosePlanner,
+    CalibratorConfig,
+    IterativeCalibrator,
+    NextPose,
+)
 from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobPlan, JobSequencer, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo

@@ -16,10 +16,9 @@ from weldcal.calibration.motion.drift.watch import Watched, watch
 from weldcal.calibration.motion.frames import observed_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.motion.calibrator import posed_stream
-from weldcal.systems.jobs.motion.config import MotionJob
-from weldcal.systems.jobs.motion.job import AddedMotion
-from weldcal.systems.jobs.motion.messages import MotionRecord
+from weldcal.systems.jobs.motion.collector import posed_stream
+from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
+from weldcal.systems.jobs.motion.procedure import MotionRecord
 from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.checks import check_scenario

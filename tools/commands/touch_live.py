@@ -6,7 +6,7 @@ from pathlib import Path
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.touch.table import touches_text
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.touch.config import TouchConfig
+from weldcal.systems.jobs.touch.planner import TouchConfig
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.next_scan import next_scan
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Run

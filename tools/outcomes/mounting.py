@@ -9,7 +9,7 @@ from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.solve import HandEyeResult, pose_difference
 from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.systems.jobs.mounting.job import FOOT, AddedMounting
-from weldcal.systems.jobs.mounting.messages import MountingStatus
+from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.outcomes.first_screen import (
     Expected,

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.runner import Run
 from weldcal.tools.outcomes.first_screen import FirstScreen
 from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome

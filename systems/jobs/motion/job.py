@@ -1,6 +1,6 @@
 """The motion job: calibrates a streaming scanner and its clock, or watches a calibration, while the flange moves in a cube."""
 
-from dataclasses import dataclass
+import dataclasses as dc
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +14,8 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
-from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
-from weldcal.systems.jobs.motion.collector import MotionCollector
-from weldcal.systems.jobs.motion.config import MotionJob, check_motion
-from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord
-from weldcal.systems.jobs.motion.procedure import MotionProcedure
-from weldcal.systems.jobs.motion.recorder import MotionRecorder
+from weldcal.systems.jobs.motion.collector import MotionCalibrator, MotionCollector, MotionRecorder
+from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProcedure, MotionRecord
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
 from weldcal.systems.jobs.weld.settings import feature_on_flange, feature_standard
 from weldcal.systems.messages import CalibrationStatus, JobCommand
@@ -33,12 +29,49 @@ from weldcal.systems.station import Station
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
 
+LEAST_FRAMES, MOST_FRAMES = 40, 5000
+
+
+@dc.dataclass
+class MotionJob:
+    """The flange moves between corners of a cube while the scanner streams."""
+
+    centre_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.30])  # of the cube, in the base
+    edge_mm: float = 200.0
+    lean_deg: float = (
+        15.0  # largest lean of the flange from the scanner's direction, drawn from the seed for each corner
+    )
+    frames: int = 400  # frames with the flange that are wanted
+    speed_m_s: float = 0.25  # largest speed of the flange
+    queue: int = 2  # frames that wait for the fit
+    record: bool = False  # write what streams as a recording in motion, to `recording` in the result folder
+    recording_folder: str = ""  # set by the command
+    watch: str = ""  # a calibration that is watched for drift instead of calibrating; set by `weldcal monitor`
+    false_alarms_per_hour: float = 1e-3  # that are accepted of the drift test
+
+
+def check_motion(job: MotionJob) -> None:
+    """Check the part's numbers. Raises InputError: one sentence that says what to change."""
+    if len(job.centre_m) != 3 or not np.isfinite(job.centre_m).all():
+        raise InputError("motion.centre_m must be three numbers, in metres.")
+    if not 20.0 <= job.edge_mm <= 1000.0:
+        raise InputError(f"motion.edge_mm must be from 20 to 1000, and it is {job.edge_mm:g}.")
+    if not 0.0 <= job.lean_deg <= 30.0:
+        raise InputError(f"motion.lean_deg must be from 0 to 30, and it is {job.lean_deg:g}.")
+    if not LEAST_FRAMES <= job.frames <= MOST_FRAMES:
+        raise InputError(f"motion.frames must be from {LEAST_FRAMES} to {MOST_FRAMES}, and it is {job.frames}.")
+    if not 0.01 <= job.speed_m_s <= 1.0:
+        raise InputError(f"motion.speed_m_s must be from 0.01 to 1, and it is {job.speed_m_s:g}.")
+    if not 1 <= job.queue <= 8:
+        raise InputError(f"motion.queue must be from 1 to 8, and it is {job.queue}.")
+
+
 CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]], dtype=np.float64) - 0.5  # no four in a plane
 _TRIES = 40  # leans drawn for a corner
 _POLL_S = 0.004  # of the queue and the estimator: a twelfth of a frame
 
 
-@dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False)
 class MotionPlanned:
     """Joint angles (6,) rad of the corners, the scanner's delay (s) as known from its data sheet, and what is watched, if anything."""
 
@@ -48,7 +81,7 @@ class MotionPlanned:
     watched: CalibrationResult | None = None
 
 
-@dataclass(eq=False)
+@dc.dataclass(eq=False)
 class AddedMotion(AddedJob):
     """The systems of the job; it has a `calibrator` or, where it watches a calibration, a `monitor`."""
 

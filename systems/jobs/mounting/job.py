@@ -20,8 +20,7 @@ from weldcal.systems.drivers.simulated.second_arm import place_second_arm
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
 from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
-from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
-from weldcal.systems.jobs.mounting.procedure import MountingProcedure
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario

@@ -9,7 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, State
 
 from weldcal.models.arms.kinematics import ArmModel, jacobian
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, Message, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory

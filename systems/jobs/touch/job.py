@@ -14,8 +14,7 @@ from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
-from weldcal.systems.jobs.touch.config import TouchConfig, check_touch
-from weldcal.systems.jobs.touch.planner import TouchPlanner, TouchPlanning
+from weldcal.systems.jobs.touch.planner import TouchConfig, TouchPlanner, TouchPlanning, check_touch
 from weldcal.systems.jobs.touch.procedure import Felt, TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.jobs.weld.job import seam_planning

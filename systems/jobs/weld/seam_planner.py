@@ -3,10 +3,11 @@
 import dataclasses as dc
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue
@@ -25,15 +26,47 @@ from weldcal.models.workpieces.part import WeldPart, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.weld.levelled import plan_root_anyhow
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
-from weldcal.welding.locate.planning import PlanningMethod, RootPlan
+from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.room import check_ends, check_room
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import check_length, touch_start_pose
+
+_Z = (0.0, 0.0, 1.0)
+
+
+def plan_root_anyhow(
+    points_B: npt.NDArray[np.floating],
+    workpiece: WeldPart,
+    X_BP_guess: RigidTransform,
+    method: PlanningMethod,
+    eye_B: npt.NDArray[np.float64],
+    up_B: npt.NDArray[np.float64],
+    plan: Callable[..., RootPlan] = plan_root,
+) -> RootPlan:
+    """`plan_root` where up_B (3,), the direction against gravity in the base, may differ from the base's z.
+
+    Finding a part takes up for +z: the scan is turned about the base's origin, and the result is turned back.
+
+    Raises:
+        WeldcalError: as plan_root.
+    """
+    if tuple(up_B) == _Z:
+        return plan(points_B, workpiece, X_BP_guess, method, eye_B)
+    R_BU = RotationMatrix.MakeFromOneVector(up_B, 2)
+    X_UB = RigidTransform(R_BU.inverse(), np.zeros(3))
+    if method.start_B is not None:
+        x, y, z = X_UB @ np.array(method.start_B)
+        method = dc.replace(method, start_B=(x, y, z))
+    R_UB = X_UB.rotation().matrix()
+    found = plan(points_B @ R_UB.T, workpiece, X_UB @ X_BP_guess, method, R_UB @ eye_B)
+    R = R_BU.matrix()
+    X_BP = None if found.X_BP is None else X_UB.inverse() @ found.X_BP
+    return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
+
 
 CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
 CLEAR_OF_PART_M = 0.002

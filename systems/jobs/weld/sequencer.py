@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, State
 
-from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, UrStatus

@@ -14,7 +14,7 @@ from pydrake.systems.analysis import Simulator
 
 from tests.systems.cells import Q_HOME
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, HeldOut
-from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
 from weldcal.systems.jobs.weld.job import SHARES
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport

@@ -19,9 +19,8 @@ from weldcal.calibration.touch.table import read_touches, touches_text
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, link_frames
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.touch.config import TouchConfig
 from weldcal.systems.jobs.touch.job import AddedTouches
-from weldcal.systems.jobs.touch.planner import Place, PlannedTouches, TouchPlanning, plan_touches
+from weldcal.systems.jobs.touch.planner import Place, PlannedTouches, TouchConfig, TouchPlanning, plan_touches
 from weldcal.systems.jobs.touch.procedure import FRAMES, Felt, TouchMotion, TouchSeen, TouchState, next_touch_state
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.jobs.weld.job import seam_planning
