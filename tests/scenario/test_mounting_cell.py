@@ -240,7 +240,7 @@ def test_a_person_holds_the_procedure_on_its_way(alone: Alone) -> None:
     alone.tell(hold=[1.0])
     alone.simulator.AdvanceTo(alone.simulator.get_context().get_time() + 0.05)
     assert alone.state.phase == "held"
-    assert alone.state.reason.startswith("A person ended the job")
+    assert alone.state.reason.startswith("The operator ended the job in phase")
     command = alone.procedure.GetOutputPort("job").Eval(alone.simulator.get_context())
     assert (command.finished, command.held, command.mode) == (True, True, "hold")
 

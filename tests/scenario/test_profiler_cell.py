@@ -139,7 +139,7 @@ def test_profiles_that_show_nothing_hold_it_with_a_sentence(alone: Alone) -> Non
     for _ in range(300):
         if alone.state.phase == "held":
             break
-        alone.tell(profile=AbstractValue.Make(ProfileScan(alone.state.sequence, 1.0, nothing)))
+        alone.tell(profile=AbstractValue.Make(ProfileScan(alone.state.trigger, 1.0, nothing)))
         alone.run(0.1)
     assert alone.state.phase == "held"
     assert "edge" in alone.state.reason
@@ -167,7 +167,7 @@ def test_a_person_holds_it(alone: Alone) -> None:
     alone.tell(hold=[1.0])
     alone.run(0.04)
     assert alone.state.phase == "held"
-    assert alone.state.reason.startswith("A person ended the job")
+    assert alone.state.reason.startswith("The operator ended the job in phase")
 
 
 @pytest.mark.parametrize(

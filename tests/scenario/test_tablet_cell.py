@@ -171,7 +171,7 @@ def test_a_person_holds_the_visit(alone: Alone) -> None:
     alone.tell(hold=[1.0])
     alone.run(0.05)
     assert (alone.state.phase, alone.state.finished) == ("held", True)
-    assert "A person ended the job, in the phase 'descend'" in alone.state.reason
+    assert "The operator ended the job in phase 'descend'" in alone.state.reason
 
 
 def test_a_touch_at_a_time_that_no_pose_is_known_for_is_not_used(alone: Alone) -> None:

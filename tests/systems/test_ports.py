@@ -61,6 +61,7 @@ from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProce
 from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
 from weldcal.systems.jobs.mounting.job import mounting_scene
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
+from weldcal.systems.jobs.procedure import Procedure
 from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.jobs.profiler.job import RobotError
 from weldcal.systems.jobs.profiler.plan import PlanningContext
@@ -121,7 +122,18 @@ from weldcal.welding.servo.settings import ServoConfig
 X = RigidTransform()
 IDEAL = get_scanner("ideal", width=206, height=154)
 CALIBRATOR = CalibratorConfig(1e-4, 6, 10, np.zeros(3))
-JOB = JobPlan(True, True, Q_HOME, 10, 1, 5e-4, 1e-4)
+JOB = JobPlan(
+    calibrate=True,
+    weld=True,
+    q_home=Q_HOME,
+    maximum_scans=10,
+    verification_scans=1,
+    verification_limit_m=5e-4,
+    required_error_m=1e-4,
+)
+TOUCH = TouchMotion(
+    q_home=Q_HOME, descent_m_s=3e-3, press_m=1e-3, deepest_m=6e-3, move_timeout_s=20.0, maximum_time_s=240.0
+)
 
 
 def profiler_fixture() -> ProfilerFixture:
@@ -196,7 +208,13 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     TouchPlanner: lambda: TouchPlanner(
         TouchPlanning(cast("SeamPlanning", None), X, ScannerCorrection(), TouchConfig())
     ),
-    TouchProcedure: lambda: TouchProcedure(the_arm(), TOOL, TouchMotion(Q_HOME, 3e-3, 1e-3, 6e-3, 20.0, 240.0)),
+    TouchProcedure: lambda: TouchProcedure(
+        the_arm(),
+        TOOL,
+        TouchMotion(
+            q_home=Q_HOME, descent_m_s=3e-3, press_m=1e-3, deepest_m=6e-3, move_timeout_s=20.0, maximum_time_s=240.0
+        ),
+    ),
     WristCamera: lambda: WristCamera(RenderedWristCamera(), 0),
     MountingProcedure: lambda: MountingProcedure((), 0, 0, (Q_HOME, None)),
     MountingCalibrator: lambda: MountingCalibrator(
@@ -501,7 +519,7 @@ def test_every_system_of_this_room_is_tested_here() -> None:
     for module in pkgutil.walk_packages(weldcal.systems.__path__, "weldcal.systems."):
         members = inspect.getmembers(importlib.import_module(module.name), inspect.isclass)
         found |= {c for _, c in members if issubclass(c, LeafSystem) and c.__module__.startswith("weldcal.")}
-    found -= {LeafSystem, BackgroundSystem}  # the base classes have no ports of their own
+    found -= {LeafSystem, BackgroundSystem, Procedure}  # the base classes have no ports of their own
     assert found == set(MAKERS) == set(KINDS)
 
 

@@ -69,7 +69,7 @@ class DemoResult:
     def warnings(self) -> tuple[str, ...]:
         """What the job warned of and did not hold for."""
         sequencer = self.run.cell.job.sequencer
-        return sequencer.job_state(sequencer.GetMyContextFromRoot(self.run.root)).warnings
+        return sequencer.state_in(sequencer.GetMyContextFromRoot(self.run.root)).warnings
 
     @property
     def first(self) -> FirstScreen:

@@ -180,7 +180,7 @@ class Motion(Job[MotionPlanned]):
         procedure = wiring.add(
             "motion_procedure",
             MotionProcedure(
-                plan.corners, plan.q_home, job.frames, share, maximum_time_s=maximum_time_s, calibrates=watched is None
+                plan.corners, plan.q_home, job.frames, speed_share=share, maximum_time_s=maximum_time_s, calibrates=watched is None
             ),
         )  # fmt: skip
         queue = wiring.add("frame_queue", FrameQueue(job.queue, _POLL_S))

@@ -20,7 +20,7 @@ from weldcal.systems.jobs.profiler.plan import PlanningContext
 from weldcal.systems.jobs.profiler.procedure import PLANS, ProfilerProcedure, ProfilerState
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand
-from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
@@ -129,7 +129,14 @@ class Profiler(Job[PlanningContext]):
         profiler = wiring.scenario.profiler
         assert isinstance(profiler, RenderedProfiler)
         procedure = wiring.add(
-            "profiler_procedure", ProfilerProcedure(plan, profiler, wiring.seed, wiring.station.background)
+            "profiler_procedure",
+            ProfilerProcedure(
+                plan,
+                profiler,
+                wiring.seed,
+                wiring.station.background,
+                move_timeout_s=MOVE_TIMEOUT_S / wiring.scenario.job.speed_factor,
+            ),
         )
         wiring.connect(
             procedure,

@@ -104,12 +104,12 @@ class TouchJob(Job[TouchPlanning]):
         assert isinstance(scenario.finger_camera, FingerCameraConfig)
         slower = 1.0 / scenario.job.speed_factor
         motion = TouchMotion(
-            np.deg2rad(scenario.home_deg),
-            1e-3 * config.descent_mm_s,
-            1e-3 * config.press_mm,
-            1e-3 * (config.deepest_mm + config.press_mm),
-            MOVE_TIMEOUT_S * slower,
-            scenario.job.maximum_time_s * slower,
+            q_home=np.deg2rad(scenario.home_deg),
+            descent_m_s=1e-3 * config.descent_mm_s,
+            press_m=1e-3 * config.press_mm,
+            deepest_m=1e-3 * (config.deepest_mm + config.press_mm),
+            move_timeout_s=MOVE_TIMEOUT_S * slower,
+            maximum_time_s=scenario.job.maximum_time_s * slower,
         )
         planner = wiring.add("touch_planner", TouchPlanner(plan, station.background))
         finger = wiring.add(

@@ -59,9 +59,9 @@ JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
     "mounting": (
         Facts("eye_in_hand", steps=MOUNTING_STEPS, required_mm=0.2, maximum_scans=10),
         {
-            "state": MountingState("move", visit=11, purpose="verify", label="aside01"),
+            "state": MountingState(phase="move", visit=11, purpose="verify", label="aside01"),
             "status": MountingStatus(
-                7, history=((4, 9e-4), (5, 4e-4), (6, 1.8e-4)), held_out=(HeldOut("aside01", 3e-4, 0.0),), next_best=BEST
+                sequence=7, history=((4, 9e-4), (5, 4e-4), (6, 1.8e-4)), held_out=(HeldOut("aside01", 3e-4, 0.0),), next_best=BEST
             ),
         },
         "Verify",
@@ -70,7 +70,7 @@ JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
     "motion": (
         Facts("motion", steps=MOTION_STEPS, maximum_scans=300),
         {
-            "state": MotionState("collect"),
+            "state": MotionState(phase="collect"),
             "record": MotionRecord(2, refused=(("frame07", "no flange in the scan"),), waits_s=(0.04, 0.05)),
         },
         "Collect frames",
@@ -78,14 +78,14 @@ JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
     ),
     "monitor": (
         Facts("monitor", steps=WATCH_STEPS, maximum_scans=300),
-        {"state": MotionState("collect"), "drift": drifted(True)},
+        {"state": MotionState(phase="collect"), "drift": drifted(True)},
         "Watch",
         "Error of the calibration",
     ),
     "tablet": (
         Facts("tablet", steps=TABLET_STEPS, maximum_scans=12),
         {
-            "state": TabletState("descend", landmark=2, touches=(Touched(0, np.zeros(2), np.zeros(6)), Touched(1, np.array([120.0, 3.5]), np.zeros(6)))),
+            "state": TabletState(phase="descend", landmark=2, touches=(Touched(0, np.zeros(2), np.zeros(6)), Touched(1, np.array([120.0, 3.5]), np.zeros(6)))),
         },
         "Touch",
         "landmark 2 at 120.0, 3.5 px",
@@ -94,7 +94,7 @@ JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
         Facts("touch", steps=TOUCH_STEPS, maximum_scans=8, press_mm=1.0, height=lambda felt: 1e-3 * felt.q[0]),
         {
             "state": TouchState(
-                "descend", places=(PLACE,) * 8, index=2, zero=np.zeros(3), frames=tuple(np.array([0.0, 0.0, 1e-4 * k]) for k in range(9)),
+                phase="descend", places=(PLACE,) * 8, index=2, zero=np.zeros(3), frames=tuple(np.array([0.0, 0.0, 1e-4 * k]) for k in range(9)),
                 felt=tuple(Felt(PLACE, np.full(6, height), np.zeros(3)) for height in (0.05, -0.12)),
             ),
         },
@@ -103,7 +103,7 @@ JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
     ),
     "profiler": (
         Facts("profiler_edge", steps=PROFILER),
-        {"state": ProfilerState("move", step="edge", taken=(Taken("edge", np.zeros(6), PROFILE),))},
+        {"state": ProfilerState(phase="move", step="edge", taken=(Taken("edge", np.zeros(6), PROFILE),))},
         "Scan the edge",
         "Last profile",
     ),
@@ -164,7 +164,7 @@ def test_a_job_of_another_package_has_neither(source: DashboardSource) -> None:
 
 def test_a_scanner_that_moved_is_a_warning_and_a_step_of_its_curve(source: DashboardSource) -> None:
     calm = DashboardSource(LiveView(), Person(), Facts(steps=WATCH_STEPS))
-    calm.live.moment = Moment(2.0, JobCommand(), {"state": MotionState("collect"), "drift": drifted(False)})
+    calm.live.moment = Moment(2.0, JobCommand(), {"state": MotionState(phase="collect"), "drift": drifted(False)})
     assert calm.values()["panel"]["warning"] == ""
     moved = told(source, "monitor")["panel"]
     assert moved["warning"]
