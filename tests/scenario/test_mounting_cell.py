@@ -157,6 +157,12 @@ def test_what_does_not_belong_together_is_refused_before_any_work(tmp_path: Path
     refused("calibrate_only", "robot_2: !SimulatedUr {}", "second robot belongs to co_manipulation")
     refused("co_manipulation", "robot_2: !NoDevice {}", "robot_2")
     refused("eye_on_arm", "mounting: {spread_deg: -3.0}", "positive")
+    second = "mounting: {second_arm: {home_deg: [0.0, -400.0, 110.0, -120.0, -90.0, 0.0]}}"
+    refused(
+        "co_manipulation",
+        second,
+        "second_arm.home_deg puts joint 2 of the ur10e at -400 deg, and its limits are -360 to 360",
+    )
     with pytest.raises(InputError, match="has no mounting part"):
         run_mounting_live(load_scenario("calibrate_only"), RunOptions("calibrate_only", tmp_path), lambda *_: None)
     assert not any(tmp_path.iterdir())

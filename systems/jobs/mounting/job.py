@@ -23,6 +23,7 @@ from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
+from weldcal.systems.scenario.numbers import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.station import Station
@@ -86,6 +87,9 @@ class Mounting(Job[MountingPlanned]):
             second_robot=not isinstance(scenario.robot_2, NoDevice),
             weld=scenario.job.weld,
         )
+        job = scenario.part(MountingJob)
+        if job is not None and job.second_arm is not None:
+            check_home(job.second_arm.home_deg, job.second_arm.arm, "mounting.second_arm.home_deg")
 
     def furnish(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
