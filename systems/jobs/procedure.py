@@ -256,6 +256,10 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         """The state at the start of a phase that waits for a scan or a picture."""
         return self.enter(s, now, phase, trigger=s.trigger + 1, **changes)
 
+    def end(self, s: StateOf, now: InputsOf) -> StateOf:
+        """The state at the end: held where a reason was found on the way, else done."""
+        return self.enter(s, now, "held" if s.reason else "done")
+
     def held(self, s: StateOf, now: InputsOf, reason: str) -> StateOf:
         """The state in which the arm stays at rest and the process off; only a new job leaves it."""
         return self.enter(s, now, "held", reason=self.because(s, reason))

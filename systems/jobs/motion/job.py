@@ -16,9 +16,9 @@ from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.motion.collector import MotionCalibrator, MotionCollector, MotionRecorder
 from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProcedure, MotionRecord
-from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
-from weldcal.systems.jobs.weld.settings import feature_on_flange, feature_standard
-from weldcal.systems.messages import CalibrationStatus, JobCommand
+from weldcal.systems.jobs.weld.job import POLL_S, add_drift_view, add_stream
+from weldcal.systems.jobs.weld.settings import feature_on_flange
+from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.motion.clear_moves import clear_move, station_bodies
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.frame_queue import FrameQueue
@@ -26,7 +26,6 @@ from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
-from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
 
 LEAST_FRAMES, MOST_FRAMES = 40, 5000
@@ -38,9 +37,8 @@ class MotionJob:
 
     centre_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.30])  # of the cube, in the base
     edge_mm: float = 200.0
-    lean_deg: float = (
-        15.0  # largest lean of the flange from the scanner's direction, drawn from the seed for each corner
-    )
+    # largest lean of the flange from the scanner's direction, drawn from the seed for each corner
+    lean_deg: float = 15.0
     frames: int = 400  # frames with the flange that are wanted
     speed_m_s: float = 0.25  # largest speed of the flange
     queue: int = 2  # frames that wait for the fit
@@ -68,7 +66,6 @@ def check_motion(job: MotionJob) -> None:
 
 CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]], dtype=np.float64) - 0.5  # no four in a plane
 _TRIES = 40  # leans drawn for a corner
-_POLL_S = 0.004  # of the queue and the estimator: a twelfth of a frame
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -81,7 +78,7 @@ class MotionPlanned:
     watched: CalibrationResult | None = None
 
 
-@dc.dataclass(eq=False)
+@dc.dataclass(eq=False, kw_only=True)
 class AddedMotion(AddedJob):
     """The systems of the job; it has a `calibrator` or, where it watches a calibration, a `monitor`."""
 
@@ -99,16 +96,14 @@ class AddedMotion(AddedJob):
 
     def record(self, root: Context) -> MotionRecord:
         """What was collected so far."""
-        port = self.collector.GetOutputPort("record")
-        found: MotionRecord = port.Eval(self.collector.GetMyContextFromRoot(root))
+        found: MotionRecord = self.value(self.collector.GetOutputPort("record"), root)
         return found
 
     def calibration(self, root: Context) -> MotionCalibration:
         """The result, where it is there."""
         if self.calibrator is None:
             return MotionCalibration()
-        port = self.calibrator.GetOutputPort("calibration")
-        found: MotionCalibration = port.Eval(self.calibrator.GetMyContextFromRoot(root))
+        found: MotionCalibration = self.value(self.calibrator.GetOutputPort("calibration"), root)
         return found
 
     def drift(self, root: Context) -> DriftStatus:
@@ -117,7 +112,7 @@ class AddedMotion(AddedJob):
 
     def counts(self, root: Context) -> tuple[int, int]:
         """Frames that were taken from the queue, and frames that were dropped."""
-        taken, dropped, _ = self.queue.GetOutputPort("counts").Eval(self.queue.GetMyContextFromRoot(root))
+        taken, dropped, _ = self.value(self.queue.GetOutputPort("counts"), root)
         return int(taken), int(dropped)
 
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
@@ -170,7 +165,7 @@ class Motion(Job[MotionPlanned]):
     def add(self, wiring: Wiring, spine: Spine, plan: MotionPlanned) -> AddedMotion:
         """See Job."""
         scenario, station, c = wiring.scenario, wiring.station, wiring.scenario.calibration
-        job, standard, X_FR = scenario.part(MotionJob), feature_standard(scenario), feature_on_flange(scenario, station)
+        job, X_FR = scenario.part(MotionJob), feature_on_flange(scenario, station)
         assert job is not None
         watched = plan.watched
         factor = scenario.job.speed_factor
@@ -180,38 +175,29 @@ class Motion(Job[MotionPlanned]):
         procedure = wiring.add(
             "motion_procedure",
             MotionProcedure(
-                plan.corners, plan.q_home, job.frames, speed_share=share, maximum_time_s=maximum_time_s, calibrates=watched is None
+                plan.corners,
+                plan.q_home,
+                job.frames,
+                speed_share=share,
+                maximum_time_s=maximum_time_s,
+                calibrates=watched is None,
             ),
-        )  # fmt: skip
-        queue = wiring.add("frame_queue", FrameQueue(job.queue, _POLL_S))
-        estimator = wiring.add(
-            "flange_estimator",
-            FlangeEstimator(
-                station.arm, X_FR, standard, c.mounting_guess.pose() if watched is None else watched.X_BC,
-                c.guess_radius_mm * 1e-3, station.background, _POLL_S, plan.delay_s,
-            ),
-        )  # fmt: skip
+        )
+        queue = FrameQueue(job.queue, POLL_S)
+        X_BC = c.mounting_guess.pose() if watched is None else watched.X_BC
+        nominal = wiring.constant("nominal_scanner", CalibrationStatus())
+        estimate, scan = add_stream(wiring, spine, "flange_estimator", X_FR, X_BC, plan.delay_s, queue, nominal)
         collector = wiring.add("motion_collector", MotionCollector())
-        estimate, state = estimator.GetOutputPort("flange_estimate"), procedure.GetOutputPort("state")
-        record = collector.GetOutputPort("record")
-        wiring.connect(queue, stream=wiring.out("scanner.stream"), flange_estimate=estimate)
+        state, record = procedure.GetOutputPort("state"), collector.GetOutputPort("record")
         wiring.connect(
-            estimator,
-            scan=queue.GetOutputPort("scan"),
-            job=wiring.constant("no_ordered_scan", JobCommand()),
-            history=spine.arm.history,
-            calibration_status=wiring.constant("nominal_scanner", CalibrationStatus()),
+            collector,
+            flange_estimate=estimate,
+            state=state,
+            position_measured=spine.arm.position,
+            sample_time=wiring.out(f"{FIRST}.sample_time"),
         )
         wiring.connect(
-            collector, flange_estimate=estimate, state=state,
-            position_measured=spine.arm.position, sample_time=wiring.out(f"{FIRST}.sample_time"),
-        )  # fmt: skip
-        wiring.connect(
-            procedure,
-            settled_goal=spine.arm.settled_goal,
-            robot_status=spine.arm.status,
-            record=record,
-            hold=spine.end,
+            procedure, settled_goal=spine.arm.settled_goal, robot_status=spine.arm.status, record=record, hold=spine.end
         )
         calibrator, monitor = None, None
         if watched is None:
@@ -220,11 +206,9 @@ class Motion(Job[MotionPlanned]):
             wiring.connect(procedure, calibration=calibrator.GetOutputPort("calibration"))
         else:
             monitored = MonitoredCalibration.of(watched, plan.delay_s, false_alarms_per_hour=job.false_alarms_per_hour)
-            monitor = wiring.add("drift_monitor", DriftMonitor(station.arm, X_FR, monitored, period_s=_POLL_S))
+            monitor = wiring.add("drift_monitor", DriftMonitor(station.arm, X_FR, monitored, period_s=POLL_S))
             wiring.connect(monitor, flange_estimate=estimate, history=spine.arm.history)
-        if wiring.meshcat is not None and monitor is not None:
-            view = wiring.add("drift_view", DriftView(wiring.meshcat, 0.5 * standard.outer_m, scenario.visualization))
-            wiring.connect(view, drift=monitor.GetOutputPort("drift"), flange_estimate=estimate)
+            add_drift_view(wiring, monitor, estimate)
         wiring.feed("scanner.streaming", procedure.GetOutputPort("streaming"))
         recorder = None
         if job.record and job.recording_folder:
@@ -234,14 +218,24 @@ class Motion(Job[MotionPlanned]):
         for name in ("scanner_capture", "joints"):  # for reports only
             if station.diagram.HasOutputPort(f"cheat.{name}"):
                 logged[name] = wiring.out(f"cheat.{name}")
-        shown = {"record": record, "scan": queue.GetOutputPort("scan"), "flange_estimate": estimate}
+        shown = {"record": record, "scan": scan, "flange_estimate": estimate}
         if calibrator is not None:
             shown["calibration"] = calibrator.GetOutputPort("calibration")
         if monitor is not None:
             shown["drift"] = monitor.GetOutputPort("drift")
         ports = JobPorts((procedure.GetOutputPort("job"),), state, logged=logged, shown=shown)
         return AddedMotion(
-            plan, X_FR, procedure, collector, calibrator, monitor, queue, recorder, job.frames, ports, maximum_time_s
+            plan=plan,
+            X_FR=X_FR,
+            procedure=procedure,
+            collector=collector,
+            calibrator=calibrator,
+            monitor=monitor,
+            queue=queue,
+            recorder=recorder,
+            frames=job.frames,
+            ports=ports,
+            maximum_time_s=maximum_time_s,
         )
 
 
@@ -255,11 +249,8 @@ def plan_corners(
         InputError: a corner is out of reach, or the arm would touch the table or itself on the way.
     """
     X_BC = scenario.calibration.mounting_guess.pose()
-    centre, bodies, X_RF = (
-        np.array(job.centre_m),
-        station_bodies(station),
-        feature_on_flange(scenario, station).inverse(),
-    )
+    centre, bodies = np.array(job.centre_m), station_bodies(station)
+    X_RF = feature_on_flange(scenario, station).inverse()
     found: list[Array] = []
     for corner in CORNERS:
         p = centre + 1e-3 * job.edge_mm * corner

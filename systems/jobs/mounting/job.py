@@ -43,7 +43,7 @@ class MountingPlanned:
     poses: tuple[MountingPose, ...]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class AddedMounting(AddedJob):
     """The systems of the job; `truth` (X, and Y or Z where they are estimated) is for reports and tests only."""
 
@@ -58,9 +58,7 @@ class AddedMounting(AddedJob):
 
     def status(self, root: Context) -> MountingStatus:
         """The present result of the calibration."""
-        status: MountingStatus = self.calibrator.GetOutputPort("status").Eval(
-            self.calibrator.GetMyContextFromRoot(root)
-        )
+        status: MountingStatus = self.value(self.calibrator.GetOutputPort("status"), root)
         return status
 
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
@@ -142,14 +140,14 @@ class Mounting(Job[MountingPlanned]):
         shown = {"status": calibrator.GetOutputPort("status"), "scan": wiring.out("scanner.scan")}
         commands = tuple(procedure.GetOutputPort(name) for name in ("job", "job_2"))[: len(spine.arms)]
         return AddedMounting(
-            scene,
-            plan.poses,
-            c.maximum_scans + c.verification_scans,
-            procedure,
-            calibrator,
-            true_poses(scene, wiring.station),
-            JobPorts(commands, state, shown=shown),
-            maximum_time_s,
+            scene=scene,
+            plan=plan.poses,
+            scans=c.maximum_scans + c.verification_scans,
+            procedure=procedure,
+            calibrator=calibrator,
+            truth=true_poses(scene, wiring.station),
+            ports=JobPorts(commands, state, shown=shown),
+            maximum_time_s=maximum_time_s,
         )
 
 

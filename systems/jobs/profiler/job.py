@@ -102,10 +102,7 @@ class Profiler(Job[PlanningContext]):
         table_z_m = scenario.calibration.table_z_m
         fixture = draw_fixture(drawn_pose(p), *error, job, rng, table_z_m, part, X_BP)
         return Furnishing(
-            profiler=fixture,
-            time_step_s=fixture.time_step_s,
-            parts=(fixture, fixture.truth),
-            contacts_read=True,
+            profiler=fixture, time_step_s=fixture.time_step_s, parts=(fixture, fixture.truth), contacts_read=True
         )
 
     def position_error(self, scenario: Scenario, arm: ArmModel, seed: int) -> LeafSystem | None:

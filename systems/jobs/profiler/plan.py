@@ -33,9 +33,8 @@ from weldcal.systems.jobs.profiler.config import ProfilerJob, edge_as_thought, p
 from weldcal.systems.messages import Message
 from weldcal.welding.seam.curve import SeamCurve
 
-STEP_RAD = (
-    0.1  # along a move, between the configurations that are checked against table, surroundings and the arm itself
-)
+# along a move, between the configurations that are checked against table, surroundings and the arm itself
+STEP_RAD = 0.1
 STEP_M = 5e-4  # of torch and profiler, between those that are checked against the objects, where these are near
 FASTER = 1.2  # than the mean speed in a step of STEP_RAD: no point of the rig is
 

@@ -55,7 +55,7 @@ class TabletConfig:
         """The nominal X_BT."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
-    def landmarks_m(self) -> NDArray[np.float64]:
+    def landmarks_m(self) -> Array:
         """Landmarks (n, 2) m of the page from its first, row by row."""
         return 1e-3 * np.array(
             [[i * self.across_mm, j * self.down_mm] for j in range(self.rows) for i in range(self.columns)]

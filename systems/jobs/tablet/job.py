@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
 
@@ -28,13 +27,10 @@ from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
 
 PEN_BODY_M = 0.006  # radius of the pen in the clearance checks
-_LOOK_ASLANT_RAD = (
-    0.12,
-    -0.10,
-)  # a slightly inclined view determines the tablet's tilt better than a perpendicular one
-_LEAN_STEP_RAD = (
-    2.4  # between the tilt directions of consecutive touches: the golden angle, so that no direction repeats
-)
+# a slightly inclined view determines the tablet's tilt better than a perpendicular one
+_LOOK_ASLANT_RAD = (0.12, -0.10)
+# between the tilt directions of consecutive touches: the golden angle, so that no direction repeats
+_LEAN_STEP_RAD = 2.4
 
 
 def tablet_of(scenario: Scenario) -> TabletConfig:
@@ -117,7 +113,7 @@ def check_moves(scenario: Scenario, station: Station, plan: TabletPlan) -> None:
             )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class AddedVisit(AddedJob):
     """The systems of the job, the nominal tablet and camera; `known` is the ground truth of a simulation."""
 
@@ -143,7 +139,7 @@ class AddedVisit(AddedJob):
         shown: WristPicture = diagram.GetOutputPort("wrist_camera.picture").Eval(diagram.GetMyContextFromRoot(root))
         return shown
 
-    def view(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def view(self) -> tuple[Array, Array]:
         """See AddedJob: in front of the tablet."""
         middle = self.tablet.pose().multiply(np.r_[0.5 * self.tablet.landmarks_m().max(axis=0), 0.0])
         return middle + np.array([0.55, -0.35, 0.45]), middle + np.array([0.0, 0.0, 0.08])
@@ -202,14 +198,14 @@ class Tablet(Job[TabletPlan]):
             shown={"picture": wiring.out("wrist_camera.picture")},
         )
         return AddedVisit(
-            plan,
-            tablet_of(scenario),
-            camera_of(scenario),
-            procedure,
-            station,
-            station.truth.tablet,
-            ports,
-            plan.maximum_time_s,
+            plan=plan,
+            tablet=tablet_of(scenario),
+            camera=camera_of(scenario),
+            procedure=procedure,
+            station=station,
+            known=station.truth.tablet,
+            ports=ports,
+            maximum_time_s=plan.maximum_time_s,
         )
 
 

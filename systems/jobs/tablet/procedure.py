@@ -149,9 +149,6 @@ class TabletProcedure(Procedure[TabletState, TabletInputs]):
             return self.go(s, now, "to_above", self._plan.q_above[following], landmark=following)
         return self.go(s, now, "to_home", self._plan.q_home)
 
-    def _end(self, s: TabletState, now: TabletInputs) -> TabletState:
-        return self.enter(s, now, "held" if s.reason else "done")
-
     steps: ClassVar = {
         "start": _start,
         "to_start": _started,
@@ -160,5 +157,5 @@ class TabletProcedure(Procedure[TabletState, TabletInputs]):
         "to_above": _above,
         "descend": _descend,
         "lift": _lifted,
-        "to_home": _end,
+        "to_home": Procedure.end,
     }

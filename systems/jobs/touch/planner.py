@@ -5,7 +5,6 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
@@ -15,6 +14,7 @@ from weldcal.calibration.planning.clearance import arm_bodies
 from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.calibration.touch.fitted import around, fit_touched_plane
 from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
@@ -82,7 +82,7 @@ _COLUMN_M = 0.003  # points of the scan this near to a line along `up` show the 
 _FLAT_M = 0.004  # of the face around a place, to which a plane is fitted
 _LEAST_COLUMN, _LEAST_FLAT = 5, 8  # points
 
-Joints = NDArray[np.float64]
+Joints = Array
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -90,11 +90,11 @@ class Place(Message):
     """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal in the base."""
 
     q_above: Joints
-    p_C: NDArray[np.float64]
-    n_C: NDArray[np.float64]
+    p_C: Array
+    n_C: Array
     sigma_m: float
-    p_B: NDArray[np.float64]
-    n_B: NDArray[np.float64]
+    p_B: Array
+    n_B: Array
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -181,9 +181,7 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
     return PlannedTouches(scan.sequence, tuple(places))
 
 
-def _face(
-    raw: NDArray[np.float64], points_B: NDArray[np.float64], p_B: NDArray[np.float64], up: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _face(raw: Array, points_B: Array, p_B: Array, up: Array) -> tuple[Array, Array, float]:
     """Plane of the face on the line through p_B along ``up``: point and normal towards the scanner as scanned, and the sigma, m."""
     away = points_B - p_B
     height = away @ up

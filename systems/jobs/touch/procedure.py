@@ -190,9 +190,6 @@ class TouchProcedure(Procedure[TouchState, TouchInputs]):
             return self.go(s, now, "to_above", s.places[s.index + 1].q_above, index=s.index + 1)
         return self.go(s, now, "go_home", self._motion.q_home)
 
-    def _end(self, s: TouchState, now: TouchInputs) -> TouchState:
-        return self.enter(s, now, "held" if s.reason else "done")
-
     def _framed(self, s: TouchState, now: TouchInputs) -> TouchState:
         """The state with a new valid frame of the finger camera."""
         sequence, sample = now.deformation.sequence, now.deformation.sample
@@ -214,5 +211,5 @@ class TouchProcedure(Procedure[TouchState, TouchInputs]):
         "descend": _descend,
         "press": _press,
         "lift": _lifted,
-        "go_home": _end,
+        "go_home": Procedure.end,
     }

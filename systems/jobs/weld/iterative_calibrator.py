@@ -4,7 +4,6 @@ import dataclasses as dc
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, State
@@ -26,6 +25,7 @@ from weldcal.calibration.published.icp import make_verification
 from weldcal.calibration.refinement.refined import PLAIN, Plain, Refined, refine_arm, refine_locally
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.background import Answer, Background
@@ -64,14 +64,7 @@ def _message(kind: str, found: Refined, arm: ArmModel) -> Refinement:
     if found.stack is not None:
         corrected = with_link_transforms(arm, found.stack, "", "The refined kinematics")
     return Refinement(
-        kind,
-        found.sentence,
-        found.accepted,
-        corrected,
-        found.field,
-        found.kinematics,
-        found.arm,
-        found.document(kind),
+        kind, found.sentence, found.accepted, corrected, found.field, found.kinematics, found.arm, found.document(kind)
     )
 
 
@@ -82,7 +75,7 @@ class NextPose(Message):
     after_sequence: int = -1
     index: int = 0
     label: str = ""
-    q: NDArray[np.float64] | None = None
+    q: Array | None = None
 
 
 class CalibrationPosePlanner(LeafSystem):
@@ -129,7 +122,7 @@ class CalibratorConfig:
     required_error_m: float
     minimum_scans: int
     maximum_scans: int
-    p_BWork: NDArray[np.float64]
+    p_BWork: Array
     cost: str = "translation"
     work_radius_m: float = 0.2
     cost_axes: tuple[str, ...] = COST_AXES
@@ -191,7 +184,7 @@ def digest(
     X_BR: RigidTransform | None,
     standard: FlangeStandard,
     config: CalibratorConfig,
-    q: NDArray[np.float64] | None = None,
+    q: Array | None = None,
     arm: ArmModel | None = None,
 ) -> CalibrationStatus:
     """Compute the status after one more flange estimate; an unusable scan is listed as refused with its label and the reason.
@@ -236,7 +229,7 @@ def digest(
     return dc.replace(status, predicted_error_m=expected_error(status.estimate, config.p_BWork))
 
 
-def expected_error(estimate: CalibrationEstimate, p_BWork: NDArray[np.float64]) -> float:
+def expected_error(estimate: CalibrationEstimate, p_BWork: Array) -> float:
     """Expected error (m, rms) of the base position of a point seen at the work point, from the estimate's covariance."""
     return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BWork))))
 

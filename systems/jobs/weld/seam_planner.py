@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
@@ -20,6 +19,7 @@ from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart, numbered
@@ -43,8 +43,8 @@ def plan_root_anyhow(
     workpiece: WeldPart,
     X_BP_guess: RigidTransform,
     method: PlanningMethod,
-    eye_B: npt.NDArray[np.float64],
-    up_B: npt.NDArray[np.float64],
+    eye_B: Array,
+    up_B: Array,
     plan: Callable[..., RootPlan] = plan_root,
 ) -> RootPlan:
     """`plan_root` where up_B (3,), the direction against gravity in the base, may differ from the base's z.
@@ -83,7 +83,7 @@ class SeamPlanning:
     workpiece: WeldPart
     X_BP_guess: RigidTransform
     config: ServoConfig
-    q_near: NDArray[np.float64]
+    q_near: Array
     clearance_m: float
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
@@ -97,7 +97,7 @@ class SeamPlanning:
             return None
         return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
 
-    def field_at(self, points_B: NDArray[np.float64]) -> NDArray[np.float64]:
+    def field_at(self, points_B: Array) -> Array:
         """The local field (n, 3) m at points (n, 3) m of the part, for the orientation in which the flange would weld them as drawn.
 
         Where that orientation is none of the calibration's, or the points lie far from its poses, this is zero.
@@ -107,13 +107,11 @@ class SeamPlanning:
         R = touch_start_pose(seam, self.config).rotation() @ self.tool.X_FT.rotation().inverse()
         return self.local_field.at_places(points_B, R.matrix())
 
-    def tip_to_torch(self, seam: SeamCurve, q_start: NDArray[np.float64]) -> TipToTorch:
+    def tip_to_torch(self, seam: SeamCurve, q_start: Array) -> TipToTorch:
         """What errors of the arm do between tip and torch along a seam."""
         return tip_to_torch(self.arm, self.tool, seam, q_start, self.arm_errors)
 
-    def waypoints(
-        self, seam: SeamCurve, X_BP: RigidTransform | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def waypoints(self, seam: SeamCurve, X_BP: RigidTransform | None) -> tuple[Array, Array, Array]:
         """Joint positions of the approach; see arm_waypoints. Beside a high part they are higher above the seam than the clearance.
 
         Raises:
@@ -220,15 +218,15 @@ def plan_seam(
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
     return PlannedSeam(
-        scan.sequence,
-        seam,
-        found.X_BP,
-        found.rms_m,
-        found.confidence,
-        q_start,
-        q_above,
-        q_retract,
-        points_B,
+        sequence=scan.sequence,
+        seam=seam,
+        X_BP=found.X_BP,
+        rms_m=found.rms_m,
+        confidence=found.confidence,
+        q_start=q_start,
+        q_above=q_above,
+        q_retract=q_retract,
+        points_B=points_B,
         sigma_m=found.sigma_m,
         summary=found.summary,
         arm_sigma_m=share.sigma_m,
@@ -239,13 +237,7 @@ def plan_seam(
 _LEVEL = math.cos(math.radians(20.0))
 
 
-def check_weld_path(
-    planning: SeamPlanning,
-    seam: SeamCurve,
-    q_start: NDArray[np.float64],
-    q_above: NDArray[np.float64],
-    q_retract: NDArray[np.float64],
-) -> None:
+def check_weld_path(planning: SeamPlanning, seam: SeamCurve, q_start: Array, q_above: Array, q_retract: Array) -> None:
     """Check that approach, weld and retreat keep away from the cell's surroundings.
 
     Raises:
@@ -277,9 +269,7 @@ def check_weld_path(
             )
 
 
-def check_moves(
-    planning: SeamPlanning, X_BP: RigidTransform, q_above: NDArray[np.float64], q_retract: NDArray[np.float64]
-) -> None:
+def check_moves(planning: SeamPlanning, X_BP: RigidTransform, q_above: Array, q_retract: Array) -> None:
     """Check that the moves to the seam and from it, to other seams too, keep clear of the part.
 
     Raises:
@@ -312,7 +302,7 @@ def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, lengt
     return _cut(line @ R.T + X_BP.translation(), ups, tool, length_m)
 
 
-def _cut(line: NDArray[np.float64], ups: NDArray[np.float64], tool: WeldingTool, length_m: float | None) -> SeamCurve:
+def _cut(line: Array, ups: Array, tool: WeldingTool, length_m: float | None) -> SeamCurve:
     """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is still in it."""
     if length_m is None:
         return SeamCurve.from_points(line, up=ups)
@@ -333,13 +323,8 @@ def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_
 
 
 def arm_waypoints(
-    arm: ArmModel,
-    tool: WeldingTool,
-    seam: SeamCurve,
-    config: ServoConfig,
-    q_near: NDArray[np.float64],
-    clearance_m: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    arm: ArmModel, tool: WeldingTool, seam: SeamCurve, config: ServoConfig, q_near: Array, clearance_m: float
+) -> tuple[Array, Array, Array]:
     """Joint positions (6,) rad at the touch start, above it, and above the far end.
 
     Raises:
@@ -363,7 +348,7 @@ def arm_waypoints(
     return q_start, q_above, q_retract
 
 
-def _away(up: NDArray[np.float64], vertical: NDArray[np.float64]) -> NDArray[np.float64]:
+def _away(up: Array, vertical: Array) -> Array:
     """Direction (3,) out of a joint: vertical on a level face, along the bisector of a leaning joint."""
     return vertical if float(up @ vertical) > _LEVEL else up
 
@@ -399,16 +384,16 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
         return PlannedSeam(sequence=sequence, reason=str(error))
     points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
     return PlannedSeam(
-        sequence,
-        seam,
-        planning.X_BP_guess,
-        0.0,
-        1.0,
-        q_start,
-        q_above,
-        q_retract,
-        points_B,
-        summary="the pose of the part is from the fixture's drawing; the scan was not used",
+        sequence=sequence,
+        seam=seam,
+        X_BP=planning.X_BP_guess,
+        rms_m=0.0,
+        confidence=1.0,
+        q_start=q_start,
+        q_above=q_above,
+        q_retract=q_retract,
+        points_B=points_B,
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
+        summary="the pose of the part is from the fixture's drawing; the scan was not used",
     )

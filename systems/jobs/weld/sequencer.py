@@ -282,9 +282,6 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             return self._homeward(s, now, "park", seam=number)
         return self._homeward(s, now, "home")
 
-    def _end(self, s: JobState, now: JobInputs) -> JobState:
-        return self.enter(s, now, "done")
-
     steps: ClassVar = {
         "start": _start,
         "move_home": _begin,
@@ -300,7 +297,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         "approach": _approached,
         "weld": _welding,
         "retract": _retracted,
-        "home": _end,
+        "home": Procedure.end,
     }
 
 
