@@ -31,7 +31,7 @@ from weldcal.systems.wiring import Wiring
 LEAST_FRAMES, MOST_FRAMES = 40, 5000
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class MotionJob:
     """The flange moves between corners of a cube while the scanner streams."""
 
@@ -223,7 +223,7 @@ class Motion(Job[MotionPlanned]):
             shown["calibration"] = calibrator.GetOutputPort("calibration")
         if monitor is not None:
             shown["drift"] = monitor.GetOutputPort("drift")
-        ports = JobPorts((procedure.GetOutputPort("job"),), state, logged=logged, shown=shown)
+        ports = JobPorts(commands=(procedure.GetOutputPort("job"),), state=state, logged=logged, shown=shown)
         return AddedMotion(
             plan=plan,
             X_FR=X_FR,

@@ -146,7 +146,7 @@ class Mounting(Job[MountingPlanned]):
             procedure=procedure,
             calibrator=calibrator,
             truth=true_poses(scene, wiring.station),
-            ports=JobPorts(commands, state, shown=shown),
+            ports=JobPorts(commands=commands, state=state, shown=shown),
             maximum_time_s=maximum_time_s,
         )
 

@@ -192,9 +192,9 @@ class Tablet(Job[TabletPlan]):
         )
         wiring.feed("wrist_camera.trigger", procedure.GetOutputPort("trigger"))
         ports = JobPorts(
-            (procedure.GetOutputPort("job"),),
-            procedure.GetOutputPort("state"),
-            procedure.GetOutputPort("descent"),
+            commands=(procedure.GetOutputPort("job"),),
+            state=procedure.GetOutputPort("state"),
+            velocity=procedure.GetOutputPort("descent"),
             shown={"picture": wiring.out("wrist_camera.picture")},
         )
         return AddedVisit(

@@ -74,7 +74,7 @@ TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the ch
 HIGHER = (1.0, 2.0, 4.0)  # of the clearance above the seam, until the moves are clear
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class SeamPlanning:
     """What a seam is planned from besides the scan: arm, tool, nominal part and its expected pose, and the job's limits."""
 

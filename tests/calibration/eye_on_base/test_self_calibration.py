@@ -22,7 +22,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.tools.studies.flange.warped import calibrate_warped, new_errors
+from weldcal.tools.worlds.warped_scanner import calibrate_warped, new_errors
 
 X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
 WRONG = ScannerCorrection(1.003, (0.015, -0.01))
@@ -57,7 +57,14 @@ def _cell(
         x, y = R_CR.matrix()[:, 0], R_CR.matrix()[:, 1]
         J = needs.jacobian(seen)
         ratio = 2.0 / float(x @ J @ x + y @ J @ y) + NOISE_RATIO * rng.standard_normal()
-        patterns[f"p{k:02d}"] = HolePattern(np.zeros((4, 3)), np.zeros(4), p_C, RigidTransform(R_CR, p_C), ratio, 0.0)
+        patterns[f"p{k:02d}"] = HolePattern(
+            holes_C=np.zeros((4, 3)),
+            angles_rad=np.zeros(4),
+            center_C=p_C,
+            X_CR=RigidTransform(R_CR, p_C),
+            ratio=ratio,
+            rms_m=0.0,
+        )
     return observations, patterns
 
 

@@ -13,7 +13,7 @@ from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
-from weldcal.tools.studies.hand_eye.fuzz import MISTAKES, fuzz, judge, random_world
+from weldcal.tools.worlds.hand_eye_mistakes import MISTAKES, fuzz, judge, random_world
 
 QUICK = HandEyeConfig(folds=0)
 
@@ -40,7 +40,7 @@ def test_a_mistake_is_named_or_at_least_not_answered_with_confidence(mistake: st
 
 
 def pairs_of(F: Array, G: Array) -> PosePairs:
-    return PosePairs("made up", F, G, "eye_in_hand")
+    return PosePairs(source="made up", robot=F, camera=G, mode="eye_in_hand")
 
 
 def test_a_camera_that_hardly_moves_is_no_mistake_in_units() -> None:

@@ -100,7 +100,7 @@ def planning() -> PlanningContext:
     job = ProfilerJob(stages=["sphere"])
     job.sphere.descent_mm_s = 20.0
     tip, ball = np.array(job.torch.tip_m), np.array(job.ball.xyz_m)
-    return PlanningContext(the_arm(), job, Q_HOME, RigidTransform(), tip, ball)
+    return PlanningContext(arm=the_arm(), job=job, q_home=Q_HOME, X_FS=RigidTransform(), p_FTip=tip, center=ball)
 
 
 def profiler(goal: Goal | None = None) -> Descent:

@@ -166,7 +166,15 @@ def test_the_touches_of_a_true_calibration_agree_with_the_scan_and_go_through_th
     (tmp_path / "touches.csv").write_text(touches_text(touches))
     read = read_touches(tmp_path / "touches.csv")
     assert station.truth.X_BC is not None
-    result = CalibrationResult(station.truth.X_BC, 1e-10 * np.eye(6), {}, {}, (), sigma_position_mm=0.02, robot="ur10e")
+    result = CalibrationResult(
+        X_BC=station.truth.X_BC,
+        covariance=1e-10 * np.eye(6),
+        held_out_mm={},
+        tilt_deg={},
+        poses=(),
+        sigma_position_mm=0.02,
+        robot="ur10e",
+    )
     for each in (touches, read):
         assert np.abs(judge_touches(result, each).error_m).max() < 2e-5
 

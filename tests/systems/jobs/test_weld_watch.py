@@ -16,11 +16,10 @@ from weldcal.systems.jobs.job import Phases
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.commands.demo import measure
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.report.demo import demo_report
-from weldcal.tools.studies.perfect_world import perfect
+from weldcal.tools.commands.weld import measure
+from weldcal.tools.report.demo import DemoResult, demo_report
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.worlds.perfect_world import perfect
 
 KNOCK_MM = [0.0, 1.2, 0.9]
 POSE = "X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"
@@ -44,7 +43,7 @@ def knocked(knock_s: float, speed_factor: float, fps: float) -> DemoResult:
         return found
 
     cell.job.stage = stop_when_measured
-    return measure(run_cell(cell), RunOptions("straight_groove", Path("unused")))
+    return measure(run_cell(cell), RunOptions(scenario="straight_groove", out=Path("unused")))
 
 
 def test_a_scanner_knocked_before_the_weld_holds_the_job() -> None:
