@@ -142,8 +142,8 @@ def benchmark_whole_body(
 ) -> Outcome:
     """Compare the tracking error of the flange with that of a link, by its mesh and by a model fused from the scans."""
     from weldcal.tools.studies.motion.whole_body import run_whole_body
-    from weldcal.tools.studies.motion.world import MotionOptions
     from weldcal.tools.studies.targets import print_targets
+    from weldcal.tools.worlds.motion import MotionOptions
 
     options = MotionOptions(
         frames=frames, size=(width, round(0.749 * width)), noise_mm=noise_mm, seed=call.seed, surroundings=False

@@ -11,9 +11,8 @@ import pytest
 from scipy.stats import chi2
 
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
-from weldcal.tools.studies.motion.clock import run_clock_study
-from weldcal.tools.studies.motion.exact import exact_errors
-from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
+from weldcal.tools.studies.motion.clock import exact_errors, run_clock_study
+from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 
 def test_a_short_run_keeps_the_targets(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanner_streams import ScannerStream, get_stream
 from weldcal.models.scanners import depth_to_points
 from weldcal.tools.studies.motion.command import DataRequest, write_motion_data
-from weldcal.tools.studies.motion.disturbance import Disturbance
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld
+from weldcal.tools.worlds.disturbance import Disturbance
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld
 
 SMALL = MotionOptions(size=(534, 400), noise_mm=0.0, frames=4, surroundings=False)
 

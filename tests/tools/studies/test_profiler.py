@@ -15,12 +15,12 @@ from weldcal.tools.studies.profiler import command
 from weldcal.tools.studies.profiler.command import run_profiler_study
 from weldcal.tools.studies.profiler.edge import edge_rows
 from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines
-from weldcal.tools.studies.profiler.pieces import groove_mesh, scan_groove
 from weldcal.tools.studies.profiler.results import ProfilerStudyOptions
-from weldcal.tools.studies.profiler.sets import made_edge_trials
-from weldcal.tools.studies.profiler.sphere import METHODS, WorldData, measure
-from weldcal.tools.studies.profiler.worlds import SphereWorld, sphere_trial
+from weldcal.tools.studies.profiler.sphere import METHODS, measure
 from weldcal.tools.studies.targets import Target
+from weldcal.tools.worlds.edge_trials import made_edge_trials
+from weldcal.tools.worlds.profiler import SphereWorld, sphere_trial
+from weldcal.tools.worlds.profiler_parts import WorldData, groove_mesh, scan_groove
 
 
 def test_on_other_edges_the_joint_method_is_near_its_bound_and_the_papers_is_not() -> None:

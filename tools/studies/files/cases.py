@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.files import binary_mutations, text_mutations
-from weldcal.tools.studies.files.examples import Files
 from weldcal.tools.studies.files.readers import READERS, Reader, all_finite
+from weldcal.tools.worlds import binary_damage, text_damage
+from weldcal.tools.worlds.file_examples import Files
 
 ACCEPTED, REFUSED, INTERNAL, WRONG = "accepted", "refused", "internal error", "silently wrong"
 HANG, MEMORY, CRASH, EXECUTED = "hang", "memory", "crash", "executed"
 GOOD = (ACCEPTED, REFUSED)
-GRAMMARS = text_mutations.GRAMMARS | binary_mutations.GRAMMARS
+GRAMMARS = text_damage.GRAMMARS | binary_damage.GRAMMARS
 _PLACES = ("a pipe", "a folder", "a device", "a loop of links", "nothing")
 _ODD_PLACE = 0.02  # share of the cases in which no regular file is there
 _UNITS = 0.05  # and in which a dataset's unit is exchanged

@@ -20,8 +20,8 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.images import read_grey_image
 from weldcal.systems.scenario.loading import load_scenario, scenario_class
 from weldcal.tools.commands.profiler.files import read_profiler_file
-from weldcal.tools.studies.files import examples
-from weldcal.tools.studies.files.examples import Files, Rng
+from weldcal.tools.worlds import file_examples as examples
+from weldcal.tools.worlds.file_examples import Files, Rng
 from weldcal.welding.record.weld_log import load_weld_log
 
 Values = Sequence[Any]

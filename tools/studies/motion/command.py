@@ -7,8 +7,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanner_streams import get_stream
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.console import Progress
-from weldcal.tools.studies.motion.disturbance import Disturbance, Vector
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
+from weldcal.tools.worlds.disturbance import Disturbance, Vector
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from weldcal.models.arrays import Array
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.motion.feature_world import Change, World, WorldConfig, simulate
 from weldcal.tools.studies.targets import Target, all_met
+from weldcal.tools.worlds.features import Change, World, WorldConfig, simulate
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
 WITHIN_S = 2.0

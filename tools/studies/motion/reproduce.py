@@ -25,8 +25,8 @@ from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.motion.report import motion_report
 from weldcal.tools.studies.motion.results import MotionStudy, MotionStudyOptions, Quality, Row, Track
-from weldcal.tools.studies.motion.static_mode import Look, StaticMode, noise_of_face
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
+from weldcal.tools.worlds.static_scans import Look, StaticMode, noise_of_face
 
 _ICP_FRAMES, _QUICK_FRAMES = 120, 10  # for Table 1 and Fig. 6
 _REACH_M = 0.01

@@ -30,8 +30,8 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld
 from weldcal.tools.studies.targets import Target
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld
 
 _POLL_S = 0.004
 _STEP_S = 0.004

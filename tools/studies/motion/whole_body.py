@@ -16,8 +16,8 @@ from weldcal.models.arms.link_mesh import link_index
 from weldcal.tools.commands.monitor_body import see_link
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
 from weldcal.tools.studies.targets import Target, all_met
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
 
 LINK = "wrist_1_link"
 WITHIN = 2.0

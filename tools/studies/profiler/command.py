@@ -11,9 +11,9 @@ from weldcal.tools.studies.profiler.edge import all_sets, ball_points
 from weldcal.tools.studies.profiler.fixed import fixed_lines, published_lines, require_files
 from weldcal.tools.studies.profiler.report import profiler_report
 from weldcal.tools.studies.profiler.results import ProfilerStudy, ProfilerStudyOptions
-from weldcal.tools.studies.profiler.sets import SETS, EdgeTrial, fixed_edge_trials, made_edge_trials
 from weldcal.tools.studies.profiler.sphere import all_worlds, fixed_worlds, made_worlds
 from weldcal.tools.studies.targets import Target
+from weldcal.tools.worlds.edge_trials import SETS, EdgeTrial, fixed_edge_trials, made_edge_trials
 
 TRIALS, WORLDS, GROOVES, BOSSES = 10, 8, 3, 2
 QUICK_SETS = ("xy_paper", "tilt_nominal")

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial
+from weldcal.tools.worlds.edge_trials import TRANSLATIONS, EdgeTrial
 
 COUNTS = (10, 15, 20, 25)
 METHODS = ("paper", "joint")

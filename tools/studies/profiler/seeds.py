@@ -21,7 +21,6 @@ from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.profiler.edge import TARGETS, edge_figures, edge_targets
 from weldcal.tools.studies.profiler.plots import over_seeds
 from weldcal.tools.studies.profiler.results import Reached, TargetLine
-from weldcal.tools.studies.profiler.sets import EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 from weldcal.tools.studies.profiler.sphere import (
     METHODS,
     MM,
@@ -37,6 +36,7 @@ from weldcal.tools.studies.profiler.sphere import (
     sphere_figures,
     sphere_targets,
 )
+from weldcal.tools.worlds.edge_trials import EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 
 TRIALS = {"free": 20}
 WORLDS, GROOVES, BOSSES = 8, 3, 2

@@ -16,7 +16,7 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
+from weldcal.tools.worlds.edge_trials import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 
 SETS = 20
 SEARCHED = 5  # sets on which the search is tried

@@ -6,10 +6,10 @@ from weldcal.calibration.tablet.planar.linear import fit_linear
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.tablet.paper import published_touches
 from weldcal.tools.studies.tablet.report import tablet_report
 from weldcal.tools.studies.tablet.results import TabletOptions, TabletStudy
 from weldcal.tools.studies.tablet.study import compare_models, compare_signs, dh_by_eq_20, held_out, reproduce_stages
+from weldcal.tools.worlds.tablet import published_touches
 
 PUBLISHED_TRIALS = 20
 

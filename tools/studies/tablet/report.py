@@ -8,9 +8,9 @@ from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, svg
 from weldcal.tools.report.render import fixed, render
-from weldcal.tools.studies.tablet.paper import TABLE_NUMBER, TOUCHING_MM, printed_stage, published_touches
 from weldcal.tools.studies.tablet.results import TabletStudy, limit_words
 from weldcal.tools.studies.tablet.study import HeldOutRow, ModelRow, Reproduced
+from weldcal.tools.worlds.tablet import TABLE_NUMBER, TOUCHING_MM, printed_stage, published_touches
 
 _LARGER = 20.0
 SIGN_WORDS = {Sign.PRINTED: "as printed (−)", Sign.NONE: "left out", Sign.CORRECTED: "reversed (+)"}

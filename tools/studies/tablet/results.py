@@ -6,9 +6,9 @@ from pathlib import Path
 from weldcal.calibration.tablet.planar.linear import LinearFit
 from weldcal.calibration.tablet.published.calibration import StageResult
 from weldcal.calibration.tablet.published.two_stage import Fitness
-from weldcal.tools.studies.tablet.paper import STAGE_1, TABLE_NUMBER, TOUCHING_MM, printed_stage
 from weldcal.tools.studies.tablet.study import Cost, HeldOutRow, ModelRow, Reproduced, SignRow
 from weldcal.tools.studies.targets import Target, all_met
+from weldcal.tools.worlds.tablet import STAGE_1, TABLE_NUMBER, TOUCHING_MM, printed_stage
 
 # What the reproduction must reach: mm, seconds
 FITNESS_TARGETS = {("htm", 1): 1.6739, ("htm", 2): 0.9989, ("dh", 1): 7.103, ("dh", 2): 4.272}

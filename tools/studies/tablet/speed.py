@@ -7,9 +7,8 @@ from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_fo
 from weldcal.calibration.tablet.published.calibration import tablet_stage1, tablet_stage2
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.tablet.paper import published_touches
 from weldcal.tools.studies.tablet.study import PUBLISHED_EVALUATIONS, evaluation_seconds, median_seconds
-from weldcal.tools.studies.tablet.world import simulate_trial
+from weldcal.tools.worlds.tablet import published_touches, simulate_trial
 
 
 def run_tablet_benchmark(folder: Path, seed: int, progress: Progress) -> dict[str, object]:

@@ -1,0 +1,1 @@
+"""Simulated parts, rigs and recordings that tests and studies share."""
