@@ -9,7 +9,7 @@ import typer
 from weldcal.tools.cli.options import FARM, Call, Outcome, ScenarioOption, command, option, switch
 
 
-@command("benchmark tablet")
+@command("benchmark tablet", short_help="Time the tablet calibrations and the published search.")
 def tablet(call: Call) -> Mapping[str, object]:
     """Time each tablet calibration and compare it with the published search."""
     from weldcal.tools.studies.tablet.speed import run_tablet_benchmark
@@ -17,7 +17,7 @@ def tablet(call: Call) -> Mapping[str, object]:
     return run_tablet_benchmark(call.folder("benchmark", "tablet"), call.seed, call.progress)
 
 
-@command("benchmark seam-planning")
+@command("benchmark seam-planning", short_help="Measure the error of a seam planned from one scan.")
 def seam_planning(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Random poses of each part.", min=1)] = 2,
@@ -43,7 +43,7 @@ def seam_planning(
     return Outcome(summary, rows=rows)
 
 
-@command("benchmark part-welds")
+@command("benchmark part-welds", short_help="Weld twelve parts in four joints from STEP files.")
 def part_welds(
     call: Call,
     part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
@@ -71,7 +71,7 @@ def part_welds(
     return Outcome(summary)
 
 
-@command("benchmark part-registration")
+@command("benchmark part-registration", short_help="Register twelve parts from STEP files in their scans.")
 def part_registration(
     call: Call,
     part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
@@ -87,7 +87,7 @@ def part_registration(
     return Outcome(run_registration_study(folder, first, second, third, part, call.progress))
 
 
-@command("benchmark hand-eye")
+@command("benchmark hand-eye", short_help="Compare the hand-eye solvers with OpenCV's.")
 def hand_eye(
     call: Call,
     data: Annotated[Path | None, option("--data", "FOLDER", "A folder of sets, each a folder with pairs.npz.")] = None,
@@ -102,7 +102,9 @@ def hand_eye(
     return Outcome(result.summary(), text=write_table(result, folder))
 
 
-@command("benchmark hand-eye-cells", options=FARM)
+@command(
+    "benchmark hand-eye-cells", short_help="Compare with OpenCV on cells with a wrong camera or arm.", options=FARM
+)
 def hand_eye_cells(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Number of cells of each kind.", min=1)] = 40,
@@ -114,7 +116,7 @@ def hand_eye_cells(
     return Outcome(summary, text=table)
 
 
-@command("benchmark touch", options=FARM)
+@command("benchmark touch", short_help="Count touched points within the stated 95 % region.", options=FARM)
 def touch(
     call: Call,
     runs: Annotated[
@@ -137,7 +139,7 @@ def touch(
     return Outcome(run_touch_study(farm, runs, call.seed))
 
 
-@command("benchmark mountings", options=FARM)
+@command("benchmark mountings", short_help="Calibrate every mounting live over several seeds.", options=FARM)
 def mountings(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Number of seeds of each.", min=1)] = 5,
@@ -154,7 +156,7 @@ def mountings(
     return Outcome(summary)
 
 
-@command("benchmark profiler")
+@command("benchmark profiler", short_help="Time the profiler's calibration by an edge.")
 def profiler(
     call: Call,
     data: Annotated[
@@ -168,7 +170,7 @@ def profiler(
     return Outcome(summary, values={}, rows=lines(summary))
 
 
-@command("benchmark cell")
+@command("benchmark cell", short_help="Measure the real-time factor of the cell while welding.")
 def cell(call: Call) -> Mapping[str, object]:
     """Measure the real-time factor of the whole cell while welding, finger camera included."""
     from weldcal.tools.studies.cell.speed import run_cell_benchmark
@@ -176,7 +178,7 @@ def cell(call: Call) -> Mapping[str, object]:
     return run_cell_benchmark(call.folder("benchmark", "cell"), call.seed, call.progress)
 
 
-@command("benchmark seeds", options=FARM)
+@command("benchmark seeds", short_help="Run the demo over many seeds.", options=FARM)
 def seeds(
     call: Call,
     scenario: ScenarioOption = "s_groove",
@@ -189,7 +191,7 @@ def seeds(
     return run_seeds(scenario, call.farm(folder), range(call.seed, call.seed + runs))
 
 
-@command("benchmark fleet", options=FARM)
+@command("benchmark fleet", short_help="Count what weldcal fleet states about made cells.", options=FARM)
 def fleet(
     call: Call,
     cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 25,
@@ -201,7 +203,7 @@ def fleet(
     return run_fleet_study(call.farm(call.folder("benchmark", "fleet")), cells, datasets, call.seed)
 
 
-@command("benchmark replay", options=FARM)
+@command("benchmark replay", short_help="Record runs of every kind and replay each bit for bit.", options=FARM)
 def replays(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Number of runs, over all kinds in turn.", min=1)] = 20,
@@ -213,7 +215,7 @@ def replays(
     return Outcome(summary, text=table)
 
 
-@command("benchmark recording")
+@command("benchmark recording", short_help="Measure the computing time that a recording costs.")
 def recording(
     call: Call,
     pairs: Annotated[int, option("--pairs", "N", "Pairs of runs.", min=6)] = 11,
@@ -225,7 +227,7 @@ def recording(
     return Outcome(summary, text=table)
 
 
-@command("benchmark doctor", options=FARM)
+@command("benchmark doctor", short_help="Count how often the doctor names the injected cause.", options=FARM)
 def doctor(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Sets with each cause.", min=1)] = 20,
@@ -238,7 +240,7 @@ def doctor(
     return Outcome(summary, text=table)
 
 
-@command("benchmark arms", options=FARM)
+@command("benchmark arms", short_help="Run the demo on six UR arms, scaled to their reach.", options=FARM)
 def arms(
     call: Call,
     names: Annotated[list[str] | None, option("--arm", "NAME", "Only this arm; repeat for more.")] = None,
@@ -256,7 +258,9 @@ def arms(
     return Outcome(summary, text=arms_table(rows))
 
 
-@command("benchmark robot-faults", options=("address",))
+@command(
+    "benchmark robot-faults", short_help="Inject every fault of the robot link while moving.", options=("address",)
+)
 def robot_faults(
     call: Call,
     sequences: Annotated[int, option("--sequences", "N", "Number of random fault sequences.", min=0)] = 20,
@@ -276,7 +280,7 @@ def robot_faults(
     return Outcome(result.summary(), rows={outcome.name: outcome.line for outcome in result.outcomes})
 
 
-@command("benchmark robot", options=("address",))
+@command("benchmark robot", short_help="Measure the periods of commands streamed at 125 Hz.", options=("address",))
 def robot(
     call: Call, minutes: Annotated[float, option("--minutes", "M", "Length of the stream.", min=0.05)] = 10.0
 ) -> Mapping[str, object]:
@@ -289,7 +293,7 @@ def robot(
     ).summary()
 
 
-@command("benchmark robot-jobs")
+@command("benchmark robot-jobs", short_help="Measure how late velocities are in whole jobs.")
 def robot_jobs(
     call: Call,
     scenario: ScenarioOption = "s_groove",
@@ -308,7 +312,7 @@ def robot_jobs(
     return Outcome(result.summary(), rows=rows)
 
 
-@command("benchmark fuzz-files")
+@command("benchmark fuzz-files", short_help="Give every file reader damaged files.")
 def fuzz_files(
     call: Call,
     cases: Annotated[int, option("--cases", "N", "Damaged files for each reader.", min=1)] = 1000,
@@ -325,7 +329,7 @@ def fuzz_files(
     return Outcome(result.summary(), values={}, rows=rows)
 
 
-@command("benchmark motion-clock")
+@command("benchmark motion-clock", short_help="Measure how well the clock's offset is found in motion.")
 def motion_clock(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Number of calibrations with each clock.", min=2)] = 300,
@@ -337,28 +341,3 @@ def motion_clock(
     folder = call.folder("benchmark", "motion-clock")
     found = run_clock_study(runs, folder, seed=call.seed, duration_s=seconds, progress=call.progress)
     return Outcome({name: kind.summary() for name, kind in found.items()}, text=clock_table(found))
-
-
-COMMANDS = (
-    tablet,
-    seam_planning,
-    part_welds,
-    part_registration,
-    hand_eye,
-    hand_eye_cells,
-    touch,
-    mountings,
-    profiler,
-    cell,
-    seeds,
-    doctor,
-    fleet,
-    replays,
-    recording,
-    arms,
-    fuzz_files,
-    robot_faults,
-    robot,
-    robot_jobs,
-    motion_clock,
-)

@@ -15,7 +15,7 @@ FlangeName = Annotated[str, option("--flange", "NAME", "Flange standard.")]
 FLANGE = "iso9409-1-50-4-m6"
 
 
-@command("benchmark flange")
+@command("benchmark flange", short_help="Time the detection of the flange beside other chains.")
 def speed(
     call: Call,
     loop: Annotated[
@@ -29,7 +29,7 @@ def speed(
     return _figures(call, speed_table(run_flange_benchmark(call.seed, loop=loop, progress=call.progress)))
 
 
-@command("benchmark flange-frames")
+@command("benchmark flange-frames", short_help="Count detections in frames with and without a flange.")
 def frames(
     call: Call,
     count: Annotated[int, option("--frames", "N", "Number of frames with a flange, and without.", min=1)] = 500,
@@ -46,7 +46,7 @@ def frames(
     return _figures(call, frames_table(study_frames(scanner, standard, count, seed=call.seed, progress=call.progress)))
 
 
-@command("benchmark flange-hidden")
+@command("benchmark flange-hidden", short_help="Detect a flange that is partly hidden.")
 def hidden(
     call: Call,
     count: Annotated[int, option("--frames", "N", "Number of frames for each kind of occlusion.", min=1)] = 30,
@@ -68,7 +68,7 @@ def hidden(
     return _figures(call, hidden_table(rows))
 
 
-@command("benchmark flange-parts")
+@command("benchmark flange-parts", short_help="Compare flange centres found in two parts of a cloud.")
 def parts(
     call: Call,
     dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="A dataset folder with clouds, as for calibrate.")],
@@ -89,7 +89,7 @@ def parts(
     return _figures(call, parts_table(rows))
 
 
-@command("benchmark flange-honesty")
+@command("benchmark flange-honesty", short_help="Measure how often stated 95 % regions hold the truth.")
 def honesty(
     call: Call, runs: Annotated[int, option("--runs", "N", "Number of calibrations of each size.", min=10)] = 500
 ) -> Outcome:
@@ -107,7 +107,7 @@ def honesty(
     return _figures(call, coverage_table(studies))
 
 
-@command("benchmark flange-live")
+@command("benchmark flange-live", short_help="Compare live calibrations with the Cramer-Rao bound.")
 def live(
     call: Call,
     seeds: Annotated[int, option("--seeds", "N", "Number of calibrations, each in its own world.", min=1)] = 10,
@@ -132,7 +132,7 @@ def live(
     return _figures(call, live_table(rows, scans, repeatability))
 
 
-@command("benchmark flange-ingredients")
+@command("benchmark flange-ingredients", short_help="Measure what each part of the method contributes.")
 def ingredients(
     call: Call, dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least twelve scans.")]
 ) -> Outcome:
@@ -143,7 +143,7 @@ def ingredients(
     return _figures(call, ingredients_table(study_ingredients(dataset, call.seed, call.progress)))
 
 
-@command("benchmark flange-few")
+@command("benchmark flange-few", short_help="Calibrate from 1 to 12 of the scans.")
 def few(
     call: Call,
     dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least eight scans.")],
@@ -156,7 +156,7 @@ def few(
     return _figures(call, few_table(study_few_scans(dataset, draws, call.seed, progress=call.progress), draws))
 
 
-@command("benchmark flange-holes")
+@command("benchmark flange-holes", short_help="Fill holes of the flange and count wrong rotations.")
 def holes(
     call: Call,
     scans: Annotated[int, option("--scans", "N", "Number of scans for each set of filled holes.", min=1)] = 200,
@@ -175,7 +175,7 @@ def holes(
     return _figures(call, hole_turn_table(rows))
 
 
-@command("benchmark flange-imperfect")
+@command("benchmark flange-imperfect", short_help="Calibrate with an imperfect scanner and arm.")
 def imperfect(
     call: Call,
     scenario: Annotated[
@@ -193,7 +193,7 @@ def imperfect(
     return _figures(call, light_runs_table(found))
 
 
-@command("benchmark flange-halves")
+@command("benchmark flange-halves", short_help="Calibrate from random halves of the scans.")
 def held_out(
     call: Call,
     dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least sixteen scans.")],
@@ -209,7 +209,7 @@ def held_out(
     return _figures(call, halves_table(study_halves(dataset, draws, call.seed, call.progress, local=local)))
 
 
-@command("benchmark flange-arm")
+@command("benchmark flange-arm", short_help="Calibrate cells with errors of the arm, and refine them.")
 def arm(
     call: Call,
     worlds: Annotated[int, option("--worlds", "N", "Number of simulated cells.", min=1)] = 40,
@@ -222,9 +222,6 @@ def arm(
     from weldcal.tools.studies.flange.wrong_arm import run_wrong_arm
 
     return _figures(call, arm_table(run_wrong_arm(worlds, call.seed, kind, call.progress)))
-
-
-COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes, imperfect, held_out, arm)
 
 
 def _figures(call: Call, table: "Table") -> Outcome:

@@ -5,7 +5,7 @@ from typing import Annotated
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 
 
-@command("benchmark soak")
+@command("benchmark soak", short_help="Calibrate and weld by wire for an hour with faults.")
 def soak(
     call: Call,
     minutes: Annotated[float, option("--minutes", "M", "How long new cycles begin.", min=0.1)] = 60.0,
@@ -17,7 +17,7 @@ def soak(
     return Outcome(summary, text=table)
 
 
-@command("benchmark wired-faults", options=FARM)
+@command("benchmark wired-faults", short_help="Disturb each device by wire in each phase of the job.", options=FARM)
 def wired_faults(
     call: Call,
     devices: Annotated[list[str] | None, option("--device", "NAME", "Only this device; repeat for more.")] = None,
@@ -29,6 +29,3 @@ def wired_faults(
     farm = call.farm(call.folder("benchmark", "wired-faults"))
     summary, table = run_wired_faults(farm, call.seed, devices or (), phases or ())
     return Outcome(summary, text=table)
-
-
-COMMANDS = (soak, wired_faults)

@@ -22,7 +22,7 @@ from weldcal.tools.cli.runs import run_options
 @command(
     "calibrate",
     options=(*MOTION, "record"),
-    short_help="Calibrate a scanner from a folder of scans, or live in a scenario.",
+    short_help="Calibrate a scanner from scans, or live in a scenario.",
 )
 def calibrate(
     call: Call,

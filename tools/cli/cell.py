@@ -69,7 +69,7 @@ def print_board(
     return Outcome({"state": "done", "kind": kind, **written, "note": printing.NOTE})
 
 
-@command("finger calibrate", short_help="Calibrate the finger camera, its tag and the soft tip from pictures.")
+@command("finger calibrate", short_help="Calibrate the finger camera, its tag and the soft tip.")
 def finger_calibrate(
     call: Call,
     folder: Annotated[Path, typer.Argument(metavar="PICTURES", help="Folder of pictures of the board, png or jpg.")],

@@ -27,7 +27,7 @@ ScannerOption = Annotated[
 ]
 
 
-@command("hand-eye ax-xb")
+@command("hand-eye ax-xb", short_help="Solve AX = XB for the camera's pose.")
 def ax_xb(
     call: Call,
     file: FileArgument,
@@ -40,7 +40,7 @@ def ax_xb(
     return _solve("ax-xb", call, file, mounting=mounting, unit=unit, motions=motions, limit_mm=limit_mm)
 
 
-@command("hand-eye ax-yb")
+@command("hand-eye ax-yb", short_help="Solve AX = YB for the poses of camera and target.")
 def ax_yb(
     call: Call,
     file: FileArgument,
@@ -82,7 +82,7 @@ def ax_yb(
     )
 
 
-@command("hand-eye axb-ycz")
+@command("hand-eye axb-ycz", short_help="Solve AXB = YCZ for two robots.")
 def axb_ycz(
     call: Call,
     file: FileArgument,

@@ -107,7 +107,7 @@ def _outcome(summary: dict[str, Any], moves: Sequence[Any], first: FirstScreen) 
     return Outcome(summary, values=values, rows=rows, first=first)
 
 
-@command("benchmark drift")
+@command("benchmark drift", short_help="Measure how soon a moved scanner is found.")
 def benchmark_drift(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Recordings with a knock: every other one shifts, turns.", min=2)] = 200,
@@ -130,7 +130,7 @@ def benchmark_drift(
     return Outcome(result, text=lambda: print_targets("Drift", targets))
 
 
-@command("benchmark whole-body")
+@command("benchmark whole-body", short_help="Compare tracking by the flange with tracking by a link.")
 def benchmark_whole_body(
     call: Call,
     frames: Annotated[int, option("--frames", "N", "Frames of the recording.", min=12)] = 200,
@@ -150,6 +150,3 @@ def benchmark_whole_body(
     )
     summary, targets = run_whole_body(call.folder("benchmark", "whole-body"), options, body, call.progress)
     return Outcome(summary, text=lambda: print_targets("Whole body", targets))
-
-
-COMMANDS = (benchmark_drift, benchmark_whole_body)

@@ -8,7 +8,7 @@ import typer
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 
-@command("plan-motion", short_help="Find the motion that tells most, before calibrating in motion.")
+@command("plan-motion", short_help="Find the best motion for a calibration in motion.")
 def plan_motion(
     call: Call,
     scenario: Annotated[

@@ -7,7 +7,7 @@ import typer
 from weldcal.tools.cli.options import Call, Outcome, command, option
 
 
-@command("plan-poses", short_help="Find the poses of scans that tell most of the arm's errors, for calibrate --refine.")
+@command("plan-poses", short_help="Find the poses of scans for calibrate --refine.")
 def plan_poses(
     call: Call,
     scenario: Annotated[

@@ -111,7 +111,7 @@ def sphere(
     return _outcome(call, summary, made)
 
 
-@command("profiler compensate", short_help="Calibrate by the published sphere method, with compensation by touches.")
+@command("profiler compensate", short_help="Calibrate by the published sphere method.")
 def compensate(
     call: Call,
     file: FileArgument,

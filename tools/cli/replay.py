@@ -8,7 +8,7 @@ import typer
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command
 
 
-@command("replay", common=LOOK, short_help="Run today's algorithms on a recording and compare bit for bit.")
+@command("replay", common=LOOK, short_help="Repeat a recorded run and compare bit for bit.")
 def replay(
     call: Call,
     recording: Annotated[Path, typer.Argument(help="A recording.mcap from --record, or the folder that holds it.")],

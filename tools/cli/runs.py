@@ -44,7 +44,9 @@ def weld(call: Call, scenario: ScenarioOption = "straight_groove") -> Outcome:
     return Outcome(found.summary(), first=found.first)
 
 
-@command("tablet demo", options=LIVE, defaults={"browser": False})
+@command(
+    "tablet demo", short_help="Run the tablet calibration in a scenario.", options=LIVE, defaults={"browser": False}
+)
 def tablet_demo(call: Call, scenario: ScenarioOption = "tablet", record: RecordOption = False) -> Outcome:
     """Run the tablet calibration: look, touch each landmark, calibrate, compare with the truth."""
     from weldcal.systems.scenario.loading import load_scenario
@@ -55,7 +57,9 @@ def tablet_demo(call: Call, scenario: ScenarioOption = "tablet", record: RecordO
     return Outcome(found.summary(), first=found.first)
 
 
-@command("hand-eye live", options=LIVE, defaults={"browser": False})
+@command(
+    "hand-eye live", short_help="Calibrate a scanner live in any mounting.", options=LIVE, defaults={"browser": False}
+)
 def hand_eye_live(
     call: Call,
     scenario: Annotated[
@@ -72,7 +76,12 @@ def hand_eye_live(
     return Outcome(result.summary(), text=result.text(), first=result.first)
 
 
-@command("profiler live", options=LIVE, defaults={"browser": False})
+@command(
+    "profiler live",
+    short_help="Calibrate a profiler on the arm and follow a seam.",
+    options=LIVE,
+    defaults={"browser": False},
+)
 def profiler_live(
     call: Call,
     name: ScenarioArgument = None,

@@ -8,7 +8,7 @@ import typer
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, check_writable, command, option, switch
 
 
-@command("tablet serve", common=("debug",))
+@command("tablet serve", short_help="Serve the target page to a tablet.", common=("debug",))
 def serve(
     call: Call,
     host: Annotated[
@@ -26,7 +26,7 @@ def serve(
     run_server(host, port, out, typer.echo)
 
 
-@command("tablet calibrate")
+@command("tablet calibrate", short_help="Calibrate a camera by touches of the tablet.")
 def calibrate(
     call: Call,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The page's touches (CSV), or planar touches (npz).")],
