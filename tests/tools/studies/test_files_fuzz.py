@@ -10,9 +10,21 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.files import cases, fuzz, readers, worker
-from weldcal.tools.studies.files.cases import ACCEPTED, CRASH, GOOD, HANG, INTERNAL, MEMORY, REFUSED, WRONG, judge
-from weldcal.tools.studies.files.readers import READERS, Reader
+from weldcal.tools.studies import fuzz_files as fuzz
+from weldcal.tools.worlds import damaged_files as cases
+from weldcal.tools.worlds.damaged_files import (
+    ACCEPTED,
+    CRASH,
+    GOOD,
+    HANG,
+    INTERNAL,
+    MEMORY,
+    READERS,
+    REFUSED,
+    WRONG,
+    Reader,
+    judge,
+)
 
 SLOW = ("scenario",)  # a tenth of a second each
 
@@ -91,8 +103,8 @@ def test_the_child_is_watched_and_ended(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_gigabyte_and_ten_times_the_file_are_allowed() -> None:
-    assert not worker.too_much(1024**3 + 10 * 5, 5)
-    assert worker.too_much(1024**3 + 10 * 5 + 1, 5)
+    assert not fuzz.too_much(1024**3 + 10 * 5, 5)
+    assert fuzz.too_much(1024**3 + 10 * 5 + 1, 5)
 
 
 def test_findings_are_kept_and_end_in_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,5 +118,5 @@ def test_findings_are_kept_and_end_in_exit_code_1(tmp_path: Path, monkeypatch: p
 
 
 def test_numbers_that_are_not_finite_are_found_anywhere() -> None:
-    assert readers.all_finite([{"a": [1.0]}, None, "x"])
-    assert not readers.all_finite([{"a": [float("nan")]}])
+    assert cases.all_finite([{"a": [1.0]}, None, "x"])
+    assert not cases.all_finite([{"a": [float("nan")]}])

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -16,6 +16,7 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.output import markdown_table
 from weldcal.tools.worlds.moves import DELAY_S, cube_moves, observed_frames
@@ -72,6 +73,18 @@ class ClockRuns:
             "work_worst_mm": float(self.work_mm.max()),
             "turn_worst_deg": float(self.turn_deg.max()),
         }
+
+
+@command("benchmark motion-clock", short_help="Measure how well the clock's offset is found in motion.", hidden=True)
+def benchmark_clock(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Number of calibrations with each clock.", min=2)] = 300,
+    seconds: Annotated[float, option("--seconds", "S", "Length of each recording.", min=5.0)] = 20.0,
+) -> Outcome:
+    """Repeat calibrations in motion with known truth: coverage of the clock's offset, error and NEES of the scanner's pose."""
+    folder = call.folder("benchmark", "motion-clock")
+    found = run_clock_study(runs, folder, seed=call.seed, duration_s=seconds, progress=call.progress)
+    return Outcome({name: kind.summary() for name, kind in found.items()}, text=clock_table(found))
 
 
 def run_clock_study(

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,12 @@ from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter
 from weldcal.calibration.motion.drift.residuals import CLOCK
 from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.targets import Target, all_met
+from weldcal.tools.studies.targets import Target, all_met, print_targets
 from weldcal.tools.worlds.features import Change, World, WorldConfig, simulate
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
@@ -55,6 +58,25 @@ class Size:
     knocks: int = 200
     creeps: int = 8
     hours: float = 10.0
+
+
+@command("benchmark drift", short_help="Measure how soon a moved scanner is found.", hidden=True)
+def benchmark_drift(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Recordings with a knock: every other one shifts, turns.", min=2)] = 200,
+    creeps: Annotated[int, option("--creeps", "N", "Recordings with a creep.", min=1)] = 8,
+    hours: Annotated[float, option("--hours", "H", "Simulated hours in which nothing happens.", min=0.01)] = 10.0,
+    stamps: Annotated[str, option("--stamps", "KIND", "device (0.1 ms) or arrival (15 ms, skewed).")] = "device",
+    quick: Annotated[bool, switch("--quick", "Few recordings and minutes: seconds instead of an hour.")] = False,
+) -> Outcome:
+    """Measure the drift test: how soon knocks of 0.2 mm or 0.03 degrees and creeps are found, and false alarms."""
+    if stamps not in ("device", "arrival"):
+        raise InputError(f"Stamps are 'device' or 'arrival', not '{stamps}'.")
+    size = Size(2, 1, 0.01) if quick else Size(runs, creeps, hours)
+    result, targets = run_drift_study(
+        call.folder("benchmark", "drift"), size, stamps=stamps, seed=call.seed, progress=call.progress
+    )
+    return Outcome(result, text=lambda: print_targets("Drift", targets))
 
 
 def run_drift_study(

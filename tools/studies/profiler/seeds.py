@@ -1,11 +1,13 @@
 """Every target of the profiler study over many seeds: figures, their Cramer-Rao bounds, and the fixed files."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
@@ -15,21 +17,18 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.errors import InputError
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
+from weldcal.tools.report.pictures import OURS, plain, svg
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.profiler.edge import TARGETS, edge_figures, edge_targets
-from weldcal.tools.studies.profiler.plots import over_seeds
-from weldcal.tools.studies.profiler.results import Reached, TargetLine
+from weldcal.tools.studies.profiler.plots import legend
 from weldcal.tools.studies.profiler.sphere import (
     METHODS,
-    MM,
-    WorldData,
     WorldResult,
     cloud_of,
-    fixed_worlds,
     joint_records,
-    made_worlds,
     measured,
     named_figures,
     seam_features,
@@ -37,9 +36,49 @@ from weldcal.tools.studies.profiler.sphere import (
     sphere_targets,
 )
 from weldcal.tools.worlds.edge_trials import EdgeTrial, fixed_edge_trials, made_edge_trials, rms
+from weldcal.tools.worlds.profiler_parts import MM, WorldData, fixed_worlds, made_worlds
 
 TRIALS = {"free": 20}
 WORLDS, GROOVES, BOSSES = 8, 3, 2
+
+
+@dataclass(frozen=True)
+class Reached:
+    """One figure of one seed or of the fixed files: what was reached, and the bound where there is one (mm or deg)."""
+
+    value: float
+    bound: float | None
+
+
+@dataclass(frozen=True)
+class TargetLine:
+    """One target over the seeds."""
+
+    what: str
+    unit: str
+    target: float
+    seeds: tuple[Reached, ...]
+    fixed: Reached | None
+
+    @property
+    def values(self) -> np.ndarray:
+        """Reached (n,), seed by seed."""
+        return np.array([r.value for r in self.seeds])
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Bounds (n,); not a number where there is none."""
+        return np.array([np.nan if r.bound is None else r.bound for r in self.seeds])
+
+    @property
+    def over_bound(self) -> float:
+        """All seeds together, root of the mean squares over the bound's."""
+        return float(np.sqrt(np.mean(self.values**2) / np.mean(self.bounds**2)))
+
+    @property
+    def met(self) -> int:
+        """In how many seeds the target is met."""
+        return int((self.values <= self.target).sum())
 
 
 @dataclass(frozen=True)
@@ -75,6 +114,25 @@ class SeedStudy:
             "wall_seconds": self.wall_seconds,
             "written_to": self.folder,
         }  # fmt: skip
+
+
+@command("reproduce profiler-seeds", short_help="Run every target of 'reproduce profiler' on many seeds.", hidden=True)
+def profiler_seeds(
+    call: Call,
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds.", min=2)] = 12,
+    data: Annotated[Path | None, option("--data", "FOLDER", "The fixed files, shown together with the seeds.")] = None,
+) -> Outcome:
+    """Run every target of 'reproduce profiler' over many seeds and compare with the Cramer-Rao bound. 20 s per seed."""
+    study = run_profiler_seeds(call.folder("reproduce", "profiler-seeds"), call.seed, seeds, data, call.progress)
+    rows = {}
+    for line in study.lines:
+        fixed = "" if line.fixed is None else f"; fixed files {line.fixed.value:.3f}"
+        rows[line.what] = (
+            f"{float(line.values.min()):.3f} to {float(line.values.max()):.3f} {line.unit}, {line.over_bound:.2f} of the bound, "
+            f"target {line.target:g} met in {line.met} of {len(line.seeds)}{fixed}"
+        )
+    rows["edge, squared error in units of the bound"] = f"{study.nees:.2f} of 6 expected, {study.trials} trials"
+    return Outcome(study.summary(), values={}, rows=rows)
 
 
 def run_profiler_seeds(folder: Path, first: int, count: int, data: Path | None, progress: Progress) -> SeedStudy:
@@ -221,3 +279,25 @@ def world_bounds(world: WorldData, features: Floats | None, seed: int) -> dict[s
         ]
         found["boss"] = np.mean(off, axis=0)
     return found
+
+
+def over_seeds(lines: Sequence[TargetLine]) -> bytes:
+    """Every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
+    picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
+    axes = picture.add_subplot()
+    for k, line in enumerate(lines):
+        axes.plot(line.values / line.target, np.full(len(line.values), k), "o", ms=4, mew=0, alpha=0.5, color=OURS,
+                  label="one seed" if k == 0 else None)  # fmt: skip
+        low, high = np.nanmin(line.bounds) / line.target, np.nanmax(line.bounds) / line.target
+        axes.plot([low, high], [k + 0.28] * 2, "-", lw=3, color="0.45", solid_capstyle="round",
+                  label="its bound, over the seeds" if k == 0 else None)  # fmt: skip
+        if line.fixed is not None:
+            axes.plot(line.fixed.value / line.target, k, "D", ms=5, mfc="none", mec="black", mew=1.4,
+                      label="the fixed files" if k == 0 else None)  # fmt: skip
+    axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
+    axes.set_yticks(range(len(lines)), [f"{line.what}, {line.target:g} {line.unit}" for line in lines], fontsize=8)
+    axes.invert_yaxis()
+    plain(axes, "reached over target", "")
+    axes.set_xlim(left=0.0)
+    legend(picture, axes)
+    return svg(picture)

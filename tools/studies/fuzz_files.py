@@ -1,28 +1,62 @@
-"""Damaged files for every reader, in child processes: accepted or refused by a sentence, or something that must not be."""
+"""`weldcal benchmark fuzz-files`: damaged files for every reader, read in a child process.
+
+As a program of its own this module is the child: it reads "reader seed case" lines and answers each with a line of JSON.
+"""
 
 import json
 import os
+import resource
 import selectors
 import shutil
 import subprocess
 import sys
+import time
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 
 from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.files.cases import CRASH, GOOD, HANG, MEMORY, Verdict, damaged, lay_out
-from weldcal.tools.studies.files.readers import READERS, Reader
+from weldcal.tools.worlds.damaged_files import (
+    CRASH,
+    GOOD,
+    HANG,
+    MEMORY,
+    READERS,
+    Reader,
+    Verdict,
+    damaged,
+    judge,
+    lay_out,
+)
 
 WATCHDOG_S = 10.0
-WORKER = ("-m", "weldcal.tools.studies.files.worker")
+WORKER = ("-m", "weldcal.tools.studies.fuzz_files")
 _START_S = 120.0  # to import everything, on a slow computer
 _KEPT = 20  # offending files of each reader and verdict
+FREE = 1024**3  # bytes above those of the idle process that any file may take
+TIMES = 10  # and as many times the size of the file
+
+
+@command("benchmark fuzz-files", short_help="Give every file reader damaged files.")
+def benchmark_fuzz_files(
+    call: Call,
+    cases: Annotated[int, option("--cases", "N", "Damaged files for each reader.", min=1)] = 1000,
+    readers: Annotated[
+        list[str] | None, option("--readers", "NAME", "Only this reader; repeat for more.", show_default="all")
+    ] = None,
+) -> Outcome:
+    """Damage files of every format by its own grammar: each reader must accept or refuse them by a sentence, in 10 s and 1 GB."""
+    wanted = chosen(readers or ())
+    result = fuzz_files(wanted, cases, call.seed, call.folder("benchmark", "fuzz-files"), call.progress)
+    rows = {name: ", ".join(f"{n} {said}" for said, n in count.most_common()) for name, count in result.counts.items()}
+    return Outcome(result.summary(), values={}, rows=rows)
 
 
 @dataclass(frozen=True)
@@ -176,3 +210,39 @@ class _Child:
             self._process.kill()
             self._process.communicate()
             self._process = None
+
+
+def main() -> None:
+    """Work in the folder that is the first argument until the input ends."""
+    folder = Path(sys.argv[1])
+    os.chdir(folder)
+    warnings.simplefilter("ignore")
+    readers = {reader.name: reader for reader in READERS}
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print must not come between the answers
+    idle = _peak()
+    for line in sys.stdin:
+        name, seed, case = line.split()
+        place = folder / "case"
+        begin = time.monotonic()
+        verdict = judge(readers[name], int(seed), int(case), place)
+        seconds = time.monotonic() - begin
+        size = sum(p.stat().st_size for p in place.rglob("*") if p.is_file() and not p.is_symlink())
+        if too_much(_peak() - idle, size):
+            verdict = Verdict(MEMORY, f"{(_peak() - idle) / 2**20:.0f} MiB for {size} bytes; {verdict.said}")
+        answers.write(json.dumps({"said": verdict.said, "detail": verdict.detail, "seconds": seconds}) + "\n")
+        answers.flush()
+
+
+def too_much(taken: int, size: int) -> bool:
+    """Whether a case took more bytes than files of so many bytes may."""
+    return taken > FREE + TIMES * size
+
+
+def _peak() -> int:
+    """The largest resident size so far, bytes."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+if __name__ == "__main__":
+    main()
