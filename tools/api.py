@@ -23,7 +23,7 @@ from weldcal.tools.commands.hand_eye import solve_pairs
 from weldcal.tools.commands.procedures import run_procedure
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.outcomes.calibration import CalibrationReport, VerifyReport
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 
 Floats = npt.NDArray[np.floating[Any]]
 FLANGE = "iso9409-1-50-4-m6"

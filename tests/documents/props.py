@@ -26,7 +26,7 @@ from weldcal.models.mesh import extrude
 from weldcal.models.scanners import get_scanner
 from weldcal.models.tools.loading import WELDING
 from weldcal.tools.scenarios.new_cell import write_cell
-from weldcal.tools.studies.touch.world import touch_world
+from weldcal.tools.worlds.touch import touch_world
 
 # An angle bracket of plates 10 mm thick; lengths in mm. Its inner corner is the longest concave edge.
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])

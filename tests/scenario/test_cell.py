@@ -29,8 +29,8 @@ from weldcal.systems.station import Truth
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.commands.run import JobRun
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import calibration_error, weld_outcome
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.weld import calibration_error, weld_outcome
 from weldcal.tools.studies.cell.study import figures
 from weldcal.welding.record.weld_log import load_weld_log
 

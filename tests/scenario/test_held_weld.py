@@ -11,8 +11,8 @@ from tests.held_weld import HeldWeld, held_weld, short_weld
 from weldcal.systems.runner import Run
 from weldcal.tools.commands.record import RunRecorder
 from weldcal.tools.commands.replay import replay
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import weld_outcome
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.weld import weld_outcome
 
 
 @pytest.fixture(scope="module")

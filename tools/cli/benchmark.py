@@ -212,10 +212,10 @@ def doctor(
     cleans: Annotated[int, option("--clean", "N", "Sets without a cause.", min=0)] = 200,
 ) -> Outcome:
     """Inject each cause into simulated sets of scans, and count which one `weldcal doctor` names first."""
-    from weldcal.tools.studies.doctor.study import run_doctor_study
+    from weldcal.tools.studies.doctor.study import STUDY, cases
 
-    summary, table = run_doctor_study(call.farm(call.folder("benchmark", "doctor")), runs, cleans, call.seed)
-    return Outcome(summary, text=table)
+    found = STUDY.run(call.farm(call.folder("benchmark", "doctor")), cases(runs, cleans, call.seed))
+    return Outcome(found.figures, text=found.show, problem=found.problem)
 
 
 @command("benchmark arms", short_help="Run the demo on six UR arms, scaled to their reach.", options=FARM)

@@ -58,8 +58,9 @@ def hidden(
     stated uncertainty."""
     from weldcal.models.flanges import get_flange
     from weldcal.models.scanners import get_scanner
-    from weldcal.tools.studies.flange.found import WAYS, study_hidden
+    from weldcal.tools.studies.flange.found import study_hidden
     from weldcal.tools.studies.flange.tables import hidden_table
+    from weldcal.tools.worlds.flange_frames import WAYS
 
     scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
     rows = [
@@ -95,9 +96,8 @@ def honesty(
 ) -> Outcome:
     """Measure how often the stated 95 % regions contain the truth, and the ratio of held-out to true errors."""
     from weldcal.tools.report.render import write_atomic
-    from weldcal.tools.studies.flange.coverage import coverage_picture, study_corrected, study_coverage
+    from weldcal.tools.studies.flange.coverage import coverage_picture, study_corrected, study_coverage, study_warped
     from weldcal.tools.studies.flange.tables import coverage_table
-    from weldcal.tools.studies.flange.warped import study_warped
 
     studies = [study_coverage(n, runs, call.seed, call.progress) for n in (5, 6, 8, 12, 20)]
     studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
@@ -219,7 +219,7 @@ def arm(
 ) -> Outcome:
     """Calibrate UR10e cells with factory-size errors of the arm from 20 planned scans, plain and refined, and judge both on new scans."""
     from weldcal.tools.studies.flange.tables import arm_table
-    from weldcal.tools.studies.flange.wrong_arm import run_wrong_arm
+    from weldcal.tools.worlds.wrong_arm import run_wrong_arm
 
     return _figures(call, arm_table(run_wrong_arm(worlds, call.seed, kind, call.progress)))
 

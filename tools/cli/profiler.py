@@ -13,9 +13,9 @@ from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, optio
 
 if TYPE_CHECKING:
     from weldcal.calibration.profiler.sphere.model import SphereData
-    from weldcal.tools.commands.profiler.files import ProfilerFile
-    from weldcal.tools.outcomes.profiler_file import ProfilerFile as ProfilerResult
-    from weldcal.tools.outcomes.profiler_file import ProfilerSeam
+    from weldcal.tools.commands.profiler.files import Measurements
+    from weldcal.tools.report.profiler_file import ProfilerFile as ProfilerResult
+    from weldcal.tools.report.profiler_file import ProfilerSeam
 
 FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Measurements, .npz or .csv (docs/profiler.md).")]
 UnitOption = Annotated[str | None, option("--unit", "U", "m or mm, for an NPZ that does not state its unit.")]
@@ -197,7 +197,7 @@ def _sphere(
     tip: str,
     arm: str = "",
     lost: list[int] | None = None,
-) -> tuple[ProfilerFile, SphereData]:
+) -> tuple[Measurements, SphereData]:
     from weldcal.tools.commands.profiler.calibrate import parse_tip, sphere_data
     from weldcal.tools.commands.profiler.files import read_profiler_file
 
@@ -208,7 +208,7 @@ def _sphere(
     return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=call.seed)
 
 
-def _with(data: ProfilerFile, found: Mapping[str, Any]) -> dict[str, Any]:
+def _with(data: Measurements, found: Mapping[str, Any]) -> dict[str, Any]:
     """What was found, with the warnings about the file first."""
     return {**found, **({"warnings": [*data.warnings, *found.get("warnings", [])]} if data.warnings else {})}
 

@@ -18,7 +18,7 @@ from weldcal.tools.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from weldcal.tools.outcomes.options import RunOptions
+    from weldcal.tools.report.run import RunOptions
 
 DEMO_SCENARIO = "s_groove"
 RECORDED = (*LIVE, "record")
@@ -106,7 +106,7 @@ def profiler_live(
 
 def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:
     """The options of a run; its folder is named after the command and the scenario."""
-    from weldcal.tools.outcomes.options import RunOptions
+    from weldcal.tools.report.run import RunOptions
 
     return RunOptions(scenario=scenario, out=call.folder(command, scenario), seed=call.seed, **{**call.live, **more})
 

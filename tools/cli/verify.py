@@ -106,7 +106,7 @@ def _by_touch(call: Call, result: Path, touches: Path) -> Outcome:
 def _touched_live(call: Call, result: Path, scenario: str, robot: str, points: int) -> Outcome:
     from weldcal.tools.commands.touch_live import run_touches, touching
     from weldcal.tools.outcomes.calibration import DO_NOT
-    from weldcal.tools.outcomes.options import RunOptions
+    from weldcal.tools.report.run import RunOptions
 
     options = RunOptions(
         scenario=scenario, out=call.folder("verify", scenario), seed=call.seed, robot=robot, **call.live

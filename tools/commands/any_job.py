@@ -7,8 +7,8 @@ from pathlib import Path
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 
 
 @dataclass(frozen=True, eq=False)

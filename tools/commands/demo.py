@@ -9,12 +9,11 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.commands.run_files import SCANS, SUMMARY, weld_record, write_calibration, write_scans, write_weld_log
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import live_calibration_error, weld_outcome
-from weldcal.tools.report.demo import demo_pictures, demo_report
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.weld import live_calibration_error, weld_outcome
 
 
 def run_demo(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
@@ -74,7 +73,9 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
         if status.estimate is None
         else live_calibration_error(cell, status.estimate, status.arm_or(cell.station.arm))
     )
-    return DemoResult(options, run, status, error, weld_outcome(cell, run.root), robot)
+    return DemoResult(
+        options=options, run=run, status=status, calibration=error, weld=weld_outcome(cell, run.root), robot=robot
+    )
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:

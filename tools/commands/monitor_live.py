@@ -29,9 +29,9 @@ from weldcal.tools.commands.monitor import causes, rate_checked, recalibrated_re
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next
 from weldcal.tools.outcomes.monitor import MonitorReport, drift_document
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.monitor import monitor_page
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 
 _LAST = ("rms_mm", "frames", "dropped", "drift")
 _LOST = "The frame came while others were waiting for their fit."

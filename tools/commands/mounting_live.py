@@ -13,11 +13,11 @@ from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.mounting import mounting_report
 from weldcal.tools.report.mounting_picture import station_picture
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 
 
 def run_mounting_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MountingReport:

@@ -8,7 +8,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.run_files import write_scans
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.scenarios.dataset_forms import FORMS, rewrite
 
 EXAMPLE = "calibrate_only"

@@ -16,7 +16,7 @@ from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.commands.touch_live import run_touches
 from weldcal.tools.outcomes.first_screen import FirstScreen
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 
 
 class Outcome(Protocol):

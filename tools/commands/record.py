@@ -16,7 +16,7 @@ from weldcal.systems.recording.writer import RecordingWriter
 from weldcal.systems.runner import Run
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 
 RECORDING: Final = "recording.mcap"
 _PACKAGES = ("drake", "numpy", "scipy", "open3d", "opencv-python-headless", "numba")

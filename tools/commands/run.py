@@ -27,8 +27,8 @@ from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.dashboard.facts import facts_of
 from weldcal.tools.dashboard.recording import with_overlay
 from weldcal.tools.dashboard.source import DashboardSource
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 
 
 @dataclass(frozen=True, eq=False)

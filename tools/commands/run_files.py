@@ -21,9 +21,9 @@ from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Run
-from weldcal.tools.outcomes.demo import live_errors
-from weldcal.tools.outcomes.weld import WeldOutcome, columns
+from weldcal.tools.report.demo import live_errors
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.weld import WeldOutcome, columns
 from weldcal.welding.record.process import speed_along, torch_angles
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 from weldcal.welding.servo.state import Phase

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from weldcal.models.tools.loading import check_sight, load_tool
-from weldcal.tools.outcomes.tool import ToolCheck
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.tool import tool_picture, tool_report
+from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
 
 
 def check_tool(file: Path, folder: Path) -> ToolCheck:

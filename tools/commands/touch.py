@@ -7,10 +7,9 @@ from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.touch.judge import judge_touches
 from weldcal.calibration.touch.table import read_touches
 from weldcal.models.errors import InputError
-from weldcal.tools.outcomes.touch import TouchReport
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.touch import touch_page
+from weldcal.tools.report.touch import TouchReport, touch_page
 
 
 def verify_touches(result: Path, touches: Path, out: Path) -> TouchReport:

@@ -13,10 +13,10 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.touch import verify_touches
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.touch import TouchReport
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.touch import TouchReport
 
 TABLE = "touches.csv"
 

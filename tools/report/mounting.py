@@ -7,7 +7,7 @@ from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.report.hand_eye import unknown_tables
 from weldcal.tools.report.pictures import OURS, error_bars, millimetres, svg
 from weldcal.tools.report.render import fixed, render
-from weldcal.tools.report.robot_timing import robot_timing
+from weldcal.tools.report.run import robot_timing
 
 
 def mounting_report(report: MountingReport, picture: bytes | None) -> str:

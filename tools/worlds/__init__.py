@@ -1,1 +1,1 @@
-"""Simulated parts, rigs and recordings that tests and studies share."""
+"""Simulated parts, rigs, scans and recordings with a known truth, for tests and studies."""

@@ -19,7 +19,7 @@ from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.flange.wrong_arm import Station, run_wrong_arm, station
+from weldcal.tools.worlds.wrong_arm import Station, run_wrong_arm, station
 
 ARM = load_chain("ur10e")
 

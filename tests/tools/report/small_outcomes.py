@@ -33,25 +33,21 @@ from weldcal.tools.outcomes.calibration import (
     VerifyReport,
     error_summary,
 )
-from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.first_screen import NO_TOLERANCE, FirstScreen
 from weldcal.tools.outcomes.hand_eye import HandEyeReport, MethodRow
 from weldcal.tools.outcomes.monitor import MonitorReport
 from weldcal.tools.outcomes.motion import MotionReport
 from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome, ProfilerLive
-from weldcal.tools.outcomes.profiler_file import ProfilerFile, ProfilerSeam
-from weldcal.tools.outcomes.tablet import tablet_screen
 from weldcal.tools.report.calibration import calibration_report
-from weldcal.tools.report.demo import demo_pictures, demo_report
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
 from weldcal.tools.report.hand_eye import hand_eye_report
 from weldcal.tools.report.monitor import monitor_page
 from weldcal.tools.report.motion_calibration import motion_report
 from weldcal.tools.report.mounting import mounting_report
-from weldcal.tools.report.profiler_file import profiler_report, seam_report
-from weldcal.tools.report.profiler_live import live_report
-from weldcal.tools.report.tablet import Shown
+from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report, seam_report
+from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, ProfilerLive, live_report
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
 from weldcal.tools.report.verify import verify_report
 
@@ -214,7 +210,7 @@ def _demo(estimate: Any, *, held: bool) -> Made:
         11, 10, tuple(OBSERVATIONS), (("p77", "No ring."),), estimate, 9e-5,
         history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)), verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
     )  # fmt: skip
-    result = DemoResult(RunOptions("calibrate_only", OUT), run, status, None, None)
+    result = DemoResult(options=RunOptions("calibrate_only", OUT), run=run, status=status, calibration=None, weld=None)
     return result.first, demo_report(result, demo_pictures(result), recording=True)
 
 
@@ -235,14 +231,29 @@ def profiler() -> Made:
     """`profiler sphere` with a tolerance that it misses."""
     points = np.random.default_rng(0).uniform([-0.02, 0.15], [0.02, 0.2], (100, 2))
     found = {"scans": 20, "model": "affine", "rms_mm": 0.05, "without_sphere": [3], "warnings": ["Check the radius."]}
-    made = ProfilerFile(RECORD, found, points, np.linspace(0.1, 0.4, 19), "sphere.npz", OUT, 0.2)
+    made = ProfilerFile(
+        record=RECORD,
+        found=found,
+        points=points,
+        held_out_mm=np.linspace(0.1, 0.4, 19),
+        source="sphere.npz",
+        out=OUT,
+        limit_mm=0.2,
+    )
     return made.first, profiler_report(made)
 
 
 def seam() -> Made:
     """`profiler seam`."""
     found = {"scans": 20, "found": 19, "without_groove": [4], "rms_mm": 0.05, "error_95_mm": 0.12, "method": "sphere"}
-    made = ProfilerSeam(RECORD, found, np.random.default_rng(0).uniform(0.0, 100.0, (19, 3)), "groove.npz", OUT, OUT)
+    made = ProfilerSeam(
+        record=RECORD,
+        found=found,
+        root_mm=np.random.default_rng(0).uniform(0.0, 100.0, (19, 3)),
+        source="groove.npz",
+        calibration=OUT,
+        out=OUT,
+    )
     return made.first, seam_report(made)
 
 
@@ -256,7 +267,15 @@ def profiler_live() -> Made:
         edge=edge, sphere=None, seam=None, edge_scans=scans, sphere_scans=(), seam_scans=(), touches=()
     )
     run = _run("profiler_edge", state=lambda root: state)
-    outcome = LiveOutcome(PoseOutcome(0.1, 0.01, 0.1, 0.01, np.ones(6), 6.0), None, None, None, None, None, None)
+    outcome = LiveOutcome(
+        edge=PoseOutcome(0.1, 0.01, 0.1, 0.01, np.ones(6), 6.0),
+        sphere=None,
+        tip_mm=None,
+        center_mm=None,
+        points=None,
+        curve=None,
+        torch=None,
+    )
     live = ProfilerLive(RunOptions("profiler_edge", OUT), run, outcome)
     page = live_report(live.summary(), outcome, cast(Any, state), run, first=live.first, recording=False)
     return live.first, page
@@ -283,7 +302,15 @@ def finger() -> Made:
 
     camera = Intrinsics(np.diag([900.0, 900.0, 1.0]), np.zeros(5), 640, 480, 0.2, 0.3, 20, 5, 1.0)
     tip = TipCalibration(1.0, 1e-3, None, np.array([0.0, 1e-4, np.nan]), {"x": 900.0}, 2e-5, ("pressed along x only",))
-    report = FingerReport(camera, tip, ("lost.png",), 10.0, (0.0, 1.0, 30.0), 8, 0.05)
+    report = FingerReport(
+        camera=camera,
+        tip=tip,
+        without_board=("lost.png",),
+        tag_size_mm=10.0,
+        tag_at_rest_mm=(0.0, 1.0, 30.0),
+        touches=8,
+        limit_mm=0.05,
+    )
     return report.first, finger_page(report, Path("pictures"))
 
 

@@ -38,7 +38,7 @@ from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.calibration.profiler.sphere.radius import SCALE_SIGMAS, check_radius
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.commands.profiler.files import ProfilerFile
+from weldcal.tools.commands.profiler.files import Measurements
 from weldcal.tools.commands.profiler.noise import Sigmas, edge_by_noise
 
 CANDIDATES = 300
@@ -53,7 +53,7 @@ FEATURES = ("bar", "step", "apex")
 
 
 def calibrate_edge(
-    file: ProfilerFile,
+    file: Measurements,
     sigmas: Sigmas,
     *,
     method: str = "joint",
@@ -104,7 +104,7 @@ def calibrate_edge(
     return ProfilerRecord.of("edge, joint", e, found, file.digest), found
 
 
-def edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, list[int]]:
+def edge_points(file: Measurements, feature: str, side: str) -> tuple[Floats, list[int]]:
     """Points (n, 2) m, not finite where a profile shows no edge, and the numbers of those."""
     if not feature:
         return file.needed(
@@ -124,12 +124,12 @@ def edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, li
 
 
 def sphere_data(
-    file: ProfilerFile,
+    file: Measurements,
     *,
     radius_m: float | None,
     arm: str = "",
     tip_m: Floats | None = None,
-    touches: ProfilerFile | None = None,
+    touches: Measurements | None = None,
     lost: list[int] | None = None,
     seed: int = 0,
 ) -> SphereData:
@@ -297,7 +297,7 @@ def _without_arm(data: SphereData) -> SphereData:
 
 
 def calibrate_compensate(
-    file: ProfilerFile, data: SphereData, *, solve_tip: bool = False
+    file: Measurements, data: SphereData, *, solve_tip: bool = False
 ) -> tuple[ProfilerRecord, dict[str, Any]]:
     """The sphere paper's method: centres on the sides given in the file, two linear steps, compensation by touches."""
     sign = file.needed(

@@ -15,11 +15,17 @@ from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.profiler import WITHIN_MM, LiveOutcome, ProfilerLive, live_outcome
 from weldcal.tools.report.files import mappings_csv
-from weldcal.tools.report.profiler_live import live_report, seeds_report
+from weldcal.tools.report.profiler_live import (
+    WITHIN_MM,
+    LiveOutcome,
+    ProfilerLive,
+    live_outcome,
+    live_report,
+    seeds_report,
+)
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 
 
 def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progress) -> ProfilerLive:

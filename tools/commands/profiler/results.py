@@ -13,10 +13,9 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import Model, leave_one_out_m
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.commands.profiler import files
 from weldcal.tools.commands.profiler.calibrate import edge_points, write_calibration
-from weldcal.tools.outcomes.profiler_file import ProfilerFile
-from weldcal.tools.report.profiler_file import profiler_report
+from weldcal.tools.commands.profiler.files import Measurements
+from weldcal.tools.report.profiler_file import ProfilerFile, profiler_report
 from weldcal.tools.report.render import write_atomic
 
 FOLDS = 5
@@ -24,7 +23,7 @@ _MANY = 2000  # points of a report's picture
 
 
 def finish_edge(
-    file: files.ProfilerFile, feature: str, side: str, record: ProfilerRecord, found: dict[str, Any], source: str,
+    file: Measurements, feature: str, side: str, record: ProfilerRecord, found: dict[str, Any], source: str,
     out: Path, limit_mm: float | None,
 ) -> tuple[ProfilerFile, dict[str, Any]]:  # fmt: skip
     """Write an edge's calibration and its report; the result, and its JSON object without the folder."""
@@ -80,7 +79,15 @@ def _finish(
     limit_mm: float | None,
 ) -> tuple[ProfilerFile, dict[str, Any]]:  # fmt: skip
     points = points[np.isfinite(points).all(axis=1)]
-    made = ProfilerFile(record, found, points[:: max(1, len(points) // _MANY)], held_mm, source, out, limit_mm)
+    made = ProfilerFile(
+        record=record,
+        found=found,
+        points=points[:: max(1, len(points) // _MANY)],
+        held_out_mm=held_mm,
+        source=source,
+        out=out,
+        limit_mm=limit_mm,
+    )
     written = write_calibration(record, out)
     write_atomic(out / "report.html", profiler_report(made))
     return made, {**found, **written}

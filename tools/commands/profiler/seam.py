@@ -11,14 +11,13 @@ from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.record import load_record
 from weldcal.models.errors import InputError
 from weldcal.tools.commands.profiler.calibrate import check_number
-from weldcal.tools.commands.profiler.files import ProfilerFile
-from weldcal.tools.outcomes.profiler_file import ProfilerSeam, middle_error_mm
+from weldcal.tools.commands.profiler.files import Measurements
 from weldcal.tools.report.files import csv_text
-from weldcal.tools.report.profiler_file import seam_report
+from weldcal.tools.report.profiler_file import ProfilerSeam, middle_error_mm, seam_report
 from weldcal.tools.report.render import write_atomic
 
 
-def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, Any]:
+def map_seam(file: Measurements, calibration: Path, folder: Path) -> dict[str, Any]:
     """Writes a V-groove's three features of every profile in the base frame as seam.csv; returns the summary."""
     record = load_record(calibration)
     if file.profiles is None:
@@ -58,6 +57,14 @@ def finish_seam(
     """Write the report of a mapped seam, from the seam.csv beside it."""
     columns = np.genfromtxt(out / "seam.csv", delimiter=",", names=True)
     root = np.column_stack([np.atleast_1d(columns[f"root_{a}_mm"]) for a in "xyz"])
-    seam = ProfilerSeam(load_record(calibration), found, root, source, calibration, out, limit_mm)
+    seam = ProfilerSeam(
+        record=load_record(calibration),
+        found=found,
+        root_mm=root,
+        source=source,
+        calibration=calibration,
+        out=out,
+        limit_mm=limit_mm,
+    )
     write_atomic(out / "report.html", seam_report(seam))
     return seam

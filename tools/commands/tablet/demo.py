@@ -18,10 +18,9 @@ from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
 from weldcal.tools.commands.tablet.files import write_visit
 from weldcal.tools.outcomes.first_screen import FirstScreen
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.tablet import NO_KEY, run_screen
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.tablet import visit_report
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.tablet import NO_KEY, run_screen, visit_report
 
 MOST_LEAN_RAD = 0.15  # tilt of the pen at the unseen points
 UNSEEN = 50  # points of the tablet that are neither landmarks nor touched
@@ -91,10 +90,10 @@ def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCa
     write_visit(run, folder)
     done = calibrate_tablet(
         TabletInputs(
-            folder / "touches.csv",
-            folder / "poses.csv",
-            folder / "camera.yaml",
-            folder / "picture.png",
+            file=folder / "touches.csv",
+            poses=folder / "poses.csv",
+            camera=folder / "camera.yaml",
+            image=folder / "picture.png",
             pen_radius_m=1e-3 * tablet.pen.radius_mm,
         ),
         folder,

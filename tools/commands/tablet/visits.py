@@ -17,14 +17,13 @@ from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.tablet.planar import NAMES, VisitFits, best_model, fit_visit
 from weldcal.tools.outcomes.calibration import error_summary
 from weldcal.tools.outcomes.first_screen import FirstScreen
-from weldcal.tools.outcomes.tablet import visits_screen
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.report.tablet import Page
+from weldcal.tools.report.tablet import Page, visits_screen
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ManyVisits:
     """The fits of all visits, the refused visits with the reason, and the model chosen for all."""
 
@@ -153,7 +152,9 @@ def fit_many(file: Path, read: PlanarFile, sign: Sign, step_m: float) -> ManyVis
     if first is not None and not fitted:
         raise first
     model, errors = best_model(fitted)
-    return ManyVisits(file, tuple(fitted), tuple(refused), model, errors, step_m)
+    return ManyVisits(
+        file=file, visits=tuple(fitted), refused=tuple(refused), model=model, errors_mm=errors, step_m=step_m
+    )
 
 
 def _number(value: float) -> float | None:

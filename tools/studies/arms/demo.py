@@ -9,9 +9,9 @@ from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.demo import run_demo
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.arms.scaled import arm_scenario
 
 ARMS = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "ur30")

@@ -8,9 +8,9 @@ import numpy as np
 from weldcal.tools.commands.demo import run_demo
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 
 COLUMNS = (
     "seed", "state", "n_scans", "X_BC_error_mm", "X_BC_error_deg", "X_BC_error_at_work_mm", "expected_error_mm",

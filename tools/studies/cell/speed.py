@@ -6,7 +6,7 @@ from pathlib import Path
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.demo import run_scenario
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 
 SEAM_MM = 100.0
 

@@ -13,11 +13,11 @@ from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.loading import scenario_names
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import known_camera, measure
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import FeltSeam, felt_seam
+from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.weld import FeltSeam, felt_seam
 from weldcal.tools.studies.output import print_note, print_table
 from weldcal.tools.studies.targets import Target, print_targets
 from weldcal.welding.servo.laws import get_law

@@ -20,7 +20,8 @@ from weldcal.calibration.planning.observability import check_diversity
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.pictures import svg
-from weldcal.tools.studies.flange.frames import facing
+from weldcal.tools.worlds import warped_scanner
+from weldcal.tools.worlds.flange_frames import facing
 
 LEVEL = 0.95
 SIGMA_M, SIGMA_RAD, SIGMA_RATIO = 1e-4, 1e-3, 1e-3  # of a centre and a normal per axis, and of a hole circle's ratio
@@ -188,3 +189,25 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
     axes[0].set_ylabel("inside the stated 95 % region, %")
     axes[0].legend(frameon=False, fontsize=9, loc="lower right")
     return svg(figure, *axes)
+
+
+def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Coverage:
+    """Calibrate ``runs`` devices, each with a warp of its own, from ``poses`` scans each."""
+    X_BC = warped_scanner.X_BC
+    inside, stated, true = np.zeros(2), [], []
+    for device in range(runs):
+        progress(f"calibrations of {poses} scans by a warped scanner", device / runs)
+        _, estimate, scanner = warped_scanner.calibrate_warped(device, poses)
+        seen = warped_scanner.warped_point(warped_scanner.WORK_C, device)
+        found = estimate.X_BC @ (seen if scanner.accepted is None else scanner.accepted.points(seen))
+        p_BQ = X_BC @ warped_scanner.WORK_C
+        turn = rotation_vector(X_BC.rotation() @ estimate.X_BC.rotation().inverse())
+        e, d = np.concatenate([turn, X_BC.translation() - estimate.X_BC.translation()]), p_BQ - found
+        inside[0] += float(e @ np.linalg.solve(estimate.covariance, e)) < chi2.ppf(LEVEL, 6)
+        inside[1] += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < chi2.ppf(LEVEL, 3)
+        stated.append(float(np.mean(estimate.held_out.position_m)))
+        true.append(float(np.mean(warped_scanner.new_errors(device, estimate, scanner))))
+    pose, point = inside / max(runs, 1)
+    return Coverage(
+        poses, runs, float(pose), float(point), float(np.mean(stated) / np.mean(true)), corrected=True, warped=True
+    )

@@ -14,7 +14,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.studies.flange.frames import flange_frame
+from weldcal.tools.worlds.flange_frames import flange_frame
 
 _WRONG_RAD = float(np.radians(10.0))  # half of the least symmetry that a pattern has is more
 

@@ -20,9 +20,9 @@ from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.outcomes.weld import calibration_error
 from weldcal.tools.report.pictures import svg
-from weldcal.tools.studies.perfect_world import perfect
+from weldcal.tools.report.weld import calibration_error
+from weldcal.tools.worlds.perfect_world import perfect
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.flanges import PAPER_RADIUS_M, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.studies.flange.frames import Frame, facing, flange_frame
+from weldcal.tools.worlds.flange_frames import Frame, facing, flange_frame
 
 FLANGE = "iso9409-1-50-4-m6"
 _E_D, _E_R, _K_MAX = 0.0003, 0.001, 10_000  # paper, section 3.2.2

@@ -5,7 +5,7 @@ from pathlib import Path
 from weldcal.tools.commands.fleet import run_fleet
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.outcomes.fleet import FINE, LOOK, VISIT
-from weldcal.tools.studies.fleet.made_cells import FAULTS, write_fleet
+from weldcal.tools.worlds.fleet_cells import FAULTS, write_fleet
 
 RIGHT = {"none": (FINE,), "moved": (VISIT,), "drifts": (LOOK, VISIT), "broken": (VISIT,)}
 

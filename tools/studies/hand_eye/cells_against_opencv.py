@@ -2,38 +2,11 @@
 
 import numpy as np
 
-from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate
-from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
-from weldcal.calibration.hand_eye.problem import full_problem
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
-from weldcal.models.errors import WeldcalError
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.studies.hand_eye.imperfect_cells import KINDS, imperfect_cell
 from weldcal.tools.studies.output import markdown_table
+from weldcal.tools.worlds.imperfect_cells import KINDS, WEIGHTINGS, ratios
 
-WEIGHTINGS: dict[str, tuple[Candidate, ...]] = {
-    "weldcal": CANDIDATES,
-    "least squares alone": CANDIDATES[:1],
-    "rotations alone": CANDIDATES[5:6],
-}
-NO_ANSWER = 1e9  # the ratio where weldcal gives none: the worst one
 MARGIN = 0.02  # by which a method must be better to count as ahead
-
-
-def ratios(kind: str, seed: int) -> dict[str, list[float]]:
-    """Held-out errors (deg, mm) of each of WEIGHTINGS in one cell over the best of OpenCV's methods in that column."""
-    cell = imperfect_cell(kind, seed)
-    theirs = [opencv_held_out(m, cell.F, cell.G) for m in METHODS]
-    whole = [h for h in theirs if np.isfinite(h.translation).all()]
-    best = min(h.rms_deg for h in whole), min(h.rms_translation for h in whole)
-    out = {}
-    for name, weightings in WEIGHTINGS.items():
-        try:
-            ours = solve_problem(full_problem(cell.F, cell.G), config=HandEyeConfig(candidates=weightings)).held_out
-            out[name] = [ours.rms_deg / best[0], ours.rms_translation / best[1]]
-        except WeldcalError:
-            out[name] = [NO_ANSWER, NO_ANSWER]
-    return out
 
 
 def run_cells(farm: Farm, runs: int, seed: int = 0) -> tuple[dict[str, object], str]:

@@ -26,8 +26,8 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.hand_eye.fuzz import fuzz
 from weldcal.tools.studies.output import markdown_table
+from weldcal.tools.worlds.hand_eye_mistakes import fuzz
 
 _PLAIN = HandEyeConfig(folds=0)
 _TOLERANCE = (0.02, 0.01, 0.05)  # share, degrees, millimetres: how much of a tie still counts as one

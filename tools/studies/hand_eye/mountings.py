@@ -11,9 +11,9 @@ from weldcal.systems.scenario.loading import load_scenario, scenario_names
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.output import markdown_table
 
 HEADER = (

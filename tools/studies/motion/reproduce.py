@@ -26,7 +26,7 @@ from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.choice import MISSED
+from weldcal.tools.studies.harness import MISSED
 from weldcal.tools.studies.motion.report import motion_report
 from weldcal.tools.studies.motion.results import MotionStudy, MotionStudyOptions, Quality, Row, Track
 from weldcal.tools.studies.targets import print_targets

@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -29,7 +29,7 @@ from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.cli.options import Call, Outcome
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.studies.targets import Target, print_targets
@@ -83,7 +83,10 @@ class Throughput:
         }  # fmt: skip
 
 
-def measure_throughput(call: Call, seconds: float = 30.0) -> Outcome:
+@command("benchmark motion-speed", short_help="Measure frames per second beside an arm's control.", hidden=True)
+def benchmark_speed(
+    call: Call, seconds: Annotated[float, option("--seconds", "S", "Length of the stream.", min=2.0)] = 30.0
+) -> Outcome:
     """Fit half-megapixel frames at 20 per second beside an arm's control: frames per second, and arrival to estimate."""
     found = run_throughput(call.folder("benchmark", "motion"), seconds, call.seed, call.progress)
     return Outcome(found.summary(), text=partial(print_targets, "streamed scans", found.targets))

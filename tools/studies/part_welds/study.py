@@ -14,9 +14,9 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import known_camera, run_scenario
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.part_welds.step_parts import PARTS, MadePart
 
 COLUMNS = (

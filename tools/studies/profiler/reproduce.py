@@ -10,7 +10,7 @@ from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.choice import MISSED
+from weldcal.tools.studies.harness import MISSED
 from weldcal.tools.studies.profiler.edge import all_sets, ball_points
 from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines, published_lines, require_files
 from weldcal.tools.studies.profiler.report import ProfilerStudy, ProfilerStudyOptions, profiler_report

@@ -16,9 +16,9 @@ from weldcal.calibration.profiler.edge.start import edge_starts
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.cli.subject import one_of
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.choice import run_chosen
 from weldcal.tools.studies.profiler.seeds import profiler_seeds
 from weldcal.tools.worlds.edge_trials import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 
@@ -47,26 +47,22 @@ class SpeedRow:
     translation_mm: float
 
 
-@command("benchmark profiler", short_help="Measure the profiler's calibration: speed, or seeds.")
-def profiler(
+@command("benchmark profiler-speed", short_help="Time the profiler's calibration by an edge.", hidden=True)
+def benchmark_speed(
     call: Call,
-    what: Annotated[str, option("--what", "NAME", "speed, or seeds: every target of 'reproduce profiler'.")] = "speed",
-    seeds: Annotated[int | None, option("--seeds", "N", "seeds: number of seeds.", min=2, show_default="12")] = None,
     data: Annotated[
         Path | None, option("--data", "FOLDER", "The fixed files. Without them, sets generated from the seed.")
     ] = None,
 ) -> Outcome:
-    """Time the profiler's calibration by an edge and compare it with the published method and a grid search; or run every target of
-    'reproduce profiler' over many seeds, 20 s per seed."""
-    return run_chosen(
-        call, what, {"speed": measure_speed, "seeds": profiler_seeds.body}, {"seeds": seeds, "data": data}
-    )
-
-
-def measure_speed(call: Call, data: Path | None = None) -> Outcome:
-    """Time the calibration by an edge, the paper's method and a grid search."""
+    """Time the profiler's calibration by an edge and compare it with the published method and a grid search."""
     summary = run_profiler_benchmark(call.folder("benchmark", "profiler"), call.seed, data, call.progress)
     return Outcome(summary, values={}, rows=lines(summary))
+
+
+@command("benchmark profiler", short_help="Measure the profiler's calibration: speed, or seeds.")
+@one_of("speed", speed=benchmark_speed, seeds=profiler_seeds)
+def benchmark_profiler(call: Call) -> None:
+    """Time the profiler's calibration by an edge, or run every target of 'reproduce profiler' over many seeds."""
 
 
 def run_profiler_benchmark(folder: Path, seed: int, data: Path | None, progress: Progress) -> dict[str, object]:

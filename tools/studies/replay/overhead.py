@@ -16,7 +16,7 @@ from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.commands.record import RECORDING
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.output import markdown_table
 from weldcal.tools.studies.replay.study import FEW, SHORT
 

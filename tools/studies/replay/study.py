@@ -19,10 +19,10 @@ from weldcal.tools.emulators.cell.process import X_BC, wired_world
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.output import markdown_table
 
 COLUMNS = ("kind", "seed", "run", "reason", "replayed", "first", "seconds", "compared", "size_mb")

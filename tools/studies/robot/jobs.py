@@ -16,8 +16,8 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.emulators.ur.process import emulator_process
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import write_json
+from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.robot.host_probe import HostLateness, watched_host
 
 BUSY = "while True: pass"

@@ -19,7 +19,7 @@ from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, svg
 from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.studies.choice import MISSED
+from weldcal.tools.studies.harness import MISSED
 from weldcal.tools.studies.tablet.study import (
     Cost,
     HeldOutRow,

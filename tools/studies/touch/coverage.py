@@ -12,9 +12,9 @@ from weldcal.tools.commands.demo import run_calibration_live
 from weldcal.tools.commands.touch_live import run_touches, touching
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.farm.work import FAILED
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.touch.world import touch_world
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.worlds.touch import touch_world
 
 
 def judge_worlds(seeds: list[int]) -> Mapping[str, object]:

@@ -15,7 +15,7 @@ from weldcal.systems.wall_clock import Lateness, WallClock
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.emulators.cell.process import WiredWorld
 from weldcal.tools.emulators.ur.process import Emulator
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 
 DEVICES = ("scanner", "finger camera", "controller", "digital inputs")
 FAULTS = ("killed", "frozen", "delayed", "garbage")

@@ -1,16 +1,20 @@
 """Ray-cast scanner frames with a flange at a known pose, or with objects that resemble one."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import open3d as o3d
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard, flange_mesh, flange_ring
 from weldcal.models.mesh import TriMesh, merge, revolve
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
 
+WAYS = ("plate", "border", "missing")
+"""How a part of a flange is hidden."""
 _THICK_M = 0.012
 _SEGMENTS = 96  # of bodies that are no flange
 
@@ -84,6 +88,59 @@ def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random
     for k in range(3):
         bodies.append(_lookalike(standard, rng, k).transformed(random_place(scanner, standard, rng)))
     return Frame(_scan(bodies, scanner, rng), None)
+
+
+class FrameFit(NamedTuple):
+    """The centre's error (m), its square per axis in units of the stated covariance, and the share of the edge that was seen."""
+
+    error_m: float
+    normalised: float
+    coverage: float
+
+
+def fit_frame(frame: Frame, standard: FlangeStandard) -> FrameFit:
+    """Fit the flange of a frame and compare with the truth. Raises FlangeNotFound."""
+    assert frame.X_CR is not None
+    fit = fit_flange(frame.points_C, standard)
+    e_C = fit.center_C - frame.X_CR.translation()
+    normalised = float(e_C @ np.linalg.solve(fit.center_covariance, e_C)) / 3.0
+    return FrameFit(float(np.linalg.norm(e_C)), normalised, fit.coverage)
+
+
+def hidden_frame(
+    way: str, scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator, *, share: float = 0.5
+) -> Frame:
+    """A frame that hides ``share`` of the flange's width in one of the ``WAYS``, from a random side."""
+    X_CR = random_place(scanner, standard, rng, max_tilt_deg=25.0)
+    beyond = (0.5 - share) * standard.outer_m  # from the centre to where the hidden part begins
+    azimuth = rng.uniform(0.0, 2.0 * np.pi)
+    if way == "plate":
+        height, wide = rng.uniform(0.03, 0.08), 3.0 * standard.outer_m
+        turned = RigidTransform(RollPitchYaw(0.0, 0.0, azimuth), [0.0, 0.0, 0.0])
+        plate = box(wide, wide, 0.004).transformed(
+            X_CR @ turned @ RigidTransform([beyond + 0.5 * wide + height * _lean(X_CR, turned), 0.0, height])
+        )
+        return flange_frame(scanner, standard, rng, X_CR=X_CR, before=(plate,))
+    if way == "border":
+        p = X_CR.translation().copy()
+        side = int(rng.integers(4))
+        axis, sign = side % 2, 1.0 if side < 2 else -1.0
+        size, focal, middle = ((scanner.width, scanner.fx, scanner.cx), (scanner.height, scanner.fy, scanner.cy))[axis]
+        edge = (size - 0.5 - middle if sign > 0.0 else -0.5 - middle) / focal
+        p[axis] = edge * p[2] - sign * beyond
+        return flange_frame(scanner, standard, rng, X_CR=RigidTransform(X_CR.rotation(), p))
+    frame = flange_frame(scanner, standard, rng, X_CR=X_CR)
+    in_R = (X_CR.inverse() @ frame.points_C.reshape(-1, 3).T).T.reshape(frame.points_C.shape)
+    with np.errstate(invalid="ignore"):
+        lost = in_R[..., 0] * np.cos(azimuth) + in_R[..., 1] * np.sin(azimuth) > beyond
+        lost &= np.hypot(in_R[..., 0], in_R[..., 1]) < 1.5 * standard.outer_m
+    return replace(frame, points_C=np.where(lost[..., None], np.nan, frame.points_C))
+
+
+def _lean(X_CR: RigidTransform, turned: RigidTransform) -> float:
+    """How far, per metre above the face, the line of sight to its centre runs along the plate's x axis."""
+    sight = (X_CR @ turned).inverse() @ np.zeros(3)
+    return float(sight[0] / sight[2])
 
 
 def _wrist(standard: FlangeStandard, rng: np.random.Generator) -> list[TriMesh]:

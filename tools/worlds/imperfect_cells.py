@@ -6,9 +6,14 @@ import cv2
 import numpy as np
 
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, nearest_rotation, pose
+from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate
 from weldcal.calibration.hand_eye.joints import flange_poses
+from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
+from weldcal.calibration.hand_eye.problem import full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
+from weldcal.models.errors import WeldcalError
 
 KINDS = ("corners only", "camera", "robot", "both", "target poses", "heavy tails", "poor camera")
 """What is wrong besides the corners' own noise; "target poses" and "heavy tails": no corners, but poses with noise of their own (normal, or Student's t of
@@ -107,3 +112,27 @@ def _read(
     if not good:
         return None
     return pose(nearest_rotation(np.asarray(cv2.Rodrigues(turn)[0], dtype=float)), np.asarray(shift, dtype=float)[:, 0])
+
+
+WEIGHTINGS: dict[str, tuple[Candidate, ...]] = {
+    "weldcal": CANDIDATES,
+    "least squares alone": CANDIDATES[:1],
+    "rotations alone": CANDIDATES[5:6],
+}
+NO_ANSWER = 1e9  # the ratio where weldcal gives none: the worst one
+
+
+def ratios(kind: str, seed: int) -> dict[str, list[float]]:
+    """Held-out errors (deg, mm) of each of WEIGHTINGS in one cell over the best of OpenCV's methods in that column."""
+    cell = imperfect_cell(kind, seed)
+    theirs = [opencv_held_out(m, cell.F, cell.G) for m in METHODS]
+    whole = [h for h in theirs if np.isfinite(h.translation).all()]
+    best = min(h.rms_deg for h in whole), min(h.rms_translation for h in whole)
+    out = {}
+    for name, weightings in WEIGHTINGS.items():
+        try:
+            ours = solve_problem(full_problem(cell.F, cell.G), config=HandEyeConfig(candidates=weightings)).held_out
+            out[name] = [ours.rms_deg / best[0], ours.rms_translation / best[1]]
+        except WeldcalError:
+            out[name] = [NO_ANSWER, NO_ANSWER]
+    return out

@@ -1,5 +1,6 @@
 """Errors of the weld and of the calibration of a run against the ground truth of the simulation."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.calibration.geometry.rigid import fit_rigid
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import numbered
 from weldcal.systems.cell import Cell
@@ -17,7 +20,6 @@ from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, seated_tip, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
 from weldcal.systems.station import Truth
-from weldcal.tools.outcomes.arm_frame import true_work_point
 from weldcal.welding.record.process import (
     PathError,
     SpeedStatistics,
@@ -30,7 +32,32 @@ from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Phase
 
 
-@dataclass(frozen=True, eq=False)
+def true_work_point(
+    arm: ArmModel,
+    true_arm: ArmModel,
+    X_FT: RigidTransform | None,
+    p_BWork: Array,
+    q_home: Array,
+    poses: Sequence[Array],
+) -> Array:
+    """The place (3,) m in the true base that the arm reports as the work point (3,) m.
+
+    With a tool: where its tip is when it is reported there, upright as at ``q_home`` (6,) rad. Without one no posture
+    belongs to the work point: it is mapped by the rigid transform that fits the true to the reported flange positions of
+    the calibration ``poses`` (n, 6) rad best.
+    """
+    if X_FT is not None:
+        p_FT = np.asarray(X_FT.translation())
+        R = forward_kinematics(arm, q_home).rotation()
+        q = nearest_solution(arm, RigidTransform(R, p_BWork - R.multiply(p_FT)), q_home)
+        if q is not None:
+            shift = forward_kinematics(true_arm, q).multiply(p_FT) - forward_kinematics(arm, q).multiply(p_FT)
+            return np.asarray(p_BWork + shift)
+    reported, true = (np.array([forward_kinematics(a, q).translation() for q in poses]) for a in (arm, true_arm))
+    return np.asarray(fit_rigid(true, reported).multiply(p_BWork))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class WeldLog:
     """The weld's time series, one row per servo tick; (N,) and (N, 3) arrays in B, SI units."""
 
@@ -45,7 +72,7 @@ class WeldLog:
     sigma_min: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class WeldOutcome:
     """Errors of the weld against the true seam (simulation only)."""
 
@@ -193,21 +220,23 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
         line = lowered.position(np.linspace(0.0, lowered.length, 200))
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
-        return WeldOutcome(log, seam, plan, None, None, plan_error)
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
     wanted = cell.job.servo_config.weld_speed_m_s
     parts = [part for part in welds(log) if (part & log.torch_on).sum() >= 30]
     if not parts:
-        return WeldOutcome(log, seam, plan, None, None, plan_error)
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
     speed = _together([speed_statistics(log.time[p], log.p_BTorch[p], log.torch_on[p], wanted) for p in parts])
     if seam is None:
-        return WeldOutcome(log, seam, plan, None, speed, plan_error)
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=speed, plan_error=plan_error)
     errors = tuple(
         path_error(log.p_BTorch[part & log.torch_on], true)
         for k, part in enumerate(welds(log))
         if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, k)) is not None
     )
     error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
-    return WeldOutcome(log, seam, plan, error, speed, plan_error, errors)
+    return WeldOutcome(
+        log=log, true_seam=seam, planned=plan, error=error, speed=speed, plan_error=plan_error, seams=errors
+    )
 
 
 def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:

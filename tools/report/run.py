@@ -1,6 +1,8 @@
-"""The section of a run with a robot: how late each velocity left the Diagram, as a histogram and in words."""
+"""What every run has: its options, and the section of its report on how late each velocity left the Diagram."""
 
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -9,6 +11,39 @@ from weldcal.systems.runner import Run
 from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, plain, svg
 from weldcal.tools.report.render import fixed
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The user's options of a run.
+
+    Attributes:
+        scenario: name or path.
+        out: result folder.
+        seed: of all random numbers.
+        browser: open the dashboard in the browser.
+        realtime: run no faster than real time.
+        robot: see chosen_robot; None: the scenario's.
+        dry_run, pace: see chosen_robot.
+        speed_factor: speed of the arm's moves; None: the scenario's.
+        recording: write the viewer's recording.html.
+        share: show the dashboard, read-only, to the network too.
+        record: write recording.mcap, which `weldcal replay` plays back.
+    """
+
+    scenario: str
+    out: Path
+    seed: int = 0
+    _: KW_ONLY
+    browser: bool = False
+    realtime: bool = False
+    robot: str | None = None
+    dry_run: bool = False
+    pace: float | None = None
+    speed_factor: float | None = None
+    recording: bool = True
+    share: bool = False
+    record: bool = False
 
 
 def robot_timing(run: Run[Any]) -> dict[str, object]:

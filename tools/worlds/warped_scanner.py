@@ -1,25 +1,21 @@
-"""Calibrations with a scanner that errs by another model than the one that is fitted: what their stated figures are worth."""
+"""Observations by a scanner that errs by another model than the one that is fitted, and calibrations from them."""
 
 from functools import cache
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import map_coordinates, spline_filter
-from scipy.stats import chi2
 
 from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
-from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import device_warp
-from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.studies.flange.coverage import LEVEL, Coverage
 
 WARP_M = 0.8e-3
 """Largest depth error at ``REFERENCE_M``: 0.2 % of it, as a real scanner showed."""
@@ -30,7 +26,7 @@ _FIELD = 0.5  # half of what the scanner sees over its distance
 _BORDER = 12  # pixels
 _REACH = np.array([0.12, 0.10, 0.06])  # m, of the places round the middle of the field
 _MIDDLE = np.array([0.0, 0.0, REFERENCE_M])
-_WORK_C = np.array([0.02, -0.05, 0.38])
+WORK_C = np.array([0.02, -0.05, 0.38])
 
 
 @cache
@@ -91,25 +87,4 @@ def new_errors(
     correction = None if scanner is None else scanner.accepted
     return position_errors(
         estimate.X_BC, new if correction is None else [corrected_observation(correction, o) for o in new]
-    )
-
-
-def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Coverage:
-    """Calibrate ``runs`` devices, each with a warp of its own, from ``poses`` scans each."""
-    inside, stated, true = np.zeros(2), [], []
-    for device in range(runs):
-        progress(f"calibrations of {poses} scans by a warped scanner", device / runs)
-        _, estimate, scanner = calibrate_warped(device, poses)
-        seen = warped_point(_WORK_C, device)
-        found = estimate.X_BC @ (seen if scanner.accepted is None else scanner.accepted.points(seen))
-        p_BQ = X_BC @ _WORK_C
-        turn = rotation_vector(X_BC.rotation() @ estimate.X_BC.rotation().inverse())
-        e, d = np.concatenate([turn, X_BC.translation() - estimate.X_BC.translation()]), p_BQ - found
-        inside[0] += float(e @ np.linalg.solve(estimate.covariance, e)) < chi2.ppf(LEVEL, 6)
-        inside[1] += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < chi2.ppf(LEVEL, 3)
-        stated.append(float(np.mean(estimate.held_out.position_m)))
-        true.append(float(np.mean(new_errors(device, estimate, scanner))))
-    pose, point = inside / max(runs, 1)
-    return Coverage(
-        poses, runs, float(pose), float(point), float(np.mean(stated) / np.mean(true)), corrected=True, warped=True
     )
