@@ -10,12 +10,18 @@ A study is one frozen description in its own module, and the command that runs i
         header=("injected", "named first", "instead"),
         rows=cause_rows,
     )
-    found = STUDY.run(call.farm(folder), {"moved, set 0": {"cause": "moved", "seed": 0}, ...})
-    return found.outcome()
+
+    @command("benchmark doctor", short_help="Count ...", options=FARM)
+    def doctor(call: Call, runs: ...) -> Outcome:
+        return STUDY.outcome(call, cases(runs, call.seed))
+
+Each case is {name: keyword arguments}, such as {"moved, set 0": {"cause": "moved", "seed": 0}}.
 """
 
+import shlex
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -24,6 +30,8 @@ import numpy as np
 
 from weldcal.calibration.data.results import software_version
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.console import plain
 from weldcal.tools.farm.journal import Result
 from weldcal.tools.farm.run import Farm
@@ -40,6 +48,8 @@ Results = Mapping[str, Result]
 Figures = Mapping[str, Any]
 """The figures of a study: its JSON object."""
 Row = Sequence[str]
+Table = tuple[str, Row, Sequence[Row]]
+"""Title, names of the columns and lines of a table."""
 TABLE, RUNS, SUMMARY = "table.json", "runs.csv", "summary.json"
 MISSED = "Some targets were missed; see the table."
 
@@ -57,7 +67,9 @@ class Study:
         rows: the table's lines, from the figures.
         targets: the bounds that the figures are judged against, from the figures.
         plots: file name to a function of the results that draws an SVG.
-        numbers: how many columns from the right are numbers; None: all but the first.
+        numbers: how many columns from the right are numbers.
+        others: further tables from the figures: title, names of the columns, lines.
+        group: of its command, "benchmark" or "reproduce". A missed target ends "reproduce" with exit code 1.
     """
 
     name: str
@@ -68,16 +80,39 @@ class Study:
     case: Callable[..., Mapping[str, object]] | None = None
     targets: Callable[[Figures], Sequence[Target]] = lambda figures: ()
     plots: Mapping[str, Callable[[Results], bytes]] = field(default_factory=dict)
-    numbers: int | None = 0
+    numbers: int = 0
+    others: Callable[[Figures], Iterable[Table]] = lambda figures: ()
+    group: str = "benchmark"
+
+    def outcome(self, call: Call, cases: Cases, folder: Path | None = None) -> Outcome:
+        """Run it for a command, on workers where the command takes --workers, else in this process.
+
+        Raises:
+            InputError: the folder holds another study, or no case could be done. WorkerLost: a process has ended.
+        """
+        farm = call.farm(folder or self.folder(call))
+        return self.run(farm if "workers" in call.given else replace(farm, workers=0), cases).outcome()
+
+    def folder(self, call: Call) -> Path:
+        """Where a command writes the result, once a call."""
+        return call.folder(self.group, self.name.replace(" ", "-"))
+
+    def here(self, cases: Cases) -> "Measured":
+        """Compute the cases in this process, write nothing, and pass on every error."""
+        assert self.case is not None
+        return self.measured({name: Result(_plain(self.case(**given))) for name, given in cases.items()})
 
     def run(self, farm: Farm, cases: Cases) -> "Measured":
         """Compute the cases that the folder does not hold yet, and write the files of the result.
 
         Raises:
-            InputError: the folder holds another study. WorkerLost: a process has ended.
+            InputError: the folder holds another study, or no case could be done. WorkerLost: a process has ended.
         """
         assert self.case is not None
-        return self.measured(farm.run(self.case, cases), farm.folder, cases)
+        found = farm.run(self.case, cases)
+        if found and not done(found):
+            raise InputError(str(next(iter(found.values()))["reason"]))
+        return self.measured(found, farm.folder, cases)
 
     def measured(self, results: Results, folder: Path | None = None, cases: Cases | None = None) -> "Measured":
         """The figures, the table and the verdicts of results; with a folder their files are written there."""
@@ -85,9 +120,13 @@ class Study:
         found = Measured(
             study=self,
             figures={"state": "done", **figures},
-            rows=tuple(tuple(row) for row in self.rows(figures)),
+            tables=(
+                (self.name, self.header, tuple(tuple(row) for row in self.rows(figures))),
+                *((title, header, tuple(rows)) for title, header, rows in self.others(figures)),
+            ),
             targets=tuple(self.targets(figures)),
             folder=folder,
+            command=command_line(),
         )
         if folder is not None:
             found.write(folder)
@@ -105,16 +144,18 @@ class Measured:
     Attributes:
         study: its description.
         figures: the JSON object.
-        rows: lines of its table.
+        tables: its table, and further ones.
         targets: figures that were held against a bound.
         folder: where its files are; None: nowhere.
+        command: the command line that measured it.
     """
 
     study: Study
     figures: Figures
-    rows: tuple[Row, ...]
+    tables: tuple[Table, ...]
     targets: tuple[Target, ...]
     folder: Path | None = None
+    command: str = ""
 
     @property
     def met(self) -> bool:
@@ -126,25 +167,29 @@ class Measured:
         """One line a target: figure, bound, value, verdict."""
         return [(t.what, t.wanted, f"{t.value:.4g}", t.verdict) for t in self.targets]
 
+    def outcome(self) -> Outcome:
+        """The outcome of the command: the JSON object and the table, exit code 1 where a reproduced target is missed."""
+        problem = None if self.figures["state"] != "done" else MISSED if self._fails else ""
+        return Outcome(self.figures, text=self.show, problem=problem)
+
     @property
-    def problem(self) -> str:
-        """A sentence for exit code 1, empty where all targets are met."""
-        return "" if self.met else MISSED
+    def _fails(self) -> bool:
+        return self.study.group == "reproduce" and not self.met
 
     def markdown(self) -> str:
-        """The table, and below it the targets where the study has some."""
-        tables = [markdown_table(self.study.header, self.rows)] if self.rows else []
-        if self.targets:
-            tables.append(markdown_table(("figure", "target", "reached", ""), self.target_rows))
-        return "\n".join(tables)
+        """The tables, and below them the targets where the study has some."""
+        return "\n".join(markdown_table(header, rows) for _, header, rows in self._shown)
+
+    @property
+    def _shown(self) -> list[Table]:
+        targets: Table = ("Targets", ("figure", "target", "reached", ""), self.target_rows)
+        return [table for table in (*self.tables, targets) if table[2]]
 
     def show(self) -> None:
         """Write the tables on stdout."""
-        width = len(self.study.header)
-        numbers = width - 1 if self.study.numbers is None else self.study.numbers
-        print_table(self.study.name, self.study.header, self.rows, text=range(width - numbers))
-        if self.targets:
-            print_table("Targets", ("figure", "target", "reached", ""), self.target_rows, text=(0, 1, 3))
+        for k, (title, header, rows) in enumerate(self._shown):
+            numbers = self.study.numbers if k == 0 else 0
+            print_table(title, header, rows, text=range(len(header) - numbers))
         if self.folder is not None:
             print_note(f"written to {self.folder}")
 
@@ -157,13 +202,22 @@ class Measured:
             {
                 "study": self.study.name,
                 "what": self.study.what,
-                "header": self.study.header,
-                "rows": self.rows,
-                "targets": self.target_rows,
+                "command": self.command,
+                "tables": [{"title": title, "header": header, "rows": rows} for title, header, rows in self._shown],
+                "met": self.met,
                 "software": software_version(),
                 "measured_on": date.today().isoformat(),
             },
         )
+
+
+def command_line() -> str:
+    """The arguments of this program as a user types them, without the output folder."""
+    words = sys.argv[1:]
+    if "--out" in words:
+        k = words.index("--out")
+        words = words[:k] + words[k + 2 :]
+    return shlex.join(["weldcal", *(word for word in words if word != "--json")])
 
 
 def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]:
@@ -191,6 +245,13 @@ def runs_csv(cases: Cases, results: Results) -> str:
     lines = [{"case": name} | _flat(cases.get(name, {})) | _flat(found) for name, found in results.items()]
     columns = list(dict.fromkeys(key for line in lines for key in line))
     return csv_text(columns, ([line.get(key, "") for key in columns] for line in lines))
+
+
+def _plain(found: Mapping[str, object]) -> Mapping[str, Any]:
+    """As another process would return it: in JSON's own types."""
+    value = plain(found)
+    assert isinstance(value, dict)
+    return value
 
 
 def _flat(value: Mapping[str, Any], before: str = "") -> dict[str, object]:

@@ -9,11 +9,11 @@ import pytest
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.hand_eye import cells_against_opencv
+from weldcal.tools.studies.hand_eye import cells as cells_study
 
 
 def test_the_command_tells_how_often_opencv_is_ahead(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cells_against_opencv, "KINDS", ("robot",))
+    monkeypatch.setattr(cells_study, "KINDS", ("robot",))
     call = ["benchmark", "hand-eye-cells", "--runs", "1", "--json", "--out", str(tmp_path)]
     found = CliRunner().invoke(app, call)
     assert found.exit_code == 0, found.output

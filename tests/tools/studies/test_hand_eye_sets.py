@@ -12,7 +12,7 @@ from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.hand_eye.comparison import HandEyeBenchmark, run_hand_eye_benchmark, write_table
+from weldcal.tools.studies.hand_eye.comparison import SETS, HandEyeBenchmark, run_hand_eye_benchmark
 
 DATA = SHARED_DATA / "handeye"
 
@@ -73,9 +73,9 @@ def test_the_quick_checks_hold(report: HandEyeBenchmark, tmp_path: Path) -> None
     for name, (ok, seen) in report.checks.items():
         if not name.startswith("speed"):  # a figure of the machine, not of the solver
             assert ok, f"{name}: {seen}"
-    text = write_table(report, tmp_path)
-    assert "handeye_4dof" in text
-    assert (tmp_path / "hand_eye.md").read_text() == text
+    found = SETS.measured({"all": report.summary()}, tmp_path)
+    assert "handeye_4dof" in found.markdown()
+    assert (tmp_path / "table.md").read_text() == found.markdown()
 
 
 def test_corners_find_the_principal_point_that_hides_the_truth(report: HandEyeBenchmark) -> None:

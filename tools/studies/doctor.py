@@ -2,8 +2,10 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from typing import Annotated
 
 from weldcal.calibration.doctor.diagnose import diagnose
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.outcomes.doctor import worded
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
 from weldcal.tools.worlds.doctor import CAUSES, clean
@@ -54,3 +56,13 @@ STUDY = Study(
     header=("injected", "named first", "instead"),
     rows=_rows,
 )
+
+
+@command("benchmark doctor", short_help="Count how often the doctor names the injected cause.", options=FARM)
+def doctor(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Sets with each cause.", min=1)] = 20,
+    cleans: Annotated[int, option("--clean", "N", "Sets without a cause.", min=0)] = 200,
+) -> Outcome:
+    """Inject each cause into simulated sets of scans, and count which one `weldcal doctor` names first."""
+    return STUDY.outcome(call, cases(runs, cleans, call.seed))
