@@ -22,7 +22,7 @@ def test_the_short_form_meets_the_targets(tmp_path: Path) -> None:
     assert result["false_alarms"] == 0
     assert result["largest_statistic"] < 0.8 * result["threshold"]
     assert max(result["creep_mm_when_found"]) < 0.2
-    assert (tmp_path / "trials.csv").read_text().count("\n") == 4
+    assert (tmp_path / "runs.csv").read_text().count("\n") == 5
 
 
 def test_a_trial_says_what_the_change_was() -> None:

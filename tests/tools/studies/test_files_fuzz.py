@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from weldcal.models.errors import InputError
 from weldcal.tools.studies import fuzz_files as fuzz
 from weldcal.tools.worlds import damaged_files as cases
+from weldcal.tools.worlds import damaged_reading
 from weldcal.tools.worlds.damaged_files import (
     ACCEPTED,
     CRASH,
@@ -25,6 +26,7 @@ from weldcal.tools.worlds.damaged_files import (
     Reader,
     judge,
 )
+from weldcal.tools.worlds.damaged_reading import Child, too_much
 
 SLOW = ("scenario",)  # a tenth of a second each
 
@@ -92,10 +94,10 @@ def test_the_child_is_watched_and_ended(tmp_path: Path, monkeypatch: pytest.Monk
         "    said = 'memory' if case == 3 else 'accepted'\n"
         "    print(json.dumps({'said': said, 'detail': '', 'seconds': 0.1}), flush=True)\n"
     )
-    monkeypatch.setattr(fuzz, "WORKER", ("-c", code))
-    with fuzz._Child(tmp_path / "place") as child:
+    monkeypatch.setattr(damaged_reading, "WORKER", ("-c", code))
+    with Child(tmp_path / "place") as child:
         assert child.ask(READERS[0], 0, 0)[0].said == ACCEPTED
-        monkeypatch.setattr(fuzz, "WATCHDOG_S", 0.5)
+        monkeypatch.setattr(damaged_reading, "WATCHDOG_S", 0.5)
         begin = time.monotonic()
         assert child.ask(READERS[0], 0, 1)[0].said == HANG
         assert time.monotonic() - begin < 5.0
@@ -103,12 +105,12 @@ def test_the_child_is_watched_and_ended(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_gigabyte_and_ten_times_the_file_are_allowed() -> None:
-    assert not fuzz.too_much(1024**3 + 10 * 5, 5)
-    assert fuzz.too_much(1024**3 + 10 * 5 + 1, 5)
+    assert not too_much(1024**3 + 10 * 5, 5)
+    assert too_much(1024**3 + 10 * 5 + 1, 5)
 
 
 def test_findings_are_kept_and_end_in_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuzz._Child, "ask", lambda self, reader, seed, case: (cases.Verdict(WRONG, "x"), 0.1))
+    monkeypatch.setattr(Child, "ask", lambda self, reader, seed, case: (cases.Verdict(WRONG, "x"), 0.1))
     result = fuzz.fuzz_files(READERS[:1], 2, 0, tmp_path)
     assert result.summary()["state"] == "failed"
     assert "silently wrong" in str(result.summary()["reason"])

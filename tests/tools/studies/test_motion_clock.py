@@ -14,8 +14,8 @@ from scipy.stats import chi2
 
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.studies.motion.clock import STUDY, cases, exact_errors
-from weldcal.tools.worlds.moves import cube_moves, observed_frames
+from weldcal.tools.studies.motion.clock import STUDY, cases
+from weldcal.tools.worlds.moves import cube_moves, exact_errors, observed_frames
 
 
 def test_a_short_run_keeps_the_targets(tmp_path: Path) -> None:

@@ -2,15 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
-from weldcal.models.errors import InputError
 from weldcal.models.scanner_streams import get_stream
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, command, option, switch
-from weldcal.tools.console import Progress
-from weldcal.tools.worlds.disturbance import Disturbance, Vector
+from weldcal.tools.worlds.disturbance import disturbance_of
 from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
 
 
@@ -63,46 +60,8 @@ def motion_data(
         stream_hz=stream_hz, stream_columns="pose" if poses else "joints", device_clock=device_clock,
         surroundings=surroundings, disturbance=disturbance_of(knock, creep, base, warm_up), seed=call.seed,
     )  # fmt: skip
-    return write_motion_data(options, folder, call.progress)
-
-
-def disturbance_of(knock: str = "", creep: str = "", base: str = "", warm_up: str = "") -> Disturbance:
-    """What happens while the scanner streams, from the numbers of the command line; "" for nothing.
-
-    Raises:
-        InputError: a text is no such list of numbers.
-    """
-    knocked = _numbers(knock, "--knock", (4, 7))
-    creeping = _numbers(creep, "--creep", (4,))
-    based = _numbers(base, "--base", (4, 7))
-    warming = _numbers(warm_up, "--warm-up", (2, 3))
-    return Disturbance(
-        knock_s=knocked[0], knock_mm=_vector(knocked[1:4]), knock_deg=_vector(knocked[4:7]),
-        creep_s=creeping[0], creep_mm_per_min=_vector(creeping[1:4]),
-        base_s=based[0], base_mm=_vector(based[1:4]), base_deg=_vector(based[4:7]),
-        warm_up_s=warming[0], warm_up_scale=1e-6 * warming[1], warm_up_gradient_per_m=1e-6 * warming[2],
-    )  # fmt: skip
-
-
-def _numbers(text: str, name: str, counts: tuple[int, ...]) -> tuple[float, ...]:
-    """Seven numbers, zeros behind those given."""
-    try:
-        given = tuple(float(part) for part in text.split(",")) if text else ()
-    except ValueError:
-        given = (float("nan"),)
-    if text and (len(given) not in counts or not all(abs(v) < 1e6 for v in given)):
-        raise InputError(f"{name} takes {' or '.join(map(str, counts))} numbers with commas between, and is '{text}'.")
-    return given + (0.0,) * (7 - len(given))
-
-
-def _vector(values: tuple[float, ...]) -> Vector:
-    return values[0], values[1], values[2]
-
-
-def write_motion_data(options: MotionOptions, folder: Path, progress: Progress) -> dict[str, object]:
-    """Write the recording to `dataset` and its truth to `truth.json` in the folder; returns where they are."""
     world = MotionWorld(options)
-    write_motion_dataset(world, folder / "dataset", folder / "truth.json", progress)
+    write_motion_dataset(world, folder / "dataset", folder / "truth.json", call.progress)
     return {
         "dataset": str(folder / "dataset"), "truth": str(folder / "truth.json"), "frames": len(world.captures),
         "seconds": round(float(world.captures[-1] - world.captures[0]), 3), "pixels": world.scanner.width * world.scanner.height,

@@ -11,10 +11,10 @@ from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.harness import MISSED
-from weldcal.tools.studies.profiler.edge import all_sets, ball_points
+from weldcal.tools.studies.profiler.edge import EdgeRow, ball_points, edge_rows
 from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines, published_lines, require_files
 from weldcal.tools.studies.profiler.report import ProfilerStudy, ProfilerStudyOptions, profiler_report
-from weldcal.tools.studies.profiler.sphere import all_worlds
+from weldcal.tools.studies.profiler.sphere import WorldResult, measure
 from weldcal.tools.studies.targets import Target
 from weldcal.tools.worlds.edge_trials import SETS, EdgeTrial, fixed_edge_trials, made_edge_trials
 from weldcal.tools.worlds.profiler_parts import fixed_worlds, made_worlds
@@ -58,9 +58,18 @@ def run_profiler_study(options: ProfilerStudyOptions, progress: Progress) -> Pro
     def trials_of(name: str) -> Iterator[EdgeTrial]:
         return made_edge_trials(name, TRIALS, options.seed) if data is None else fixed_edge_trials(data, name)
 
-    rows = all_sets(trials_of, names, lambda name, share: progress(f"edge {name}", 0.4 * share))
+    rows: list[EdgeRow] = []
+    for k, name in enumerate(names):
+
+        def tell(share: float, k: int = k) -> None:
+            progress(f"edge {names[k]}", 0.4 * (k + share) / len(names))
+
+        rows += edge_rows(name, trials_of(name), tell)
     made = made_worlds(worlds, options.seed, GROOVES, BOSSES) if data is None else fixed_worlds(data, worlds)
-    results = all_worlds(made, worlds, lambda name, share: progress(f"sphere, {name}", 0.4 + 0.4 * share))
+    results: list[WorldResult] = []
+    for k, world in enumerate(made):
+        progress(f"sphere, world {k}", 0.4 + 0.4 * k / worlds)
+        results += measure(k, world)
     fixed: list[Target] = []
     if whole is not None:
         fixed = [*published_lines(results), *fixed_lines(whole, lambda name, share: progress(name, 0.8 + 0.2 * share))]

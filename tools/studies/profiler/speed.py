@@ -15,7 +15,7 @@ from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.edge.start import edge_starts
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
-from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
@@ -59,7 +59,7 @@ def benchmark_speed(
     return Outcome(summary, values={}, rows=lines(summary))
 
 
-@command("benchmark profiler", short_help="Measure the profiler's calibration: speed, or seeds.")
+@command("benchmark profiler", short_help="Measure the profiler's calibration: speed, or seeds.", options=FARM)
 @one_of("speed", speed=benchmark_speed, seeds=profiler_seeds)
 def benchmark_profiler(call: Call) -> None:
     """Time the profiler's calibration by an edge, or run every target of 'reproduce profiler' over many seeds."""

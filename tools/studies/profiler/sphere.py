@@ -1,6 +1,6 @@
 """Tables 1 to 3 of the sphere paper: points, seam and frustum, by the paper's method and by the joint method."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,12 +159,3 @@ def cloud_of(record: ProfilerRecord, arm: DhArm, q: Floats, profiles: Floats) ->
     X = _flange(record, arm, q)
     parts = [record.points_F(without_spikes(p)) @ X.rotation[k].T + X.translation[k] for k, p in enumerate(profiles)]
     return np.vstack(parts)
-
-
-def all_worlds(worlds: Iterator[WorldData], count: int, progress: Callable[[str, float], None]) -> list[WorldResult]:
-    """Every world, all methods."""
-    results: list[WorldResult] = []
-    for k, world in enumerate(worlds):
-        progress(f"world {k}", k / count)
-        results += measure(k, world)
-    return results
