@@ -19,8 +19,8 @@ from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.demo import run_scenario
-from weldcal.tools.commands.procedures import RUNNERS
+from weldcal.tools.commands.demo import RUNNERS
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions
 

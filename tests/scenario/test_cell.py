@@ -21,17 +21,18 @@ from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.jobs.weld.settings import job_plan
 from weldcal.systems.motion.clear_moves import clear_poses
+from weldcal.systems.person import Person
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Truth
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.demo import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.commands.run import JobRun
+from weldcal.tools.commands.weld import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import calibration_error, weld_outcome
-from weldcal.tools.studies.cell.study import figures
+from weldcal.tools.worlds.weld.cell_run import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.
@@ -47,7 +48,7 @@ FAST = "welding: {speed_mm_s: 32.0}"
 
 
 def run(scenario: Scenario, folder: Path, seed: int = 0) -> DemoResult:
-    return run_scenario(scenario, RunOptions("a test's own", folder, seed, recording=False))
+    return run_scenario(scenario, RunOptions(scenario="a test's own", out=folder, seed=seed, recording=False))
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +175,7 @@ def test_the_same_seed_gives_the_same_run(
 def test_the_weld_log_needs_nothing_that_only_a_simulation_knows(short_job: DemoResult) -> None:
     run = short_job.run
     logs = {name: sink for name, sink in run.cell.logs.items() if name not in ("torch", "tip_and_deflection")}
-    nothing_known = dc.replace(run.cell.station, truth=Truth(None, None, None))
+    nothing_known = dc.replace(run.cell.station, truth=Truth(X_BC=None, X_BP=None, workpiece=None))
     real = dc.replace(run.cell, logs=logs, station=nothing_known)
     found, known = weld_outcome(real, run.root), short_job.weld
     assert found is not None
@@ -356,10 +357,20 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
     assert found.reason == "A person stopped the run with Ctrl-C, in the phase 'approach_above'."
     with pytest.raises(KeyboardInterrupt, match="in the phase 'approach_above'"):
         found.raise_if_interrupted()  # a study of many runs ends with it
-    result = measure(found, RunOptions("a test's own", tmp_path / "run", recording=False))
+    result = measure(found, RunOptions(scenario="a test's own", out=tmp_path / "run", recording=False))
     write_result(result, JobRun(found, None, "simulated"))
     assert result.summary()["state"] == "held"
     assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_a_held_run_keeps_the_share_that_it_had_reached() -> None:
+    person, shares = Person(), []
+    person.end()
+    cell = build_cell(load_scenario("straight_groove", TOLD), person=person)
+    found = run_cell(cell, lambda stage, share: shares.append(share))
+    assert found.held
+    assert max(shares) < 0.5
+    assert JobRun(found, None, "simulated").share(0.985) == shares[-1]
 
 
 def test_an_error_in_the_run_lets_go_of_the_robot() -> None:
@@ -394,7 +405,7 @@ def test_a_robot_that_cannot_be_had_is_refused_with_one_sentence(
     options: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(WeldcalError, match=said) as refusal:
-        run_scenario(load_scenario("straight_groove", TOLD), RunOptions("x", tmp_path / "run", **options))
+        run_scenario(load_scenario("straight_groove", TOLD), RunOptions(scenario="x", out=tmp_path / "run", **options))
     assert str(refusal.value).count(". ") == 0
     assert not (tmp_path / "run").exists()
 
@@ -403,4 +414,4 @@ def test_a_weld_needs_a_workpiece(tmp_path: Path) -> None:
     path = tmp_path / "bare.yaml"
     path.write_text("welding: {seam_length_mm: 20.0}\n")
     with pytest.raises(WeldcalError, match="needs a workpiece"):
-        run_weld(RunOptions(str(path), tmp_path / "out", recording=False))
+        run_weld(RunOptions(scenario=str(path), out=tmp_path / "out", recording=False))

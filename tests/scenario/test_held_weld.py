@@ -9,8 +9,8 @@ import pytest
 
 from tests.held_weld import HeldWeld, held_weld, short_weld
 from weldcal.systems.runner import Run
-from weldcal.tools.commands.record import RunRecorder
-from weldcal.tools.commands.replay import replay
+from weldcal.tools.commands.replay import replay_recording
+from weldcal.tools.commands.run import RunRecorder
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import weld_outcome
 
@@ -20,7 +20,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> tuple[HeldWeld, Path]:
     """The weld and its recording."""
     folder = tmp_path_factory.mktemp("held")
     scenario = short_weld()
-    recorder = RunRecorder(scenario, RunOptions("straight_groove", folder), "simulated")
+    recorder = RunRecorder(scenario, RunOptions(scenario="straight_groove", out=folder), "simulated")
     found = held_weld(scenario, recorder.open_sink)
     run: Run = found.run  # type: ignore[type-arg]
     recorder.close(run)
@@ -57,6 +57,6 @@ def test_the_page_shows_how_far_the_seam_is_beside_the_plan(held: tuple[HeldWeld
 
 
 def test_a_hold_is_an_input_of_the_run(held: tuple[HeldWeld, Path]) -> None:
-    again = replay(held[1])
+    again = replay_recording(held[1])
     assert again.first is None, again.summary()
     assert again.phase == "done"

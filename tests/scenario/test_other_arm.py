@@ -12,10 +12,9 @@ from weldcal.models.arms.kinematics import link_frames, load_arm
 from weldcal.models.robots import get_robot
 from weldcal.models.tools.loading import WELDING
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.commands.demo import run_weld
+from weldcal.tools.commands.weld import run_weld
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.studies.arms.demo import ARMS
-from weldcal.tools.studies.arms.scaled import arm_scenario
+from weldcal.tools.worlds.scaled_arms import ARMS, arm_scenario
 
 HANGING = """
 arm: ur5e
@@ -49,7 +48,7 @@ def test_a_ur5e_on_the_ceiling_welds_with_its_own_tool(tmp_path: Path) -> None:
         tool = tool.replace(old, new)
     (tmp_path / "my_tool.yaml").write_text(tool)
     (tmp_path / "cell.yaml").write_text(HANGING)
-    found = run_weld(RunOptions(str(tmp_path / "cell.yaml"), tmp_path / "out", recording=False)).summary()
+    found = run_weld(RunOptions(scenario=str(tmp_path / "cell.yaml"), out=tmp_path / "out", recording=False)).summary()
     assert found["state"] == "done", found
     torch_mean, torch_max = (float(str(found[key])) for key in ("torch_mean_mm", "torch_max_mm"))
     assert torch_mean <= 0.10

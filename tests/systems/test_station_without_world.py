@@ -12,7 +12,7 @@ from tests.systems.plugin_scanner import RayScanner
 from weldcal.systems.cell import build_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions
 
@@ -25,7 +25,9 @@ def real_cell() -> Scenario:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
-    return run_scenario(real_cell(), RunOptions("calibrate_only", tmp_path_factory.mktemp("real"), recording=False))
+    return run_scenario(
+        real_cell(), RunOptions(scenario="calibrate_only", out=tmp_path_factory.mktemp("real"), recording=False)
+    )
 
 
 def test_it_holds_no_world_and_speaks_of_no_truth(finished: DemoResult) -> None:

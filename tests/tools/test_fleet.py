@@ -13,9 +13,8 @@ from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.fleet import find_cells
-from weldcal.tools.outcomes.fleet import FINE, LOOK, VISIT, Checked, judge_cell
-from weldcal.tools.report.fleet import sparkline
+from weldcal.tools.commands.fleet import find_cells, judge_cell
+from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, sparkline
 from weldcal.tools.worlds import fleet_cells
 from weldcal.tools.worlds.fleet_cells import write_cell
 

@@ -17,7 +17,7 @@ from weldcal.tools import console
 
 if TYPE_CHECKING:
     from weldcal.tools.farm.run import Farm
-    from weldcal.tools.outcomes.first_screen import FirstScreen
+    from weldcal.tools.report.first_screen import FirstScreen
 
 
 LEAST_BYTES = 1 << 20

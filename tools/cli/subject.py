@@ -84,7 +84,7 @@ def _merged(name: str, users: Mapping[str, _Parameter]) -> inspect.Parameter:
     info.min = info.max = None
     kind: Any = str
     if isinstance(info, ArgumentInfo):
-        info.metavar, info.show_default = "[DATA]", False
+        info.metavar, info.show_default = "DATA", False
     else:
         kinds = {p.kind for p in users.values()}
         assert len(kinds) == 1, f"--{name} has several types: {kinds}"

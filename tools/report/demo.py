@@ -14,8 +14,10 @@ from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
-from weldcal.tools.outcomes.calibration import error_summary
-from weldcal.tools.outcomes.first_screen import (
+from weldcal.tools.report import plots_weld
+from weldcal.tools.report.calibration import error_summary
+from weldcal.tools.report.first_screen import (
+    SCANNER,
     Expected,
     Findings,
     FirstScreen,
@@ -23,11 +25,10 @@ from weldcal.tools.outcomes.first_screen import (
     ShownPose,
     Tolerance,
     refused_note,
+    work_point_error,
     work_point_expected,
 )
-from weldcal.tools.outcomes.monitor import drift_document
-from weldcal.tools.outcomes.poses import SCANNER, work_point_error
-from weldcal.tools.report import plots_weld
+from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, svg
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render
@@ -122,7 +123,7 @@ class DemoResult:
                 0,
                 f"X_BC applies to corrected scanner points: multiply every point, in metres, by {estimate.scanner.formula}.",
             )
-        found = Findings(against, tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
+        found = Findings(against=against, tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
         return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())
 
@@ -370,7 +371,8 @@ def _process(result: DemoResult) -> list[tuple[str, str]]:
 def _timing(result: DemoResult) -> list[tuple[str, ...]]:
     """Simulated and wall seconds per phase, phases of one name added up."""
     phases = result.run.phases
-    ends = [*phases[1:], ("", float(result.run.root.get_time()), result.run.wall_seconds)]
+    # a run that is ended before its first phase has none
+    ends = [*phases, ("", float(result.run.root.get_time()), result.run.wall_seconds)][1:]
     total: dict[str, list[float]] = {}
     for (name, t0, w0), (_, t1, w1) in zip(phases, ends, strict=True):
         spent = total.setdefault(phase_words(name), [0.0, 0.0])

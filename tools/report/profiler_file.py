@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.models.arrays import Array
-from weldcal.tools.outcomes.first_screen import (
+from weldcal.tools.report.first_screen import (
     Expected,
     Findings,
     FirstScreen,
@@ -20,10 +20,30 @@ from weldcal.tools.outcomes.first_screen import (
     Tolerance,
     expected_error,
     point_covariance,
+    radius_95,
 )
-from weldcal.tools.outcomes.poses import radius_95
 from weldcal.tools.report.pictures import OURS, error_bars, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
+
+_NAMES = {
+    "scans": ("scans", ""),
+    "touches": ("touches", ""),
+    "inliers": ("points used", ""),
+    "found": ("profiles with a groove", ""),
+    "model": ("model", ""),
+    "model_reason": ("why this model", ""),
+    "method": ("method", ""),
+    "rms_mm": ("residual, rms", "mm"),
+    "reduced_chi2": ("reduced chi-square, 1 where the stated sigmas are right", ""),
+    "condition": ("condition of the scans, 1 at best", ""),
+    "sigma_translation_mm": ("one sigma of the position", "mm"),
+    "sigma_rotation_deg": ("one sigma of the rotation", "deg"),
+    "radius_of_profiles_mm": ("radius that the profiles show", "mm"),
+    "mean_distance_mm": ("mean distance of the points from the edge", "mm"),
+    "touch_rms_mm": ("touches off the sphere, rms", "mm"),
+    "centre_before_mm": ("centres apart before the compensation", "mm"),
+    "centre_after_mm": ("centres apart after the compensation", "mm"),
+}
 
 WORDS = "pose of the scan plane S in the robot's flange F"
 _LOST = {
@@ -144,27 +164,6 @@ def scan_notes(found: Mapping[str, Any]) -> tuple[list[str], list[str]]:
         return [text.format(n=len(found[key]), all=found["scans"]) for key, text in words.items() if found.get(key)]
 
     return said(_GRAVE), said(_LOST)
-
-
-_NAMES = {
-    "scans": ("scans", ""),
-    "touches": ("touches", ""),
-    "inliers": ("points used", ""),
-    "found": ("profiles with a groove", ""),
-    "model": ("model", ""),
-    "model_reason": ("why this model", ""),
-    "method": ("method", ""),
-    "rms_mm": ("residual, rms", "mm"),
-    "reduced_chi2": ("reduced chi-square, 1 where the stated sigmas are right", ""),
-    "condition": ("condition of the scans, 1 at best", ""),
-    "sigma_translation_mm": ("one sigma of the position", "mm"),
-    "sigma_rotation_deg": ("one sigma of the rotation", "deg"),
-    "radius_of_profiles_mm": ("radius that the profiles show", "mm"),
-    "mean_distance_mm": ("mean distance of the points from the edge", "mm"),
-    "touch_rms_mm": ("touches off the sphere, rms", "mm"),
-    "centre_before_mm": ("centres apart before the compensation", "mm"),
-    "centre_after_mm": ("centres apart after the compensation", "mm"),
-}
 
 
 def profiler_report(made: ProfilerFile) -> str:

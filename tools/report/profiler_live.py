@@ -16,7 +16,7 @@ from weldcal.systems.jobs.profiler.estimates import pose_sigmas
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.runner import Run
-from weldcal.tools.outcomes.first_screen import (
+from weldcal.tools.report.first_screen import (
     Expected,
     Findings,
     FirstScreen,
@@ -24,14 +24,34 @@ from weldcal.tools.outcomes.first_screen import (
     ShownPose,
     Tolerance,
     point_covariance,
+    radius_95,
 )
-from weldcal.tools.outcomes.poses import radius_95
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.profiler_file import WORDS
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.run import RunOptions, robot_timing
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
+
+WITHIN_MM = 0.3
+_NO_KEY = "No scenario key states the error that is allowed: compare it with what your job allows."
+_COLUMNS = {
+    "seed": "seed",
+    "state": "",
+    "edge_error_mm": "edge, mm",
+    "edge_sigma_mm": "sigma",
+    "edge_nees": "NEES",
+    "sphere_error_mm": "sphere, mm",
+    "sphere_sigma_mm": "sigma",
+    "sphere_nees": "NEES",
+    "largest_sigmas": "largest",
+    "sphere_tip_error_mm": "tip, mm",
+    "torch_mean_mm": "torch, mm",
+    "torch_max_mm": "at most",
+}
+RUST, GREY, GREEN = "#c4622d", "#9aa3ab", "#4b7f52"
+PARTS = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
+_COLOURS = {"edge": OURS, "sphere": RUST}
 
 JOINT_3_SIGMA = chi2_quantile(chi2_share(9.0, 1), 6)  # 20.06
 
@@ -148,10 +168,6 @@ def _off(p: Array, line: SeamCurve) -> PathOutcome:
     return PathOutcome(error.s, error.lateral, error.height)
 
 
-WITHIN_MM = 0.3
-_NO_KEY = "No scenario key states the error that is allowed: compare it with what your job allows."
-
-
 @dataclass(frozen=True, eq=False)
 class ProfilerLive:
     """The result of one run."""
@@ -208,7 +224,9 @@ class ProfilerLive:
             if any(not p.within_3_sigma for p in known)
             else []
         )
-        found_all = Findings(against, tolerance, _NO_KEY, unseen, concerns)
+        found_all = Findings(
+            against=against, tolerance=tolerance, no_tolerance=_NO_KEY, unseen=unseen, concerns=concerns
+        )
         if held:
             after = Next("Settle the reason, then run the job again.")
         else:
@@ -346,22 +364,6 @@ def seeds_report(
     )
 
 
-_COLUMNS = {
-    "seed": "seed",
-    "state": "",
-    "edge_error_mm": "edge, mm",
-    "edge_sigma_mm": "sigma",
-    "edge_nees": "NEES",
-    "sphere_error_mm": "sphere, mm",
-    "sphere_sigma_mm": "sigma",
-    "sphere_nees": "NEES",
-    "largest_sigmas": "largest",
-    "sphere_tip_error_mm": "tip, mm",
-    "torch_mean_mm": "torch, mm",
-    "torch_max_mm": "at most",
-}
-
-
 def _poses(o: LiveOutcome) -> dict[str, PoseOutcome]:
     return {n: p for n in ("edge", "sphere") if (p := getattr(o, n)) is not None}
 
@@ -383,11 +385,6 @@ def _row(name: str, p: PoseOutcome) -> tuple[str, ...]:
 
 def _shown(value: object) -> str:
     return fixed(value, 2) if isinstance(value, float) else "–" if value is None else str(value)
-
-
-RUST, GREY, GREEN = "#c4622d", "#9aa3ab", "#4b7f52"
-PARTS = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
-_COLOURS = {"edge": OURS, "sphere": RUST}
 
 
 def sigmas_picture(poses: Mapping[str, Sequence[PoseOutcome]]) -> bytes:

@@ -1,6 +1,6 @@
 """What every run has: its options, and the section of its report on how late each velocity left the Diagram."""
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from weldcal.tools.report.pictures import GREY, OURS, THEIRS, plain, svg
 from weldcal.tools.report.render import fixed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """The user's options of a run.
 
@@ -34,7 +34,6 @@ class RunOptions:
     scenario: str
     out: Path
     seed: int = 0
-    _: KW_ONLY
     browser: bool = False
     realtime: bool = False
     robot: str | None = None

@@ -15,10 +15,20 @@ from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
-from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 from weldcal.tools.report.run import robot_timing
+
+Card = tuple[str, str, str, str, str]
+_MARK = (40, 60, 220)  # BGR
+_MODELS = {
+    "wrist": "full robot poses: touches determine tablet and pen, the image determines the camera",
+    "pnp": "the tablet's true size (PnP), then a rigid motion and the pen",
+    "pnp_free_scale": "the tablet's size (PnP) with a free scale, then a rigid motion and the pen",
+    "closed_form": "one linear least squares of six unknowns",
+}
+_UNITS = {"phi": ("deg", 180.0 / np.pi), "scale": ("", 1.0), "roll": ("deg", 180.0 / np.pi)}
 
 WORDS = "pose of the camera C in the robot's flange F"
 NO_KEY = "No scenario key states how exact a touch must be: compare the error with what your job allows."
@@ -94,15 +104,6 @@ def _next(tolerance: Tolerance | None) -> Next:
     return Next("Touch a point on the tablet that is no landmark, and compare.")
 
 
-Card = tuple[str, str, str, str, str]
-_MARK = (40, 60, 220)  # BGR
-_MODELS = {
-    "wrist": "full robot poses: touches determine tablet and pen, the image determines the camera",
-    "pnp": "the tablet's true size (PnP), then a rigid motion and the pen",
-    "pnp_free_scale": "the tablet's size (PnP) with a free scale, then a rigid motion and the pen",
-    "closed_form": "one linear least squares of six unknowns",
-}
-_UNITS = {"phi": ("deg", 180.0 / np.pi), "scale": ("", 1.0), "roll": ("deg", 180.0 / np.pi)}
 _UNITS |= {"pitch": _UNITS["roll"], "yaw": _UNITS["roll"]}
 
 

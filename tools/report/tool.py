@@ -23,6 +23,11 @@ from weldcal.models.tools.loading import LoadedTool
 from weldcal.systems.drivers.simulated.tag_view import TagView
 from weldcal.tools.report.render import render
 
+COLOURS = {"dark": "#4a525c", "steel": "#a5abb3", "copper": "#c47a3d", "soft": "#3d7aa6", "white": "#f4f4f4"}
+KEEP, AXIS = "#b04a3a", "#20262c"
+_SEGMENTS = 32
+NAMES_APART_MM = 9.0
+
 
 @dataclass(frozen=True, eq=False)
 class ToolCheck:
@@ -127,11 +132,6 @@ def _text(values: object) -> str:
 
 
 matplotlib.use("Agg")
-
-COLOURS = {"dark": "#4a525c", "steel": "#a5abb3", "copper": "#c47a3d", "soft": "#3d7aa6", "white": "#f4f4f4"}
-KEEP, AXIS = "#b04a3a", "#20262c"
-_SEGMENTS = 32
-NAMES_APART_MM = 9.0
 
 
 def tool_report(check: ToolCheck, picture: bytes) -> str:

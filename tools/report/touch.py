@@ -7,10 +7,11 @@ import numpy as np
 
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.touch.judge import LEVEL, TouchErrors
-from weldcal.tools.outcomes.calibration import CARE, DO_NOT, USE, Verdict, error_summary, scanner_pose
-from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, Tolerance
+from weldcal.tools.report.calibration import error_summary, scanner_pose
+from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, Expected, Findings, FirstScreen, Next, Tolerance
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.verify import Verdict
 
 ENOUGH = 4
 """Touches from which on the verdict may be "use"."""

@@ -246,13 +246,13 @@ def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
     mean = float(means @ length / length.sum())
     spread = np.array([w.cv * w.mean for w in welds]) ** 2 + (means - mean) ** 2
     return SpeedStatistics(
-        mean,
-        min(w.least for w in welds),
-        max(w.most for w in welds),
-        float(np.sqrt(spread @ length / length.sum())) / mean,
-        sum(w.outside_m for w in welds),
-        float(length.sum()),
-        sum(w.seconds for w in welds),
+        mean=mean,
+        least=min(w.least for w in welds),
+        most=max(w.most for w in welds),
+        cv=float(np.sqrt(spread @ length / length.sum())) / mean,
+        outside_m=sum(w.outside_m for w in welds),
+        welded_m=float(length.sum()),
+        seconds=sum(w.seconds for w in welds),
     )
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.commands.fleet import run_fleet
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.outcomes.fleet import FINE, LOOK, VISIT
+from weldcal.tools.report.fleet import FINE, LOOK, VISIT
 from weldcal.tools.studies.harness import Figures, Results, Row, Study
 from weldcal.tools.worlds.fleet_cells import FAULTS, write_fleet
 

@@ -169,9 +169,15 @@ def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
     arm = DhArm.checked(d["dh_nominal"] * [MM, np.radians(1.0), MM, np.radians(1.0)])
     for w in range(min(count, len(d["scan_T"]))):
         data = SphereData(
-            _poses(d["scan_T"][w]), [p * MM for p in d["scan_prof"][w].astype(float)], float(d["radius"]) * MM,
-            _poses(d["touch_T"][w]), d["tip_nominal"][w] * MM, arm, d["scan_q"][w], d["touch_q"][w],
-        )  # fmt: skip
+            poses=_poses(d["scan_T"][w]),
+            profiles=[p * MM for p in d["scan_prof"][w].astype(float)],
+            radius_m=float(d["radius"]) * MM,
+            touches=_poses(d["touch_T"][w]),
+            tip=d["tip_nominal"][w] * MM,
+            arm=arm,
+            q=d["scan_q"][w],
+            touch_q=d["touch_q"][w],
+        )
         tests = SphereTests(d["test_q_view"][w], d["test_m"][w] * MM, d["test_q_touch"][w], d["test_point"][w])
         groove = boss = None
         if w < len(g["q"]):

@@ -64,7 +64,14 @@ def warped_observations(
         name = f"p{k:02d}"
         observations.append(Observation(name, X_BC @ RigidTransform(R_CR, true), p_C, normal / np.linalg.norm(normal)))
         ratio = 0.5 * float(np.linalg.norm(x) + np.linalg.norm(y)) + NOISE_RATIO * rng.standard_normal()
-        patterns[name] = HolePattern(np.zeros((4, 3)), np.zeros(4), p_C, RigidTransform(R_CR, p_C), ratio, 0.0)
+        patterns[name] = HolePattern(
+            holes_C=np.zeros((4, 3)),
+            angles_rad=np.zeros(4),
+            center_C=p_C,
+            X_CR=RigidTransform(R_CR, p_C),
+            ratio=ratio,
+            rms_m=0.0,
+        )
     return observations, patterns
 
 

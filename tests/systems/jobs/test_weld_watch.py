@@ -16,7 +16,7 @@ from weldcal.systems.jobs.job import Phases
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.commands.demo import measure
+from weldcal.tools.commands.weld import measure
 from weldcal.tools.report.demo import DemoResult, demo_report
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.worlds.perfect_world import perfect
@@ -43,7 +43,7 @@ def knocked(knock_s: float, speed_factor: float, fps: float) -> DemoResult:
         return found
 
     cell.job.stage = stop_when_measured
-    return measure(run_cell(cell), RunOptions("straight_groove", Path("unused")))
+    return measure(run_cell(cell), RunOptions(scenario="straight_groove", out=Path("unused")))
 
 
 def test_a_scanner_knocked_before_the_weld_holds_the_job() -> None:

@@ -25,31 +25,19 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.systems.messages import CalibrationStatus, VerificationResult
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.outcomes.calibration import (
-    CARE,
-    CalibrationReport,
-    PoseError,
-    Verdict,
-    VerifyReport,
-    error_summary,
-)
-from weldcal.tools.outcomes.first_screen import NO_TOLERANCE, FirstScreen
-from weldcal.tools.outcomes.hand_eye import HandEyeReport, MethodRow
-from weldcal.tools.outcomes.monitor import MonitorReport
-from weldcal.tools.outcomes.motion import MotionReport
-from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.report.calibration import calibration_report
+from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
-from weldcal.tools.report.hand_eye import hand_eye_report
-from weldcal.tools.report.monitor import monitor_page
-from weldcal.tools.report.motion_calibration import motion_report
-from weldcal.tools.report.mounting import mounting_report
+from weldcal.tools.report.first_screen import CARE, NO_TOLERANCE, FirstScreen
+from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
+from weldcal.tools.report.monitor import MonitorReport, monitor_page
+from weldcal.tools.report.motion_calibration import MotionReport, motion_report
+from weldcal.tools.report.mounting import MountingReport, mounting_report
 from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report, seam_report
 from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, ProfilerLive, live_report
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
-from weldcal.tools.report.verify import verify_report
+from weldcal.tools.report.verify import PoseError, Verdict, VerifyReport, verify_report
 
 Made = tuple[FirstScreen, str]
 OUT = Path("result")
@@ -58,11 +46,16 @@ COVARIANCE = np.diag([1e-4] * 3 + [5e-5] * 3) ** 2
 OBSERVATIONS = make_observations(10, 3)
 ESTIMATE = estimate_eye_on_base(OBSERVATIONS, SolveConfig(hypotheses=40))
 RESULT = CalibrationResult(
-    ESTIMATE.X_BC,
-    ESTIMATE.covariance,
-    error_summary(1e3 * ESTIMATE.held_out.position_m),
-    {"median": 0.01, "p95": 0.03},
-    tuple(PoseRecord(o.id, True, "", 0.1, 0.2, 0.01, 0.02) for o in OBSERVATIONS),
+    X_BC=ESTIMATE.X_BC,
+    covariance=ESTIMATE.covariance,
+    held_out_mm=error_summary(1e3 * ESTIMATE.held_out.position_m),
+    tilt_deg={"median": 0.01, "p95": 0.03},
+    poses=tuple(
+        PoseRecord(
+            id=o.id, used=True, reason="", residual_mm=0.1, held_out_mm=0.2, tilt_deg=0.01, held_out_tilt_deg=0.02
+        )
+        for o in OBSERVATIONS
+    ),
     warnings=("A <warning> of this calibration.",),
     robot="ur10e",
     flange="iso9409-1-50-4-m6",
@@ -77,9 +70,21 @@ def calibrate() -> Made:
     counts = np.arange(4, 10)
     curve = Convergence(counts, *(1e-4 * np.ones((2, len(counts))) for _ in range(3)))
     report = CalibrationReport(
-        RESULT, ESTIMATE, tuple(OBSERVATIONS), None, {}, (("p99", "No flange was found."),), (), None, curve,
-        error_summary(np.array([0.2])), 1.0, OUT, ("Add a pose near (1, 2, 3).",), limit_mm=2.0,
-    )  # fmt: skip
+        result=RESULT,
+        estimate=ESTIMATE,
+        observations=tuple(OBSERVATIONS),
+        scanner=None,
+        fits={},
+        refused=(("p99", "No flange was found."),),
+        outliers=(),
+        algorithm1=None,
+        convergence=curve,
+        k_fold_mm=error_summary(np.array([0.2])),
+        seconds=1.0,
+        out=OUT,
+        advice=("Add a pose near (1, 2, 3).",),
+        limit_mm=2.0,
+    )
     return report.first, calibration_report(report, dataset="scans")
 
 
@@ -88,8 +93,18 @@ def verify() -> Made:
     poses = tuple(PoseError(o.id, 0.1 + 0.01 * k, 0.02, k < 3) for k, o in enumerate(OBSERVATIONS))
     verdict = Verdict(CARE, 0.4, "The median error is within the limit. But: something.")
     report = VerifyReport(
-        RESULT, None, tuple(OBSERVATIONS), {}, poses, (("p99", "Empty."),), ("Take new scans.",), {}, OUT, verdict, "given"
-    )  # fmt: skip
+        result=RESULT,
+        correction=None,
+        observations=tuple(OBSERVATIONS),
+        fits={},
+        poses=poses,
+        refused=(("p99", "Empty."),),
+        warnings=("Take new scans.",),
+        hashes={},
+        out=OUT,
+        verdict=verdict,
+        source="given",
+    )
     return report.first, verify_report(report, dataset="others")
 
 
@@ -101,16 +116,35 @@ def motion() -> Made:
     p_C = np.array([o.p_CR for o in make_observations(n, 1)])
     estimate = SimpleNamespace(
         X_BC=RESULT.X_BC,
-        clock=ScannerClock("arrival", 0.03, 1e-4, 1e-3, 0.0, reason="There is no other."),
+        clock=ScannerClock(
+            kind="arrival", offset_s=0.03, sigma_s=1e-4, jitter_s=1e-3, reference_s=0.0, reason="There is no other."
+        ),
         start=SimpleNamespace(delays=np.linspace(0.0, 0.1, 20), rms_m=1e-3 * np.ones(20), delay_s=0.03),
-        inliers=np.ones(n, bool), capture=np.linspace(0.0, 3.0, n), residual_m=values[0], along_m=values[1], before_m=values[2],
+        inliers=np.ones(n, bool),
+        capture=np.linspace(0.0, 3.0, n),
+        residual_m=values[0],
+        along_m=values[1],
+        before_m=values[2],
         held_out_m=values[3],
-    )  # fmt: skip
+    )
     frames = ObservedFrames(
-        tuple(map(str, range(n))), np.linspace(0.0, 3.0, n), None, p_C, np.tile([0.0, 0.0, 1.0], (n, 1)),
-        np.tile(1e-9 * np.eye(3), (n, 1, 1)), 1e-3 * np.ones(n),
-    )  # fmt: skip
-    report = MotionReport(RESULT, cast(Any, estimate), frames, (("31", "No flange."),), (), 1.0, OUT)
+        ids=tuple(map(str, range(n))),
+        arrival=np.linspace(0.0, 3.0, n),
+        device=None,
+        p_C=p_C,
+        n_C=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        covariance=np.tile(1e-9 * np.eye(3), (n, 1, 1)),
+        normal_sigma=1e-3 * np.ones(n),
+    )
+    report = MotionReport(
+        result=RESULT,
+        estimate=cast(Any, estimate),
+        frames=frames,
+        refused=(("31", "No flange."),),
+        outliers=(),
+        seconds=1.0,
+        out=OUT,
+    )
     return report.first, motion_report(report, dataset="moving")
 
 
@@ -119,20 +153,52 @@ def monitor() -> Made:
     n = 60
     rng = np.random.default_rng(0)
     event = DriftEvent(
-        MOVED, 2.0, 0.05, 2.3, np.array([1e-3, 0.0, 0.0]), np.zeros(3), COVARIANCE, X, "translation", 80.0, 30.0,
-        "the scanner or the base has moved",
-    )  # fmt: skip
+        kind=MOVED,
+        time_s=2.0,
+        time_sigma_s=0.05,
+        found_s=2.3,
+        translation_m=np.array([1e-3, 0.0, 0.0]),
+        rotation_rad=np.zeros(3),
+        covariance=COVARIANCE,
+        X_BC_after=X,
+        model="translation",
+        statistic=80.0,
+        threshold=30.0,
+        cause="the scanner or the base has moved",
+    )
     clock = SimpleNamespace(
         clock=SimpleNamespace(kind="arrival"), delay_s=0.1, sigma_s=1e-3, jitter_s=1e-3, source="recording"
     )
     watched = SimpleNamespace(
-        ids=tuple(map(str, range(n))), rows=SimpleNamespace(times=np.linspace(0.0, 4.0, n)),
-        residuals=1e-4 * rng.standard_normal((n, 3)), tilts=1e-4 * rng.standard_normal((n, 2)),
-        before=1e-3 * rng.standard_normal((n, 3)), offsets=1e-3 * rng.standard_normal(n), gross=np.zeros(n, bool),
-        statistic=np.linspace(1.0, 80.0, n), threshold=30.0, events=(event,), X_BC=X, covariance=COVARIANCE, since_s=2.0,
-        clock=clock, noise=SimpleNamespace(jitter_s=1e-3), dropped=(("q", "No flange: 3"),), rms_m=2e-4, rms_after_m=1e-4,
-    )  # fmt: skip
-    report = MonitorReport(cast(Any, watched), RESULT, None, event.cause, 1e-3, (), 1.0, OUT)
+        ids=tuple(map(str, range(n))),
+        rows=SimpleNamespace(times=np.linspace(0.0, 4.0, n)),
+        residuals=1e-4 * rng.standard_normal((n, 3)),
+        tilts=1e-4 * rng.standard_normal((n, 2)),
+        before=1e-3 * rng.standard_normal((n, 3)),
+        offsets=1e-3 * rng.standard_normal(n),
+        gross=np.zeros(n, bool),
+        statistic=np.linspace(1.0, 80.0, n),
+        threshold=30.0,
+        events=(event,),
+        X_BC=X,
+        covariance=COVARIANCE,
+        since_s=2.0,
+        clock=clock,
+        noise=SimpleNamespace(jitter_s=1e-3),
+        dropped=(("q", "No flange: 3"),),
+        rms_m=2e-4,
+        rms_after_m=1e-4,
+    )
+    report = MonitorReport(
+        watched=cast(Any, watched),
+        calibration=RESULT,
+        recalibrated=None,
+        cause=event.cause,
+        false_alarms_per_hour=1e-3,
+        warnings=(),
+        seconds=1.0,
+        out=OUT,
+    )
     return report.first, monitor_page(report, recording="moving")
 
 
@@ -152,7 +218,14 @@ def hand_eye() -> Made:
     comparison = (MethodRow("weldcal", 0.01, 0.1), MethodRow("TSAI", float("nan"), float("nan")))
     mounting = get_mounting("eye_in_hand")
     report = HandEyeReport(
-        _hand_eye(), mounting, comparison, None, (), 0.1, advice="Like sample 3, turned.", folder=OUT
+        result=_hand_eye(),
+        mounting=mounting,
+        comparison=comparison,
+        next_pose=None,
+        files=(),
+        seconds=0.1,
+        advice="Like sample 3, turned.",
+        folder=OUT,
     )
     return report.first, hand_eye_report(report, "samples.npz", "ab" * 32)
 
@@ -164,9 +237,16 @@ def _run(name: str, **job: Any) -> Any:
     context = SimpleNamespace(get_time=lambda: 10.0)
     cell = SimpleNamespace(scenario=scenario, job=SimpleNamespace(**job))
     return SimpleNamespace(
-        cell=cell, root=context, held=False, reason=None, clock=None, seconds=10.0, wall_seconds=5.0,
-        phases=[("start", 0.0, 0.0), ("scan_pose", 1.0, 0.5), ("done", 9.0, 4.5)], timing=lambda: timing,
-    )  # fmt: skip
+        cell=cell,
+        root=context,
+        held=False,
+        reason=None,
+        clock=None,
+        seconds=10.0,
+        wall_seconds=5.0,
+        phases=[("start", 0.0, 0.0), ("scan_pose", 1.0, 0.5), ("done", 9.0, 4.5)],
+        timing=lambda: timing,
+    )
 
 
 class LiveMounting(MountingReport):
@@ -186,15 +266,21 @@ def mounting() -> Made:
         mounting=get_mounting("eye_in_hand"), scanner=scanner, known=(), configuration="eye_in_hand", two=False
     )
     status = SimpleNamespace(
-        sequence=9, seen=(), refused=(("pose3", "No circle."),), sigma_work_m=2e-5, history=((4, 4e-5), (9, 2e-5)),
-        held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),), next_best=None, message="",
-    )  # fmt: skip
+        sequence=9,
+        seen=(),
+        refused=(("pose3", "No circle."),),
+        sigma_work_m=2e-5,
+        history=((4, 4e-5), (9, 2e-5)),
+        held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),),
+        next_best=None,
+        message="",
+    )
     run = _run("eye_in_hand", scene=scene, truth={}, status=lambda root: status)
     report = LiveMounting(run, _hand_eye(), OUT, 5.0)
     return report.first, mounting_report(report, None)
 
 
-def _demo(estimate: Any, *, held: bool) -> Made:
+def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
     sequencer = SimpleNamespace(
         GetMyContextFromRoot=lambda root: root, job_state=lambda context: SimpleNamespace(warnings=("A remark.",))
     )
@@ -206,11 +292,21 @@ def _demo(estimate: Any, *, held: bool) -> Made:
     )
     if held:
         run.held, run.reason = True, "The tag was lost."
+    if not begun:
+        run.phases = []
     status = CalibrationStatus(
-        11, 10, tuple(OBSERVATIONS), (("p77", "No ring."),), estimate, 9e-5,
-        history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)), verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
-    )  # fmt: skip
-    result = DemoResult(options=RunOptions("calibrate_only", OUT), run=run, status=status, calibration=None, weld=None)
+        sequence=11,
+        calibration_scans=10,
+        observations=tuple(OBSERVATIONS),
+        refused=(("p77", "No ring."),),
+        estimate=estimate,
+        predicted_error_m=9e-5,
+        history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)),
+        verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
+    )
+    result = DemoResult(
+        options=RunOptions(scenario="calibrate_only", out=OUT), run=run, status=status, calibration=None, weld=None
+    )
     return result.first, demo_report(result, demo_pictures(result), recording=True)
 
 
@@ -224,7 +320,17 @@ def held() -> Made:
     return _demo(None, held=True)
 
 
-RECORD = ProfilerRecord("sphere, affine", X.rotation().matrix(), np.array([0.03, -0.07, 0.16]), COVARIANCE)
+def unbegun() -> Made:
+    """`demo` that the operator ended before its first phase."""
+    return _demo(None, held=True, begun=False)
+
+
+RECORD = ProfilerRecord(
+    method="sphere, affine",
+    rotation=X.rotation().matrix(),
+    translation=np.array([0.03, -0.07, 0.16]),
+    covariance=COVARIANCE,
+)
 
 
 def profiler() -> Made:
@@ -276,7 +382,7 @@ def profiler_live() -> Made:
         curve=None,
         torch=None,
     )
-    live = ProfilerLive(RunOptions("profiler_edge", OUT), run, outcome)
+    live = ProfilerLive(RunOptions(scenario="profiler_edge", out=OUT), run, outcome)
     page = live_report(live.summary(), outcome, cast(Any, state), run, first=live.first, recording=False)
     return live.first, page
 
@@ -286,9 +392,17 @@ def tablet() -> Made:
     n = 9
     covariance = COVARIANCE.tolist()
     result = TabletResult(
-        "wrist", {"x": 0.1}, covariance, [0.1] * n, [0.2 + 0.01 * k for k in range(n)], X, covariance, [0.0, 0.0, 0.15],
-        (1e-9 * np.eye(3)).tolist(), data_sha256={"touches.csv": "ab" * 32},
-    )  # fmt: skip
+        model="wrist",
+        parameters={"x": 0.1},
+        covariance=covariance,
+        residual_mm=[0.1] * n,
+        leave_one_out_mm=[0.2 + 0.01 * k for k in range(n)],
+        X_FC=X,
+        X_FC_covariance=covariance,
+        p_FP_m=[0.0, 0.0, 0.15],
+        p_FP_covariance=(1e-9 * np.eye(3)).tolist(),
+        data_sha256={"touches.csv": "ab" * 32},
+    )
     grid = 0.05 * np.array([(i, j) for i in range(3) for j in range(3)], dtype=float)
     shown = Shown(grid, 1e-4 * random_poses(n, np.random.default_rng(1))[:, :2, 3], tuple(map(str, range(n))))
     first = tablet_screen(result, np.zeros(0), 0.5, NO_TOLERANCE)
@@ -297,11 +411,29 @@ def tablet() -> Made:
 
 def finger() -> Made:
     """`finger calibrate` with touches."""
-    from weldcal.tools.commands.finger_calibrate import FingerReport, finger_page
+    from weldcal.tools.commands.cell.finger import FingerReport, finger_page
     from weldcal.welding.finger.calibration import Intrinsics, TipCalibration
 
-    camera = Intrinsics(np.diag([900.0, 900.0, 1.0]), np.zeros(5), 640, 480, 0.2, 0.3, 20, 5, 1.0)
-    tip = TipCalibration(1.0, 1e-3, None, np.array([0.0, 1e-4, np.nan]), {"x": 900.0}, 2e-5, ("pressed along x only",))
+    camera = Intrinsics(
+        K=np.diag([900.0, 900.0, 1.0]),
+        distortion=np.zeros(5),
+        width=640,
+        height=480,
+        rms_px=0.2,
+        held_out_px=0.3,
+        used=20,
+        held_out=5,
+        focal_sigma_px=1.0,
+    )
+    tip = TipCalibration(
+        scale=1.0,
+        scale_sigma=1e-3,
+        rotation_deg=None,
+        seat_m=np.array([0.0, 1e-4, np.nan]),
+        stiffness_N_per_m={"x": 900.0},
+        held_out_m=2e-5,
+        unknown=("pressed along x only",),
+    )
     report = FingerReport(
         camera=camera,
         tip=tip,
@@ -317,6 +449,19 @@ def finger() -> Made:
 PAGES: dict[str, Callable[[], Made]] = {
     made.__name__: made
     for made in (
-        calibrate, verify, motion, monitor, hand_eye, mounting, demo, held, profiler, seam, profiler_live, tablet, finger,
+        calibrate,
+        verify,
+        motion,
+        monitor,
+        hand_eye,
+        mounting,
+        demo,
+        held,
+        unbegun,
+        profiler,
+        seam,
+        profiler_live,
+        tablet,
+        finger,
     )
-}  # fmt: skip
+}

@@ -2,43 +2,40 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from scipy.stats import binom
 
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import get_flange
-from weldcal.models.scanners import get_scanner
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.studies.flange.coverage import study_coverage
-from weldcal.tools.studies.flange.found import study_frames, study_hidden
-from weldcal.tools.studies.flange.hole_turn import study_hole_turn
 from weldcal.tools.studies.flange.imperfect import study_light_runs
+from weldcal.tools.studies.flange.scans import FRAMES, HIDDEN, HOLES, fit_one, frame_cases, hidden_cases, hole_cases
 from weldcal.tools.worlds.flange_frames import WAYS
 
 ISO_50 = "iso9409-1-50-4-m6"
-HALF_MPX = get_scanner("phoxi_m", 824)
+HALF_MPX = 824
 
 
 def test_found_in_every_frame_that_shows_it_and_in_none_that_does_not() -> None:
-    study = study_frames(HALF_MPX, get_flange(ISO_50), 12, empty=8, seed=3)
-    assert (study.found, study.mistaken, study.imagined) == (12, 0, 0)
+    study = FRAMES.here(frame_cases(12, 8, 3, HALF_MPX)).figures
+    assert (study["found"], study["mistaken"], study["imagined"]) == (12, 0, 0)
     # 0.07 mm rms over 500 frames; of 12, chi-square with 24 degrees of freedom allows 1.4 times that at 99.9 %
-    assert study.rms_mm < 0.1
+    assert study["centre_rms_mm"] < 0.1
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_flange_half_hidden_is_found_whatever_hides_it(way: str) -> None:
-    study = study_hidden(way, HALF_MPX, get_flange(ISO_50), 4, seed=2)
-    assert study.missed == ()
-    assert (study.coverage < 0.6).all()
+    found = {name: fit_one(**case) for name, case in hidden_cases(4, 0.5, 2, HALF_MPX, ways=(way,)).items()}
+    assert [f["reason"] for f in found.values()] == [None] * 4
+    assert all(f["coverage"] < 0.6 for f in found.values())
     # 0.13 mm rms over 30 frames each; of 4, chi-square with 8 degrees of freedom allows 1.8 times that at 99.9 %
-    assert np.sqrt((study.errors_m**2).mean()) < 2.4e-4
+    assert HIDDEN.measured(found).figures["rows"][0]["centre_rms_mm"] < 0.24
 
 
 @pytest.mark.parametrize("name", ["iso9409-1-80-6-m8", "wrist-ring-90"])
 def test_half_of_a_larger_one_is_found_as_well(name: str) -> None:
-    assert study_hidden("plate", HALF_MPX, get_flange(name), 2, seed=4).missed == ()
+    (row,) = HIDDEN.here(hidden_cases(2, 0.5, 4, HALF_MPX, name, ("plate",))).figures["rows"]
+    assert row["missed"] == []
 
 
 def test_the_stated_region_of_a_calibration_holds_the_truth_as_often_as_it_says() -> None:
@@ -51,17 +48,17 @@ def test_the_stated_region_of_a_calibration_holds_the_truth_as_often_as_it_says(
 
 
 def test_no_filled_holes_lead_to_a_wrong_rotation() -> None:
-    rows = study_hole_turn(get_scanner("phoxi_m", 1032), get_flange(ISO_50), 2, seed=4)
-    assert [r.filled for r in rows] == ["nothing", *(f"thread {k}" for k in (1, 2, 3, 4)), "dowel hole", "two"]
-    assert sum(r.wrong for r in rows) == 0
-    assert rows[0].right > 0
-    assert rows[5].right == 0
-    assert rows[5].left_open > 0
+    rows = HOLES.here(hole_cases(2, 4, 1032)).figures["rows"]
+    assert [r["filled"] for r in rows] == ["nothing", *(f"thread {k}" for k in (1, 2, 3, 4)), "dowel hole", "two"]
+    assert sum(r["wrong"] for r in rows) == 0
+    assert rows[0]["right"] > 0
+    assert rows[5]["right"] == 0
+    assert rows[5]["left_open"] > 0
 
 
 def test_a_flange_without_holes_has_none_to_fill() -> None:
     with pytest.raises(InputError, match="has no holes to fill"):
-        study_hole_turn(get_scanner("phoxi_m", 1032), get_flange("tool-ring-63"), 1)
+        hole_cases(1, 0, 1032, "tool-ring-63")
 
 
 @pytest.mark.parametrize("name", ["tablet", "eye_in_hand"])

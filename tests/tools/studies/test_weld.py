@@ -14,16 +14,14 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, planned_seam, roughness
-from weldcal.tools.studies.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, Tip
-from weldcal.tools.studies.weld.metrics import RunMetrics
-from weldcal.tools.studies.weld.plant import StudyRun, simulate
-from weldcal.tools.studies.weld.rows import ROWS, Case, Target, UnknownRow, get_rows
-from weldcal.tools.studies.weld.seams import NAMES, UnknownSeam, get_seam
-from weldcal.tools.studies.weld.stamps import Stamps
-from weldcal.tools.studies.weld.study import CaseResult, hold_against, run_case, study_config
-from weldcal.tools.studies.weld.turns import run_turn
-from weldcal.tools.studies.weld.unknowns import World, draw_world
+from weldcal.tools.studies.weld.rows import ROWS, CaseResult, Target, UnknownRow, get_rows, hold_against, run_turn
+from weldcal.tools.worlds.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, planned_seam, roughness
+from weldcal.tools.worlds.weld.case import Case, run_case, study_config
+from weldcal.tools.worlds.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, Tip
+from weldcal.tools.worlds.weld.metrics import RunMetrics
+from weldcal.tools.worlds.weld.plant import Stamps, StudyRun, simulate
+from weldcal.tools.worlds.weld.seams import NAMES, UnknownSeam, get_seam
+from weldcal.tools.worlds.weld.unknowns import World, draw_world
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import DeflectionSample
@@ -174,7 +172,10 @@ def test_a_turn_no_torch_can_follow_is_refused_and_welded_in_pieces() -> None:
 
 def test_figures_that_a_run_lacks_count_as_missed() -> None:
     case = Case("straight")
-    good, broken = RunMetrics(True, "DONE", "", 300.0, max_mm=0.1), RunMetrics(False, "FAULT", "why", 20.0)
+    good, broken = (
+        RunMetrics(completed=True, phase="DONE", reason="", reached_mm=300.0, max_mm=0.1),
+        RunMetrics(completed=False, phase="FAULT", reason="why", reached_mm=20.0),
+    )
     target = Target("max_mm", 0.15)
     assert hold_against(target, [CaseResult(case, (0,), (good,))]).met
     both = hold_against(target, [CaseResult(case, (0, 1), (good, broken))])

@@ -1,7 +1,8 @@
 """Coverage of the stated 95 % regions: shares of simulated calibrations whose regions hold the truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,7 +20,10 @@ from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.calibration.planning.observability import check_diversity
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import svg
+from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.worlds import warped_scanner
 from weldcal.tools.worlds.flange_frames import facing
 
@@ -31,7 +35,7 @@ Calibrated = tuple[CalibrationEstimate, RigidTransform, Array]
 """An estimate, the true X_BC, and where the estimate puts the work point (3,) m in B."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Coverage:
     """Of ``runs`` calibrations from ``poses`` observations each: how often the truth lies within the stated 95 % region of
     X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both means
@@ -99,7 +103,14 @@ def seen_by_a_wrong_scanner(
         x, y = np.linalg.svd(np.asarray(o.n_C)[None])[2][1:]
         ratio = 2.0 / float(x @ J @ x + y @ J @ y) + SIGMA_RATIO * rng.standard_normal()
         R = RotationMatrix(np.column_stack([x, np.cross(o.n_C, x), o.n_C]))
-        patterns[o.id] = HolePattern(np.zeros((4, 3)), np.zeros(4), seen, RigidTransform(R, seen), ratio, 0.0)
+        patterns[o.id] = HolePattern(
+            holes_C=np.zeros((4, 3)),
+            angles_rad=np.zeros(4),
+            center_C=seen,
+            X_CR=RigidTransform(R, seen),
+            ratio=ratio,
+            rms_m=0.0,
+        )
     return out, patterns
 
 
@@ -127,7 +138,13 @@ def study_coverage(poses: int, runs: int, seed: int = 0, progress: Progress = no
         return estimate, X_BC, estimate.X_BC @ WORK_C
 
     pose, point = _inside(calibrate, f"calibrations from {poses} scans", runs, progress)
-    return Coverage(poses, runs, pose, point, float(np.mean(stated) / np.mean(true)) if runs else np.nan)
+    return Coverage(
+        poses=poses,
+        runs=runs,
+        pose=pose,
+        point=point,
+        held_out_over_true=float(np.mean(stated) / np.mean(true)) if runs else np.nan,
+    )
 
 
 def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
@@ -144,7 +161,7 @@ def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = n
         return estimate, X_BC, estimate.X_BC @ found.correction.points(as_measured(WORK_C))
 
     pose, point = _inside(calibrate, f"corrected calibrations from {poses} scans", runs, progress)
-    return Coverage(poses, runs, pose, point, float("nan"), corrected=True)
+    return Coverage(poses=poses, runs=runs, pose=pose, point=point, held_out_over_true=float("nan"), corrected=True)
 
 
 def _inside(calibrate: Callable[[int], Calibrated], name: str, runs: int, progress: Progress) -> tuple[float, float]:
@@ -211,3 +228,33 @@ def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Cov
     return Coverage(
         poses, runs, float(pose), float(point), float(np.mean(stated) / np.mean(true)), corrected=True, warped=True
     )
+
+
+def _coverage_rows(f: Figures) -> Iterable[Row]:
+    for s in f["studies"]:
+        kind = "of another model" if s["warped"] else "corrected" if s["corrected"] else "exact"
+        shares = (f"{100 * s[key]:.1f} %" for key in ("pose", "point"))
+        yield str(s["poses"]), kind, *shares, fixed(s["held_out_over_true"])
+
+
+HONESTY = Study(
+    name="flange-honesty",
+    what="How often stated 95 % regions hold the truth, and the ratio of held-out to true errors.",
+    figures=lambda results: results["all"],
+    header=("scans", "scanner", "X_BC inside", "work point inside", "held-out over true error"),
+    rows=_coverage_rows,
+    numbers=3,
+)
+
+
+@command("benchmark flange-honesty", short_help="Measure how often stated 95 % regions hold the truth.", hidden=True)
+def honesty(
+    call: Call, runs: Annotated[int, option("--runs", "N", "Number of calibrations of each size.", min=10)] = 500
+) -> Outcome:
+    """Measure how often the stated 95 % regions contain the truth, and the ratio of held-out to true errors."""
+    folder = HONESTY.folder(call)
+    studies = [study_coverage(n, runs, call.seed, call.progress) for n in (5, 6, 8, 12, 20)]
+    studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
+    studies.append(study_warped(12, max(10, runs // 5), call.progress))
+    write_atomic(folder / "coverage.svg", coverage_picture(studies))
+    return HONESTY.measured({"all": {"studies": [vars(s) for s in studies]}}, folder).outcome()

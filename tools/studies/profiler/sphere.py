@@ -28,7 +28,7 @@ SEAM_FEATURES = ("first edge", "root", "second edge")
 HIP_MM, SLOPE_DEG = 50.0, float(np.degrees(np.arctan2(4.0, 3.0)))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WorldResult:
     """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and the frustum."""
 
@@ -92,8 +92,12 @@ def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
     felt = fit_touch_sphere(data.touches.rotation, data.touches.translation, data.tip, data.radius_m)
     best = compensate(linear, R, t, centers, felt.center)
     return {
-        METHODS[0]: ProfilerRecord(METHODS[0], linear.rotation, linear.translation, tip=data.tip),
-        METHODS[1]: ProfilerRecord(METHODS[1], best.rotation, best.translation, tip=data.tip),
+        METHODS[0]: ProfilerRecord(
+            method=METHODS[0], rotation=linear.rotation, translation=linear.translation, tip=data.tip
+        ),
+        METHODS[1]: ProfilerRecord(
+            method=METHODS[1], rotation=best.rotation, translation=best.translation, tip=data.tip
+        ),
         **joint_records(world),
     }
 
@@ -138,7 +142,9 @@ def measured(
     if world.boss is not None and boss:
         cloud = cloud_of(record, arm, *world.boss)
         found = fit_frustum(cloud)
-    return WorldResult(k, method, points, seam, each, found, cloud)
+    return WorldResult(
+        world=k, method=method, points_mm=points, seam_mm=seam, seam_each_mm=each, boss=found, cloud=cloud
+    )
 
 
 def _flange(record: ProfilerRecord, arm: DhArm, q: Floats) -> FlangePoses:
