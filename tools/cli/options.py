@@ -172,7 +172,7 @@ class Command:
 
     title: str
     function: Callable[..., None]
-    body: "Body"
+    body: Callable[..., Any]
 
 
 LARGEST_OPTION = 1e6

@@ -21,7 +21,7 @@ from weldcal.tools.report.render import fixed, fixed_row, render
 CALM, DRIFTED, WARMED = "no drift found", "the scanner has moved", "the scanner warms up"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MonitorReport:
     """What was watched, the calibration, the recalibrated result where it was asked for, and the folder."""
 

@@ -29,7 +29,7 @@ from weldcal.tools.report.pictures import GREY, OURS, TRUTH, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MotionReport:
     """The estimate, the records written, and the folder. ``dropped``: frames of the recording that no estimate used."""
 
@@ -174,7 +174,9 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
             ("device time of the offset, s", fixed(clock.reference_s, 3)),
         ]
     if clock.rolling_s is not None:
-        facts.append(("rolling time per unit of y/z, ms", f"{_ms_text(clock.rolling_s)} ± {_ms_text(clock.rolling_sigma_s)}"))
+        facts.append(
+            ("rolling time per unit of y/z, ms", f"{_ms_text(clock.rolling_s)} ± {_ms_text(clock.rolling_sigma_s)}")
+        )
     return render(
         "motion_calibration.html.j2",
         dataset=dataset,
