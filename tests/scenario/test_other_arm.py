@@ -14,8 +14,7 @@ from weldcal.models.tools.loading import WELDING
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.weld import run_weld
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.studies.arms.demo import ARMS
-from weldcal.tools.studies.arms.scaled import arm_scenario
+from weldcal.tools.worlds.scaled_arms import ARMS, arm_scenario
 
 HANGING = """
 arm: ur5e

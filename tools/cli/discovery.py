@@ -16,7 +16,7 @@ from weldcal.tools.cli.options import Command
 PACKAGES = ("weldcal.tools.commands", "weldcal.tools.studies", "weldcal.tools.cli")
 """Packages whose modules, at any depth, may hold commands."""
 
-DECORATOR = re.compile(r"^@command(\(.*?\))\ndef ", re.MULTILINE | re.DOTALL)
+DECORATOR = re.compile(r"^@command(\([^@]*?\))\n(?:@one_of\([^@]*?\)\n)?def ", re.MULTILINE | re.DOTALL)
 
 
 @dataclass(frozen=True)

@@ -86,25 +86,6 @@ def profiler_seeds(
     return Outcome(study.summary(), values={}, rows=rows)
 
 
-@command("reproduce weld", short_help="Run the weld law in a small kinematic world.")
-def weld(
-    call: Call,
-    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each weld.", min=1)] = 10,
-    rows: Annotated[str, option("--rows", "NAMES", "Only these rows, separated by commas.", show_default="all")] = "",
-    quick: Annotated[
-        bool, switch("--quick", "Two seeds of each weld, and two for the comparison of the laws.")
-    ] = False,
-) -> Outcome:
-    """Run the weld law in a small kinematic world: every target, the published law for comparison, figures, a report."""
-    from weldcal.tools.studies.weld.command import run_study
-    from weldcal.tools.studies.weld.report import print_study
-    from weldcal.tools.studies.weld.results import StudyOptions
-
-    folder, number = call.folder("reproduce", "weld"), min(seeds, 2) if quick else seeds
-    study = run_study(StudyOptions(folder, _names(rows), number, call.seed, quick), call.progress)
-    return _compared(study, text=partial(print_study, study))
-
-
 @command("reproduce profiler", short_help="Repeat both papers on laser profilers.")
 def profiler(
     call: Call,
@@ -124,24 +105,6 @@ def profiler(
     found = _compared(study, rows=rows)
     # the targets were set for the fixed files: other worlds may be harder
     return found if data is not None else replace(found, problem="")
-
-
-@command("reproduce cell", short_help="Weld in the whole simulated cell.")
-def cell(
-    call: Call,
-    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each scenario.", min=1)] = 3,
-    scenarios: Annotated[str, option("--scenarios", "NAMES", "Scenarios, separated by commas.")] = "s_groove,l_groove",
-    seam_mm: Annotated[
-        float | None, option("--seam-mm", "MM", "Weld only this length; default: all.", min=10.0)
-    ] = None,
-    law: Annotated[str, option("--law", "NAME", "Steering law, for comparison.")] = "guarded",
-) -> Outcome:
-    """Weld in the whole simulated cell, with contact and rendered tag: seam points, torch and real-time factor."""
-    from weldcal.tools.studies.cell.study import CellStudyOptions, print_cell_study, run_cell_study
-
-    folder = call.folder("reproduce", "cell")
-    study = run_cell_study(CellStudyOptions(folder, _names(scenarios), seeds, call.seed, seam_mm, law), call.progress)
-    return _compared(study, text=partial(print_cell_study, study))
 
 
 @command("reproduce flange-sphere", short_help="Repeat Table 2 of the flange paper with a sphere.")

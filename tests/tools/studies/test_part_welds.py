@@ -16,8 +16,9 @@ from weldcal.systems.messages import CalibrationStatus, PlannedSeam, Refinement
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.report.demo import DemoResult
-from weldcal.tools.studies.part_welds.step_parts import PARTS
-from weldcal.tools.studies.part_welds.study import Trial, run_part_welds, write_cell
+from weldcal.tools.studies.parts.welds import run_part_welds
+from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.step_parts import PARTS
 
 
 def test_a_refined_cell_calibrates_scanner_and_arm_before_it_welds(tmp_path: Path) -> None:
