@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,11 @@ def test_importing_weldcal_loads_nothing_else_and_shows_its_functions() -> None:
     finished = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True)
     assert finished.stdout.split() == sorted(weldcal.__all__)
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
-        weldcal.calibrat  # noqa: B018
+        weldcal.calibrat  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_weldcal_states_its_installed_version() -> None:
+    assert weldcal.__version__ == version("weldcal")
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (3, 3, 4), (2, 4, 4)])
