@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydrake.geometry import Meshcat
 
 from weldcal.calibration.data import clouds
 from weldcal.calibration.flange import fit as flange_fit
@@ -129,13 +130,19 @@ def hand_eye(robot: Floats, camera: Floats, mounting: str = "eye_in_hand") -> Ha
     return solve_pairs(pairs)
 
 
-def build_cell(scenario: Scenario | str, seed: int = 0) -> Cell[Any]:
+def build_cell(scenario: Scenario | str, seed: int = 0, meshcat: Meshcat | None = None) -> Cell[Any]:
     """Build the Drake Diagram of a scenario (or of its name or path); close its `.station` after use.
+
+    Args:
+        meshcat: viewer of the cell; None: no viewer.
+
+    Returns:
+        `.diagram`; `.plant` and `.scene_graph` of its simulation, finalized; `.logs`, the VectorLogSinks by name.
 
     Raises:
         InputError, UnreachableScanner: the scenario cannot be run.
     """
-    return build(load_scenario(scenario) if isinstance(scenario, str) else scenario, seed)
+    return build(load_scenario(scenario) if isinstance(scenario, str) else scenario, seed, meshcat)
 
 
 def run(scenario: str, out: str | Path, seed: int = 0, *, recording: bool = True) -> dict[str, object]:
