@@ -288,6 +288,8 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
         console.emit_text(outcome.text)
     else:
         values = dict(summary if outcome.values is None else outcome.values)
+        if outcome.first is not None:
+            values.pop("unobservable", None)  # what matters to the pose is among the first screen's concerns
         if outcome.first is not None and isinstance(warnings := values.get("warnings"), list):
             said_there = (*outcome.first.concerns, *outcome.first.notes)
             values["warnings"] = [text for text in warnings if text not in said_there]
