@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         fit_flange,
         hand_eye,
         load_scenario,
+        read_calibration,
         read_cloud,
         run,
         verify,
@@ -19,7 +20,17 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["build_cell", "calibrate", "fit_flange", "hand_eye", "load_scenario", "read_cloud", "run", "verify"]
+__all__ = [
+    "build_cell",
+    "calibrate",
+    "fit_flange",
+    "hand_eye",
+    "load_scenario",
+    "read_calibration",
+    "read_cloud",
+    "run",
+    "verify",
+]
 
 if not TYPE_CHECKING:  # a type checker would take every name for one of weldcal
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from pydrake.geometry import Meshcat
 
 from weldcal.calibration.data import clouds
+from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.flange import fit as flange_fit
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.files import PosePairs
@@ -30,7 +31,7 @@ Floats = npt.NDArray[np.floating[Any]]
 FLANGE = "iso9409-1-50-4-m6"
 
 __all__ = [
-    "build_cell", "calibrate", "fit_flange", "hand_eye", "load_scenario", "read_cloud", "run", "verify",
+    "build_cell", "calibrate", "fit_flange", "hand_eye", "load_scenario", "read_calibration", "read_cloud", "run", "verify",
 ]  # fmt: skip
 
 
@@ -96,6 +97,18 @@ def read_cloud(file: str | Path, unit: str = "m") -> Floats:
     if metres is None:
         raise InputError(f"The unit of a cloud must be m or mm, not '{unit}'.")
     return metres * clouds.read_cloud(Path(file))
+
+
+def read_calibration(file: str | Path) -> CalibrationResult:
+    """Read a calibration: the folder that `calibrate` wrote, or its calibration.yaml.
+
+    Returns:
+        `.X_BC` (X_FC of a scanner on the flange has the same name), `.covariance` (6, 6); `.correct(points_C)` corrects scanned points.
+
+    Raises:
+        InputError: there is no calibration, or it cannot be read.
+    """
+    return load_result(Path(file))
 
 
 def fit_flange(points_C: Floats, flange: str = FLANGE) -> FlangeFit:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import CalibrationResult, correction_note, matrix4
+from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note, matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.nested import bootstrap_interval, mean_interval
 from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
@@ -116,7 +116,8 @@ class CalibrationReport:
         tolerance = None
         if self.limit_mm is not None:
             tolerance = Tolerance("the error at the work point, 95 %,", figure, self.limit_mm, "--limit-mm")
-        notes = [*filter(None, (correction_note(r),)), *refused_note(self.refused, len(r.poses)), *self._refined]
+        corrected = correction_note(r, self.out / RESULT_FILE)
+        notes = [*filter(None, (corrected,)), *refused_note(self.refused, len(r.poses)), *self._refined]
         found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),))
 
@@ -293,7 +294,7 @@ class VerifyReport:
             tolerance=tolerance,
             unseen=len(new),
             concerns=self.warnings,
-            notes=tuple(filter(None, (correction_note(r),))),
+            notes=tuple(filter(None, (correction_note(r, RESULT_FILE),))),
             settled=settled,
         )
         if len(new):

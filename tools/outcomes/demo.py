@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from weldcal.calibration.data.results import RESULT_FILE, correction_hint
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.next_scan import next_scan
 from weldcal.systems.jobs.weld.settings import work_point
@@ -106,11 +107,7 @@ class DemoResult:
         concerns = (*self.warnings, *estimate.warnings)
         notes = [*refused_note(status.refused, self.n_scans), *self.arm_note]
         if estimate.scanner is not None:
-            # as calibration.yaml says to programs that use X_BC
-            notes.insert(
-                0,
-                f"X_BC applies to corrected scanner points: multiply every point, in metres, by {estimate.scanner.formula}.",
-            )
+            notes.insert(0, correction_hint("X_BC", self.folder / RESULT_FILE))
         found = Findings(against, tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
         return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())
