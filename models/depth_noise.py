@@ -13,7 +13,7 @@ Depth = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DepthNoise:
     """How a scanner errs along its optical axis; metres, radians, pixels. All zero is a perfect scanner.
 

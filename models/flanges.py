@@ -34,7 +34,7 @@ CIRCLE_SEGMENTS = 256
 """Default facets of a full turn: the chord of a 63 mm circle then lies at most 2.4 micrometres inside it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FlangeStandard:
     """A tool flange or a flange-like ring, in metres and radians (angles about z of frame R, from x).
 
@@ -125,7 +125,18 @@ def flange_ring(
 ) -> FlangeStandard:
     """A flange-like ring without holes (a tool's calibration ring, the rim of a wrist); diameters in metres."""
     return FlangeStandard(
-        designation, outer_m, outer_m, bore_m, bore_depth_m, 0, "", 0.0, (), 0.0, 0.0, chamfer_m=chamfer_m
+        designation=designation,
+        pitch_circle_m=outer_m,
+        outer_m=outer_m,
+        bore_m=bore_m,
+        bore_depth_m=bore_depth_m,
+        n_holes=0,
+        thread="",
+        hole_m=0.0,
+        hole_angles_rad=(),
+        pin_m=0.0,
+        pin_angle_rad=0.0,
+        chamfer_m=chamfer_m,
     )
 
 

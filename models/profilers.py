@@ -15,7 +15,7 @@ from weldcal.models.mesh import TriMesh
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ProfilerPreset:
     """What a profiler sees: samples over a width, between two distances, with its errors (all m; shares of samples).
 

@@ -15,7 +15,7 @@ CATALOGUE = ("flange", "payload", "reach", "repeatability", "joint limits")
 """What a maker's data sheet says of a robot, beside its kinematics."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Robot:
     """One robot. ``flange`` is its ISO 9409-1 designation, the dowel at ``pin_angle_rad``; payload kg, reach m (the maker's
     working radius), repeatability m; ``inverse`` says how its joint angles are found; ``source`` where the numbers are from.
@@ -108,7 +108,19 @@ def _ur(
     name: str, title: str, payload: float, reach: float, repeatability: float, source: str, flange: str = ISO_50
 ) -> Robot:
     known = CONFIRMED.get(name, ())
-    return Robot(name, title, 6, flange, _RIGHT_ANGLE, payload, reach, repeatability, CLOSED_FORM, source, known)
+    return Robot(
+        name=name,
+        title=title,
+        joints=6,
+        flange=flange,
+        pin_angle_rad=_RIGHT_ANGLE,
+        payload_kg=payload,
+        reach_m=reach,
+        repeatability_m=repeatability,
+        inverse=CLOSED_FORM,
+        source=source,
+        confirmed=known,
+    )
 
 
 ROBOTS: dict[str, Robot] = {
@@ -125,22 +137,46 @@ ROBOTS: dict[str, Robot] = {
         _ur("ur20", "Universal Robots UR20", 20.0, 1.750, 1e-4, _UR_LARGE, ISO_80),
         _ur("ur30", "Universal Robots UR30", 30.0, 1.300, 1e-4, _UR_LARGE, ISO_80),
         Robot(
-            "franka_panda", "Franka Emika Panda", 7, ISO_50, math.pi, 3.0, 0.855, 1e-4, NUMERIC,
-            "Franka Emika data sheet; limits: FCI documentation; kinematics: franka_description; dowel: the recorded scans' CAD",
-            CONFIRMED["franka_panda"],
+            name="franka_panda",
+            title="Franka Emika Panda",
+            joints=7,
+            flange=ISO_50,
+            pin_angle_rad=math.pi,
+            payload_kg=3.0,
+            reach_m=0.855,
+            repeatability_m=1e-4,
+            inverse=NUMERIC,
+            source="Franka Emika data sheet; limits: FCI documentation; kinematics: franka_description; dowel: the recorded scans' CAD",
+            confirmed=CONFIRMED["franka_panda"],
         ),
         Robot(
-            "franka_fr3", "Franka Research 3", 7, ISO_50, math.pi, 3.0, 0.855, 1e-4, NUMERIC,
-            "Franka Research 3 data sheet; limits and kinematics: franka_description; dowel as on the Panda",
-            CONFIRMED["franka_fr3"],
+            name="franka_fr3",
+            title="Franka Research 3",
+            joints=7,
+            flange=ISO_50,
+            pin_angle_rad=math.pi,
+            payload_kg=3.0,
+            reach_m=0.855,
+            repeatability_m=1e-4,
+            inverse=NUMERIC,
+            source="Franka Research 3 data sheet; limits and kinematics: franka_description; dowel as on the Panda",
+            confirmed=CONFIRMED["franka_fr3"],
         ),
         Robot(
-            "aubo_i5", "AUBO i5", 6, ISO_50, _RIGHT_ANGLE, 5.0, 0.8865, 5e-5, NUMERIC,
-            "AUBO i5 user manual (not confirmed by a second source); kinematics: AUBO's aubo_i5.urdf",
-            CONFIRMED["aubo_i5"],
+            name="aubo_i5",
+            title="AUBO i5",
+            joints=6,
+            flange=ISO_50,
+            pin_angle_rad=_RIGHT_ANGLE,
+            payload_kg=5.0,
+            reach_m=0.8865,
+            repeatability_m=5e-5,
+            inverse=NUMERIC,
+            source="AUBO i5 user manual (not confirmed by a second source); kinematics: AUBO's aubo_i5.urdf",
+            confirmed=CONFIRMED["aubo_i5"],
         ),
     )
-}  # fmt: skip
+}
 """Every robot known by name; the ISO 9409-1 designation of each in one place."""
 
 CONTROLLER_MODELS: dict[str, tuple[str, int]] = {

@@ -13,7 +13,7 @@ from weldcal.models.keys import read_part
 LARGEST_PX = 8192
 
 
-@dataclass
+@dataclass(kw_only=True)
 class NoisePart:
     """What differs from scan to scan."""
 
@@ -40,7 +40,7 @@ class DistortionPart:
     warp_mm: float = 0.0  # largest error of a smooth warp of the depth at optimum_mm
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ScannerPart:
     """A scanner file. Pixels as in OpenCV: the centre of the first pixel is (0, 0). fx, fy, cx, cy, or field_of_view_deg."""
 
@@ -59,7 +59,7 @@ class ScannerPart:
     distortion: DistortionPart = field(default_factory=DistortionPart)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReadScanner:
     """A scanner file in pixels and metres."""
 
@@ -138,4 +138,16 @@ def _read(path: Path, changed: int) -> ReadScanner:
     except InputError as error:
         raise InputError(f"'{file}': {error}") from error
     near, far = part.near_mm / 1e3, part.far_mm / 1e3
-    return ReadScanner(part.name or path.stem, part.width, part.height, fx, fy, cx, cy, near, far, optimum / 1e3, noise)
+    return ReadScanner(
+        name=part.name or path.stem,
+        width=part.width,
+        height=part.height,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        near_m=near,
+        far_m=far,
+        optimum_m=optimum / 1e3,
+        noise=noise,
+    )

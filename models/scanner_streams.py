@@ -15,7 +15,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScannerStream:
     """Timing of streamed frames; seconds. A frame is captured in the middle of the exposure of its middle row.
 

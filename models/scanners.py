@@ -26,7 +26,7 @@ from weldcal.models.scanner_files import read_scanner_file
 Floats = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScannerPreset:
     """A scanner: image size and intrinsics in pixels (OpenCV convention), working range in metres, and its noise."""
 
@@ -95,7 +95,19 @@ def _by_area(
 ) -> ScannerPreset:
     """A scanner with square pixels and a centred axis; its image spans `scan_width` metres at the optimum distance."""
     f = width * optimum / scan_width
-    return ScannerPreset(name, width, height, f, f, 0.5 * (width - 1), 0.5 * (height - 1), near, far, optimum, noise)
+    return ScannerPreset(
+        name=name,
+        width=width,
+        height=height,
+        fx=f,
+        fy=f,
+        cx=0.5 * (width - 1),
+        cy=0.5 * (height - 1),
+        near_m=near,
+        far_m=far,
+        optimum_m=optimum,
+        noise=noise,
+    )
 
 
 def _structured_light(sigma_m: float, optimum_m: float, correlation_px: float, flying: float) -> DepthNoise:
@@ -131,17 +143,17 @@ SCANNERS: dict[str, ScannerPreset] = {
         _by_area("motioncam_3d_stream", 1068, 800, 0.497, 0.650, 0.939, 0.590, _STREAMED),
         _by_area("motioncam_3d_stream_half", 816, 612, 0.497, 0.650, 0.939, 0.590, _STREAMED),
         ScannerPreset(
-            "azure_kinect",
-            640,
-            576,
-            504.0,
-            504.0,
-            319.5,
-            287.5,
-            0.5,
-            3.86,
-            1.0,
-            DepthNoise(
+            name="azure_kinect",
+            width=640,
+            height=576,
+            fx=504.0,
+            fy=504.0,
+            cx=319.5,
+            cy=287.5,
+            near_m=0.5,
+            far_m=3.86,
+            optimum_m=1.0,
+            noise=DepthNoise(
                 sigma_m=1.0e-3,
                 reference_m=1.0,
                 edge_step_m=0.02,

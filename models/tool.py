@@ -34,7 +34,7 @@ class Placed:
         return RigidTransform(RollPitchYaw(*self.rpy_rad), self.xyz_m)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ToolShape:
     """A drawn body of a tool, on the flange: ``size`` m of a box (x, y, z), cylinder (radius, length along z), capsule (likewise),
     sphere (radius) or mesh (none: vertices and triangles are those of the file)."""
@@ -61,7 +61,7 @@ def flipped_where_it_is(X: RigidTransform) -> RigidTransform:
     return RigidTransform(R_FLIPPED, X.translation()) if same else X
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WeldingTool:
     """Numbers of a tool, all in the flange frame F (m, rad, N, kg). The defaults are the welding tool of the paper's figure; a tool
     file gives the fields at the end, which replace what follows from the others (models/tools).
@@ -236,7 +236,10 @@ class WeldingTool:
             ("torch_wire", (0.0006, 0.012), (x, 0.0, float(p_FW[2]) - 0.006), "steel"),
         ]
         kinds = {2: "cylinder", 3: "box"}
-        return tuple(ToolShape(name, kinds[len(size)], size, Placed(at), colour) for name, size, at, colour in rows)
+        return tuple(
+            ToolShape(name=name, kind=kinds[len(size)], size=size, place=Placed(at), colour=colour)
+            for name, size, at, colour in rows
+        )
 
     @property
     def X_KM_rest(self) -> RigidTransform:

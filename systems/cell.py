@@ -89,7 +89,14 @@ def build_cell(
     try:
         check_way_home(scenario, station)
         person = person or Person()
-        wiring = Wiring(DiagramBuilder(), station, scenario, seed, meshcat, person if played is None else None)
+        wiring = Wiring(
+            builder=DiagramBuilder(),
+            station=station,
+            scenario=scenario,
+            seed=seed,
+            meshcat=meshcat,
+            person=person if played is None else None,
+        )
         cell = _build(job, job.plan(scenario, station, seed), wiring, noted, open_sink, live)
         return dc.replace(cell, person=person)
     except BaseException:

@@ -103,7 +103,7 @@ class UrStatus(Message):
         return self.fault is None and self.program_running and self.safety_mode in ("NORMAL", "REDUCED")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class JobCommand(Message):
     """The JobSequencer's command to the other systems."""
 
@@ -123,7 +123,7 @@ class JobCommand(Message):
     seam: int = 0  # number of the seam that is planned and welded, from 0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FlangeEstimate(Message):
     """The FlangeEstimator's result for one scan."""
 
@@ -149,7 +149,7 @@ class VerificationResult(Message):
     tilt_rad: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Refinement(Message):
     """What became of the refinement of a live calibration: the arm with corrected kinematics or the local field, where one is applied;
     the text of the kinematics file, the stated errors of the arm, and the JSON object of `calibrate`."""
@@ -164,7 +164,7 @@ class Refinement(Message):
     document: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationStatus(Message):
     """The state of the IterativeCalibrator after its newest scan."""
 
@@ -209,7 +209,7 @@ class CalibrationStatus(Message):
         return ScannerCorrection() if found is None else found
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PlannedSeam(Message):
     """The SeamPlanner's result for the workpiece scan."""
 

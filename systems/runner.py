@@ -38,7 +38,7 @@ def no_progress(stage: str, fraction: float) -> None:
     """A progress callback that does nothing."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Run(Generic[JobOf]):
     """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began.
 
@@ -141,7 +141,7 @@ def run_cell(
         HostTooLate: the computer cannot keep the robot's rate; nothing has moved.
     """
     simulator, station = Simulator(cell.diagram), cell.station
-    run = Run(cell, simulator, clock=station.robot.clock)
+    run = Run(cell=cell, simulator=simulator, clock=station.robot.clock)
     if realtime and run.clock is None:
         simulator.set_target_realtime_rate(1.0)
         cell.person.ask_pace(1.0)

@@ -38,7 +38,7 @@ from weldcal.systems.scenario.workpiece import made, part_of
 from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class Truth(Message):
     """Ground truth of a simulation, for reports and tests (`cheat.*`) only."""
 
@@ -53,7 +53,7 @@ class Truth(Message):
     arm: ArmModel | None = None  # with its true kinematics
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class Station:
     """The station's Diagram and the handles that the cell needs. The caller that makes a station must close it."""
 
@@ -213,7 +213,9 @@ def _make_station(
     tool = _tool(scenario, cad)
     devices: dict[str, DriverConfig] = {} if played is not None else {name: getattr(scenario, name) for name in DEVICES}
     builder = DiagramBuilder()
-    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot, closables=opened)
+    build = StationBuild(
+        builder=builder, arm=robot.arm, tool=tool, q_start=robot.q_start, rng=rng, robot=robot, closables=opened
+    )
     furnishing = Furnishing()
     world, true_arm = None, controller
     if any(config.SIMULATED for config in devices.values()):
@@ -253,15 +255,15 @@ def _make_station(
     scanner = scenario.scanner_config()
     on_base = scanner is None or scanner.mounted_on == "base"
     truth = Truth(
-        X_LC if on_base else None,
-        X_BP if world is not None else None,
-        real if world is not None else None,
-        build.find(TabletTruth),
-        X_LC,
-        None if furnishing.second is None else furnishing.second.X_BD,
-        build.find(ProfilerTruth),
-        build.find(TrueScanner),
-        None if world is None else true_arm,
+        X_BC=X_LC if on_base else None,
+        X_BP=X_BP if world is not None else None,
+        workpiece=real if world is not None else None,
+        tablet=build.find(TabletTruth),
+        X_LC=X_LC,
+        X_BD=None if furnishing.second is None else furnishing.second.X_BD,
+        profiler=build.find(ProfilerTruth),
+        scanner=build.find(TrueScanner),
+        arm=None if world is None else true_arm,
     )
     _export(build, world, truth, scenario, surroundings)
     diagram = builder.Build()
@@ -271,7 +273,18 @@ def _make_station(
     background: Background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
     if played is not None:
         background = RepeatedBackground(looks=played.looks)
-    return Station(diagram, robot, tool, cad, truth, world, second, background, tuple(opened), surroundings)
+    return Station(
+        diagram=diagram,
+        robot=robot,
+        tool=tool,
+        cad=cad,
+        truth=truth,
+        world=world,
+        second=second,
+        background=background,
+        devices=tuple(opened),
+        surroundings=surroundings,
+    )
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:

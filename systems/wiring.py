@@ -16,7 +16,7 @@ from weldcal.systems.station import Station
 AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Wiring:
     """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers; `person` may hold and end
     the run (None: a recording is played back).

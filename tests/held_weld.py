@@ -34,7 +34,7 @@ def short_weld() -> Scenario:
     return load_scenario("straight_groove", SHORT_WELD)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class HeldWeld:
     """The run, ms of the robot's time from the hold (the torch goes off) to the still arm, and the torch near the join: mean and
     largest distance from the true seam, the longest stretch that was left out, and how much was welded twice, m."""
@@ -81,4 +81,12 @@ def held_weld(scenario: Scenario, open_sink: OpenSink | None = None) -> HeldWeld
     twice = -float(np.diff(error.s).min())
     left_out = float(np.diff(np.sort(error.s[near])).max())
     still_ms = 1e3 * float(times[still] - times[off])
-    return HeldWeld(run, still_ms, float(aside.mean()), float(aside.max()), left_out, twice, live)
+    return HeldWeld(
+        run=run,
+        still_ms=still_ms,
+        mean_m=float(aside.mean()),
+        largest_m=float(aside.max()),
+        left_out_m=left_out,
+        welded_twice_m=twice,
+        live=live,
+    )

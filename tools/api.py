@@ -139,7 +139,9 @@ def hand_eye(robot: Floats, camera: Floats, mounting: str = "eye_in_hand") -> Ha
     shapes = np.shape(robot), np.shape(camera)
     if any(len(shape) != 3 or shape[1:] != (4, 4) for shape in shapes) or shapes[0] != shapes[1]:
         raise InputError(f"robot and camera must both be (n, 4, 4) matrices; they are {shapes[0]} and {shapes[1]}.")
-    pairs = PosePairs("the poses", np.asarray(robot, dtype=float), np.asarray(camera, dtype=float), mounting)
+    pairs = PosePairs(
+        source="the poses", robot=np.asarray(robot, dtype=float), camera=np.asarray(camera, dtype=float), mode=mounting
+    )
     return solve_pairs(pairs)
 
 
@@ -164,5 +166,5 @@ def run(scenario: str, out: str | Path, seed: int = 0, *, recording: bool = True
     Raises:
         InputError, UnreachableScanner, RobotRefused: the scenario cannot be run; nothing has been written or moved.
     """
-    options = RunOptions(scenario, Path(out), seed, recording=recording)
+    options = RunOptions(scenario=scenario, out=Path(out), seed=seed, recording=recording)
     return dict(run_procedure(options, lambda stage, fraction: None).summary())

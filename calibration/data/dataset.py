@@ -50,7 +50,7 @@ class Pair:
     has_orientation: bool
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Dataset:
     """A dataset, checked. ``poses`` maps id to X_BF; ``clouds`` maps id to file; ``refused`` lists (id, reason).
     ``recorded`` holds the clouds, in metres, that stand in no file of their own; ``notes`` say what was recognised."""
@@ -161,7 +161,7 @@ def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
         pairs = _pairs(folder / "pairs.csv", *scales)
         again = _repeated({p.id: (*p.X_BR.GetAsMatrix34().ravel(), *p.p_CR) for p in pairs})
         pairs = tuple(p for p in pairs if p.id not in dict(again))
-        return Dataset(folder, header, {}, {}, pairs, again, hashes)
+        return Dataset(folder=folder, header=header, poses={}, clouds={}, pairs=pairs, refused=again, hashes=hashes)
     if source is not None:
         return _recognised(folder, header, source, hashes)
     if bag is not None:
@@ -229,7 +229,17 @@ def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str,
     note = f"{bag.name}: {len(X)} scans at rest, {found.read_as}."
     poses = {id: _rigid(pose) for id, pose in zip(found.ids, X, strict=True)}
     clouds = {id: bag / id for id in found.ids}
-    return Dataset(folder, header, poses, clouds, (), found.refused, hashes, recorded, (note,))
+    return Dataset(
+        folder=folder,
+        header=header,
+        poses=poses,
+        clouds=clouds,
+        pairs=(),
+        refused=found.refused,
+        hashes=hashes,
+        recorded=recorded,
+        notes=(note,),
+    )
 
 
 def _finished(
@@ -253,7 +263,16 @@ def _finished(
             f"example {next(iter(poses), 'pose01')}.pcd."
         )
     hashes.update({f"clouds/{path.name}": content[id] for id, path in clouds.items()})
-    return Dataset(folder, header, poses, clouds, (), refused + again, hashes, notes=notes)
+    return Dataset(
+        folder=folder,
+        header=header,
+        poses=poses,
+        clouds=clouds,
+        pairs=(),
+        refused=refused + again,
+        hashes=hashes,
+        notes=notes,
+    )
 
 
 def _rigid(X: Array) -> RigidTransform:

@@ -31,7 +31,7 @@ class ScannerGuess:
     radius_m: float = 0.06
 
 
-@dataclass
+@dataclass(kw_only=True)
 class PoseForm:
     """How the poses are written, where it is not x,y,z,qw,qx,qy,qz: ``file`` (a file or folder beside dataset.yaml), ``rotation`` (a
     notation by name), ``angles`` (rad or deg), ``frame`` (flange_in_base, or base_in_flange for the inverse), ``tcp`` (the
@@ -49,7 +49,7 @@ class PoseForm:
     cloud_topic: str = ""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class DatasetHeader:
     """Contents of dataset.yaml. ``mode``: static (a scan at each pose) or motion (scans while the arm moves)."""
 

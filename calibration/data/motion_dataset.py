@@ -60,7 +60,7 @@ class FrameTime:
     device: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MotionDataset:
     """A recording in motion, checked. ``frames`` ascend by arrival and have a cloud each (``clouds``: id to file); ``refused`` lists
     (id, reason); ``warnings`` are sentences for the user."""
@@ -159,7 +159,16 @@ def load_motion_dataset(folder: Path, *, robot: str | None = None) -> MotionData
         raise DatasetError(
             f"No frame in '{folder.name}/frames.csv' has a cloud in clouds/; name the files after the ids."
         )
-    return MotionDataset(folder, header, stream, tuple(kept), clouds, tuple(refused), tuple(said), hashes)
+    return MotionDataset(
+        folder=folder,
+        header=header,
+        stream=stream,
+        frames=tuple(kept),
+        clouds=clouds,
+        refused=tuple(refused),
+        warnings=tuple(said),
+        hashes=hashes,
+    )
 
 
 def save_motion_dataset(

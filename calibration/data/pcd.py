@@ -18,7 +18,7 @@ _LONGEST_HEADER = 65536
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Header:
     """What the header says: of x, y, z the column (in text) and (offset, type) in a record; bytes and numbers of a record."""
 
@@ -107,7 +107,16 @@ def _header(path: Path, begin: bytes) -> _Header:
             (sum(s * n for s, n in zip(sizes[:k], counts[:k], strict=True)), f"<{_KINDS[kinds[k]]}{sizes[k]}")
         )
     record = sum(s * n for s, n in zip(sizes, counts, strict=True))
-    return _Header(tuple(columns), tuple(fields), record, sum(counts), width, height, data, at)
+    return _Header(
+        columns=tuple(columns),
+        fields=tuple(fields),
+        record=record,
+        numbers=sum(counts),
+        width=width,
+        height=height,
+        data=data,
+        begin=at,
+    )
 
 
 def _extent(path: Path, found: dict[str, list[str]]) -> tuple[int, int]:

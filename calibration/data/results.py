@@ -23,7 +23,7 @@ ON_BASE = "eye_on_base"
 RESULT_FILE = "calibration.yaml"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PoseRecord:
     """One pose: whether it was used, its residual and held-out error (mm), tilts (deg); reason where it was refused."""
 
@@ -36,7 +36,7 @@ class PoseRecord:
     held_out_tilt_deg: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class IcpRecord:
     """Algorithm 1's ICP figure at one verification pose: six numbers at the flange centre, and the components it does not see."""
 
@@ -49,7 +49,7 @@ class IcpRecord:
     true_error_mm: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CalibrationResult:
     """Contents of calibration.yaml. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera
     origin; ``joint_covariance`` (6 + K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one;
@@ -261,17 +261,29 @@ def _covariance(d: Section, key: str, size: int) -> Array:
 
 def _pose_record(r: Section) -> PoseRecord:
     _only(r, PoseRecord)
-    numbers = ("residual_mm", "held_out_mm", "tilt_deg", "held_out_tilt_deg")
-    return PoseRecord(r.text("id"), r.yes("used"), r.text("reason"), *(r.optional(key) for key in numbers))
+    return PoseRecord(
+        id=r.text("id"),
+        used=r.yes("used"),
+        reason=r.text("reason"),
+        residual_mm=r.optional("residual_mm"),
+        held_out_mm=r.optional("held_out_mm"),
+        tilt_deg=r.optional("tilt_deg"),
+        held_out_tilt_deg=r.optional("held_out_tilt_deg"),
+    )
 
 
 def _icp_record(r: Section) -> IcpRecord:
     _only(r, IcpRecord)
     rotation, translation = (tuple(float(v) for v in r.array(key, 3)) for key in ("rotation_deg", "translation_mm"))
     return IcpRecord(
-        r.text("id"), r.text("method"), rotation, translation, r.number("translation_norm_mm", low=0.0), r.texts("unseen"),
-        r.optional("true_error_mm"),
-    )  # fmt: skip
+        id=r.text("id"),
+        method=r.text("method"),
+        rotation_deg=rotation,
+        translation_mm=translation,
+        translation_norm_mm=r.number("translation_norm_mm", low=0.0),
+        unseen=r.texts("unseen"),
+        true_error_mm=r.optional("true_error_mm"),
+    )
 
 
 def _only(r: Section, kind: type) -> None:

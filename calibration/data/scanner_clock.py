@@ -12,7 +12,7 @@ ARRIVAL, DEVICE = "arrival", "device"
 _NUMBERS = ("offset_s", "sigma_s", "jitter_s", "reference_s", "drift", "drift_sigma", "rolling_s", "rolling_sigma_s")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScannerClock:
     """When a frame was taken, on the robot's clock, s.
 

@@ -21,7 +21,7 @@ class ArmErrors:
     sigma: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Case:
     """n scans of a flange: X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and outward normals m
     (n, 3) in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise`` (n,) m rms of each face about its plane

@@ -25,7 +25,7 @@ _TRIPLES = 300
 _BEST = 0.6  # share of the scans that the start must explain
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Fit:
     """A fitted model: camera poses R (G, 3, 3), p (G, 3); scanner terms; the cause's numbers a (p,); residuals of centres e (n, 3) m and of
     normals (n,) rad; spreads per axis; log-likelihood.
@@ -177,7 +177,20 @@ def fit(
     occam = (
         _narrowed(rows, np.concatenate([np.zeros(6 * G + 4, dtype=bool), held]), sigmas[held]) if held.any() else 0.0
     )
-    return Fit(R, t, s, a[:own_numbers], e, tilt, sigma, sigma_n, loglik, free, n, occam)
+    return Fit(
+        R=R,
+        p=t,
+        scanner=s,
+        a=a[:own_numbers],
+        e=e,
+        tilt=tilt,
+        sigma_m=sigma,
+        sigma_rad=sigma_n,
+        loglik=loglik,
+        size=free,
+        n=n,
+        occam=occam,
+    )
 
 
 def _narrowed(rows: Array, held: NDArray[np.bool_], sigma: Array) -> float:

@@ -127,17 +127,17 @@ def _tcp_starts(case: Case, null: Fit) -> Iterator[Fit]:
     U, _, Vt = np.linalg.svd(x[:9].reshape(3, 3))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     yield Fit(
-        np.asarray(R[None]),
-        np.asarray(x[9:12][None]),
-        null.scanner,
-        np.asarray(x[12:]),
-        null.e,
-        null.tilt,
-        0.0,
-        0.0,
-        0.0,
-        0,
-        n,
+        R=np.asarray(R[None]),
+        p=np.asarray(x[9:12][None]),
+        scanner=null.scanner,
+        a=np.asarray(x[12:]),
+        e=null.e,
+        tilt=null.tilt,
+        sigma_m=0.0,
+        sigma_rad=0.0,
+        loglik=0.0,
+        size=0,
+        n=n,
     )
 
 

@@ -41,11 +41,11 @@ def case_of(
     nan = np.full(3, np.nan)
     X_BR = np.array([o.X_BR.GetAsMatrix4() for o in observations]).reshape(-1, 4, 4)
     return Case(
-        tuple(o.id for o in observations),
-        X_BR @ inverse(X_FR),
-        np.array([o.p_CR for o in observations]).reshape(-1, 3),
-        np.array([nan if o.n_C is None else o.n_C for o in observations]).reshape(-1, 3),
-        X_FR,
+        ids=tuple(o.id for o in observations),
+        X_BF=X_BR @ inverse(X_FR),
+        c=np.array([o.p_CR for o in observations]).reshape(-1, 3),
+        m=np.array([nan if o.n_C is None else o.n_C for o in observations]).reshape(-1, 3),
+        X_FR=X_FR,
         noise=np.array([fits[o.id].plane_rms_m if o.id in fits else np.nan for o in observations]),
         coverage=np.array([fits[o.id].coverage if o.id in fits else np.nan for o in observations]),
         robot=robot if oriented else "",
@@ -108,11 +108,11 @@ def read_case(path: Path) -> Case:
     if not np.isfinite(seen[:, :3]).all() or not all(np.isfinite(X).all() for X in poses.values()):
         raise InputError(f"'{path.name}' lacks a number of a scan.")
     return Case(
-        ids,
-        np.array([poses[i] for i in ids]).reshape(-1, 4, 4),
-        seen[:, :3],
-        seen[:, 3:6],
-        poses.get(_FEATURE, np.eye(4)),
+        ids=ids,
+        X_BF=np.array([poses[i] for i in ids]).reshape(-1, 4, 4),
+        c=seen[:, :3],
+        m=seen[:, 3:6],
+        X_FR=poses.get(_FEATURE, np.eye(4)),
         noise=seen[:, 6],
         coverage=seen[:, 7],
         robot=words.get("robot", ""),

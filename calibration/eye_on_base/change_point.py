@@ -28,7 +28,7 @@ _HUBER = 2.0
 _FLOOR_M = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ChangePoint:
     """A change between two poses: ids of the last before and of the first after it; the two camera poses; the rms shift (m)
     of the flange centres that it makes, the spread per axis (m) with and without it, and the probability by chance."""
@@ -89,9 +89,16 @@ def find_change(observations: Sequence[Observation]) -> ChangePoint | None:
     if probability > FALSE_ALARM or shift < _LARGER_THAN * at_split.sigma:
         return None
     return ChangePoint(
-        k, observations[k - 1].id, observations[k].id, at_split.X_before, at_split.X_after,
-        shift, at_split.sigma, single.own_sigma, probability,
-    )  # fmt: skip
+        index=k,
+        before=observations[k - 1].id,
+        after=observations[k].id,
+        X_BC_before=at_split.X_before,
+        X_BC_after=at_split.X_after,
+        shift_m=shift,
+        with_m=at_split.sigma,
+        without_m=single.own_sigma,
+        probability=probability,
+    )
 
 
 @dataclass(frozen=True, eq=False)

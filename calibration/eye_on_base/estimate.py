@@ -25,7 +25,7 @@ class HeldOut:
     tilt_rad: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CalibrationEstimate:
     """Pose of the camera in the base with its covariance, residuals and held-out errors.
 

@@ -31,7 +31,7 @@ CIRCLE_OWN = np.array([5e-4, 3e-3, 3e-3])
 _RATIO_SIGMA, _RATIO_DOF = 1e-3, 6.0  # what is expected of a hole circle's size before any is seen, and its weight
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CorrectionEstimate:
     """A correction and the covariance (K, K) of its factors, in 1 and 1/m and so on.
 
@@ -126,7 +126,13 @@ def from_motion(
     X_BC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
     joint: Array = np.asarray(T @ inverse @ T.T, dtype=np.float64)
     return CorrectionEstimate(
-        correction_of(change[:terms], field), joint[6:, 6:], X_BC, joint, redundancy, float(sigma_p), float(sigma_n)
+        correction=correction_of(change[:terms], field),
+        covariance=joint[6:, 6:],
+        X_BC=X_BC,
+        joint=joint,
+        redundancy=redundancy,
+        sigma_position_m=float(sigma_p),
+        sigma_normal_rad=float(sigma_n),
     )
 
 
@@ -139,7 +145,7 @@ def from_holes(observations: Sequence[Observation], patterns: Mapping[str, HoleP
     sigma = _ratio_sigma(A, ratio)
     inverse = np.linalg.inv(A.T @ A / sigma**2 + np.diag(1.0 / _LOOSE**2))
     v = inverse @ (A.T @ (1.0 / ratio - 1.0)) / sigma**2
-    return CorrectionEstimate(correction_of(v), np.asarray(inverse))
+    return CorrectionEstimate(correction=correction_of(v), covariance=np.asarray(inverse))
 
 
 def correction_of(change: Array, field: tuple[float, float, float, float] | None = None) -> ScannerCorrection:

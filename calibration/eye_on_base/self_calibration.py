@@ -34,7 +34,7 @@ _FOLDS = 20  # of a comparison, at most: up to so many poses each is held out al
 _GAIN = 0.95  # of the held-out error that must be left at most: a correction that gains less is not worth its unknowns
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SelfCalibration:
     """Decision on the scanner correction. ``found`` is None where the scanner is taken as it is; ``sentence`` says why, or what was found;
     ``worth_saying`` where a reader of the result should know it. ``held_out_m`` and ``held_out_tilt_rad`` (n,) are errors
@@ -78,7 +78,15 @@ def self_calibrate(
     nothing = np.full(n, np.nan)
 
     def refused(why: str, said: bool = False) -> SelfCalibration:
-        return SelfCalibration(None, motion, holes, nothing, nothing, why, said)
+        return SelfCalibration(
+            found=None,
+            motion=motion,
+            holes=holes,
+            held_out_m=nothing,
+            held_out_tilt_rad=nothing,
+            sentence=why,
+            worth_saying=said,
+        )
 
     motion: CorrectionEstimate | None = None
     holes: CorrectionEstimate | None = None
@@ -129,7 +137,15 @@ def self_calibrate(
         held_out, tilt = bent, bent_tilt
         together = from_motion(observations, patterns, seed=seed, order=order, usual=True)
     said += ". X_BC applies to scans with this correction."
-    return SelfCalibration(together, motion, holes, held_out, tilt, said, True)
+    return SelfCalibration(
+        found=together,
+        motion=motion,
+        holes=holes,
+        held_out_m=held_out,
+        held_out_tilt_rad=tilt,
+        sentence=said,
+        worth_saying=True,
+    )
 
 
 def _means(before: Array, after: Array) -> tuple[float, float]:
@@ -166,15 +182,15 @@ def _from_few(
         return None
     found = from_motion(observations, patterns, seed=seed, order=2, usual=True)
     return SelfCalibration(
-        found,
-        None,
-        None,
-        errors,
-        tilts,
-        f"The scanner is corrected by what the flange's hole circle shows, as {n} poses are too few for the robot's motion to "
+        found=found,
+        motion=None,
+        holes=None,
+        held_out_m=errors,
+        held_out_tilt_rad=tilts,
+        sentence=f"The scanner is corrected by what the flange's hole circle shows, as {n} poses are too few for the robot's motion to "
         f"confirm it: a scale of {_percent(found)}; held-out errors are {1e3 * after:.3f} mm with it and {1e3 * before:.3f} without "
         "(mean). X_BC applies to scans with this correction.",
-        True,
+        worth_saying=True,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 
 import numpy as np
@@ -37,7 +37,7 @@ USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
 """What robot and scanner together are off, an axis, where too few scans show it: as on the recorded arms."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SolveConfig:
     """Settings of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
     agree). ``usual_weight`` is how many residuals the usual spread of robot and scanner (USUAL_SPREAD_M, USUAL_TILT_RAD) counts
@@ -53,7 +53,7 @@ class SolveConfig:
     usual_weight: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Data:
     """Observations as arrays: b, c (n, 3) m; z, m (n, 3) normals in B and C; has (n,) normal seen; fit noise."""
 
@@ -66,10 +66,10 @@ class _Data:
     var_n: Array
 
     def pick(self, keep: Flags) -> _Data:
-        return _Data(*(getattr(self, f)[keep] for f in ("b", "c", "z", "m", "has", "cov", "var_n")))
+        return _Data(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Solution:
     X_BC: RigidTransform
     information: Array  # about the pivot
@@ -154,7 +154,15 @@ def _arrays(observations: tuple[Observation, ...], use_normals: bool) -> _Data:
     var_n = np.array([0.0 if o.normal_sigma is None else o.normal_sigma**2 for o in observations])
     b = np.array([o.p_BR for o in observations]).reshape(n, 3)
     z = np.array([o.n_B for o in observations]).reshape(n, 3)
-    return _Data(b, np.array([o.p_CR for o in observations]).reshape(n, 3), z, m, has, cov.reshape(n, 3, 3), var_n)
+    return _Data(
+        b=b,
+        c=np.array([o.p_CR for o in observations]).reshape(n, 3),
+        z=z,
+        m=m,
+        has=has,
+        cov=cov.reshape(n, 3, 3),
+        var_n=var_n,
+    )
 
 
 def _residuals(data: _Data, X_BC: RigidTransform) -> tuple[Array, Array]:
@@ -240,7 +248,14 @@ def _reweighted(data: _Data, start: RigidTransform, usual: float = 0.0) -> tuple
     dof = max(3 * h - 6, 1) / (3 * h)
     sigma = max(_scale_from_trimmed(e, h) / np.sqrt(dof), _POSITION_FLOOR_M) * _loose(3 * h - 6)
     keep = _gate(data, start, sigma**2) if n > 4 else np.ones(n, dtype=bool)
-    solution = _Solution(start, np.eye(6), data.b.mean(axis=0), sigma**2, 1e-3**2, np.eye(6))
+    solution = _Solution(
+        X_BC=start,
+        information=np.eye(6),
+        pivot=data.b.mean(axis=0),
+        var_p=sigma**2,
+        var_n=1e-3**2,
+        information_p=np.eye(6),
+    )
     seen: set[bytes] = set()
     for _ in range(12):
         solution = _fit(data, keep, solution, usual)
@@ -280,7 +295,16 @@ def _fit(data: _Data, keep: Flags, start: _Solution, usual: float = 0.0) -> _Sol
     )
     X_BC = RigidTransform(RotationMatrix(R), p)
     pivot = d.b.mean(axis=0)
-    return _Solution(X_BC, N, pivot, var_p, var_n, N_p, redundancy_p + usual, redundancy_n + usual)
+    return _Solution(
+        X_BC=X_BC,
+        information=N,
+        pivot=pivot,
+        var_p=var_p,
+        var_n=var_n,
+        information_p=N_p,
+        redundancy=redundancy_p + usual,
+        redundancy_n=redundancy_n + usual,
+    )
 
 
 @compiled()

@@ -86,7 +86,7 @@ class Convergence:
     figure_true: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Algorithm1Run:
     """The end of one run of Algorithm 1: its calibration, its own figure, and errors (m) on poses outside its pool."""
 
@@ -118,14 +118,14 @@ def run_algorithm1(
         return None
     inside = {o.id for o in state.pool}
     return Algorithm1Run(
-        state.X_BC,
-        state.error,
-        state.cost,
-        tuple(o.id for o in state.pool),
-        position_errors(state.X_BC, [o for o in observations if o.id not in inside]),
-        np.array(counts, dtype=float),
-        np.array(figures),
-        tuple(path),
+        X_BC=state.X_BC,
+        error=state.error,
+        cost=state.cost,
+        pool=tuple(o.id for o in state.pool),
+        true_errors=position_errors(state.X_BC, [o for o in observations if o.id not in inside]),
+        counts=np.array(counts, dtype=float),
+        figures=np.array(figures),
+        path=tuple(path),
     )
 
 

@@ -27,7 +27,7 @@ _MIXED, _MOST_MIXED = 1.5, 0.2  # pitches, and at most this share of the ring
 _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FlangeFitConfig:
     """Acceptance limits of the flange fit. Lengths in m; the defaults suit structured-light scanners and admit time-of-
     flight ones. Below half of the outer edge, ``min_coverage`` of it is enough only beside a quarter of a concentric bore."""
@@ -68,7 +68,7 @@ class Face:
     quality: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Measured:
     """Measurements that the tests of a flange use: its plane and edges, the pitch between points m, the share of the outer edge seen,
     the points on the face, and the shares of the bore's core and of the ring between the edges that are face."""

@@ -35,7 +35,7 @@ class FlangeGuess:
     normal_C: Array | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FlangeFit:
     """A flange found in a cloud, camera frame C, metres.
 

@@ -23,7 +23,7 @@ _THIN_M = 0.00025  # of the face about its plane: what lies lower is countersink
 _OFF_M = 0.0004  # from its place in the pattern: such a hole is a dent or a gap in the scan
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HolePattern:
     """Holes detected in a flange's face: their centres (k, 3) m in the camera frame, their angles (k,) rad in the standard,
     the circle centre (3,) m they fix, the flange's pose X_CR with the rotation about its axis, and how the pitch circle

@@ -37,7 +37,7 @@ _DOMED = 0.8  # of its rms: a face whose inner half stands so far above or below
 _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Window:
     """Pixels of a window as arrays (h, w): measured depth z, its ray (rx, ry, 1), and where the ray meets the plane, in
     the plane's axes about ``origin``."""
@@ -146,7 +146,7 @@ def _window(z: Array, valid: Mask, rays: tuple[Array, Array], plane: PlaneFit, a
     void = cv2.morphologyEx(
         cv2.copyMakeBorder(gap, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=1), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
     )[2:-2, 2:-2]
-    return _Window(z, rays, x, y, slope, face, (valid | (void > 0)) & ~hidden)
+    return _Window(z=z, rays=rays, x=x, y=y, slope=slope, face=face, known=(valid | (void > 0)) & ~hidden)
 
 
 def _edges(

@@ -34,7 +34,7 @@ _NEAR_M = 0.02  # nor are both this near: a file in metres that is said to be in
 _FAR_M = 20.0  # no arm and no camera on one reach this far: the numbers are not metres
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosePairs:
     """Pose pairs in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE
     of a second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
@@ -178,13 +178,13 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
         robot = inverse(robot)
     X_true = raw.get("X_true")
     return PosePairs(
-        path.name,
-        robot,
-        camera,
-        mode,
-        poses["robot2"],
-        poses["link"],
-        None if X_true is None else _array(path, "X_true", X_true),
+        source=path.name,
+        robot=robot,
+        camera=camera,
+        mode=mode,
+        robot2=poses["robot2"],
+        link=poses["link"],
+        X_true=None if X_true is None else _array(path, "X_true", X_true),
         **{k: None if raw.get(k) is None else _array(path, k, raw[k]) for k in ("img", "obj", "K", "dist", "q")},
     )
 

@@ -20,7 +20,7 @@ _STALE = 100.0  # steps (sigma) shorter than this many changes are decided by de
 _HERE = 0.1  # share of the tolerance up to which derivatives are those of the place itself
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Fit:
     """A converged fit. ``left_w``, ``left_d`` (n, 3): residuals of each observation under the fit without it; ``w``, ``d``
     (n, 3): under the fit itself; ``scaled``, ``lin``: normal equations and derivatives of the observations kept."""
@@ -176,4 +176,16 @@ def fit(
     left_w, left_d = w.copy(), d.copy()
     if leave_one_out:
         left_w[keep], left_d[keep] = s.leave_one_out(lin)
-    return Fit(state, noise, centre, loss, keep, s, lin, left_w, left_d, w, d)
+    return Fit(
+        state=state,
+        noise=noise,
+        centre=centre,
+        loss=loss,
+        keep=keep,
+        scaled=s,
+        lin=lin,
+        left_w=left_w,
+        left_d=left_d,
+        w=w,
+        d=d,
+    )

@@ -60,7 +60,7 @@ class JointRefinement:
     sentence: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Robot:
     """Stated poses (n, 4, 4) and what becomes of them under errors u (k,) in units of the prior."""
 
@@ -216,7 +216,16 @@ def _robot(pairs: PosePairs, arm: Chain, kind: str, prior: JointPrior) -> tuple[
     wanted = [6 * j + p for j in range(1, arm.n) for p in ((2,) if kind == "joints" else range(6))]
     which = np.array([i for i in wanted if i not in (last + 2, last + 5)])
     names = tuple(f"{arm.joint_names[i // 6]} {parts[i % 6]}" for i in which)
-    return _Robot(pairs.robot, arm, pairs.q, tool, pairs.mode, which, each[which % 6], pairs.camera), names
+    return _Robot(
+        stated=pairs.robot,
+        arm=arm,
+        q=pairs.q,
+        tool=tool,
+        mode=pairs.mode,
+        which=which,
+        scale=each[which % 6],
+        camera=pairs.camera,
+    ), names
 
 
 def _tool(pairs: PosePairs, arm: Chain) -> Array:

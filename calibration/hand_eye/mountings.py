@@ -111,7 +111,7 @@ MOUNTINGS: dict[str, Mounting] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TargetObservation:
     """One observation of the target. ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that
     carries the camera (eye_on_arm only); ``X_DE``: the second robot's flange in its base (co_manipulation only).
@@ -182,7 +182,7 @@ def problem_of(
             raise InputError("Give a covariance for every sample or for none.")
         covariance = np.array([c for c in stated if c is not None], dtype=float)
     free = tuple(k in mounting.unknowns and k not in known for k in "XYZ")
-    return Problem(F, G, H, full, normal, covariance, (free[0], free[1], free[2]))
+    return Problem(F=F, G=G, H=H, full=full, normal=normal, covariance=covariance, free=(free[0], free[1], free[2]))
 
 
 def _frame_with_z(z: Array) -> Array:

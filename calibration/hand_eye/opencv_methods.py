@@ -75,7 +75,7 @@ def opencv_held_out(method: str, F: Array, G: Array, folds: int = 5, most: int |
             continue
         rest = int(test.sum())
         H = np.broadcast_to(IDENTITY, (rest, 4, 4))
-        problem = Problem(F[test], G[test], H, np.ones(rest, dtype=bool), np.zeros(rest, dtype=bool))
+        problem = Problem(F=F[test], G=G[test], H=H, full=np.ones(rest, dtype=bool), normal=np.zeros(rest, dtype=bool))
         w, d = residuals(problem, (*found, IDENTITY))
         out.rotation_rad[test], out.translation[test] = np.linalg.norm(w, axis=1), np.linalg.norm(d, axis=1)
     return out

@@ -18,7 +18,7 @@ State = tuple[Array, Array, Array]
 NAMES = ("X", "Y", "Z")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Problem:
     """Observations of one equation F_i X G_i = Y H_i Z (metres or any other unit of length).
 
@@ -211,7 +211,16 @@ def full_problem(
     """A problem whose observations are all full poses."""
     n = len(F)
     H = np.broadcast_to(IDENTITY, (n, 4, 4)) if H is None else H
-    return Problem(F, G, H, np.ones(n, dtype=bool), np.zeros(n, dtype=bool), covariance, free, tied)
+    return Problem(
+        F=F,
+        G=G,
+        H=H,
+        full=np.ones(n, dtype=bool),
+        normal=np.zeros(n, dtype=bool),
+        covariance=covariance,
+        free=free,
+        tied=tied,
+    )
 
 
 def predicted(problem: Problem, state: State) -> Array:

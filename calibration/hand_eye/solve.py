@@ -59,7 +59,7 @@ class HandEyeHeldOut:
         return _rms(self.translation)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HandEyeResult:
     """The unknown poses with their covariances, residuals and held-out errors.
 
@@ -334,7 +334,16 @@ def _problem(
 ) -> Problem:
     n = len(F)
     H = np.broadcast_to(IDENTITY, (n, 4, 4)) if H is None else H
-    return Problem(F, G, H, np.ones(n, dtype=bool), np.zeros(n, dtype=bool), covariance, free, tied)
+    return Problem(
+        F=F,
+        G=G,
+        H=H,
+        full=np.ones(n, dtype=bool),
+        normal=np.zeros(n, dtype=bool),
+        covariance=covariance,
+        free=free,
+        tied=tied,
+    )
 
 
 def _renamed(result: HandEyeResult, names: dict[str, str]) -> HandEyeResult:

@@ -55,7 +55,7 @@ TARGET = (10, 11, 12, 13, 14)
 _PRIOR = np.array([0.0] * 9 + [1.0 / 3.0**2] + [0.0] * 5)  # information: edges lie within some noises of the face
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ClockFit:
     """Result of the joint fit of N frames. ``X_BC``; ``offset`` s and ``drift`` of the FrameClock's nominal times, ``rolling`` s, ``edge`` height of the
     edges found over the face's noise; ``free`` indices of the unknowns that were estimated (0..5: X_BC, rotation then translation on the base side about ``pivot``);
@@ -201,9 +201,28 @@ def fit_clock(
     jitters = (Pg * linear.y).sum(axis=1) / a
     e, m, v, _, _ = problem.residuals(X_BC, capture, rolling, edge)
     return ClockFit(
-        X_BC, float(offset), float(drift), float(rolling), float(edge), free, pivot, information, variances, kept, late, capture, nominal,
-        e, m, v, jitters, 1.0 / a, linear.J[:, :, index], W, problem.X_FR,
-    )  # fmt: skip
+        X_BC=X_BC,
+        offset=float(offset),
+        drift=float(drift),
+        rolling=float(rolling),
+        edge=float(edge),
+        free=free,
+        pivot=pivot,
+        information=information,
+        variances=variances,
+        keep=kept,
+        late=late,
+        capture=capture,
+        nominal=nominal,
+        centre=e,
+        lean=m,
+        rates=v,
+        jitters=jitters,
+        jitter_variance=1.0 / a,
+        jacobian=linear.J[:, :, index],
+        weights=W,
+        X_FR=problem.X_FR,
+    )
 
 
 def _solved(N: Array, b: Array) -> Array:

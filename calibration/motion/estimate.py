@@ -48,7 +48,7 @@ _NAMES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MotionEstimate:
     """Calibration from N frames in motion.
 

@@ -53,8 +53,14 @@ def expected_of_motion(
     R = X_BC.rotation().matrix()
     n = len(t)
     frames = ObservedFrames(
-        tuple(str(k) for k in range(n)), t, None, (at.p - X_BC.translation()) @ R, at.n @ R, np.zeros((n, 3, 3)), np.zeros(n)
-    )  # fmt: skip
+        ids=tuple(str(k) for k in range(n)),
+        arrival=t,
+        device=None,
+        p_C=(at.p - X_BC.translation()) @ R,
+        n_C=at.n @ R,
+        covariance=np.zeros((n, 3, 3)),
+        normal_sigma=np.zeros(n),
+    )
     problem = MotionProblem(frames, arrival_clock(frames), motion, X_FR)
     pivot = at.p.mean(axis=0)
     linear = linearised(problem, X_BC, t, t, 0.0, 0.0, pivot)

@@ -52,14 +52,14 @@ def observed_frames(frames: list[FrameTime], fits: dict[str, FlangeFit]) -> Obse
     device = np.array([np.nan if f.device is None else f.device for f in frames])
     found = [fits[f.id] for f in frames]
     return ObservedFrames(
-        tuple(f.id for f in frames),
-        np.array([f.arrival for f in frames], dtype=float),
-        device if np.isfinite(device).any() else None,
-        np.array([f.center_C for f in found]).reshape(-1, 3),
-        np.array([f.normal_C for f in found]).reshape(-1, 3),
-        np.array([fit_covariance(f) for f in found]).reshape(-1, 3, 3),
-        np.array([f.normal_sigma for f in found], dtype=float),
-        np.array([f.plane_rms_m * _slant(f) for f in found]).reshape(-1, 3),
+        ids=tuple(f.id for f in frames),
+        arrival=np.array([f.arrival for f in frames], dtype=float),
+        device=device if np.isfinite(device).any() else None,
+        p_C=np.array([f.center_C for f in found]).reshape(-1, 3),
+        n_C=np.array([f.normal_C for f in found]).reshape(-1, 3),
+        covariance=np.array([fit_covariance(f) for f in found]).reshape(-1, 3, 3),
+        normal_sigma=np.array([f.normal_sigma for f in found], dtype=float),
+        slide=np.array([f.plane_rms_m * _slant(f) for f in found]).reshape(-1, 3),
     )
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from weldcal.models.arrays import Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ObservedFrames:
     """N frames in the order of their arrival. ``arrival`` (N,) s on the robot's clock; ``device`` (N,) s on the scanner's own clock,
     NaN where a frame has none, or None; ``p_C`` (N, 3) m flange centre and ``n_C`` (N, 3) outward normal in the camera frame;
@@ -31,12 +31,12 @@ class ObservedFrames:
         """Some of the frames."""
         index = np.arange(len(self.ids))[which]
         return ObservedFrames(
-            tuple(self.ids[k] for k in index),
-            self.arrival[index],
-            None if self.device is None else self.device[index],
-            self.p_C[index],
-            self.n_C[index],
-            self.covariance[index],
-            self.normal_sigma[index],
-            None if self.slide is None else self.slide[index],
+            ids=tuple(self.ids[k] for k in index),
+            arrival=self.arrival[index],
+            device=None if self.device is None else self.device[index],
+            p_C=self.p_C[index],
+            n_C=self.n_C[index],
+            covariance=self.covariance[index],
+            normal_sigma=self.normal_sigma[index],
+            slide=None if self.slide is None else self.slide[index],
         )

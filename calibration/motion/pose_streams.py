@@ -44,7 +44,7 @@ class PoseStreams:
     eye: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Synchronised:
     """``offset_s``: time of the eye's stamps less the hand's time of the same instant, ``sigma_s`` its standard deviation; ``X`` eye in
     the hand, ``Y`` world in the base, 4 x 4; ``rms_deg`` and ``rms_m`` of the frames; ``pairs`` for the solvers; ``before_m`` the rms
@@ -153,16 +153,16 @@ def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: 
     none[12] = -start
     known = hand.known(t)
     before = residuals(none)[:, 3:] * scales[1]
-    pairs = PosePairs(source, hand.poses(t[chosen] - offset), inverse(E[chosen]), mounting)
+    pairs = PosePairs(source=source, robot=hand.poses(t[chosen] - offset), camera=inverse(E[chosen]), mode=mounting)
     return Synchronised(
-        offset,
-        sigma,
-        A,
-        B,
-        float(np.degrees(np.sqrt((r[:, :3] ** 2).sum(axis=1).mean()))),
-        float(np.sqrt((r[:, 3:] ** 2).sum(axis=1).mean())),
-        float(np.sqrt((before[known] ** 2).sum(axis=1).mean())),
-        pairs,
+        offset_s=offset,
+        sigma_s=sigma,
+        X=A,
+        Y=B,
+        rms_deg=float(np.degrees(np.sqrt((r[:, :3] ** 2).sum(axis=1).mean()))),
+        rms_m=float(np.sqrt((r[:, 3:] ** 2).sum(axis=1).mean())),
+        before_m=float(np.sqrt((before[known] ** 2).sum(axis=1).mean())),
+        pairs=pairs,
     )
 
 

@@ -21,7 +21,7 @@ _LEAST_SHOWN_M = 2e-3
 _WORST_S = 0.01  # a less certain offset is not used
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Synchronised:
     """Nominal capture times (N,) s on the robot's clock, NaN where a frame has none, and how they were found: ``clock`` of the
     frames, its delay (s, capture = base - delay + drift (base - reference)) with a standard deviation, both None where neither the
@@ -61,9 +61,14 @@ def synchronise(
         if sigma is not None and sigma < _WORST_S:
             delay = -clock.sign * fit.offset
             return Synchronised(
-                clock, clock.nominal(fit.offset, fit.drift), delay, sigma, fit.drift,
-                float(np.sqrt(fit.variances.jitter)), "recording",
-            )  # fmt: skip
+                clock=clock,
+                times=clock.nominal(fit.offset, fit.drift),
+                delay_s=delay,
+                sigma_s=sigma,
+                drift=fit.drift,
+                jitter_s=float(np.sqrt(fit.variances.jitter)),
+                source="recording",
+            )
     if known is not None and known.offset_s is not None and known.kind == clock.kind:
         device = frames.device if clock.kind == DEVICE else None
         times = [
@@ -71,9 +76,23 @@ def synchronise(
         ]
         base = np.array([np.nan if t is None else t for t in times])
         delay = float(np.nanmedian(clock.base - base))
-        return Synchronised(clock, base, delay, known.sigma_s, 0.0, known.jitter_s or 0.0, "calibration")
+        return Synchronised(
+            clock=clock,
+            times=base,
+            delay_s=delay,
+            sigma_s=known.sigma_s,
+            drift=0.0,
+            jitter_s=known.jitter_s or 0.0,
+            source="calibration",
+        )
     return Synchronised(
-        clock, clock.base if coarse is None else clock.base - coarse, coarse, None, 0.0, 0.0, "recording"
+        clock=clock,
+        times=clock.base if coarse is None else clock.base - coarse,
+        delay_s=coarse,
+        sigma_s=None,
+        drift=0.0,
+        jitter_s=0.0,
+        source="recording",
     )
 
 

@@ -19,7 +19,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlannerConfig:
     """Limits and weights of the planner; m and rad.
 

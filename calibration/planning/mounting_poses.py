@@ -19,7 +19,7 @@ _PRIOR = (0.2, 0.2)  # what is believed of an unknown pose before the first scan
 _BIAS_M = 1e-3  # and of a constant error of the circle's centre in its own frame
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MountingPlan:
     """Limits (m, rad) and how the poses are weighed.
 

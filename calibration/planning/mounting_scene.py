@@ -27,7 +27,7 @@ _RING = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
 _ALONG = np.linspace(0.0, 1.0, 9)[:, None]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MountingScene:
     """The estimated scene during planning.
 
@@ -112,7 +112,7 @@ class MountingScene:
         frames = self.frames(q)
         X_DE = None if self.arm_2 is None or q_2 is None else link_frames(self.arm_2, q_2)[FLANGE]
         X_BL = frames[self.link] if "arm" in self.configuration else None
-        return TargetObservation(frames[FLANGE], p_CR, n_CM=n_CR, covariance=covariance, X_BL=X_BL, X_DE=X_DE)
+        return TargetObservation(X_BF=frames[FLANGE], p_CM=p_CR, n_CM=n_CR, covariance=covariance, X_BL=X_BL, X_DE=X_DE)
 
     def problem(self, observations: Sequence[TargetObservation]) -> Problem:
         """The equation of some observations."""

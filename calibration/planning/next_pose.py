@@ -27,7 +27,7 @@ _ROOM = 0.1  # of their spread: how far from the places so far a pose may lie wh
 _MOST = 0.8  # of the poses so far that a robot must reach, to be the one that took them
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NextPose:
     """A pose to add: robot pose X_BF (the first robot's, or None where the mounting leaves it open) with joint angles ``q``
     (rad) where a robot was named, target in the camera X_CM, like which taken sample and turned how, the predicted sigma (3-D)
@@ -96,13 +96,13 @@ def next_pose(
     if not len(like):
         return None
     one = Problem(
-        (state[1] @ used.H[like] @ state[2]) @ inverse(state[0] @ G),
-        G,
-        used.H[like],
-        used.full[like],
-        used.normal[like],
-        None,
-        problem.free,
+        F=(state[1] @ used.H[like] @ state[2]) @ inverse(state[0] @ G),
+        G=G,
+        H=used.H[like],
+        full=used.full[like],
+        normal=used.normal[like],
+        covariance=None,
+        free=problem.free,
     )
     lin = linearise(one, state, np.zeros(3))
     more = np.swapaxes(lin.Jw, 1, 2) @ lin.Jw / noise.rotation + np.swapaxes(lin.Jd, 1, 2) @ lin.Jd / noise.translation
@@ -120,15 +120,15 @@ def next_pose(
         return None
     k, q = found
     return NextPose(
-        None if robot is None else as_transform(robot[k]),
-        as_transform(G[k]),
-        int(taken[like[k]]),
-        float(np.degrees(angle[k])),
-        axis[k],
-        before if before < result.extent else float("inf"),
-        float(after[k]),
-        q,
-        f"{checked} Seen within {view.source}.",
+        X_BF=None if robot is None else as_transform(robot[k]),
+        X_CM=as_transform(G[k]),
+        like=int(taken[like[k]]),
+        turn_deg=float(np.degrees(angle[k])),
+        axis_C=axis[k],
+        sigma_before=before if before < result.extent else float("inf"),
+        sigma_after=float(after[k]),
+        q=q,
+        checked=f"{checked} Seen within {view.source}.",
     )
 
 

@@ -25,7 +25,7 @@ RECORD_FILE = "profiler.yaml"
 JSON_FILE = "X_FS.json"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerRecord:
     """Calibration that maps a profile point into the base frame, with its uncertainty.
 
@@ -56,12 +56,27 @@ class ProfilerRecord:
         """Of an edge's or a sphere's estimate; arm, as it is drawn, only where its joints were corrected."""
         if not isinstance(e, SphereEstimate):
             return ProfilerRecord(
-                method, e.rotation, e.translation, e.covariance, figures=figures, data_sha256=data_sha256
+                method=method,
+                rotation=e.rotation,
+                translation=e.translation,
+                covariance=e.covariance,
+                figures=figures,
+                data_sha256=data_sha256,
             )
         return ProfilerRecord(
-            method, e.rotation, e.translation, e.covariance, e.affine, e.origin, e.tip,
-            None if arm is None else arm.changed(e.arm_errors.table), e.arm_errors.offsets, e.arm_errors.sag, figures, data_sha256,
-        )  # fmt: skip
+            method=method,
+            rotation=e.rotation,
+            translation=e.translation,
+            covariance=e.covariance,
+            affine=e.affine,
+            origin=e.origin,
+            tip=e.tip,
+            arm=None if arm is None else arm.changed(e.arm_errors.table),
+            offsets=e.arm_errors.offsets,
+            sag=e.arm_errors.sag,
+            figures=figures,
+            data_sha256=data_sha256,
+        )
 
     def points_F(self, points: Floats) -> Floats:
         """Profile points (n, 2) m in F (n, 3)."""
@@ -146,16 +161,16 @@ def load_record(path: Path) -> ProfilerRecord:
         arm = DhArm.checked(table.array("dh", -1, 4))
         offsets, sag = table.array("offsets", len(offsets)), table.array("sag", len(sag))
     return ProfilerRecord(
-        d.text("method"),
-        M[:3, :3],
-        M[:3, 3],
-        d.section("covariance").array("matrix", 6, 6) if d.has("covariance") else None,
-        sensor.array("x_scale_z_scale_shear", 3),
-        sensor.array("origin", 2),
-        d.array("tip_F", 3) if d.has("tip_F") else None,
-        arm,
-        offsets,
-        sag,
-        dict(d.section("figures").values),
-        d.text("data_sha256"),
+        method=d.text("method"),
+        rotation=M[:3, :3],
+        translation=M[:3, 3],
+        covariance=d.section("covariance").array("matrix", 6, 6) if d.has("covariance") else None,
+        affine=sensor.array("x_scale_z_scale_shear", 3),
+        origin=sensor.array("origin", 2),
+        tip=d.array("tip_F", 3) if d.has("tip_F") else None,
+        arm=arm,
+        offsets=offsets,
+        sag=sag,
+        figures=dict(d.section("figures").values),
+        data_sha256=d.text("data_sha256"),
     )

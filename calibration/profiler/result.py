@@ -13,7 +13,7 @@ VAGUE_M = 0.02  # one sigma of a direction from which on there is no calibration
 LEVER_M = 0.1  # a turn is weighed against a shift at this distance from the flange
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerEstimate:
     """Pose of the scan plane's frame S in the flange F: a profile point [x, z] is p_S = (x, 0, z).
 

@@ -73,7 +73,7 @@ def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST
     return translation_cost if name == "translation" else translation_and_rotation_cost(work_radius_m)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Algorithm1State:
     """State of Algorithm 1 after k new scans; immutable, each step returns the next one.
 

@@ -71,7 +71,7 @@ class Verifier(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Verification:
     """A verification scan: face points (N, 3) m in C, the feature's pose X_BR, and the model in R (points, normals).
 
@@ -131,7 +131,12 @@ def make_verification(
     model, normals = flange_mesh(standard).sample(12 * max_points, rng)
     up = (normals[:, 2] > 0.2) & (model[:, 2] > -1.5 * standard.chamfer_m - 1e-6)
     return Verification(
-        points, X_BR, model[up][: 4 * max_points], normals[up][: 4 * max_points], method, standard=standard
+        points_C=points,
+        X_BR=X_BR,
+        model_R=model[up][: 4 * max_points],
+        model_normals_R=normals[up][: 4 * max_points],
+        method=method,
+        standard=standard,
     )
 
 

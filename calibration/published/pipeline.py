@@ -27,7 +27,7 @@ from weldcal.models.flanges import FlangeStandard, flange_mesh
 Method = Literal["point_to_point", "point_to_plane"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PublishedParameters:
     """Parameters of the pipeline: segmentation, circle, and registration.
 
@@ -45,7 +45,7 @@ class PublishedParameters:
     k_max: int = 100
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PublishedVerification:
     """Eq. (13): measured verification face (n, 3) m in C, the robot's X_BF there, and a CAD without chamfers: points
     (m, 3) m and normals (m, 3) in F. Called with X_BC it gives e_icp as the paper takes it, at the camera's origin in the camera's axes."""

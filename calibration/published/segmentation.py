@@ -8,7 +8,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.models.arrays import Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SegmentationParameters:
     """Numbers of the segmentation, m. Section 2.1.4 names the steps but no number; these are the ones that the authors
     published beside the paper for the UR10e: filters of 50 neighbours and one standard deviation, applied twice, clusters

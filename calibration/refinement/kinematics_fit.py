@@ -88,7 +88,7 @@ def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmE
     return ArmErrors(arm, which, each[which % 6], names)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class KinematicsFit:
     """Camera pose, correction and errors u (k,) in units of their prior; ``covariance`` (6 + K + k,) of all: rotation on the base side about
     the camera's origin, its displacement, factors, u. The sigmas are the scatter per axis, ``redundancy`` the spare numbers of positions.
@@ -190,7 +190,16 @@ def fit_kinematics(
     prior = np.zeros((6 + terms + k,) * 2)
     prior[6 : 6 + terms, 6 : 6 + terms] = information
     prior[6 + terms :, 6 + terms :] = np.eye(k)
-    found = KinematicsFit(X_BC, correction, np.zeros(k), np.eye(6 + terms + k), 1e-4, 1e-3, 1.0, errors)
+    found = KinematicsFit(
+        X_BC=X_BC,
+        correction=correction,
+        u=np.zeros(k),
+        covariance=np.eye(6 + terms + k),
+        sigma_position_m=1e-4,
+        sigma_normal_rad=1e-3,
+        redundancy=1.0,
+        errors=errors,
+    )
     n, seen = len(data.c), int(data.has.sum())
     A = np.eye(6 + terms + k)
     for _ in range(_ITERATIONS):

@@ -28,7 +28,7 @@ _FOLDS = 20  # at most; up to so many poses each is held out alone
 _STARTS = 60
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LocalChoice:
     """A field and the errors of poses (n,) that neither it nor the calibration saw: ``plain_m``, ``tilt_rad`` and ``local_m`` with it, NaN
     where the others fix none; ``squares`` (n,): the squared error with the field in units of its stated variance (3 on average).
@@ -93,7 +93,9 @@ def choose_local(
             f"A local field is applied ({lengths}): {said}. It holds near the poses that were taken and at their orientation; elsewhere it "
             "falls to zero and the stated region grows. X_BC and its exports are those of the plain calibration."
         )
-    return LocalChoice(field, plain, tilt, local, squares, accepted, said)
+    return LocalChoice(
+        field=field, plain_m=plain, tilt_rad=tilt, local_m=local, squares=squares, accepted=accepted, sentence=said
+    )
 
 
 def calibrate_plain(

@@ -28,7 +28,7 @@ _USUAL_FACTOR = np.array(
 _STARTS_M = (0.08, 0.2, 0.5)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LocalField:
     """Residuals (n, 3) m, in the base, at poses of the flange (``places`` (n, 3) m and ``turns`` (n, 3, 3)), and what lies between.
 
@@ -95,15 +95,15 @@ def field_from_document(document: dict[str, Any] | None, file: str = "") -> Loca
     try:
         places, residuals = (np.array(document[key], dtype=float).reshape(-1, 3) for key in ("places", "residuals_m"))
         turns = np.array([RotationMatrix(Quaternion(np.array(q, dtype=float))).matrix() for q in document["wxyz"]])
-        values = [float(document[key]) for key in ("length_m", "turn_rad", "sigma_field_m", "sigma_scan_m")]
+        values = {key: float(document[key]) for key in ("length_m", "turn_rad", "sigma_field_m", "sigma_scan_m")}
         if (
             not len(places) == len(residuals) == len(turns) > 0
             or not np.isfinite([*places.ravel(), *residuals.ravel()]).all()
         ):
             raise ValueError("lengths differ")
-        if not (np.isfinite(values).all() and min(values) > 0.0):
+        if not (np.isfinite([*values.values()]).all() and min(values.values()) > 0.0):
             raise ValueError("not positive")
-        return LocalField(places, turns, residuals, *values)
+        return LocalField(places=places, turns=turns, residuals=residuals, **values)
     except (KeyError, TypeError, ValueError, RuntimeError) as e:
         where = f"'{file}': " if file else ""
         raise InputError(
@@ -138,7 +138,15 @@ def fit_field(X_BR: Sequence[RigidTransform], residuals: Array) -> LocalField:
     ]
     found = min((minimize(cost, s, method="L-BFGS-B", bounds=wide) for s in starts), key=lambda f: float(f.fun))
     length, turn, field, scan = (float(v) for v in np.exp(found.x))
-    return LocalField(places, turns, np.array(residuals, dtype=float), length, turn, field, scan)
+    return LocalField(
+        places=places,
+        turns=turns,
+        residuals=np.array(residuals, dtype=float),
+        length_m=length,
+        turn_rad=turn,
+        sigma_field_m=field,
+        sigma_scan_m=scan,
+    )
 
 
 def _poses(X_BR: Sequence[RigidTransform]) -> tuple[Array, Array]:

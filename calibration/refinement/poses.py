@@ -29,7 +29,16 @@ def informative_poses(arm: Chain, X_BC: RigidTransform, q: Array, n: int, kind: 
     seen = inverse(np.asarray(X_BC.GetAsMatrix4())) @ stated
     sought = arm_errors(arm, kind)
     k = len(sought.which)
-    fit = KinematicsFit(X_BC, ScannerCorrection(), np.zeros(k), np.eye(1), 1.0, 1.0, 1.0, sought)
+    fit = KinematicsFit(
+        X_BC=X_BC,
+        correction=ScannerCorrection(),
+        u=np.zeros(k),
+        covariance=np.eye(1),
+        sigma_position_m=1.0,
+        sigma_normal_rad=1.0,
+        redundancy=1.0,
+        errors=sought,
+    )
     scans = [
         Observation(
             str(i), RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]), c[:3, 3], c[:3, 2]

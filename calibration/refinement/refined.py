@@ -24,7 +24,7 @@ LIVE_KINDS = (PLAIN, *REFINEMENTS)
 KINEMATICS_FILE = "kinematics.yaml"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Plain:
     """A plain calibration: observations as seen and as corrected, their hole patterns, the estimate, the accepted scanner correction (None:
     none), whether one may be estimated, and how the calibration is made from fewer poses (None: as `calibrate` does)."""
@@ -43,7 +43,7 @@ class Plain:
         return [o for o, keep in zip(self.observations, self.estimate.inliers, strict=True) if keep]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Refined:
     """What became of it: estimate and observations; the field, or the text of the kinematics file, the link transforms (n, 4, 4) in it, the
     scanner correction that goes with them and the document of the errors, where one was accepted; the sentence that says so or why not;
@@ -78,7 +78,11 @@ def refine_locally(plain: Plain, *, seed: int) -> Refined:
     )
     estimate, observations = with_field(plain.estimate, choice, plain.corrected)
     return Refined(
-        estimate, tuple(observations), choice.sentence, choice.accepted, choice.field if choice.accepted else None
+        estimate=estimate,
+        observations=tuple(observations),
+        sentence=choice.sentence,
+        accepted=choice.accepted,
+        field=choice.field if choice.accepted else None,
     )
 
 
@@ -109,14 +113,18 @@ def refine_arm(kind: str, plain: Plain, q: Array, arm: Chain, *, note: str, seed
         held_out = replace(plain.estimate.held_out, position_m=plain.estimate.held_out.position_m.copy())
         held_out.position_m[plain.estimate.inliers] = choice.plain_m
         return Refined(
-            replace(plain.estimate, held_out=held_out), plain.corrected, choice.sentence, False, numbers=numbers
+            estimate=replace(plain.estimate, held_out=held_out),
+            observations=plain.corrected,
+            sentence=choice.sentence,
+            accepted=False,
+            numbers=numbers,
         )
     estimate, moved = with_kinematics(plain.estimate, choice, plain.observations, q)
     return Refined(
-        estimate,
-        tuple(moved),
-        choice.sentence,
-        True,
+        estimate=estimate,
+        observations=tuple(moved),
+        sentence=choice.sentence,
+        accepted=True,
         kinematics=kinematics_text(found, note),
         stack=found.corrected_stack(),
         correction=found.correction if plain.correct_scanner else None,

@@ -62,5 +62,14 @@ def shared_error(
             "The arm's errors (arm_errors) in the result cannot be read; run 'weldcal calibrate --refine' again."
         ) from problem
     errors = ArmErrors(arm, which, scale, tuple(str(i) for i in which))
-    fit = KinematicsFit(result.X_BC, correction, np.zeros(len(which)), covariance, 1.0, 1.0, 1.0, errors)
+    fit = KinematicsFit(
+        X_BC=result.X_BC,
+        correction=correction,
+        u=np.zeros(len(which)),
+        covariance=covariance,
+        sigma_position_m=1.0,
+        sigma_normal_rad=1.0,
+        redundancy=1.0,
+        errors=errors,
+    )
     return fit.sensitivity(observations, q)[:, :3], covariance

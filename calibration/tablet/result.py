@@ -26,7 +26,7 @@ _CONFIGURATION = "eye_in_hand_tablet"
 PARENT, CHILD = "flange", "camera_optical_frame"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TabletResult:
     """Contents of tablet.yaml.
 
@@ -115,20 +115,20 @@ def load_tablet_result(path: Path) -> TabletResult:
     if not all(v is None or abs(as_number(v)) <= LARGEST_NUMBER for v in left_out):
         raise d.wrong("leave_one_out_mm", "a list of numbers, or of nothing")
     return TabletResult(
-        d.text("model"),
-        _whole(d, "parameters"),
-        d.array("covariance", n, n).tolist(),
-        d.array("residual_mm", -1).tolist(),
-        [None if v is None else as_number(v) for v in left_out],
-        X_FC,
-        d.array("X_FC_covariance", 6, 6).tolist() if d.has("X_FC_covariance") else None,
-        d.array("p_FP_m", 3).tolist() if d.has("p_FP_m") else None,
-        d.array("p_FP_covariance", 3, 3).tolist() if d.has("p_FP_covariance") else None,
-        dict(d.section("two_stages").values) if d.has("two_stages") else None,
-        _whole(d, "leave_one_out_of_other_models_mm"),
-        d.texts("unobservable"),
-        d.texts("warnings"),
-        {str(name): d.section("data_sha256").text(name) for name in d.section("data_sha256").values},
+        model=d.text("model"),
+        parameters=_whole(d, "parameters"),
+        covariance=d.array("covariance", n, n).tolist(),
+        residual_mm=d.array("residual_mm", -1).tolist(),
+        leave_one_out_mm=[None if v is None else as_number(v) for v in left_out],
+        X_FC=X_FC,
+        X_FC_covariance=d.array("X_FC_covariance", 6, 6).tolist() if d.has("X_FC_covariance") else None,
+        p_FP_m=d.array("p_FP_m", 3).tolist() if d.has("p_FP_m") else None,
+        p_FP_covariance=d.array("p_FP_covariance", 3, 3).tolist() if d.has("p_FP_covariance") else None,
+        two_stages=dict(d.section("two_stages").values) if d.has("two_stages") else None,
+        other_models=_whole(d, "leave_one_out_of_other_models_mm"),
+        unobservable=d.texts("unobservable"),
+        warnings=d.texts("warnings"),
+        data_sha256={str(name): d.section("data_sha256").text(name) for name in d.section("data_sha256").values},
     )
 
 

@@ -15,7 +15,7 @@ _THIN = 0.05  # the landmarks' narrow spread as a share of their long one, below
 _LEAST_TURN_RAD = np.radians(5.0)  # spread of the hand's turns (rms) that still separates pen and camera
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TabletTouches:
     """Planar touches with an upright pen, one row per landmark; the hand turns about its own downward z only.
 

@@ -83,7 +83,16 @@ def arm_effect(
     errors = arm_errors(load_chain(result.robot), "links")
     k = len(errors.which)
     correction = correction_from_document(result.scanner_correction) or ScannerCorrection()
-    fit = KinematicsFit(result.X_BC, correction, np.zeros(k), np.eye(1), 1.0, 1.0, 1.0, errors)
+    fit = KinematicsFit(
+        X_BC=result.X_BC,
+        correction=correction,
+        u=np.zeros(k),
+        covariance=np.eye(1),
+        sigma_position_m=1.0,
+        sigma_normal_rad=1.0,
+        redundancy=1.0,
+        errors=errors,
+    )
     J = fit.sensitivity(seen, q)
     theta = J.shape[2] - k
     position = 1e-3 * result.sigma_position_mm

@@ -42,7 +42,7 @@ _FIELD_LENGTH_M = 0.2  # over which what an arm leaves at another orientation is
 _LEAST_FREE = 3.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TouchErrors:
     """Touches (n) judged: ``error_m`` (n,) distance of touched from scanned (signed where it has one direction), ``limit_m`` (n,) of
     the stated 95 % region in the direction of the error, ``inside`` (n,). ``relative_m`` (n,) is what is left of each error after the shift that
@@ -105,16 +105,16 @@ def judge_touches(result: CalibrationResult, touches: Sequence[Touch], kinematic
     blind = np.array([not np.abs(A[owner == k]).sum() > 1e-9 for k in range(len(touches))])
     left[blind] = left_limit[blind] = np.nan
     return TouchErrors(
-        tuple(t.id for t in touches),
-        tuple(t.feature for t in touches),
-        signed,
-        limit,
-        inside,
-        left,
-        left_limit,
-        left_inside | blind,
-        _most_outside(C, owner, len(touches), free),
-        bool(result.kinematics_file) and not arm_known,
+        ids=tuple(t.id for t in touches),
+        features=tuple(t.feature for t in touches),
+        error_m=signed,
+        limit_m=limit,
+        inside=inside,
+        relative_m=left,
+        relative_limit_m=left_limit,
+        relative_inside=left_inside | blind,
+        most_outside=_most_outside(C, owner, len(touches), free),
+        stated_poses=bool(result.kinematics_file) and not arm_known,
     )
 
 

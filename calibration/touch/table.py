@@ -88,18 +88,18 @@ def _touch(row: dict[str, str], path: Path, correction: ScannerCorrection | None
         )
     joints = tuple(sorted((c for c in row if re.fullmatch(r"q\d+", c) and row[c]), key=lambda c: int(c[1:])))
     touch = Touch(
-        name,
-        feature,
-        RigidTransform(unit_quaternion(list(wxyz), name), xyz),
-        np.array(tip),
-        radius,
-        np.array(row_numbers(row, CAMERA, path)),
-        _direction(row, path),
-        _positive(row, "feature_radius", 0.0, path),
-        _positive(row, "sigma_tip", SIGMA_TIP_M, path),
-        _positive(row, "sigma_radius", SIGMA_RADIUS_M, path),
-        _positive(row, "sigma_scan", SIGMA_SCAN_M, path),
-        np.array(row_numbers(row, joints, path)) if joints else None,
+        id=name,
+        feature=feature,
+        X_BF=RigidTransform(unit_quaternion(list(wxyz), name), xyz),
+        p_FT=np.array(tip),
+        radius=radius,
+        p_C=np.array(row_numbers(row, CAMERA, path)),
+        direction_C=_direction(row, path),
+        feature_radius=_positive(row, "feature_radius", 0.0, path),
+        sigma_tip=_positive(row, "sigma_tip", SIGMA_TIP_M, path),
+        sigma_radius=_positive(row, "sigma_radius", SIGMA_RADIUS_M, path),
+        sigma_scan=_positive(row, "sigma_scan", SIGMA_SCAN_M, path),
+        q=np.array(row_numbers(row, joints, path)) if joints else None,
     )
     return touch if not row.get("cloud") else _fitted(touch, row, path, correction)
 

@@ -19,7 +19,7 @@ SIGMA_SCAN_M = 5e-5
 """Assumed standard deviation of a feature in the scan, per axis."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Touch:
     """One touch.
 

@@ -22,7 +22,7 @@ _STARTS = 24
 _MAX_STEP_RAD = 0.5
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Chain:
     """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis; ``X_LF`` the
     flange in the last joint's frame; limits (n,) rad and rad/s."""
@@ -65,7 +65,7 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
             raise InputError(f"There is no file '{name}' of an arm.")
         from weldcal.models.arms.urdf_file import read_urdf_chain  # Drake's parser takes a third of a second to import
 
-        return Chain(Path(name).name, *read_urdf_chain(Path(name)))
+        return Chain(name=Path(name).name, **read_urdf_chain(Path(name))._asdict())
     if name in known_arms():
         return chain_of(load_arm(name, kinematics))
     path = _HERE / name / "chain.yaml"
@@ -73,19 +73,29 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
         raise InputError(f"There is no arm {name!r}; choose one of: {', '.join(known_chains())}.")
     data: dict[str, Any] = yaml_load_file(str(path))
     joints = data["joints"]
+    lower, upper, velocity = (np.array([float(j[key]) for j in joints]) for key in ("lower", "upper", "velocity"))
     return Chain(
-        name,
-        tuple(str(j["name"]) for j in joints),
-        np.array([_pose(j) for j in joints]),
-        _pose(data["flange"]),
-        *(np.array([float(j[key]) for j in joints]) for key in ("lower", "upper", "velocity")),
+        name=name,
+        joint_names=tuple(str(j["name"]) for j in joints),
+        stack=np.array([_pose(j) for j in joints]),
+        X_LF=_pose(data["flange"]),
+        position_lower=lower,
+        position_upper=upper,
+        velocity_limit=velocity,
     )
 
 
 def chain_of(arm: ArmModel) -> Chain:
     """A Universal Robots arm with its own kinematics as a chain."""
-    limits = (arm.position_lower, arm.position_upper, arm.velocity_limit)
-    return Chain(arm.name, arm.joint_names, arm.stack, np.eye(4), *limits)
+    return Chain(
+        name=arm.name,
+        joint_names=arm.joint_names,
+        stack=arm.stack,
+        X_LF=np.eye(4),
+        position_lower=arm.position_lower,
+        position_upper=arm.position_upper,
+        velocity_limit=arm.velocity_limit,
+    )
 
 
 def chain_forward(chain: Chain, q: ArrayLike) -> RigidTransform:

@@ -67,7 +67,7 @@ class Housings:
     forearm_tube: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ArmModel:
     """One arm. Arrays are read-only; joint order is `joint_names`, link order is `link_names` (link 0 is the base).
 

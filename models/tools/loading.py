@@ -25,7 +25,7 @@ COLOURS = ("dark", "steel", "copper", "soft", "white")
 _SIZES = ("box_mm", "cylinder_mm", "capsule_mm", "sphere_mm", "mesh")
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class LoadedTool:
     """A tool of a file: the tool, its camera's picture size and focal length, its finger calibration's path ("" without), and the
     pose X_FW of the torch (z along the wire)."""
@@ -102,14 +102,14 @@ def _load(path: Path, changed: int | None) -> LoadedTool:
     if finger is not None:
         pictures = FingerCamera(finger.width, finger.height, finger.focal_px)
     loaded = LoadedTool(
-        part.name or path.stem,
-        path,
-        tool,
-        pictures,
-        calibration,
-        finger,
-        np.array(_metres(part.torch.xyz_mm)),
-        _unit(part.torch.axis),
+        name=part.name or path.stem,
+        file=path,
+        tool=tool,
+        camera=pictures,
+        calibration=calibration,
+        finger=finger,
+        p_FW=np.array(_metres(part.torch.xyz_mm)),
+        torch_axis=_unit(part.torch.axis),
     )
     check_sight(loaded)
     return loaded
@@ -233,11 +233,13 @@ def _shape(path: Path, i: int, part: ShapePart) -> ToolShape:
         file = path.parent / part.mesh
         if not file.is_file():
             raise InputError(f"{place}: there is no file '{file}'.")
-        return ToolShape(name, kind, (), where, part.colour, str(file), UNITS_M[part.units])
+        return ToolShape(
+            name=name, kind=kind, size=(), place=where, colour=part.colour, mesh=str(file), unit_m=UNITS_M[part.units]
+        )
     size = tuple(v / 1e3 for v in (value if isinstance(value, tuple) else (value,)))
     if min(size) <= 0.0:
         raise InputError(f"{place}: {given[0]} must be positive.")
-    return ToolShape(name, kind, size, where, part.colour)
+    return ToolShape(name=name, kind=kind, size=size, place=where, colour=part.colour)
 
 
 def _keep_clear(part: ToolPart, shapes: tuple[ToolShape, ...]) -> tuple[Capsule, ...]:

@@ -21,7 +21,7 @@ class RingPart:
     thickness_mm: float = 8.0  # of the ring as it is drawn
 
 
-@dataclass
+@dataclass(kw_only=True)
 class TipPart:
     """The soft tip: a ball on three springs."""
 
@@ -58,7 +58,7 @@ class FingerCameraPart:
     )
 
 
-@dataclass
+@dataclass(kw_only=True)
 class TagPart:
     """The tag that moves with the tip."""
 
@@ -71,7 +71,7 @@ class TagPart:
     membrane_mm: float = 52.0  # diameter of the soft disc that carries it
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ShapePart:
     """A body of the tool: drawn, seen by the scanner, and kept clear of the table and of the line of sight. One kind of a shape."""
 
@@ -96,7 +96,7 @@ class CapsulePart:
     radius_mm: float = 10.0
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ToolPart:
     """A tool file."""
 

@@ -60,7 +60,7 @@ def goes_on(mesh: TriMesh, seam: DrawnSeam, by_m: float = 0.004) -> bool:
     return _chosen(section, seam.joint, seam.up_P[-1]) is not None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Fit:
     root: Floats
     up: Floats
@@ -166,7 +166,7 @@ def _fitted(mesh: TriMesh, points: Floats, t: Floats, ups: Floats | None, joint:
     heights = _heights(
         [sections[i] for i in some[:: max(1, len(some) // 12)]], joint, wanted_of=up, first=first, some=some
     )
-    return _Fit(root, up, left, right, gap, heights, first == 0 and last == n - 1)
+    return _Fit(root=root, up=up, left=left, right=right, gap_m=gap, height=heights, whole=first == 0 and last == n - 1)
 
 
 def _start(sections: list[Section], ups: Floats | None, joint: str) -> Floats:
@@ -277,14 +277,14 @@ def _even(found: _Fit, joint: str, closed: bool) -> DrawnSeam:
         return np.column_stack([np.interp(at, s, values[:, k]) for k in range(3)])
 
     return DrawnSeam(
-        along(found.root),
-        _unit(along(found.up)),
-        _unit(along(found.left)),
-        _unit(along(found.right)),
-        joint,
-        np.array(found.height),
-        found.gap_m,
-        closed,
+        points_P=along(found.root),
+        up_P=_unit(along(found.up)),
+        wall_left_P=_unit(along(found.left)),
+        wall_right_P=_unit(along(found.right)),
+        joint=joint,
+        wall_height_m=np.array(found.height),
+        gap_m=found.gap_m,
+        closed=closed,
     )
 
 

@@ -81,7 +81,7 @@ class PlanarPath:
         return replace(self, start=(x + c * x0 - s * y0, y + s * x0 + c * y0, heading + yaw))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Workpiece:
     """A grooved plate in frame P, metres and radians.
 

@@ -17,7 +17,7 @@ JOINTS = ("v_groove", "butt", "fillet", "lap")
 SPACING_M = 0.0005
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnSeam:
     """A seam in frame P (or another, see `transformed`), metres and unit vectors; N >= 4 points in the order of travel.
 

@@ -51,7 +51,7 @@ class PreparedRobot:
             self.handle.close()
 
 
-@dataclass
+@dataclass(kw_only=True)
 class StationBuild:
     """Collects the ports that drivers add; `make_station` exports them under fixed names. `q_start` (6,) rad: the arm's
     present configuration.

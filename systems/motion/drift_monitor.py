@@ -58,7 +58,7 @@ class MonitoredCalibration:
         return MonitoredCalibration(e.X_BC, e.covariance, status.correction, None, delay_s, config)
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class DriftStatus(Message):
     """The state of the watch after its newest frame. ``recent`` (n, 6): time s, error (3) m at the time by the clock, offset of the clock s, test statistic.
 
@@ -255,9 +255,17 @@ def _tracked(
     rates = (after - before) / (2.0 * _HALF_S)
     p_C, n_C = c.correction.points(fit.center_C), c.correction.normals(fit.center_C, fit.normal_C)
     return TrackedFrame(
-        str(estimate.sequence), time, now[:3, 3], now[:3, 2], rates[:3, 3], rates[:3, 2], p_C, n_C,
-        fit.center_covariance, fit.normal_sigma,
-    )  # fmt: skip
+        id=str(estimate.sequence),
+        time=time,
+        p_BR=now[:3, 3],
+        n_B=now[:3, 2],
+        v_BR=rates[:3, 3],
+        turn_B=rates[:3, 2],
+        p_CR=p_C,
+        n_C=n_C,
+        covariance=fit.center_covariance,
+        normal_sigma=fit.normal_sigma,
+    )
 
 
 def _captured(c: MonitoredCalibration, estimate: FlangeEstimate, clock: RunClock | None) -> float:

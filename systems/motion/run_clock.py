@@ -25,7 +25,7 @@ _REST_M = 1e-4  # by which the feature moves in SEARCHED_S at rest
 _ROUNDS = 8
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class RunClock:
     """A device time and the robot's time then (s), and the robot's rate over the device's.
 
@@ -87,15 +87,15 @@ def followed(
     late = 0.0 if clock is None else usual - clock.time(device)
     if clock is None or late >= _NEVER_S or late <= -(_APART_S if clock.learnt else _NEVER_S):
         if by_device and expected is not None and abs(expected - usual) < SEARCHED_S:
-            return RunClock(device, expected, rate, known=True)
-        return RunClock(device, usual, rate)
+            return RunClock(device_s=device, robot_s=expected, rate=rate, known=True)
+        return RunClock(device_s=device, robot_s=usual, rate=rate)
     if not clock.learnt and (abs(late) >= SEARCHED_S if clock.known else late < 0.0):
         return dc.replace(clock, device_s=device, robot_s=usual, known=False, late_since=None)
     if late < _APART_S:
         return clock if clock.late_since is None else dc.replace(clock, late_since=None)
     if clock.late_since is None:
         return dc.replace(clock, late_since=arrival)
-    return clock if arrival - clock.late_since < _RELEARN_S else RunClock(device, usual, rate)
+    return clock if arrival - clock.late_since < _RELEARN_S else RunClock(device_s=device, robot_s=usual, rate=rate)
 
 
 def with_frame(clock: RunClock, estimate: FlangeEstimate, seen: Seen) -> tuple[RunClock, tuple[FlangeEstimate, ...]]:

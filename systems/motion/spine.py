@@ -23,7 +23,7 @@ JERK_LIMIT = 150.0  # rad/s^3: 100 ms to the acceleration limit of the large joi
 SPEED_SHARE, ACCELERATION_SHARE = 0.6, 0.5  # of the arm's own limits
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class JobPorts:
     """The output ports of a job that the spine, the log and the run loop read.
 
@@ -42,7 +42,7 @@ class JobPorts:
     shown: dict[str, OutputPort] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SpineArm:
     """One arm of the spine: the ports that a job reads, and the systems that drive the arm."""
 
@@ -141,7 +141,17 @@ def add_spine(
         limiter = w.add(f"slew_limiter{suffix}", SlewLimiter(limits))
         w.connect(limiter, velocity_wanted=arbiter.GetOutputPort("velocity_wanted"))
         w.feed(f"{prefix}.velocity_command", limiter.get_output_port())
-        made.append(SpineArm(prefix, measured, status, recorder.GetOutputPort("history"), mover, arbiter, own_error))
+        made.append(
+            SpineArm(
+                prefix=prefix,
+                position=measured,
+                status=status,
+                history=recorder.GetOutputPort("history"),
+                mover=mover,
+                arbiter=arbiter,
+                error=own_error,
+            )
+        )
     hold, end = _person(w)
     return Spine(w, tuple(made), hold, end, w.add("process_switch", ProcessSwitch()))
 

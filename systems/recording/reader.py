@@ -40,7 +40,7 @@ class Left:
     value: Any
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class Recording:
     """A recording in memory.
 

@@ -47,7 +47,7 @@ class ErrorConfig:
     rotation_deg: float = 0.0
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class CalibrationConfig:
     """The calibration: the feature, the poses and the stop criterion."""
 
@@ -87,7 +87,7 @@ class SeamConfig:
     end_mm: float = 0.0  # cut off at the end
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class WorkpieceConfig:
     """The nominal workpiece from its CAD, and the deviations of the true one."""
 
@@ -149,7 +149,7 @@ class PlanningConfig:
         return PlanningMethod(self.method, self.search, x_y_z)
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class WeldingConfig:
     """The welding job."""
 
@@ -181,7 +181,7 @@ class VisualizationConfig:
     cloud_points: int = 20000
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class Scenario:
     """One cell: arm, devices, calibration, workpiece, welding and job.
 

@@ -219,14 +219,14 @@ def add_cameras(wiring: Wiring, ports: JobPorts, cell: tuple[Array, Array], view
     scanner = scenario.scanner_config()
     eye = scanner is not None and scanner.mounted_on == "base"
     director = CameraDirector(
-        wiring.meshcat,
-        views,
-        cell,
-        models,
-        scenario.base.pose(),
-        scenario.calibration.mounting_guess.pose() if eye else None,
-        station.tool,
-        work_point(scenario) if "servo_report" in ports.shown and scenario.job.weld else None,
+        meshcat=wiring.meshcat,
+        views=views,
+        cell=cell,
+        shown=models,
+        X_WB=scenario.base.pose(),
+        X_BC_guess=scenario.calibration.mounting_guess.pose() if eye else None,
+        tool=station.tool,
+        work_B=work_point(scenario) if "servo_report" in ports.shown and scenario.job.weld else None,
     )
     wiring.add("camera_director", director)
     read = {name: port for name, port in ports.shown.items() if director.HasInputPort(name)}

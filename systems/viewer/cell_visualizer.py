@@ -60,7 +60,7 @@ class _Circle:
     showing: str = ""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Drawn:
     """The items sent to Meshcat so far, so that each is drawn once; not part of the simulation's state."""
 
@@ -321,7 +321,14 @@ def add_visualizer(
     config = scenario.scanner_config()
     scanner = None if config is None else config.scanner()
     viewer = CellVisualizer(
-        wiring.meshcat, station.tool, X_BC_guess, circle_radius_m, scenario.visualization, cad, scanner, work_B
+        meshcat=wiring.meshcat,
+        tool=station.tool,
+        X_BC_guess=X_BC_guess,
+        circle_radius_m=circle_radius_m,
+        config=scenario.visualization,
+        cad=cad,
+        scanner=scanner,
+        work_B=work_B,
     )
     wiring.add("cell_visualizer", viewer)
     wiring.connect(viewer, **ports)

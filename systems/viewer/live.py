@@ -118,7 +118,17 @@ class LiveWriter(LeafSystem):
         # past the seam's end the tip feels nothing
         past = report.state is not None and report.state.phase == Phase.FINISH
         deflection = math.nan if past else d.delta_n
-        self._view.weld.append(WeldRow(report.time, d.s_torch, d.s_tip, offset, deflection, speed, report.torch_on))
+        self._view.weld.append(
+            WeldRow(
+                time=report.time,
+                s_torch=d.s_torch,
+                s_tip=d.s_tip,
+                offset=offset,
+                deflection=deflection,
+                speed=speed,
+                torch_on=report.torch_on,
+            )
+        )
 
 
 def add_live_view(wiring: Wiring, ports: JobPorts, view: LiveView) -> LiveWriter:

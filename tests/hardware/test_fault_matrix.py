@@ -75,7 +75,9 @@ def test_every_way_of_failing_is_in_the_matrix() -> None:
 
 def test_the_checker_would_see_an_arm_that_does_not_stop(bench: Bench) -> None:
     # nothing is done to it, and it is said to have to stop
-    calm = Case("nothing", lambda b: b.emulator.ask(ask="state")["time"], STOP, RUNNING[-1].faults)
+    calm = Case(
+        name="nothing", throw=lambda b: b.emulator.ask(ask="state")["time"], must=STOP, faults=RUNNING[-1].faults
+    )
     outcome = run_case(bench, calm, hasty=True)
     assert not outcome.ok
     assert any("not at rest" in problem for problem in outcome.problems)

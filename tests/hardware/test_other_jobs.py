@@ -18,7 +18,7 @@ calibration: {minimum_scans: 4, maximum_scans: 4, verification_scans: 1}
 
 
 def options(name: str, folder: Path) -> RunOptions:
-    return RunOptions(name, folder / "out", seed=1, robot=ROBOT, pace=PACE, recording=False)
+    return RunOptions(scenario=name, out=folder / "out", seed=1, robot=ROBOT, pace=PACE, recording=False)
 
 
 def test_a_scanner_on_the_flange_calibrates_itself_on_the_controllers_arm(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_a_new_link_that_has_heard_nothing_yet_gives_no_echo() -> None:
         states = iter([SimpleNamespace(heard=k, echo_latency_s=1e-3 * k, age_s=0.0) for k in heard])
         return SimpleNamespace(state=lambda: next(states))
 
-    tap = Tap(link(0, 1, 1, 2), array("d", [0.0]))  # type: ignore[arg-type]
+    tap = Tap(link=link(0, 1, 1, 2), command_times=array("d", [0.0]))  # type: ignore[arg-type]
     for _ in range(4):
         tap.state()
     tap.restart(link(0, 3))  # type: ignore[arg-type]

@@ -34,7 +34,9 @@ NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 def emulated_job(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
     """The short job's calibration on the emulated controller, whose time waits for a computer that is busy."""
     folder = tmp_path_factory.mktemp("emulated") / "run"
-    options = RunOptions("a test's own", folder, SEED, robot="emulated", pace=JOB_PACE, recording=False)
+    options = RunOptions(
+        scenario="a test's own", out=folder, seed=SEED, robot="emulated", pace=JOB_PACE, recording=False
+    )
     scenario = short_job_scenario()
     scenario.job.weld = False
     return run_scenario(scenario, options)
@@ -111,7 +113,7 @@ def run_until(controller: Emulator, folder: Path, stage: str, happens: Callable[
         if phase == phase_words(stage):
             happens()
 
-    options = RunOptions("a test's own", folder, pace=PACE, recording=False)
+    options = RunOptions(scenario="a test's own", out=folder, pace=PACE, recording=False)
     scenario = weld_only()
     scenario.robot = UrRtde(host=controller.host, lockstep=True)
     controller.do("reset_checker")

@@ -142,7 +142,9 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
 def welded(played: Played, tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoResult, dict[str, Any]]:
     """The job without its calibration, on a short seam, and the truth as it is when the job has ended. Somebody sets the computer's clock
     back by an hour when the workpiece is scanned, and forward by two in the middle of the weld."""
-    options = RunOptions("a test's own", tmp_path_factory.mktemp("job") / "run", SEED, recording=False)
+    options = RunOptions(
+        scenario="a test's own", out=tmp_path_factory.mktemp("job") / "run", seed=SEED, recording=False
+    )
     unix, stages = time.time, list[str]()
 
     def set_clock(by_s: float) -> None:
@@ -256,7 +258,7 @@ def held_by(played: Played, folder: Path, stage: str, happens: Callable[[], obje
             seen.append(phase)
             happens()
 
-    options = RunOptions("a test's own", folder, SEED, recording=False)
+    options = RunOptions(scenario="a test's own", out=folder, seed=SEED, recording=False)
     result = run_scenario(played.scenario(overrides), options, watch)
     assert seen, "the phase has come"
     assert result.state == "held"

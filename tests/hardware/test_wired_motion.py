@@ -43,7 +43,7 @@ def wired(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Played, st
 @pytest.fixture(scope="module")
 def calibrated(wired: tuple[Played, str, Path], tmp_path_factory: pytest.TempPathFactory) -> MotionOutcome:
     folder = tmp_path_factory.mktemp("calibration") / "run"
-    options = RunOptions("a test's own", folder, SEED, recording=False)
+    options = RunOptions(scenario="a test's own", out=folder, seed=SEED, recording=False)
     return run_motion_live(load_scenario(str(wired[2])), options, lambda stage, share: None)
 
 
@@ -76,7 +76,7 @@ def test_the_monitor_finds_the_stand_that_the_world_knocks(
         if share > 0.4 and played.truth()["knocked_at_s"] is None:
             emulator.fault("knock", latch=False)
 
-    options = RunOptions(str(cell), tmp_path / "run", SEED, recording=False)
+    options = RunOptions(scenario=str(cell), out=tmp_path / "run", seed=SEED, recording=False)
     try:
         found: LiveMonitor = monitor_live(options, calibrated.folder, watch, frames=WATCHED)
     finally:

@@ -53,7 +53,7 @@ class Wired:
 
     def run(self, name: str, overrides: str, out: Path) -> ProfilerLive:
         """Run a scenario's job."""
-        options = RunOptions("a test's own", out, SEED, recording=False)
+        options = RunOptions(scenario="a test's own", out=out, seed=SEED, recording=False)
         return run_profiler_live(load_scenario(self.cell(name), overrides), options, lambda stage, share: None)
 
     @contextmanager

@@ -36,7 +36,19 @@ from weldcal.models.scanners import (
 
 
 def _plain(noise: DepthNoise, width: int = 400, height: int = 300) -> ScannerPreset:
-    return ScannerPreset("test", width, height, 450.0, 450.0, 199.5, 149.5, 0.3, 2.0, 0.65, noise)
+    return ScannerPreset(
+        name="test",
+        width=width,
+        height=height,
+        fx=450.0,
+        fy=450.0,
+        cx=199.5,
+        cy=149.5,
+        near_m=0.3,
+        far_m=2.0,
+        optimum_m=0.65,
+        noise=noise,
+    )
 
 
 def _flat(preset: ScannerPreset, z: float) -> np.ndarray:

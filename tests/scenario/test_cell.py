@@ -47,7 +47,7 @@ FAST = "welding: {speed_mm_s: 32.0}"
 
 
 def run(scenario: Scenario, folder: Path, seed: int = 0) -> DemoResult:
-    return run_scenario(scenario, RunOptions("a test's own", folder, seed, recording=False))
+    return run_scenario(scenario, RunOptions(scenario="a test's own", out=folder, seed=seed, recording=False))
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_the_same_seed_gives_the_same_run(
 def test_the_weld_log_needs_nothing_that_only_a_simulation_knows(short_job: DemoResult) -> None:
     run = short_job.run
     logs = {name: sink for name, sink in run.cell.logs.items() if name not in ("torch", "tip_and_deflection")}
-    nothing_known = dc.replace(run.cell.station, truth=Truth(None, None, None))
+    nothing_known = dc.replace(run.cell.station, truth=Truth(X_BC=None, X_BP=None, workpiece=None))
     real = dc.replace(run.cell, logs=logs, station=nothing_known)
     found, known = weld_outcome(real, run.root), short_job.weld
     assert found is not None
@@ -356,7 +356,7 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
     assert found.reason == "A person stopped the run with Ctrl-C, in the phase 'approach_above'."
     with pytest.raises(KeyboardInterrupt, match="in the phase 'approach_above'"):
         found.raise_if_interrupted()  # a study of many runs ends with it
-    result = measure(found, RunOptions("a test's own", tmp_path / "run", recording=False))
+    result = measure(found, RunOptions(scenario="a test's own", out=tmp_path / "run", recording=False))
     write_result(result, JobRun(found, None, "simulated"))
     assert result.summary()["state"] == "held"
     assert (tmp_path / "run" / "report.html").exists()
@@ -394,7 +394,7 @@ def test_a_robot_that_cannot_be_had_is_refused_with_one_sentence(
     options: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(WeldcalError, match=said) as refusal:
-        run_scenario(load_scenario("straight_groove", TOLD), RunOptions("x", tmp_path / "run", **options))
+        run_scenario(load_scenario("straight_groove", TOLD), RunOptions(scenario="x", out=tmp_path / "run", **options))
     assert str(refusal.value).count(". ") == 0
     assert not (tmp_path / "run").exists()
 
@@ -403,4 +403,4 @@ def test_a_weld_needs_a_workpiece(tmp_path: Path) -> None:
     path = tmp_path / "bare.yaml"
     path.write_text("welding: {seam_length_mm: 20.0}\n")
     with pytest.raises(WeldcalError, match="needs a workpiece"):
-        run_weld(RunOptions(str(path), tmp_path / "out", recording=False))
+        run_weld(RunOptions(scenario=str(path), out=tmp_path / "out", recording=False))

@@ -20,7 +20,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> tuple[HeldWeld, Path]:
     """The weld and its recording."""
     folder = tmp_path_factory.mktemp("held")
     scenario = short_weld()
-    recorder = RunRecorder(scenario, RunOptions("straight_groove", folder), "simulated")
+    recorder = RunRecorder(scenario, RunOptions(scenario="straight_groove", out=folder), "simulated")
     found = held_weld(scenario, recorder.open_sink)
     run: Run = found.run  # type: ignore[type-arg]
     recorder.close(run)

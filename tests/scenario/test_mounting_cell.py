@@ -159,7 +159,9 @@ def test_what_does_not_belong_together_is_refused_before_any_work(tmp_path: Path
     refused("co_manipulation", "robot_2: !NoDevice {}", "robot_2")
     refused("eye_on_arm", "mounting: {spread_deg: -3.0}", "positive")
     with pytest.raises(InputError, match="has no mounting part"):
-        run_mounting_live(load_scenario("calibrate_only"), RunOptions("calibrate_only", tmp_path), lambda *_: None)
+        run_mounting_live(
+            load_scenario("calibrate_only"), RunOptions(scenario="calibrate_only", out=tmp_path), lambda *_: None
+        )
     assert not any(tmp_path.iterdir())
     assert kind_of(load_scenario("eye_in_hand")) == "mounting"
     assert kind_of(load_scenario("calibrate_only")) == ""

@@ -49,7 +49,7 @@ def test_a_ur5e_on_the_ceiling_welds_with_its_own_tool(tmp_path: Path) -> None:
         tool = tool.replace(old, new)
     (tmp_path / "my_tool.yaml").write_text(tool)
     (tmp_path / "cell.yaml").write_text(HANGING)
-    found = run_weld(RunOptions(str(tmp_path / "cell.yaml"), tmp_path / "out", recording=False)).summary()
+    found = run_weld(RunOptions(scenario=str(tmp_path / "cell.yaml"), out=tmp_path / "out", recording=False)).summary()
     assert found["state"] == "done", found
     torch_mean, torch_max = (float(str(found[key])) for key in ("torch_mean_mm", "torch_max_mm"))
     assert torch_mean <= 0.10

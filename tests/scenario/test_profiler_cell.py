@@ -43,7 +43,7 @@ profiler_job:
 def live(tmp_path_factory: pytest.TempPathFactory) -> ProfilerLive:
     scenario = load_scenario("profiler_seam", SHORT)
     assert RUNNERS[kind_of(scenario)] is run_profiler_live
-    options = RunOptions("profiler_seam", tmp_path_factory.mktemp("live"), seed=2, recording=False)
+    options = RunOptions(scenario="profiler_seam", out=tmp_path_factory.mktemp("live"), seed=2, recording=False)
     return run_profiler_live(scenario, options, lambda *_: None)
 
 
@@ -121,7 +121,9 @@ def alone() -> Alone:
     q = np.deg2rad([190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
     config = RenderedProfiler()
     tip, ball = np.array(job.torch.tip_m), np.array(job.ball.xyz_m)
-    planning = PlanningContext(load_arm("ur10e"), job, q, drawn_pose(config), tip, ball)
+    planning = PlanningContext(
+        arm=load_arm("ur10e"), job=job, q_home=q, X_FS=drawn_pose(config), p_FTip=tip, center=ball
+    )
     procedure = ProfilerProcedure(planning, config, 0)
     made = Alone(Simulator(procedure), procedure)
     made.tell(
@@ -202,7 +204,9 @@ def test_a_scenario_without_a_profiler_is_refused_on_the_command_line(tmp_path: 
 def test_moves_between_touches_keep_torch_and_tip_clear_of_the_sphere_all_along() -> None:
     job, q_home = ProfilerJob(), np.deg2rad([190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
     tip, ball = np.array(job.torch.tip_m), np.array(job.ball.xyz_m)
-    planning = PlanningContext(load_arm("ur10e"), job, q_home, drawn_pose(RenderedProfiler()), tip, ball)
+    planning = PlanningContext(
+        arm=load_arm("ur10e"), job=job, q_home=q_home, X_FS=drawn_pose(RenderedProfiler()), p_FTip=tip, center=ball
+    )
     for seed in range(2):
         q, gaps, tips = q_home, [], []
         for goal in plan_touches(planning, q_home, seed):

@@ -108,7 +108,16 @@ def _turned(folder: Path) -> Path:
     nothing = arm_errors(load_chain("ur10e"), "links")
     u = np.zeros(len(nothing.which))
     u[nothing.names.index("elbow_joint shift x")] = 2e-3 / 1.2e-4
-    fit = KinematicsFit(RigidTransform(), ScannerCorrection(), u, np.eye(1), 1.0, 1.0, 1.0, nothing)
+    fit = KinematicsFit(
+        X_BC=RigidTransform(),
+        correction=ScannerCorrection(),
+        u=u,
+        covariance=np.eye(1),
+        sigma_position_m=1.0,
+        sigma_normal_rad=1.0,
+        redundancy=1.0,
+        errors=nothing,
+    )
     (folder / "other.yaml").write_text(kinematics_text(fit, "another arm"))
     return folder / "other.yaml"
 

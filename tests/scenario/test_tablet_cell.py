@@ -45,7 +45,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Demo:
     shipped = (repository / "models" / "scenarios" / "tablet.yaml").read_text(encoding="utf-8")
     before, after = shipped[: shipped.index("tablet:\n")], shipped[shipped.index("calibration:") :]
     (folder / "short.yaml").write_text(f"{before}{SHORT}\n{after}")
-    options = RunOptions(str(folder / "short.yaml"), folder / "out", seed=3, recording=False)
+    options = RunOptions(scenario=str(folder / "short.yaml"), out=folder / "out", seed=3, recording=False)
     result = run_procedure(options, lambda *_: None)
     return Demo(result.summary(), result.folder, result.run.cell.station)  # type: ignore[attr-defined]
 
@@ -226,8 +226,10 @@ def test_each_procedure_is_told_to_use_its_own_command() -> None:
     assert kind_of(load_scenario("tablet")) == "tablet"
     assert kind_of(load_scenario("s_groove")) == ""
     with pytest.raises(InputError, match="run it with weldcal demo"):
-        run_scenario(load_scenario("tablet"), RunOptions("tablet", Path("never")))
+        run_scenario(load_scenario("tablet"), RunOptions(scenario="tablet", out=Path("never")))
     with pytest.raises(InputError, match="weldcal tablet demo"):
         known_camera("tablet")
     with pytest.raises(InputError, match="has no tablet"):
-        run_tablet_demo(load_scenario("straight_groove"), RunOptions("straight_groove", Path("never")), lambda *_: None)
+        run_tablet_demo(
+            load_scenario("straight_groove"), RunOptions(scenario="straight_groove", out=Path("never")), lambda *_: None
+        )

@@ -204,7 +204,14 @@ def test_pairs_are_judged_by_their_centres(tmp_path: Path) -> None:
     estimate = estimate_eye_on_base([Observation(p.id, p.X_BR, p.p_CR) for p in pairs])
     result = _result(
         tmp_path / "result",
-        CalibrationResult(estimate.X_BC, estimate.covariance, {}, {}, (), data_hashes=load_dataset(given).hashes),
+        CalibrationResult(
+            X_BC=estimate.X_BC,
+            covariance=estimate.covariance,
+            held_out_mm={},
+            tilt_deg={},
+            poses=(),
+            data_hashes=load_dataset(given).hashes,
+        ),
     )
     d = verify_dataset(result, kept, tmp_path / "out").summary()
     assert len(d["per_pose"]) == 23

@@ -56,7 +56,16 @@ def test_a_part_is_looked_for_in_a_frame_whose_z_is_up() -> None:
 
     def plan(points_U: Any, part: Any, X_UP: RigidTransform, method: PlanningMethod, eye_U: Any) -> RootPlan:
         seen.update(points=points_U, X_UP=X_UP, start=method.start_B, eye=eye_U)
-        return RootPlan(points_U[:5], np.tile([0.0, 0.0, 1.0], (5, 1)), 0.4, X_UP, 1e-4, 1e-4, 1.0, "")
+        return RootPlan(
+            root=points_U[:5],
+            up=np.tile([0.0, 0.0, 1.0], (5, 1)),
+            half_angle_rad=0.4,
+            X_BP=X_UP,
+            sigma_m=1e-4,
+            rms_m=1e-4,
+            confidence=1.0,
+            summary="",
+        )
 
     method = PlanningMethod(start_B=(0.1, 0.2, 0.3))
     part, eye = make_workpiece("straight"), np.array([0.5, 0.5, 0.5])

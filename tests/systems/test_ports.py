@@ -122,8 +122,16 @@ from weldcal.welding.servo.settings import ServoConfig
 
 X = RigidTransform()
 IDEAL = get_scanner("ideal", width=206, height=154)
-CALIBRATOR = CalibratorConfig(1e-4, 6, 10, np.zeros(3))
-JOB = JobPlan(True, True, Q_HOME, 10, 1, 5e-4, 1e-4)
+CALIBRATOR = CalibratorConfig(required_error_m=1e-4, minimum_scans=6, maximum_scans=10, p_BWork=np.zeros(3))
+JOB = JobPlan(
+    calibrate=True,
+    weld=True,
+    q_home=Q_HOME,
+    maximum_scans=10,
+    verification_scans=1,
+    verification_limit_m=5e-4,
+    required_error_m=1e-4,
+)
 
 
 def profiler_fixture() -> ProfilerFixture:
@@ -134,11 +142,22 @@ def profiler_fixture() -> ProfilerFixture:
 def profiler_planning() -> PlanningContext:
     """What a procedure without a seam is told."""
     job = ProfilerJob(stages=["edge"])
-    return PlanningContext(the_arm(), job, Q_HOME, X, np.array(job.torch.tip_m), np.array(job.ball.xyz_m))
+    return PlanningContext(
+        arm=the_arm(), job=job, q_home=Q_HOME, X_FS=X, p_FTip=np.array(job.torch.tip_m), center=np.array(job.ball.xyz_m)
+    )
 
 
 def seam_planning() -> SeamPlanning:
-    return SeamPlanning(the_arm(), TOOL, make_workpiece("straight"), X, ServoConfig(), Q_HOME, 0.025, None)
+    return SeamPlanning(
+        arm=the_arm(),
+        tool=TOOL,
+        workpiece=make_workpiece("straight"),
+        X_BP_guess=X,
+        config=ServoConfig(),
+        q_near=Q_HOME,
+        clearance_m=0.025,
+        seam_length_m=None,
+    )
 
 
 def acquisition() -> Acquisition[Any]:

@@ -61,12 +61,16 @@ def ports(station: Station) -> tuple[set[str], set[str]]:
 )
 def test_a_driver_is_found_beside_its_config(config: object, module: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ApplyDriverConfig", lambda *arguments: ("its answer", *arguments))
-    build = StationBuild(DiagramBuilder(), the_arm(), TOOL, Q_HOME, np.random.default_rng(0))
+    build = StationBuild(
+        builder=DiagramBuilder(), arm=the_arm(), tool=TOOL, q_start=Q_HOME, rng=np.random.default_rng(0)
+    )
     assert apply_driver_config(config, build) == ("its answer", config, build)
 
 
 def test_an_absent_device_adds_nothing() -> None:
-    build = StationBuild(DiagramBuilder(), the_arm(), TOOL, Q_HOME, np.random.default_rng(0))
+    build = StationBuild(
+        builder=DiagramBuilder(), arm=the_arm(), tool=TOOL, q_start=Q_HOME, rng=np.random.default_rng(0)
+    )
     assert apply_driver_config(NoDevice(), build) is None
     assert (build.inputs, build.outputs) == ({}, {})
 
@@ -137,7 +141,9 @@ def test_the_seed_draws_the_same_world_wherever_the_arm_stands() -> None:
 
 
 def test_a_simulated_driver_without_a_world_says_so() -> None:
-    build = StationBuild(DiagramBuilder(), the_arm(), TOOL, Q_HOME, np.random.default_rng(0))
+    build = StationBuild(
+        builder=DiagramBuilder(), arm=the_arm(), tool=TOOL, q_start=Q_HOME, rng=np.random.default_rng(0)
+    )
     with pytest.raises(RuntimeError, match="needs a SimulatedWorld in the station"):
         apply_driver_config(SimulatedUr(), build)
 

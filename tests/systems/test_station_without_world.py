@@ -25,7 +25,9 @@ def real_cell() -> Scenario:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
-    return run_scenario(real_cell(), RunOptions("calibrate_only", tmp_path_factory.mktemp("real"), recording=False))
+    return run_scenario(
+        real_cell(), RunOptions(scenario="calibrate_only", out=tmp_path_factory.mktemp("real"), recording=False)
+    )
 
 
 def test_it_holds_no_world_and_speaks_of_no_truth(finished: DemoResult) -> None:

@@ -138,7 +138,7 @@ def test_the_tag_the_seat_and_the_stiffness_are_found(done: dict[str, dict[str, 
 
 def test_a_scenario_that_names_the_file_sees_a_pinhole_and_the_true_tag(done: object, pictures: Path) -> None:
     path = pictures / "out" / "finger.yaml"
-    config = VideoFingerCamera(*SIZE, source="x.avi", calibration=str(path))
+    config = VideoFingerCamera(width=SIZE[0], height=SIZE[1], source="x.avi", calibration=str(path))
     found = read_finger_file(path)
     rectified = found.rectifier()(cv2.imread(str(pictures / "touch3.png"), cv2.IMREAD_GRAYSCALE))
     tag_size = config.tag_size_m()
@@ -152,7 +152,7 @@ def test_a_scenario_that_names_the_file_sees_a_pinhole_and_the_true_tag(done: ob
     assert np.abs(seen.X_KM.translation() - expected).max() < 2.5e-4
     raw = detect_tag(
         cv2.imread(str(pictures / "touch3.png"), cv2.IMREAD_GRAYSCALE),
-        VideoFingerCamera(*SIZE).camera().camera_matrix,
+        VideoFingerCamera(width=SIZE[0], height=SIZE[1]).camera().camera_matrix,
         tag,
     )
     assert raw.X_KM is not None
@@ -161,7 +161,9 @@ def test_a_scenario_that_names_the_file_sees_a_pinhole_and_the_true_tag(done: ob
 
 def test_the_station_takes_the_tags_size_from_the_file(done: object, pictures: Path) -> None:
     scenario = load_scenario("s_groove", "job: {calibrate: false, X_BC: {xyz_m: [0.65, 0.0, 0.95]}}")
-    scenario.finger_camera = _Named(*SIZE, source="x.avi", calibration=str(pictures / "out" / "finger.yaml"))
+    scenario.finger_camera = _Named(
+        width=SIZE[0], height=SIZE[1], source="x.avi", calibration=str(pictures / "out" / "finger.yaml")
+    )
     station = make_station(scenario, 0)
     assert station.tool is not None
     assert station.tool.tag_size_m == pytest.approx(TRUE_TAG_M, abs=5e-5)
@@ -173,7 +175,7 @@ class _Named(VideoFingerCamera):
 
 
 def test_pictures_of_another_size_than_the_files_are_refused(done: object, pictures: Path) -> None:
-    config = VideoFingerCamera(640, 480, source="x.avi", calibration=str(pictures / "out" / "finger.yaml"))
+    config = VideoFingerCamera(width=640, height=480, source="x.avi", calibration=str(pictures / "out" / "finger.yaml"))
     with pytest.raises(InputError, match="was made with pictures of 400 x 300, and finger_camera has 640 x 480"):
         config.camera()
 

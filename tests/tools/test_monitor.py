@@ -60,10 +60,19 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         now = RigidTransform(X_BC.rotation(), X_BC.translation() + SHIFT * (c > KNOCK_S))
         X_CR = now.InvertAndCompose(RigidTransform(X))
         clouds.append((f.id, rendered(X_CR, rng) if f.id != "020" else np.full((HEIGHT, WIDTH, 3), np.nan)))
-    header = DatasetHeader(1, "ur5e", FLANGE, "a scanner", "eye_on_base")
+    header = DatasetHeader(schema=1, robot="ur5e", flange=FLANGE, scanner="a scanner", configuration="eye_on_base")
     intrinsics = (FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1))
     save_motion_dataset(folder / "moving", header, RobotStream(t, feature(t)), frames, clouds, intrinsics=intrinsics)
-    result = CalibrationResult(X_BC, np.diag([1e-9] * 6), {}, {}, (), robot="ur5e", flange=FLANGE, scanner="a scanner")
+    result = CalibrationResult(
+        X_BC=X_BC,
+        covariance=np.diag([1e-9] * 6),
+        held_out_mm={},
+        tilt_deg={},
+        poses=(),
+        robot="ur5e",
+        flange=FLANGE,
+        scanner="a scanner",
+    )
     save_result(result, folder / "calibration")
     return folder / "moving", folder / "calibration"
 

@@ -51,11 +51,20 @@ def recording(folder: Path, moved: str) -> Path:
         flange = rendered(seen_from.InvertAndCompose(RigidTransform(X)), rng)
         behind = room(in_room, rng)
         clouds.append((f.id, np.where(np.isfinite(flange[..., 2:]), flange, behind)))
-    header = DatasetHeader(1, "ur5e", FLANGE, "a scanner", "eye_on_base")
+    header = DatasetHeader(schema=1, robot="ur5e", flange=FLANGE, scanner="a scanner", configuration="eye_on_base")
     intrinsics = (FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1))
     save_motion_dataset(folder / moved, header, RobotStream(t, feature(t)), frames, clouds, intrinsics=intrinsics)
     save_result(
-        CalibrationResult(X_BC, np.diag([1e-9] * 6), {}, {}, (), robot="ur5e", flange=FLANGE), folder / "calibration"
+        CalibrationResult(
+            X_BC=X_BC,
+            covariance=np.diag([1e-9] * 6),
+            held_out_mm={},
+            tilt_deg={},
+            poses=(),
+            robot="ur5e",
+            flange=FLANGE,
+        ),
+        folder / "calibration",
     )
     return folder / moved
 

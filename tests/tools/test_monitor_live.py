@@ -35,7 +35,12 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     X_BC = station.truth.X_BC
     station.close()
     assert X_BC is not None
-    save_result(CalibrationResult(X_BC, np.diag([1e-9] * 6), {}, {}, (), robot="ur10e"), folder / "calibration")
+    save_result(
+        CalibrationResult(
+            X_BC=X_BC, covariance=np.diag([1e-9] * 6), held_out_mm={}, tilt_deg={}, poses=(), robot="ur10e"
+        ),
+        folder / "calibration",
+    )
     words = f"monitor {scenario} --calibration {folder}/calibration --frames 100 --seed {SEED} --recalibrate --out {folder}/out --json"
     found = CliRunner().invoke(app, words.split())
     assert found.exit_code == 0, found.output

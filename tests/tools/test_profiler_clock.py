@@ -38,7 +38,7 @@ def folder(tmp_path: Path) -> Path:
         for a, x in zip(t, X, strict=True)
     ]
     (tmp_path / "stream.csv").write_text("time,x,y,z,qw,qx,qy,qz\n" + "\n".join(rows) + "\n")
-    save_record(ProfilerRecord("edge", X_FP[:3, :3], X_FP[:3, 3]), tmp_path / "calibration")
+    save_record(ProfilerRecord(method="edge", rotation=X_FP[:3, :3], translation=X_FP[:3, 3]), tmp_path / "calibration")
     return tmp_path
 
 

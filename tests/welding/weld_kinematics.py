@@ -16,7 +16,7 @@ from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase, WeldingCommand, WeldingState
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Run:
     """A simulated weld, one row per tick."""
 
@@ -64,5 +64,13 @@ def weld(
     run = simulate(seam, budget, config or ServoConfig(), seed, gaps, time_limit, plan, hidden)
     on = np.array([c.torch_on for c in run.commands])
     phases = tuple(c.phase for c in run.commands)
-    places = (run.points(name) for name in ("torch", "robot", "tip"))
-    return Run(run.column("time_s"), *places, on, phases, run.commands, run.state)
+    return Run(
+        time=run.column("time_s"),
+        torch=run.points("torch"),
+        tool=run.points("robot"),
+        tip=run.points("tip"),
+        torch_on=on,
+        phase=phases,
+        commands=run.commands,
+        state=run.state,
+    )

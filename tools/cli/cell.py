@@ -28,7 +28,7 @@ def check_cell(
         check if device == check.name else replace(check, name=f"{device.replace('_', ' ')}: {check.name}")
         for device, check in report.rows
     )
-    table = Preflight(report.name, rows)
+    table = Preflight(host=report.name, checks=rows)
     return Outcome(report.summary(), text=partial(emit_table, table), problem=report.first_problem)
 
 

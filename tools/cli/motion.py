@@ -50,9 +50,25 @@ def motion_data(
     from weldcal.tools.studies.motion.command import DataRequest, write_motion_data
 
     request = DataRequest(
-        call.folder("reproduce", "motion-data"), call.seed, frames, robot, scanner, width, move, speed, noise_mm, readout_ms,
-        stream_hz, poses, device_clock, surroundings, knock, creep, base, warm_up,
-    )  # fmt: skip
+        folder=call.folder("reproduce", "motion-data"),
+        seed=call.seed,
+        frames=frames,
+        robot=robot,
+        scanner=scanner,
+        width=width,
+        move=move,
+        speed=speed,
+        noise_mm=noise_mm,
+        readout_ms=readout_ms,
+        stream_hz=stream_hz,
+        poses=poses,
+        device_clock=device_clock,
+        surroundings=surroundings,
+        knock=knock,
+        creep=creep,
+        base=base,
+        warm_up=warm_up,
+    )
     return write_motion_data(request, call.progress)
 
 

@@ -61,18 +61,18 @@ def calibrate(
     from weldcal.tools.commands.tablet.calibrate import TabletInputs, calibrate_tablet
 
     inputs = TabletInputs(
-        file,
-        poses,
-        camera,
-        image,
-        seen,
-        look,
-        None if pen_length_mm is None else 1e-3 * pen_length_mm,
-        1e-3 * pen_radius_mm,
-        None if hand_step_mm is None else 1e-3 * hand_step_mm,
-        printed_sign,
-        two_stages,
-        limit_mm,
+        file=file,
+        poses=poses,
+        camera=camera,
+        image=image,
+        seen=seen,
+        look=look,
+        pen_length_m=None if pen_length_mm is None else 1e-3 * pen_length_mm,
+        pen_radius_m=1e-3 * pen_radius_mm,
+        hand_step_m=None if hand_step_mm is None else 1e-3 * hand_step_mm,
+        printed_sign=printed_sign,
+        two_stages=two_stages,
+        limit_mm=limit_mm,
     )
     made = calibrate_tablet(inputs, call.folder("tablet", file.stem))
     return Outcome(made.summary(), first=made.first)

@@ -60,14 +60,14 @@ def compare_algorithm1(
         return None, verifier, tuple(icp)
     true = run.true_errors[[o.id in {g.id for g in good} for o in pool if o.id not in run.pool]]
     outcome = Algorithm1Outcome(
-        held.id,
-        metric,
-        1e3 * run.cost,
-        error_summary(1e3 * true),
-        1e3 * float(position_errors(run.X_BC, [held])[0]),
-        unseen,
-        tuple(float(s) for s in shares.share) if shares is not None else (),
-        run,
+        verification=held.id,
+        metric=metric,
+        figure_mm=1e3 * run.cost,
+        true_mm=error_summary(1e3 * true),
+        at_verification_mm=1e3 * float(position_errors(run.X_BC, [held])[0]),
+        unseen=unseen,
+        shares=tuple(float(s) for s in shares.share) if shares is not None else (),
+        run=run,
     )
     return outcome, verifier, tuple(icp)
 

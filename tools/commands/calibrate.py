@@ -109,12 +109,12 @@ def calibrate_dataset(
             Refinable(
                 data,
                 Plain(
-                    observations,
-                    tuple(corrected),
-                    seen.patterns,
-                    estimate,
-                    None if scanner is None else scanner.accepted,
-                    correct_scanner and not few,
+                    observations=observations,
+                    corrected=tuple(corrected),
+                    patterns=seen.patterns,
+                    estimate=estimate,
+                    correction=None if scanner is None else scanner.accepted,
+                    correct_scanner=correct_scanner and not few,
                 ),
                 robot or data.header.robot,
                 kinematics,
@@ -193,23 +193,23 @@ def calibrate_dataset(
         software=software_version(),
     )
     report = CalibrationReport(
-        result,
-        estimate,
-        tuple(corrected),
-        scanner,
-        fits,
-        tuple(refused),
-        outliers,
-        algorithm1,
-        curve,
-        error_summary(1e3 * folds[np.isfinite(folds)]),
-        time.monotonic() - started,
-        Path(out),
-        sampling_advice(estimate, corrected),
-        seen.patterns,
-        data.notes,
-        None if refined is None else refined.document(refine or ""),
-        limit_mm,
+        result=result,
+        estimate=estimate,
+        observations=tuple(corrected),
+        scanner=scanner,
+        fits=fits,
+        refused=tuple(refused),
+        outliers=outliers,
+        algorithm1=algorithm1,
+        convergence=curve,
+        k_fold_mm=error_summary(1e3 * folds[np.isfinite(folds)]),
+        seconds=time.monotonic() - started,
+        out=Path(out),
+        advice=sampling_advice(estimate, corrected),
+        patterns=seen.patterns,
+        notes=data.notes,
+        refinement=None if refined is None else refined.document(refine or ""),
+        limit_mm=limit_mm,
     )
     tell("writing the report", 0.95)
     html = calibration_report(report, dataset=Path(folder).name)
@@ -280,16 +280,18 @@ def _pose_records(
         tilt, held_tilt = (float(np.degrees(t[k])) for t in (estimate.tilt_residuals_rad, estimate.held_out.tilt_rad))
         records.append(
             PoseRecord(
-                o.id,
-                bool(estimate.inliers[k]),
-                reasons.pop(o.id, ""),
-                float(1e3 * estimate.position_residuals_m[k]),
-                float(1e3 * estimate.held_out.position_m[k]) if np.isfinite(estimate.held_out.position_m[k]) else None,
-                tilt if np.isfinite(tilt) else None,
-                held_tilt if np.isfinite(held_tilt) else None,
+                id=o.id,
+                used=bool(estimate.inliers[k]),
+                reason=reasons.pop(o.id, ""),
+                residual_mm=float(1e3 * estimate.position_residuals_m[k]),
+                held_out_mm=float(1e3 * estimate.held_out.position_m[k])
+                if np.isfinite(estimate.held_out.position_m[k])
+                else None,
+                tilt_deg=tilt if np.isfinite(tilt) else None,
+                held_out_tilt_deg=held_tilt if np.isfinite(held_tilt) else None,
             )
         )
-    return (*records, *(PoseRecord(i, False, t) for i, t in reasons.items()))
+    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 
 
 def _centres_csv(observations: list[Observation]) -> str:

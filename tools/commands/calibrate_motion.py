@@ -99,7 +99,14 @@ def calibrate_motion(
         target=_target(estimate) if data.in_hand else None,
     )
     report = MotionReport(
-        result, estimate, frames, tuple(refused), outliers, time.monotonic() - started, Path(out), limit_mm
+        result=result,
+        estimate=estimate,
+        frames=frames,
+        refused=tuple(refused),
+        outliers=outliers,
+        seconds=time.monotonic() - started,
+        out=Path(out),
+        limit_mm=limit_mm,
     )
     tell("writing the report", 0.95)
     write_atomic(Path(out) / "report.html", motion_report(report, dataset=Path(folder).name))
@@ -145,15 +152,15 @@ def _records(
     reasons = dict(refused)
     records = []
     for k, id in enumerate(frames.ids):
-        values = (
-            1e3 * estimate.residual_m[k],
-            1e3 * estimate.held_out_m[k],
-            np.degrees(estimate.tilt_rad[k]),
-            np.degrees(estimate.held_out_tilt_rad[k]),
-        )
-        numbers = [float(v) if np.isfinite(v) else None for v in values]
-        records.append(PoseRecord(id, bool(estimate.inliers[k]), reasons.pop(id, ""), *numbers))
-    return (*records, *(PoseRecord(i, False, t) for i, t in reasons.items()))
+        values = {
+            "residual_mm": 1e3 * estimate.residual_m[k],
+            "held_out_mm": 1e3 * estimate.held_out_m[k],
+            "tilt_deg": np.degrees(estimate.tilt_rad[k]),
+            "held_out_tilt_deg": np.degrees(estimate.held_out_tilt_rad[k]),
+        }
+        numbers = {key: float(v) if np.isfinite(v) else None for key, v in values.items()}
+        records.append(PoseRecord(id=id, used=bool(estimate.inliers[k]), reason=reasons.pop(id, ""), **numbers))
+    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 
 
 def _centres_csv(frames: ObservedFrames, estimate: MotionEstimate) -> str:

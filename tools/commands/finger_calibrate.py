@@ -34,7 +34,7 @@ FORCES = ("fx_n", "fy_n", "fz_n")
 _NO_TOUCHES = "Only the camera is calibrated: without touches nothing says how exactly the tip is measured."
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FingerReport:
     """The camera, the tip (None without touches), pictures in which the board was not found, and the tag's pose at rest."""
 
@@ -158,7 +158,7 @@ def calibrate_finger(
             seen.append(found)
     assert size is not None
     camera = calibrate_intrinsics(seen, size)
-    report = FingerReport(camera, None, tuple(without))
+    report = FingerReport(camera=camera, tip=None, without_board=tuple(without))
     if touches is not None:
         report = _with_touches(report, touches, size, carrier)
     report = replace(report, limit_mm=limit_mm)
@@ -244,7 +244,14 @@ def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool
     assert rest is not None
     assert rest.X_KM is not None
     at_rest = tuple(float(1e3 * v / tip.scale) for v in rest.X_KM.translation())
-    return FingerReport(camera, tip, report.without_board, 1e3 * tag.size_m / tip.scale, at_rest, len(pressed))
+    return FingerReport(
+        camera=camera,
+        tip=tip,
+        without_board=report.without_board,
+        tag_size_mm=1e3 * tag.size_m / tip.scale,
+        tag_at_rest_mm=at_rest,
+        touches=len(pressed),
+    )
 
 
 def _number(table: Path, line: int, row: dict[str, str], key: str) -> float:

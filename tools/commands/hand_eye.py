@@ -128,7 +128,17 @@ def run_hand_eye(
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
     report = HandEyeReport(
-        result, found, comparison, advice, files, seconds, " ".join(said), sentence, streams, limit_mm, out
+        result=result,
+        mounting=found,
+        comparison=comparison,
+        next_pose=advice,
+        files=files,
+        seconds=seconds,
+        corners=" ".join(said),
+        advice=sentence,
+        streams=streams,
+        limit_mm=limit_mm,
+        folder=out,
     )
     write_atomic(out / "report.html", hand_eye_report(report, file.name, provenance.sha256))
     return report

@@ -84,9 +84,15 @@ def monitor_recording(
         recalibrated_result(result, watched, data.hashes, standard.designation, seed) if recalibrate else None
     )
     report = MonitorReport(
-        watched, result, recalibrated, causes(watched), false_alarms_per_hour,
-        (*data.warnings, *_warnings(result, data, watched, len(refused), standard.designation)), time.monotonic() - started, Path(out),
-    )  # fmt: skip
+        watched=watched,
+        calibration=result,
+        recalibrated=recalibrated,
+        cause=causes(watched),
+        false_alarms_per_hour=false_alarms_per_hour,
+        warnings=(*data.warnings, *_warnings(result, data, watched, len(refused), standard.designation)),
+        seconds=time.monotonic() - started,
+        out=Path(out),
+    )
     tell("writing the report", 0.95)
     write_atomic(Path(out) / "report.html", monitor_page(report, recording=Path(folder).resolve().name))
     if recalibrated is not None:

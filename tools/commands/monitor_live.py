@@ -157,7 +157,14 @@ def monitor_live(
         feature = feature_standard(scenario).designation
         again = recalibrated_result(result, watched, {}, feature, options.seed) if recalibrate else None
         report = MonitorReport(
-            watched, result, again, causes(watched), false_alarms_per_hour, (), time.monotonic() - started, options.out
+            watched=watched,
+            calibration=result,
+            recalibrated=again,
+            cause=causes(watched),
+            false_alarms_per_hour=false_alarms_per_hour,
+            warnings=(),
+            seconds=time.monotonic() - started,
+            out=options.out,
         )
         write_atomic(options.out / "report.html", monitor_page(report, recording=options.scenario))
         if again is not None:

@@ -180,11 +180,19 @@ def calibration_result(outcome: MotionOutcome, e: MotionEstimate) -> Calibration
     scenario, used = outcome.run.cell.scenario, e.inliers
     scanner = scenario.scanner_config()
     tilt = error_summary(np.degrees(e.held_out_tilt_rad[used]))
-    values: list[Array] = [
-        1e3 * e.residual_m, 1e3 * e.held_out_m, np.degrees(e.tilt_rad), np.degrees(e.held_out_tilt_rad)
-    ]  # fmt: skip
+    values: dict[str, Array] = {
+        "residual_mm": 1e3 * e.residual_m,
+        "held_out_mm": 1e3 * e.held_out_m,
+        "tilt_deg": np.degrees(e.tilt_rad),
+        "held_out_tilt_deg": np.degrees(e.held_out_tilt_rad),
+    }
     poses = [
-        PoseRecord(f.id, bool(used[k]), "", *(float(v[k]) if np.isfinite(v[k]) else None for v in values))
+        PoseRecord(
+            id=f.id,
+            used=bool(used[k]),
+            reason="",
+            **{key: float(v[k]) if np.isfinite(v[k]) else None for key, v in values.items()},
+        )
         for k, (f, _) in enumerate(outcome.record.seen)
     ]
     return CalibrationResult(
@@ -192,7 +200,7 @@ def calibration_result(outcome: MotionOutcome, e: MotionEstimate) -> Calibration
         covariance=e.covariance,
         held_out_mm=error_summary(1e3 * e.held_out_m[used]),
         tilt_deg={k: tilt[k] if np.isfinite(tilt[k]) else None for k in ("median", "p95")},
-        poses=(*poses, *(PoseRecord(id, False, text) for id, text in outcome.record.refused)),
+        poses=(*poses, *(PoseRecord(id=id, used=False, reason=text) for id, text in outcome.record.refused)),
         unobservable=e.unobservable,
         warnings=e.warnings,
         robot=scenario.arm,

@@ -55,7 +55,7 @@ def write_example(folder: Path, seed: int, progress: Progress = no_progress, for
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"'{folder}' is not empty: choose another folder.")
     scenario = load_scenario(EXAMPLE, SMALL)
-    finished = run_job(scenario, RunOptions(EXAMPLE, folder, seed, recording=False), progress, "")
+    finished = run_job(scenario, RunOptions(scenario=EXAMPLE, out=folder, seed=seed, recording=False), progress, "")
     progress("write", 0.99)
     status = finished.cell.job.calibration_status(finished.run.root)
     written = write_scans(finished.run, status, folder)

@@ -27,7 +27,7 @@ _EDGES, _LEANS = (0.5, 1.0, 1.25), (5.0, 15.0, 25.0)  # of the scenario's cube; 
 _SPEED_M_S = 0.25  # of a part to be scanned: what an error of the clock costs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Planned:
     """A motion and what it is expected to tell, one sigma; infinite where it shows nothing. ``cost_mm`` is the error of a point on a
     part in motion. ``corners_deg`` are the joint angles of a cube's corners, empty for a stream."""
@@ -118,7 +118,13 @@ def _of_cubes(
 def _planned(name: str, told: Expected, corners: tuple[tuple[float, ...], ...] = ()) -> Planned:
     cost = float(np.hypot(told.work_m, _SPEED_M_S * told.offset_s))
     return Planned(
-        name, 1e3 * told.work_m, float(np.degrees(told.turn_rad)), 1e3 * told.offset_s, told.shared, 1e3 * cost, corners
+        name=name,
+        error_mm=1e3 * told.work_m,
+        rotation_deg=float(np.degrees(told.turn_rad)),
+        clock_offset_ms=1e3 * told.offset_s,
+        shared=told.shared,
+        cost_mm=1e3 * cost,
+        corners_deg=corners,
     )
 
 

@@ -28,7 +28,7 @@ from weldcal.systems.runner import Progress, no_progress
 IDENTICAL, DIFFERS = "identical", "differs"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Replay:
     """A finished replay: seconds of the recording that were replayed, how many values were compared, and what differs by port.
 
@@ -90,14 +90,14 @@ def replay(
             phase, X_BC = _run(cell, recording.end_tick * PERIOD_S, progress, look)
     comparison.finish()
     return Replay(
-        recording.end_tick * PERIOD_S,
-        comparison.compared,
-        comparison.first,
-        comparison.differences,
-        about,
-        phase,
-        X_BC,
-        recording.end is None,
+        seconds=recording.end_tick * PERIOD_S,
+        compared=comparison.compared,
+        first=comparison.first,
+        differences=comparison.differences,
+        about=about,
+        phase=phase,
+        X_BC=X_BC,
+        cut_off=recording.end is None,
     )
 
 

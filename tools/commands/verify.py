@@ -112,18 +112,18 @@ def verify_dataset(
         *_diagnostics(calibration, data, observations, poses),
     )
     report = VerifyReport(
-        calibration,
-        correction,
-        observations,
-        seen.fits,
-        poses,
-        seen.refused,
-        warnings,
-        data.hashes,
-        Path(out),
-        verdict,
-        source,
-        str(dataset),
+        result=calibration,
+        correction=correction,
+        observations=observations,
+        fits=seen.fits,
+        poses=poses,
+        refused=seen.refused,
+        warnings=warnings,
+        hashes=data.hashes,
+        out=Path(out),
+        verdict=verdict,
+        source=source,
+        dataset=str(dataset),
     )
     tell("writing the report", 0.9)
     write_atomic(Path(out) / "report.html", verify_report(report, dataset=Path(dataset).resolve().name))

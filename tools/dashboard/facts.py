@@ -40,7 +40,7 @@ SCAN = "scan"
 _SCAN_S, _MOVES_S, _TOUCH_S, _WHOLE_SEAM_MM = 3.0, {"Park": 3.0, "Approach": 5.0, "Go home": 6.0}, 6.0, 300.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Facts:
     """Of a run: `steps`: name and phases of each step that the job will make; lengths in mm, NaN or None where the job has none.
 
@@ -85,17 +85,17 @@ def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
     seconds |= {name: s * slower for name, s in _MOVES_S.items()}
     seconds["Weld"] = _TOUCH_S + seam_mm / (1e3 * servo.weld_speed_m_s)
     return Facts(
-        title,
-        robot,
-        settable,
-        steps,
-        c.required_error_mm if scenario.job.calibrate else math.nan,
-        c.maximum_scans,
-        c.minimum_scans,
-        seconds,
-        1e3 * servo.weld_speed_m_s,
-        1e3 * servo.deflection.delta_d_m,
-        (1e3 * servo.contact.normal_min_m, 1e3 * servo.faults.lateral_m),
+        title=title,
+        robot=robot,
+        settable_pace=settable,
+        steps=steps,
+        required_mm=c.required_error_mm if scenario.job.calibrate else math.nan,
+        maximum_scans=c.maximum_scans,
+        minimum_scans=c.minimum_scans,
+        seconds=seconds,
+        weld_speed_mm_s=1e3 * servo.weld_speed_m_s,
+        wanted_deflection_mm=1e3 * servo.deflection.delta_d_m,
+        band_mm=(1e3 * servo.contact.normal_min_m, 1e3 * servo.faults.lateral_m),
         gain=_gain_of(job),
         work_B=work_point(scenario),
     )
@@ -106,23 +106,41 @@ def _other_facts(cell: Cell[Any], title: str, robot: str, settable: bool) -> Fac
     job, c = cell.job, cell.scenario.calibration
     if isinstance(job, AddedMounting):
         scans = c.maximum_scans
-        return Facts(title, robot, settable, MOUNTING_STEPS, c.required_error_mm, scans, c.minimum_scans)
+        return Facts(
+            title=title,
+            robot=robot,
+            settable_pace=settable,
+            steps=MOUNTING_STEPS,
+            required_mm=c.required_error_mm,
+            maximum_scans=scans,
+            minimum_scans=c.minimum_scans,
+        )
     if isinstance(job, AddedMotion):
         watches = job.monitor is not None
         steps = WATCH_STEPS if watches else MOTION_STEPS
-        return Facts(title, robot, settable, steps, maximum_scans=job.frames)
+        return Facts(title=title, robot=robot, settable_pace=settable, steps=steps, maximum_scans=job.frames)
     if isinstance(job, AddedVisit):
-        return Facts(title, robot, settable, TABLET_STEPS, maximum_scans=len(job.plan.q_above))
+        return Facts(
+            title=title, robot=robot, settable_pace=settable, steps=TABLET_STEPS, maximum_scans=len(job.plan.q_above)
+        )
     if isinstance(job, AddedTouches):
         touch = cell.scenario.part(TouchConfig)
         press_mm = math.nan if touch is None else touch.press_mm
         return Facts(
-            title, robot, settable, TOUCH_STEPS, maximum_scans=job.points, press_mm=press_mm, height=job.height_m
+            title=title,
+            robot=robot,
+            settable_pace=settable,
+            steps=TOUCH_STEPS,
+            maximum_scans=job.points,
+            press_mm=press_mm,
+            height=job.height_m,
         )
     if isinstance(job, AddedProfilerJob):
         keys = ["start", *(step for stage in job.job.stages for step in PLANS[stage]), "home"]
-        return Facts(title, robot, settable, tuple((PROFILER_STEPS[key], (key,)) for key in keys))
-    return Facts(title, robot, settable)
+        return Facts(
+            title=title, robot=robot, settable_pace=settable, steps=tuple((PROFILER_STEPS[key], (key,)) for key in keys)
+        )
+    return Facts(title=title, robot=robot, settable_pace=settable)
 
 
 def _gain_of(job: WeldJob) -> Callable[[CalibrationStatus, int], float]:

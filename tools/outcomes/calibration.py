@@ -54,7 +54,7 @@ def error_summary(values: Array) -> dict[str, float]:
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Algorithm1Outcome:
     """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive to.
 
@@ -81,7 +81,7 @@ class Algorithm1Outcome:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CalibrationReport:
     """The result of `weldcal calibrate`: the estimate, the records written, and the folder. ``observations`` include the
     scanner correction where one was accepted; ``notes`` say in which form the dataset was read; ``limit_mm`` is the error that the
@@ -263,7 +263,7 @@ class Verdict:
         return {USE: "good", DO_NOT: "bad"}.get(self.verdict, "warn")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class VerifyReport:
     """The result of a verification. ``observations`` include the scanner correction where the result has one."""
 

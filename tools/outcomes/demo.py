@@ -108,7 +108,7 @@ class DemoResult:
         notes = [*refused_note(status.refused, self.n_scans), *self.arm_note]
         if estimate.scanner is not None:
             notes.insert(0, correction_hint("X_BC", self.folder / RESULT_FILE))
-        found = Findings(against, tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
+        found = Findings(against=against, tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
         return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())
 

@@ -101,7 +101,7 @@ class ShownPose:
         return pose_rows(self.X, self.symbol, self.words)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Findings:
     """What a command found, as the verdict's rule reads it.
 

@@ -45,7 +45,7 @@ class Checked:
         return self.verification is not None and self.verification.get("verdict") == DO_NOT
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Cell:
     """A cell with its datasets in order, oldest first, and what follows from them: VISIT, LOOK or FINE, why, and what to do."""
 
@@ -158,7 +158,7 @@ def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> Cel
     else:
         reason, then = _smaller_signs(newest, usual_mm)
         state = LOOK if reason else FINE
-    return Cell(name, datasets, state, reason, then, since, trend)
+    return Cell(name=name, datasets=datasets, state=state, reason=reason, next=then, since=since, trend=trend)
 
 
 def _smaller_signs(newest: Checked, usual_mm: float) -> tuple[str, str]:

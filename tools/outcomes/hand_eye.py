@@ -28,7 +28,7 @@ class MethodRow:
     mm: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HandEyeReport:
     """A finished calibration: the result, the comparison, the next pose (``advice``: as a sentence) and the files;
     ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were given."""

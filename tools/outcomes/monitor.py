@@ -18,7 +18,7 @@ from weldcal.tools.outcomes.poses import SCANNER
 CALM, DRIFTED, WARMED = "no drift found", "the scanner has moved", "the scanner warms up"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MonitorReport:
     """What was watched, the calibration, the recalibrated result where it was asked for, and the folder."""
 

@@ -25,7 +25,7 @@ from weldcal.tools.outcomes.first_screen import (
 from weldcal.tools.outcomes.poses import radius_95
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MotionReport:
     """The estimate, the records written, and the folder. ``dropped``: frames of the recording that no estimate used."""
 
@@ -133,7 +133,14 @@ def motion_screen(
         tolerance = Tolerance(f"the {what},", larger, limit_mm, "--limit-mm")
     notes = refused_note(refused, len(p_C) + len(refused), "frames")
     concerns = (*r.warnings, *r.unobservable)
-    found = Findings(against, tolerance, no_tolerance, len(held), concerns, notes)
+    found = Findings(
+        against=against,
+        tolerance=tolerance,
+        no_tolerance=no_tolerance,
+        unseen=len(held),
+        concerns=concerns,
+        notes=notes,
+    )
     if tolerance is not None and not tolerance.met:
         after = Next("Record a longer motion, with more turns, or scans at rest: plan it first.", "weldcal plan-motion")
     elif r.symbol == "X_BC":

@@ -184,7 +184,17 @@ class MountingReport:
         status = self.status
         if self.result is None:
             return f"{self.mounting.name}: {self.state}. {self.reason}"
-        lines = [HandEyeReport(self.result, self.mounting, (), None, (), self.seconds).text(), ""]
+        lines = [
+            HandEyeReport(
+                result=self.result,
+                mounting=self.mounting,
+                comparison=(),
+                next_pose=None,
+                files=(),
+                seconds=self.seconds,
+            ).text(),
+            "",
+        ]
         lines.append(f"poses        {self.result.diversity.sentence()}")
         lines += [f"given        {sentence}" for sentence in self.given()]
         aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.held_out)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """The user's options: scenario by name or path, result folder, seed, whether to open a browser, real time or as fast as
     possible; the robot (see chosen_robot; None: the scenario's), and the speed of the arm's moves (None: the scenario's).

@@ -67,7 +67,7 @@ class PathOutcome:
         return np.asarray(1e3 * np.hypot(self.lateral, self.height))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LiveOutcome:
     """All results of a run; None for the parts that the scenario does not have."""
 
@@ -111,7 +111,7 @@ def live_outcome(run: Run[AddedProfilerJob]) -> LiveOutcome:
     truth, torch_B = cell.station.truth, true_torch(run)
     profiler = truth.profiler
     if profiler is None:
-        return LiveOutcome(None, None, None, None, None, None, None)
+        return LiveOutcome(edge=None, sphere=None, tip_mm=None, center_mm=None, points=None, curve=None, torch=None)
     touched = s.sphere if s.sphere is not None and s.sphere.estimate.tip is not None else None
     tip = center = None
     if touched is not None and touched.estimate.tip is not None:
@@ -203,7 +203,9 @@ class ProfilerLive:
             if any(not p.within_3_sigma for p in known)
             else []
         )
-        found_all = Findings(against, tolerance, _NO_KEY, unseen, concerns)
+        found_all = Findings(
+            against=against, tolerance=tolerance, no_tolerance=_NO_KEY, unseen=unseen, concerns=concerns
+        )
         if held:
             after = Next("Settle the reason, then run the job again.")
         else:

@@ -46,7 +46,7 @@ def middle_error_mm(record: ProfilerRecord, points_F: Array) -> float | None:
     return 1e3 * radius_95(S)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerFile:
     """A calibration of a profiler from a file: ``found`` are values of its JSON object, ``points`` (n, 2) m those that were measured in
     the scan plane, ``held_out_mm`` (k,) the errors of scans that their calibration did not use."""
@@ -92,7 +92,7 @@ class ProfilerFile:
                     f"weldcal profiler seam SCANS --calibration {self.out}")  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerSeam:
     """A groove that was mapped into the base: ``found`` are values of the JSON object, ``root_mm`` (n, 3) the root in B."""
 

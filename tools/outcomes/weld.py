@@ -30,7 +30,7 @@ from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Phase
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WeldLog:
     """The weld's time series, one row per servo tick; (N,) and (N, 3) arrays in B, SI units."""
 
@@ -45,7 +45,7 @@ class WeldLog:
     sigma_min: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WeldOutcome:
     """Errors of the weld against the true seam (simulation only)."""
 
@@ -193,21 +193,23 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
         line = lowered.position(np.linspace(0.0, lowered.length, 200))
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
-        return WeldOutcome(log, seam, plan, None, None, plan_error)
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
     wanted = cell.job.servo_config.weld_speed_m_s
     parts = [part for part in welds(log) if (part & log.torch_on).sum() >= 30]
     if not parts:
-        return WeldOutcome(log, seam, plan, None, None, plan_error)
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
     speed = _together([speed_statistics(log.time[p], log.p_BTorch[p], log.torch_on[p], wanted) for p in parts])
     if seam is None:
-        return WeldOutcome(log, seam, plan, None, speed, plan_error)
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=speed, plan_error=plan_error)
     errors = tuple(
         path_error(log.p_BTorch[part & log.torch_on], true)
         for k, part in enumerate(welds(log))
         if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, k)) is not None
     )
     error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
-    return WeldOutcome(log, seam, plan, error, speed, plan_error, errors)
+    return WeldOutcome(
+        log=log, true_seam=seam, planned=plan, error=error, speed=speed, plan_error=plan_error, seams=errors
+    )
 
 
 def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
@@ -217,13 +219,13 @@ def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
     mean = float(means @ length / length.sum())
     spread = np.array([w.cv * w.mean for w in welds]) ** 2 + (means - mean) ** 2
     return SpeedStatistics(
-        mean,
-        min(w.least for w in welds),
-        max(w.most for w in welds),
-        float(np.sqrt(spread @ length / length.sum())) / mean,
-        sum(w.outside_m for w in welds),
-        float(length.sum()),
-        sum(w.seconds for w in welds),
+        mean=mean,
+        least=min(w.least for w in welds),
+        most=max(w.most for w in welds),
+        cv=float(np.sqrt(spread @ length / length.sum())) / mean,
+        outside_m=sum(w.outside_m for w in welds),
+        welded_m=float(length.sum()),
+        seconds=sum(w.seconds for w in welds),
     )
 
 

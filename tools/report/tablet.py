@@ -43,7 +43,7 @@ class Shown:
     picture: bytes | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Page:
     """The contents of tablet.html.j2."""
 

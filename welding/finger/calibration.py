@@ -20,7 +20,7 @@ FAR_OFF = 0.2  # of the nominal size: a tag that is further off is another tag
 AXES = ("x", "y", "z")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Intrinsics:
     """A camera: K (3, 3) px, OpenCV's five distortion coefficients, picture size, rms reprojection in px of the pictures that
     were used and of those that were not, their numbers, and the standard deviation of the focal length in px."""
@@ -36,7 +36,7 @@ class Intrinsics:
     focal_sigma_px: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TipCalibration:
     """What touches show.
 
@@ -106,7 +106,15 @@ def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, i
     held_out = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     focal_sigma = float(np.ravel(sigmas)[0])
     return Intrinsics(
-        np.asarray(K), np.ravel(distortion), *size, float(rms), held_out, len(used), len(judges), focal_sigma
+        K=np.asarray(K),
+        distortion=np.ravel(distortion),
+        width=size[0],
+        height=size[1],
+        rms_px=float(rms),
+        held_out_px=held_out,
+        used=len(used),
+        held_out=len(judges),
+        focal_sigma_px=focal_sigma,
     )
 
 
@@ -159,7 +167,15 @@ def calibrate_tip(pressed_m: Array, shown_m: Array, forces_N: Array | None = Non
     directions = np.abs(pressed).max(axis=0) > LEAST_PRESS_M
     angle = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(R) - 1.0), -1.0, 1.0)))) if turned else None
     shown_seat = np.where(directions, seat, np.nan)
-    return TipCalibration(scale, sigma, angle, shown_seat, stiffness, float(np.median(left)), tuple(unknown))
+    return TipCalibration(
+        scale=scale,
+        scale_sigma=sigma,
+        rotation_deg=angle,
+        seat_m=shown_seat,
+        stiffness_N_per_m=stiffness,
+        held_out_m=float(np.median(left)),
+        unknown=tuple(unknown),
+    )
 
 
 def _similar(a: Array, b: Array, turned: bool) -> tuple[float, Array, Array]:

@@ -44,7 +44,7 @@ class AmbiguousWorkpiece(WorkpieceNotFound):
     """The scan agrees with two positions or two orientations of the part, and nothing distinguishes them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FindConfig:
     """Settings of the search, and the thresholds of its decision.
 

@@ -41,7 +41,7 @@ class PlanningMethod:
             raise InputError(f"planning.search must be one of {', '.join(SEARCHES)}, not '{self.search}'.")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RootPlan:
     """The planned root of the groove in base, in the direction of travel.
 

@@ -19,7 +19,7 @@ class WorkpieceNotFound(WeldcalError):
     """The scan does not show this workpiece near the guess."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RegistrationConfig:
     """Limits on the guess and on the agreement of the scan with the drawing.
 
@@ -37,7 +37,7 @@ class RegistrationConfig:
     seed: int = 0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WorkpieceRegistration:
     """The pose X_BP of the plate (frame P of models.workpieces.plate), and how well the scan agrees with it.
 

@@ -117,7 +117,7 @@ class PathError:
         return float(np.max(np.abs(self.lateral)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SpeedStatistics:
     """Statistics of the torch speed over arc length.
 
@@ -196,7 +196,13 @@ def speed_statistics(
     spread = float(np.sqrt(((speed - mean) ** 2 * lengths).sum() / total))
     outside = float(lengths[np.abs(speed / weld_speed - 1.0) > _BAND].sum())
     return SpeedStatistics(
-        mean, float(speed.min()), float(speed.max()), spread / mean, outside, total, float(t_on[-1] - t_on[0])
+        mean=mean,
+        least=float(speed.min()),
+        most=float(speed.max()),
+        cv=spread / mean,
+        outside_m=outside,
+        welded_m=total,
+        seconds=float(t_on[-1] - t_on[0]),
     )
 
 

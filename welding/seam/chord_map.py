@@ -9,7 +9,7 @@ from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ChordMap:
     """Tip and torch on the nominal plan, one row per torch position.
 
@@ -122,7 +122,17 @@ def chord_map(
     scale = np.minimum(scale, omega_limit * d / np.maximum(np.abs(np.sin(turn)), tiny))
     travel = np.arcsin(np.clip(np.sum(u * up, axis=1), -1.0, 1.0))
     conditioning = np.hypot(cos_tip, cos_torch)
-    return ChordMap(s_torch, s_tip, turn, cos_tip, cos_torch, conditioning, scale * cos_torch, scale * cos_tip, travel)
+    return ChordMap(
+        s_torch=s_torch,
+        s_tip=s_tip,
+        turn=turn,
+        cos_tip=cos_tip,
+        cos_torch=cos_torch,
+        conditioning=conditioning,
+        tip_speed=scale * cos_torch,
+        torch_speed=scale * cos_tip,
+        travel=travel,
+    )
 
 
 def _ends(plan: SeamCurve, tip: float, torch: float, tip_left: float) -> tuple[float, float, float]:

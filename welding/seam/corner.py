@@ -8,7 +8,7 @@ import numpy as np
 from weldcal.welding.numerics import Array, dot, norm, unit
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CornerConfig:
     """Thresholds for a jump of the tip at a corner, and the shape that is filled in.
 

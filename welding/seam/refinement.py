@@ -28,7 +28,7 @@ class PendingPoint(NamedTuple):
     arc: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RefinementConfig:
     """When a tactile point is committed, and how the path is smoothed.
 

@@ -39,7 +39,7 @@ class TrailPoint(NamedTuple):
     residual: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Interruption:
     """A person's hold of a weld; `Interruption()` is a weld that is not held.
 
@@ -89,7 +89,7 @@ def interruptible_step(
     sane = state.plan_fit is not None and math.isfinite(sample.time) and finite(sample.X_BT.translation())
     if over or not sane or not (holds or held.step):
         state, command = welding_step(state, sample, plan, config)
-        return state, Interruption(_longer(held.trail, state, sample)), command
+        return state, Interruption(trail=_longer(held.trail, state, sample)), command
     was_lit = state.torch_on
     state = changed(state, torch_on=False)
     if is_new_frame(state, sample):
@@ -107,7 +107,7 @@ def interruptible_step(
         return state, Interruption(), command
     if not held.step:
         state, command = welding_step(_resumed(state, held, sample), sample, plan, config)
-        return state, Interruption(held.trail[: held.goal + 1] if held.trail else ()), command
+        return state, Interruption(trail=held.trail[: held.goal + 1] if held.trail else ()), command
     if held.step == "back":
         held, V = _back(held, sample, config)
         phase = Phase.BACK
@@ -131,7 +131,15 @@ def _longer(trail: tuple[TrailPoint, ...], state: WeldingState, sample: ServoSam
     """The trail with this tick, while the arc is on."""
     if not state.torch_on:
         return ()
-    here = TrailPoint(sample.X_BT, state.V, state.s_tip, state.s_torch, state.torch_arc, state.progress, state.residual)
+    here = TrailPoint(
+        X_BT=sample.X_BT,
+        V=state.V,
+        s_tip=state.s_tip,
+        s_torch=state.s_torch,
+        torch_arc=state.torch_arc,
+        progress=state.progress,
+        residual=state.residual,
+    )
     return (*trail[1 - TRAIL_TICKS :], here)
 
 
@@ -144,7 +152,7 @@ def _next_step(
         out_at = trail[-1].s_torch if trail else 0.0
         goal = max((k for k, t in enumerate(trail) if t.s_torch <= out_at - OVERLAP_M), default=0)
         at = float(len(trail) - 1) if trail else math.nan
-        return Interruption(trail, "stop", 0, state.V, None, at, goal)
+        return Interruption(trail=trail, step="stop", ticks=0, V_stop=state.V, p_stop=None, at=at, goal=goal)
     if held.step == "stop":
         if not held.at_rest(config):
             return held

@@ -29,7 +29,7 @@ class UnknownLaw(InputError):
     """No steering law has this name."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SteeringLaw:
     """One steering law and how it differs from the paper's.
 
@@ -56,13 +56,17 @@ class SteeringLaw:
 LAWS: dict[str, SteeringLaw] = {
     law.name: law
     for law in (
-        SteeringLaw("guarded", "guarded: torch speed first, box-constrained, with phases", guarded=True),
-        SteeringLaw("printed", "Algorithm 2 as printed", sign=-1.0, feedback=False),
-        SteeringLaw("literal", "sign corrected, normal from neighbouring points", fitted=False, feedback=False),
-        SteeringLaw("open", "sign corrected, fitted normal, no feedback", feedback=False),
-        SteeringLaw("fixed", "sign corrected, fitted normal, torch position fed back"),
-        SteeringLaw("fixed_zeroed", "as fixed; delta_d set to zero where contact is lost", lost="zeroed"),
-        SteeringLaw("dls", "as fixed; division damped (0.2) and omega clipped", damping=0.2, omega_limit=0.8),
+        SteeringLaw(name="guarded", summary="guarded: torch speed first, box-constrained, with phases", guarded=True),
+        SteeringLaw(name="printed", summary="Algorithm 2 as printed", sign=-1.0, feedback=False),
+        SteeringLaw(
+            name="literal", summary="sign corrected, normal from neighbouring points", fitted=False, feedback=False
+        ),
+        SteeringLaw(name="open", summary="sign corrected, fitted normal, no feedback", feedback=False),
+        SteeringLaw(name="fixed", summary="sign corrected, fitted normal, torch position fed back"),
+        SteeringLaw(name="fixed_zeroed", summary="as fixed; delta_d set to zero where contact is lost", lost="zeroed"),
+        SteeringLaw(
+            name="dls", summary="as fixed; division damped (0.2) and omega clipped", damping=0.2, omega_limit=0.8
+        ),
     )
 }
 

@@ -62,7 +62,7 @@ class ToolGeometry:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TouchConfig:
     """The touch-on: descent, search for the groove, gain calibration and zero.
 
@@ -105,7 +105,7 @@ class TouchConfig:
             raise ServoConfigError(f"The servo setting 'touch.press_ratio' must be above 1, not {self.press_ratio}.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ContactConfig:
     """When the tip counts as in contact with the groove, and when contact is lost.
 
@@ -168,7 +168,7 @@ class FaultLimits:
         _check_numbers("faults.", self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DeflectionControl:
     """The servo that holds the tip's deflection, and that follows plan offsets without contact.
 
@@ -190,7 +190,7 @@ class DeflectionControl:
         _check_numbers("deflection.", self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TorchControl:
     """How the torch is held on the refined seam, and when the arc starts.
 
@@ -216,7 +216,7 @@ class TorchControl:
         _check_numbers("torch.", self, signed=("work_angle_rad",))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MotionLimits:
     """Bounds on the motion that a law may command.
 
@@ -297,7 +297,7 @@ class FeltPathConfig:
         _check_numbers("felt_path.", self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ServoConfig:
     """All settings of the welding servo.
 

@@ -48,7 +48,7 @@ class ServoSample:
     arc: bool = True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Diagnostics:
     """Measured and commanded values of one tick; NaN where a phase has none.
 
@@ -109,7 +109,7 @@ class GainFit(NamedTuple):
     xy: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TouchState:
     """State of the touch search: its step, the step's start, heights and lateral place; `free`: deflections of the free tip;
     `felt`: points measured on the way back to the start, each with how far ahead of its rest point friction held the tip."""
@@ -124,7 +124,7 @@ class TouchState:
     felt: tuple[PendingPoint, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WeldingState:
     """State of the servo between ticks; `WeldingState()` is the start of a weld."""
 

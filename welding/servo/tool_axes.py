@@ -41,7 +41,16 @@ def tool_axes(X_BT: RigidTransform, tip_up: Array, torch_up: Array, config: Serv
     up = unit(tip_up + torch_up, tip_up)
     left = R[:, 1]
     across = unit(cross(up, along), left)
-    return ToolAxes(X_BT.translation(), left, chord, d, along, across, cross(along, across), up)
+    return ToolAxes(
+        rest=X_BT.translation(),
+        left=left,
+        chord=chord,
+        d=d,
+        along=along,
+        across=across,
+        yaw=cross(along, across),
+        up=up,
+    )
 
 
 def height_share(axes: ToolAxes, torch_up: Array) -> float:

@@ -123,7 +123,16 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
         n = cross(up, t)
     point = on_path + config.clearance_m * up + tool.side_offset_m * n
     ahead = dot(p_BW - point, t)
-    return TorchTarget(point + ahead * t, t, n, up, arc + clip(step, -2e-3, 2e-3), s, residual, bend)
+    return TorchTarget(
+        point=point + ahead * t,
+        tangent=t,
+        normal=n,
+        up=up,
+        arc=arc + clip(step, -2e-3, 2e-3),
+        s=s,
+        residual=residual,
+        bend=bend,
+    )
 
 
 def _carried_on(

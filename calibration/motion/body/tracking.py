@@ -168,13 +168,13 @@ def _observed(found: Sequence[tuple[FrameTime, TrackedBody]], X_LR: RigidTransfo
     poses = [t.X_CL @ X_LR for _, t in found]
     device = np.array([np.nan if f.device is None else f.device for f in frames])
     return ObservedFrames(
-        tuple(f.id for f in frames),
-        np.array([f.arrival for f in frames]),
-        device if np.isfinite(device).any() else None,
-        np.array([X.translation() for X in poses]),
-        np.array([X.rotation().matrix()[:, 2] for X in poses]),
-        np.array([t.covariance[3:, 3:] for _, t in found]),
-        np.array([float(np.sqrt(np.trace(t.covariance[:3, :3]) / 3.0)) for _, t in found]),
+        ids=tuple(f.id for f in frames),
+        arrival=np.array([f.arrival for f in frames]),
+        device=device if np.isfinite(device).any() else None,
+        p_C=np.array([X.translation() for X in poses]),
+        n_C=np.array([X.rotation().matrix()[:, 2] for X in poses]),
+        covariance=np.array([t.covariance[3:, 3:] for _, t in found]),
+        normal_sigma=np.array([float(np.sqrt(np.trace(t.covariance[:3, :3]) / 3.0)) for _, t in found]),
     )
 
 

@@ -23,7 +23,7 @@ _NOVEL_OVER = 80.0  # frames over which those at new poses are counted
 _HOURS = 3600.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FilterConfig:
     """What is known before: the sigmas of clock (s) and scale, and how far pose (m, rad per root hour), clock and scale wander
     in a cell in which nothing happens; ``change`` (SIZE,) is how large a change may be."""

@@ -15,7 +15,7 @@ SIZE = 8
 """Unknowns of a change: a move of the scanner [rotation; translation] in the base about the pivot, clock (s), scale."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TrackedFrame:
     """A frame: robot time (s), the feature by the robot then, in B: centre (3,) m, outward normal (3,), their rates (m/s, 1/s); its fit.
 

@@ -24,7 +24,7 @@ _CLEARLY = 10.0  # twice the log likelihood by which a creep must beat a step
 _PARSIMONY = 0.01  # a simpler change is named unless the data refuse it at this level
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DriftConfig:
     """Settings of the test. ``false_alarms_per_hour`` bounds the alarms in a cell in which nothing happens.
 
@@ -53,7 +53,7 @@ class DriftConfig:
     filter: FilterConfig = field(default_factory=FilterConfig)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class DriftEvent:
     """A change: its kind (moved, creep or warm-up), its time and when it was found (robot clock, s), and the move of the scanner
     about its own origin in the base: translation (3,) m, rotation vector (3,) rad, their covariance (6, 6) [rotation;
@@ -267,9 +267,20 @@ class DriftTest:
         at_camera = move.copy()
         at_camera[3:] -= np.cross(move[:3], self._lever)
         event = DriftEvent(
-            kind, time, sigma, found, at_camera[3:], at_camera[:3], about(cov, -self._lever), self.current()[0], model,
-            float(T[k]), self.threshold, cause, first,
-        )  # fmt: skip
+            kind=kind,
+            time_s=time,
+            time_sigma_s=sigma,
+            found_s=found,
+            translation_m=at_camera[3:],
+            rotation_rad=at_camera[:3],
+            covariance=about(cov, -self._lever),
+            X_BC_after=self.current()[0],
+            model=model,
+            statistic=float(T[k]),
+            threshold=self.threshold,
+            cause=cause,
+            since_start=first,
+        )
         self.events.append(event)
         return [event]
 
@@ -290,9 +301,21 @@ class DriftTest:
         before = float(f.error[SCALE])
         f.absorb(k, change, cov)
         event = DriftEvent(
-            WARM_UP, time, 0.0, found, np.zeros(3), np.zeros(3), np.zeros((6, 6)), self.current()[0], "scale", statistic,
-            self.threshold, WARM_UP, False, float(f.error[SCALE]) - before,
-        )  # fmt: skip
+            kind=WARM_UP,
+            time_s=time,
+            time_sigma_s=0.0,
+            found_s=found,
+            translation_m=np.zeros(3),
+            rotation_rad=np.zeros(3),
+            covariance=np.zeros((6, 6)),
+            X_BC_after=self.current()[0],
+            model="scale",
+            statistic=statistic,
+            threshold=self.threshold,
+            cause=WARM_UP,
+            since_start=False,
+            scale=float(f.error[SCALE]) - before,
+        )
         self.events.append(event)
         return event
 

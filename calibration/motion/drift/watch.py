@@ -27,7 +27,7 @@ _MOST_SPREAD_M = 5e-4
 _ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show it
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Watched:
     """What a recording says of a calibration, for its N tracked frames in the order of their times.
 
@@ -152,9 +152,24 @@ def _tested(
     before = rows.residuals[:, :3] + at.p[order] - at_arrival
     after = held.residuals[:, :3] - moved[:, :3]
     return Watched(
-        tuple(frames.ids[k] for k in order), rows, residuals, tilts, before, after, late, gross, statistic, test.threshold,
-        tuple(events), X, covariance, moves[-1].time_s if moves else float(rows.times[0]), clock, noise, tuple(said),
-    )  # fmt: skip
+        ids=tuple(frames.ids[k] for k in order),
+        rows=rows,
+        residuals=residuals,
+        tilts=tilts,
+        before=before,
+        after=after,
+        offsets=late,
+        gross=gross,
+        statistic=statistic,
+        threshold=test.threshold,
+        events=tuple(events),
+        X_BC=X,
+        covariance=covariance,
+        since_s=moves[-1].time_s if moves else float(rows.times[0]),
+        clock=clock,
+        noise=noise,
+        dropped=tuple(said),
+    )
 
 
 def _lateness(rows: Rows, noise: FrameNoise) -> tuple[Array, NDArray[np.bool_]]:

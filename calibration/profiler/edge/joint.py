@@ -40,7 +40,7 @@ ITERATIONS = 60
 NEAR, SETTLED = 1e-2, 1e-7  # in sigmas of the unknowns: steps that end the descent, and the settling after it
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class EdgeEstimate(ProfilerEstimate):
     """X_FS and the edge itself: a point of it (3,) m and its unit direction (3,), in B."""
 

@@ -19,7 +19,7 @@ MINIMUM_POINTS = 30
 EDGE_MARGIN_M = 0.8e-3  # points nearer to a neighbouring plane are mixed of both
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Frustum:
     """Planes n . p = d.
 

@@ -74,7 +74,7 @@ def groove_features(profile: ArrayLike) -> GrooveFeatures:
     return GrooveFeatures(np.array(points), np.array(sigmas), rms)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Line:
     """z, a polynomial of u = (x - x0) / reach: its coefficients (k,) and their covariance, and the sigma of a sample across it.
 
@@ -161,12 +161,28 @@ def _line(x: Floats, z: Floats) -> _Line:
         bend = float(change[-1] ** 2)
         if k > 2 and bend > BENT**2 * C[-1, -1]:
             coefficients = straight[:k] + change
-            return _Line(x0, reach, coefficients, C, np.array(unseen), np.array(left).reshape(-1, 4), sigma)
+            return _Line(
+                x0=x0,
+                reach=reach,
+                coefficients=coefficients,
+                covariance=C,
+                unseen=np.array(unseen),
+                left=np.array(left).reshape(-1, 4),
+                sigma=sigma,
+            )
         if k > 2:
             unseen.append(max(bend - float(C[-1, -1]), 0.0))
             lower = np.linalg.lstsq(powers[:, : k - 1], powers[:, k - 1], rcond=None)[0]
             left.append(np.concatenate([-lower, [1.0], np.zeros(4 - k)]))
-    return _Line(x0, reach, straight[:2], C, np.array(unseen), np.array(left), sigma)
+    return _Line(
+        x0=x0,
+        reach=reach,
+        coefficients=straight[:2],
+        covariance=C,
+        unseen=np.array(unseen),
+        left=np.array(left),
+        sigma=sigma,
+    )
 
 
 def _orthogonal(u: Floats, z: Floats, weight: Floats) -> tuple[float, float]:

@@ -28,7 +28,7 @@ RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points 
 APART_RAD, OPEN_RAD = np.radians(1.0), np.radians(5.0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SphereEstimate(ProfilerEstimate):
     """X_FS and what was estimated with it; its residuals (n,) m are distances to the sphere.
 

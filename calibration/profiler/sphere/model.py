@@ -21,7 +21,7 @@ POINTS_PER_POSE = 120
 ROBUST: dict[str, Any] = {"loss": "soft_l1", "f_scale": 3.0, "max_nfev": 60}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SphereSigmas:
     """What is known before: of the sensor's points, the robot's position at a scan and at a touch (m), and the priors."""
 
@@ -46,7 +46,7 @@ class SphereSigmas:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SphereData:
     """One calibration's measurements.
 
@@ -70,7 +70,16 @@ class SphereData:
         keep = ~np.isin(np.arange(len(self.poses)), scans)
         q = None if self.q is None else self.q[keep]
         profiles = [p for p, kept in zip(self.profiles, keep, strict=True) if kept]
-        return SphereData(self.poses[keep], profiles, self.radius_m, self.touches, self.tip, self.arm, q, self.touch_q)
+        return SphereData(
+            poses=self.poses[keep],
+            profiles=profiles,
+            radius_m=self.radius_m,
+            touches=self.touches,
+            tip=self.tip,
+            arm=self.arm,
+            q=q,
+            touch_q=self.touch_q,
+        )
 
 
 def corrected(p: Floats, affine: Floats, origin: Floats) -> Floats:
@@ -203,7 +212,17 @@ class Problem:
         felt = np.empty((0, 3))
         if touches is not None and self.data.tip is not None:
             felt = touches.rotation @ (self.data.tip + tip) + touches.translation - c
-        self._placed = _Points(np.array(x), self._R0, at, felt, poses, touches, rotation, R, turned)
+        self._placed = _Points(
+            x=np.array(x),
+            R0=self._R0,
+            at=at,
+            felt=felt,
+            poses=poses,
+            touches=touches,
+            rotation=rotation,
+            R=R,
+            turned=turned,
+        )
         return self._placed
 
     def residual(self, x: Floats) -> Floats:

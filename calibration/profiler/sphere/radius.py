@@ -34,7 +34,7 @@ def free_radius(data: SphereData, start_m: float, sigmas: SphereSigmas) -> FreeR
 
     Gauss-Newton in the radius, all other unknowns solved at each step.
     """
-    scans, radius = SphereData(data.poses, data.profiles, start_m), start_m
+    scans, radius = SphereData(poses=data.poses, profiles=data.profiles, radius_m=start_m), start_m
     layout = Layout(tip=False, affine=False, joints=False)
     problem = Problem(scans, layout, sigmas)
     starts = sphere_starts(data.poses, problem.profiles, start_m)

@@ -16,7 +16,7 @@ from weldcal.models.arrays import Array
 PLANAR_NAMES = ("phi", "t_x", "t_y", "x_p", "y_p", "scale")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlanarFit:
     """Calibration by the tablet's own size: hand = scale M(phi) p + t + pen(theta), M = [[c, s], [s, -c]].
 
@@ -153,13 +153,13 @@ def fit_planar(touches: TabletTouches, config: PlanarConfig | None = None, *, le
     free_error = hand_over(free, touched, touches.theta_rad) - touches.hand_m
     scatter = np.sqrt((free_error**2).sum() / (2 * n - 6) * np.linalg.inv(J.T @ J)[5, 5])
     return PlanarFit(
-        X_CT,
-        parameters,
-        covariance,
-        _predict(X_CT, parameters, touches, config.sign) - touches.hand_m,
-        left_out,
-        sigma,
-        (float(free[5]), float(scatter)),
+        X_CT=X_CT,
+        parameters=parameters,
+        covariance=covariance,
+        residuals_m=_predict(X_CT, parameters, touches, config.sign) - touches.hand_m,
+        leave_one_out_m=left_out,
+        sigma_m=sigma,
+        free_scale=(float(free[5]), float(scatter)),
     )
 
 

@@ -24,7 +24,7 @@ class ClosedForm:
     leave_one_out: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LinearFit:
     """Six-parameter calibration: hand = [a x - b y + t_x + x_p C - y_p S, -b x - a y + t_y - x_p S - y_p C].
 

@@ -46,7 +46,7 @@ class WristTouches:
         return WristTouches(poses, self.touched_m[keep], self.landmark_m[keep], views, self.focal_px, self.tip_radius_m)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WristFit:
     """Camera ``X_FC`` and pen tip ``p_FP`` (3,) m on the flange, tablet ``X_BT`` in the base.
 
@@ -97,9 +97,18 @@ def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_on
             keep = np.arange(len(left_out)) != i
             left_out[i] = _missed(fit_wrist(data.pick(keep), pen_length_m, leave_one_out=False), data, i)
     return WristFit(
-        X_FC, p_FP, X_BT, covariance[9:, 9:], pen_covariance, touch, pixel, left_out, float(np.sqrt((sigma_t**2).mean())), sigma_p,
-        _open_directions(p_FP, pen_covariance, _axis_spread(data.X_BF)),
-    )  # fmt: skip
+        X_FC=X_FC,
+        p_FP=p_FP,
+        X_BT=X_BT,
+        covariance=covariance[9:, 9:],
+        pen_covariance=pen_covariance,
+        touch_residuals_m=touch,
+        pixel_residuals=pixel,
+        leave_one_out_m=left_out,
+        sigma_touch_m=float(np.sqrt((sigma_t**2).mean())),
+        sigma_pixel=sigma_p,
+        unobservable=_open_directions(p_FP, pen_covariance, _axis_spread(data.X_BF)),
+    )
 
 
 def _touch_sigmas(touch_T: Array) -> Array:

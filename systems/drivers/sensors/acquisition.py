@@ -34,7 +34,7 @@ class Garbage(WeldcalError):
     """A frame that arrived and cannot be used; the device may send a good one next."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Delivery(Generic[Datum]):
     """A frame as a source takes it from its device.
 
@@ -75,7 +75,7 @@ class Source(Protocol[Datum]):
         self.close()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Frame(Generic[Datum]):
     """A frame with its own number (from 1, gaps where frames were lost) and its stamp; `arrived` s (host, monotonic)."""
 
@@ -114,7 +114,7 @@ class Counts:
     reconnects: int = 0
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Seen:
     """What the worker notes; each attribute is replaced as a whole, so that a reader needs no lock."""
 
@@ -344,7 +344,15 @@ class Acquisition(Generic[Datum]):
             gap = max(gap, d.number - self._device_number - 1)
         self._device_number = d.number
         self._number += 1 + gap
-        frame = Frame(self._number, d.datum, d.arrived, stamp, d.device_time, d.request, d.note)
+        frame = Frame(
+            number=self._number,
+            datum=d.datum,
+            arrived=d.arrived,
+            stamp=stamp,
+            device_time=d.device_time,
+            request=d.request,
+            note=d.note,
+        )
         pushed = self._frames[: max(len(self._frames) - self._kept + 1, 0)]
         dropped = sum(f.number > self._read for f in pushed)
         c = seen.counts

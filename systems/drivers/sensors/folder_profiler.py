@@ -22,7 +22,7 @@ from weldcal.systems.drivers.station_build import StationBuild
 SUFFIXES = (".csv", ".npy")
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class FolderProfiler(WiredProfiler):
     """`!FolderProfiler`: the folder, and how the program that writes into it is told to scan; see `!FolderScanner`.
 
@@ -42,7 +42,15 @@ class FolderProfiler(WiredProfiler):
 
         if self.unit not in ("m", "mm"):
             raise InputError(f"profiler.unit must be m or mm, not '{self.unit}'.")
-        return FolderSource("The profiler", self.folder, self.trigger, SUFFIXES, read, self.settle_s, self.remove_read)
+        return FolderSource(
+            name="The profiler",
+            folder=self.folder,
+            trigger=self.trigger,
+            suffixes=SUFFIXES,
+            read=read,
+            settle_s=self.settle_s,
+            remove_read=self.remove_read,
+        )
 
 
 def read_profile(path: Path) -> Profile:

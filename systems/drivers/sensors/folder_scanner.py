@@ -10,7 +10,7 @@ from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, a
 from weldcal.systems.drivers.station_build import StationBuild
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class FolderScanner(WiredScanner):
     """`!FolderScanner`: the folder, and how the program that writes into it is told to scan.
 
@@ -31,7 +31,15 @@ class FolderScanner(WiredScanner):
         def read(path: Path) -> Cloud:
             return checked_cloud(read_cloud(path), metres, far_m)
 
-        return FolderSource("The scanner", self.folder, self.trigger, NO_NOTES, read, self.settle_s, self.remove_read)
+        return FolderSource(
+            name="The scanner",
+            folder=self.folder,
+            trigger=self.trigger,
+            suffixes=NO_NOTES,
+            read=read,
+            settle_s=self.settle_s,
+            remove_read=self.remove_read,
+        )
 
 
 def preflight(config: FolderScanner) -> Sensed:

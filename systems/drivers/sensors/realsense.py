@@ -26,7 +26,19 @@ def _stereo(name: str, fov_deg: float, near: float, far: float, optimum: float, 
     """A stereo camera of 1280 x 720; its field of view and range are those of Intel's data sheet, its noise is typical."""
     f = 640.0 / np.tan(np.deg2rad(0.5 * fov_deg))
     noise = DepthNoise(sigma_m=sigma, reference_m=optimum, edge_step_m=0.01, flying=0.5, edge_dropout=0.2)
-    return ScannerPreset(name, 1280, 720, float(f), float(f), 639.5, 359.5, near, far, optimum, noise)
+    return ScannerPreset(
+        name=name,
+        width=1280,
+        height=720,
+        fx=float(f),
+        fy=float(f),
+        cx=639.5,
+        cy=359.5,
+        near_m=near,
+        far_m=far,
+        optimum_m=optimum,
+        noise=noise,
+    )
 
 
 PRESETS = {
@@ -39,7 +51,7 @@ PRESETS = {
 }
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class RealSense(WiredScanner):
     """`!RealSense`: the camera by its serial number, its depth stream and its options.
 
@@ -146,8 +158,8 @@ class RealSenseClouds(Source[Cloud]):
         stamp, number = 1e-3 * float(depth.get_timestamp()), int(depth.get_frame_number())
         host = depth.frame_timestamp_domain != self._rs.timestamp_domain.hardware_clock
         if host:  # librealsense has mapped it to this computer's clock
-            return Delivery(cloud, arrived, unix_time=stamp, number=number, request=self._request)
-        return Delivery(cloud, arrived, device_time=stamp, number=number, request=self._request)
+            return Delivery(datum=cloud, arrived=arrived, unix_time=stamp, number=number, request=self._request)
+        return Delivery(datum=cloud, arrived=arrived, device_time=stamp, number=number, request=self._request)
 
     def close(self) -> None:
         """See Source."""

@@ -27,7 +27,7 @@ READ_MS, OPEN_MS = 1000, 5000
 UNDECODED = "it sent a picture that cannot be decoded"
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class VideoFingerCamera(WiredFingerCamera):
     """`!VideoFingerCamera`: where the pictures come from.
 
@@ -83,7 +83,7 @@ class MjpegSource(Source[Picture]):
             raise Garbage(UNDECODED)
         grey = checked_picture(picture, self._config.width, self._config.height)
         if self._config.stamps == "none":
-            return Delivery(grey, part.arrived)
+            return Delivery(datum=grey, arrived=part.arrived)
         text = part.headers.get("x-timestamp", "")
         try:
             stamp = float(text)
@@ -92,8 +92,8 @@ class MjpegSource(Source[Picture]):
         if not math.isfinite(stamp):
             raise Garbage(f"its header X-Timestamp is '{text[:40]}', not seconds: set finger_camera.stamps to none")
         if self._config.stamps == "host":
-            return Delivery(grey, part.arrived, unix_time=stamp)
-        return Delivery(grey, part.arrived, device_time=stamp)
+            return Delivery(datum=grey, arrived=part.arrived, unix_time=stamp)
+        return Delivery(datum=grey, arrived=part.arrived, device_time=stamp)
 
     def close(self) -> None:
         """See Source."""
@@ -153,7 +153,7 @@ class CaptureSource(Source[Picture]):
         if not there or picture is None:
             raise DeviceLost("the file has ended" if self._is_file else "it sends no pictures any more")
         grey = checked_picture(picture, self._config.width, self._config.height)
-        return Delivery(grey, arrived)
+        return Delivery(datum=grey, arrived=arrived)
 
     def close(self) -> None:
         """See Source."""

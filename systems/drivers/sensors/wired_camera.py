@@ -27,7 +27,7 @@ Picture = NDArray[np.uint8]
 PERIOD_S = 0.004
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class WiredFingerCamera(FingerCameraConfig):
     """The keys of all finger cameras by wire."""
 

@@ -20,7 +20,7 @@ FAR = 1.5
 FEWEST_POINTS = 10
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class WiredProfiler(RenderedProfiler):
     """The keys of all profilers by wire, with those of the simulated one: its nominal pose, range, width and noise."""
 

@@ -30,7 +30,7 @@ FAR = 1.5  # times the farthest distance of the preset: a cloud beyond it is in 
 FEWEST_POINTS = 30
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class WiredScanner(ScannerConfig):
     """The keys of all scanners by wire. `preset` and its view are what poses are planned with."""
 

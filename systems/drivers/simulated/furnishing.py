@@ -9,7 +9,7 @@ from weldcal.systems.drivers.simulated.second_arm import PlacedArm
 from weldcal.systems.drivers.simulated.world import Fittings
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Furnishing:
     """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
 

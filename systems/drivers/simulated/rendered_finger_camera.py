@@ -23,7 +23,7 @@ from weldcal.systems.messages import Image, Message
 COVERED_GREY = 25  # of a lens under spatter
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class RenderedFingerCamera(FingerCameraConfig):
     """`!RenderedFingerCamera`: the camera in the tool that observes the tag."""
 

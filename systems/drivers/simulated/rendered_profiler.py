@@ -24,7 +24,7 @@ from weldcal.systems.messages import ProfileScan, TorchTouch
 FORCE_N = 0.02  # contact force above which a touch is reported
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class RenderedProfiler(DriverConfig):
     """`!RenderedProfiler`: nominal pose of the profiler on the flange, its deviation, and its measurement model.
 

@@ -35,7 +35,7 @@ from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message, Scan
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class RenderedScanner(ScannerConfig):
     """`!RenderedScanner`: the preset of the simulated scanner, its nominal pose and the deviation from it."""
 

@@ -22,7 +22,7 @@ RENDERER = "wrist"
 _NEAR_M, _FAR_M = 0.05, 2.0
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class RenderedWristCamera(DriverConfig):
     """`!RenderedWristCamera`: nominal pose of the camera on the flange, the deviation of the true pose, and its noise."""
 

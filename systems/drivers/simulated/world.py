@@ -54,7 +54,7 @@ def servo_gains(arm: ArmModel) -> tuple[list[float], list[float]]:
     return list(share * JOINT_STIFFNESS), list(share * JOINT_DAMPING)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SimulatedWorld(Message):
     """Handles into the plant for drivers and `cheat.*` ports."""
 
@@ -173,4 +173,13 @@ def build_world(
         still.set_name(f"fittings_at_rest_{k}")
         builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(model))
     scanner_view = add_picture_scene(builder, plant, scene_graph, SCANNER_RENDERER)
-    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, second_arm, touch_pair)
+    return SimulatedWorld(
+        plant=plant,
+        scene_graph=scene_graph,
+        arm=instance,
+        tool=tool_instance,
+        tip_joints=tip_joints,
+        scanner_view=scanner_view,
+        second=second_arm,
+        touch_pair=touch_pair,
+    )

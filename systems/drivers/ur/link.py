@@ -35,7 +35,7 @@ _AT = {name: i for i, name in enumerate(STATE)}
 PLAYING, PAUSING, PAUSED = 2, 3, 4
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LinkState:
     """The worker's newest state. Times in s of the host's monotonic clock, except `robot_time` (the controller's clock)."""
 
@@ -142,21 +142,21 @@ class UrLink:
             RobotRefused: the message gives the operator action; worker and program are ended.
         """
         config = WorkerConfig(
-            host,
-            arm,
-            limits,
-            rate_hz,
-            upper_registers,
-            payload_kg,
-            payload_cog_m,
-            os.getpid(),
-            process_output,
-            arc_input,
-            arc_fault_input,
-            gas_output,
-            gas_before_s,
-            gas_after_s,
-            levels,
+            host=host,
+            arm=arm,
+            limits=limits,
+            rate_hz=rate_hz,
+            upper_registers=upper_registers,
+            payload_kg=payload_kg,
+            payload_cog_m=payload_cog_m,
+            parent=os.getpid(),
+            process_output=process_output,
+            arc_input=arc_input,
+            arc_fault_input=arc_fault_input,
+            gas_output=gas_output,
+            gas_before_s=gas_before_s,
+            gas_after_s=gas_after_s,
+            levels=levels,
         )
         link = cls(config)
         until = time.monotonic() + START_LIMIT_S / limits.pace
@@ -223,27 +223,27 @@ class UrLink:
         q, qd = (np.array(found[_AT[name] : _AT[name] + 6]) for name in ("q0", "qd0"))
         sampled_at = found[_AT["host_time"]]
         return LinkState(
-            q,
-            qd,
-            found[_AT["robot_time"]],
-            sampled_at,
-            now - sampled_at,
-            fault,
-            fault_time,
-            int(found[_AT["number"]]),
-            int(found[_AT["echo"]]),
-            found[_AT["echo_latency"]],
-            found[_AT["worst_period"]],
-            int(found[_AT["late_periods"]]),
-            found[_AT["residual"]],
-            found[_AT["drift"]],
-            found[_AT["process"]] > 0.5,
-            None if found[_AT["arc"]] < -0.5 else found[_AT["arc"]] > 0.5,
-            detail,
-            int(found[_AT["robot_mode"]]),
-            int(found[_AT["safety_mode"]]),
-            found[_AT["runtime_state"]] == PLAYING and fault is Fault.NONE,
-            found[_AT["speed_scaling"]],
+            q=q,
+            qd=qd,
+            robot_time=found[_AT["robot_time"]],
+            sampled_at=sampled_at,
+            age_s=now - sampled_at,
+            fault=fault,
+            fault_time=fault_time,
+            sent=int(found[_AT["number"]]),
+            heard=int(found[_AT["echo"]]),
+            echo_latency_s=found[_AT["echo_latency"]],
+            worst_period_s=found[_AT["worst_period"]],
+            late_periods=int(found[_AT["late_periods"]]),
+            clock_residual_s=found[_AT["residual"]],
+            clock_drift=found[_AT["drift"]],
+            process_on=found[_AT["process"]] > 0.5,
+            arc=None if found[_AT["arc"]] < -0.5 else found[_AT["arc"]] > 0.5,
+            detail=detail,
+            robot_mode=int(found[_AT["robot_mode"]]),
+            safety_mode=int(found[_AT["safety_mode"]]),
+            program_running=found[_AT["runtime_state"]] == PLAYING and fault is Fault.NONE,
+            speed_scaling=found[_AT["speed_scaling"]],
         )
 
     def close(self) -> None:

@@ -228,30 +228,30 @@ class Robot:
             self._passes, self._passed_at = passes, robot_time
         self._listen(echo, now)
         return RobotSample(
-            robot_time,
-            self._fresh_at,
-            q,
-            np.array(stream.vector("actual_qd")),
-            int(stream.number("robot_mode")),
-            int(stream.number("safety_mode")),
-            int(stream.number("runtime_state")),
+            robot_time=robot_time,
+            fresh_at=self._fresh_at,
+            q=q,
+            qd=np.array(stream.vector("actual_qd")),
+            robot_mode=int(stream.number("robot_mode")),
+            safety_mode=int(stream.number("safety_mode")),
+            runtime_state=int(stream.number("runtime_state")),
             # the slider is in the second one; the first is the limiter's
-            stream.number("speed_scaling") * stream.number("target_speed_fraction"),
-            int(stream.number(self._latch)),
-            stream.connected,
-            float(
+            speed_scaling=stream.number("speed_scaling") * stream.number("target_speed_fraction"),
+            guard=int(stream.number(self._latch)),
+            connected=stream.connected,
+            pose_error_m=float(
                 np.linalg.norm(
                     kinematics_and_jacobian(self._arm, q)[1] - np.array(stream.vector("actual_TCP_pose")[:3])
                 )
             ),
-            now - self._first_unheard if self._sent else 0.0,
-            lost_s,
-            robot_time - self._passed_at,
-            None if self._output is None else self.process_on,
-            echo < 0.0,
-            self._arc_inputs.arc(inputs),
-            self._arc_inputs.fault(inputs),
-            self._shown(),
+            unheard_s=now - self._first_unheard if self._sent else 0.0,
+            lost_s=lost_s,
+            guard_silent_s=robot_time - self._passed_at,
+            process_on=None if self._output is None else self.process_on,
+            process_asked=echo < 0.0,
+            arc=self._arc_inputs.arc(inputs),
+            arc_fault=self._arc_inputs.fault(inputs),
+            set_points=self._shown(),
         )
 
     def _shown(self) -> tuple[tuple[float, float], ...]:

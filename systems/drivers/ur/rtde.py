@@ -29,7 +29,7 @@ CATCHES_UP_S = 0.004
 N_OUTPUTS = 8
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class UrRtde(DriverConfig):
     """`!UrRtde`: a Universal Robots e-Series arm, or its emulator, at a network address."""
 
@@ -63,7 +63,10 @@ class UrRtde(DriverConfig):
     def limits(self, arm: ArmModel) -> Limits:
         """The limits against which the worker checks commands."""
         limits = Limits(
-            arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
+            position_lower=arm.position_lower,
+            position_upper=arm.position_upper,
+            speed=self.velocity_share * arm.velocity_limit,
+            acceleration=arm.acceleration_limit,
         ).slowed(self.pace)
         if not self.lockstep:
             return limits

@@ -57,7 +57,7 @@ ACTIONS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Limits:
     """The limits for commands and state. (6,) in rad, rad/s, rad/s^2; times in s of the host."""
 
@@ -127,7 +127,7 @@ class Limits:
         return bool(np.isfinite(self.blind_commands))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RobotSample:
     """The newest package; `fresh_at` is the host time at which its timestamp was first received."""
 
@@ -153,7 +153,7 @@ class RobotSample:
     set_points: tuple[tuple[float, float], ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Command:
     """The newest velocity command of the cell; `given_at` is host time."""
 

@@ -62,7 +62,7 @@ class UrTouchProbe(DriverConfig):
         return bool(bits >> self.input & 1) != self.normally_closed
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class Touches:
     """Counts the touches in an input's samples: bounce belongs to its touch, and a spike of one sample is none.
 

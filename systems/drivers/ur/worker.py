@@ -54,7 +54,7 @@ class Phase(IntEnum):
     ENDED = 3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WorkerConfig:
     """The configuration that the cell passes to its worker. `arm` has the robot's own kinematics."""
 
@@ -143,7 +143,14 @@ class Worker:
         if found is None:
             return Command(orphaned=orphaned)
         number, given_at, stop, process, *qd = found
-        return Command(int(number), given_at, np.array(qd), bool(stop), orphaned, bool(process))
+        return Command(
+            number=int(number),
+            given_at=given_at,
+            qd=np.array(qd),
+            stop=bool(stop),
+            orphaned=orphaned,
+            process=bool(process),
+        )
 
     def _with_torch(self, command: Command, robot: Robot, sample: RobotSample) -> Command:
         """The command whose torch waits for the gas and then for the set points, where they are wired."""

@@ -9,7 +9,7 @@ from weldcal.models.errors import InputError
 LEAST_FRAMES, MOST_FRAMES = 40, 5000
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class MotionJob:
     """The flange moves between corners of a cube while the scanner streams."""
 

@@ -48,7 +48,7 @@ class MotionPlanned:
     watched: CalibrationResult | None = None
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class AddedMotion(AddedJob):
     """The systems of the job; it has a `calibrator` or, where it watches a calibration, a `monitor`."""
 
@@ -154,8 +154,8 @@ class Motion(Job[MotionPlanned]):
         estimator = wiring.add(
             "flange_estimator",
             FlangeEstimator(
-                station.arm, X_FR, standard, c.mounting_guess.pose() if watched is None else watched.X_BC,
-                c.guess_radius_mm * 1e-3, station.background, _POLL_S, plan.delay_s,
+                arm=station.arm, X_FR=X_FR, standard=standard, X_BC_guess=c.mounting_guess.pose() if watched is None else watched.X_BC,
+                guess_radius_m=c.guess_radius_mm * 1e-3, background=station.background, period_s=_POLL_S, delay_s=plan.delay_s,
             ),
         )  # fmt: skip
         collector = wiring.add("motion_collector", MotionCollector())
@@ -206,9 +206,19 @@ class Motion(Job[MotionPlanned]):
             shown["calibration"] = calibrator.GetOutputPort("calibration")
         if monitor is not None:
             shown["drift"] = monitor.GetOutputPort("drift")
-        ports = JobPorts((procedure.GetOutputPort("job"),), state, logged=logged, shown=shown)
+        ports = JobPorts(commands=(procedure.GetOutputPort("job"),), state=state, logged=logged, shown=shown)
         return AddedMotion(
-            plan, X_FR, procedure, collector, calibrator, monitor, queue, recorder, job.frames, ports, maximum_time_s
+            plan=plan,
+            X_FR=X_FR,
+            procedure=procedure,
+            collector=collector,
+            calibrator=calibrator,
+            monitor=monitor,
+            queue=queue,
+            recorder=recorder,
+            frames=job.frames,
+            ports=ports,
+            maximum_time_s=maximum_time_s,
         )
 
 

@@ -11,7 +11,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.messages import Message
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MotionState(Message):
     """State of the procedure. `phase`: start, approach, collect, home, calibrate, done or held."""
 

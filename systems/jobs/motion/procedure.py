@@ -117,10 +117,10 @@ class MotionProcedure(LeafSystem):
         moving = s.phase in ("approach", "collect", "home")
         output.set_value(
             JobCommand(
-                s.phase,
-                "move" if moving else "hold",
-                s.goal_id,
-                s.q_goal if moving else None,
+                phase=s.phase,
+                mode="move" if moving else "hold",
+                goal_id=s.goal_id,
+                q_goal=s.q_goal if moving else None,
                 speed_share=self._speed_share if s.phase == "collect" else 1.0,
                 finished=s.phase in ENDS,
                 held=s.phase == "held",

@@ -43,7 +43,7 @@ class MountingPlanned:
     poses: tuple[MountingPose, ...]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class AddedMounting(AddedJob):
     """The systems of the job; `truth` (X, and Y or Z where they are estimated) is for reports and tests only."""
 
@@ -139,14 +139,14 @@ class Mounting(Job[MountingPlanned]):
         shown = {"status": calibrator.GetOutputPort("status"), "scan": wiring.out("scanner.scan")}
         commands = tuple(procedure.GetOutputPort(name) for name in ("job", "job_2"))[: len(spine.arms)]
         return AddedMounting(
-            scene,
-            plan.poses,
-            c.maximum_scans + c.verification_scans,
-            procedure,
-            calibrator,
-            true_poses(scene, wiring.station),
-            JobPorts(commands, state, shown=shown),
-            maximum_time_s,
+            scene=scene,
+            plan=plan.poses,
+            scans=c.maximum_scans + c.verification_scans,
+            procedure=procedure,
+            calibrator=calibrator,
+            truth=true_poses(scene, wiring.station),
+            ports=JobPorts(commands=commands, state=state, shown=shown),
+            maximum_time_s=maximum_time_s,
         )
 
 

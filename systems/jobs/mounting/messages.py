@@ -12,7 +12,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.messages import Message
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MountingState(Message):
     """State of the procedure. `phase`: start, move, scan, done or held; `route`: remaining moves, (arm 0 or 1, joints)."""
 
@@ -70,7 +70,7 @@ class NextBest:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MountingStatus(Message):
     """The calibration after its newest scan."""
 

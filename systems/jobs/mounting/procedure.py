@@ -145,10 +145,10 @@ class MountingProcedure(LeafSystem):
         moving = s.phase == "move" and s.moving == arm
         output.set_value(
             JobCommand(
-                s.phase,
-                "move" if moving else "hold",
-                s.goal_id,
-                s.q_goal if moving else None,
+                phase=s.phase,
+                mode="move" if moving else "hold",
+                goal_id=s.goal_id,
+                q_goal=s.q_goal if moving else None,
                 finished=s.phase in ENDS,
                 held=s.phase == "held",
                 reason=s.reason or None,

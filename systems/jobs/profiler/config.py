@@ -49,7 +49,7 @@ class EdgeStage:
     tilt_deg: float = 28.0
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class SphereStage:
     """Scans and touches of the sphere."""
 
@@ -62,7 +62,7 @@ class SphereStage:
     deepest_mm: float = 10.0  # below the nominal sphere, at which the touch is abandoned
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class SeamStage:
     """The passes of the profiler along the groove, and the following pass of the torch."""
 
@@ -76,7 +76,7 @@ class SeamStage:
     seam_length_mm: float | None = None  # length of the seam to measure
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class ProfilerJob:
     """The stages of the job: edge, sphere and seam in this order; the seam stage uses the result of the sphere stage."""
 

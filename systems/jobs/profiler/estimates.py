@@ -190,7 +190,13 @@ def find_sphere(
         arcs[one.kind][1].append(window[mask])
     _enough(len(arcs["scan"][1]), taken, "an arc of the sphere")
     felt = flange_poses(arm, list(touches)) if touches else None
-    data = SphereData(flange_poses(arm, arcs["scan"][0]), arcs["scan"][1], radius, felt, tip if touches else None)
+    data = SphereData(
+        poses=flange_poses(arm, arcs["scan"][0]),
+        profiles=arcs["scan"][1],
+        radius_m=radius,
+        touches=felt,
+        tip=tip if touches else None,
+    )
     model: Model = "rigid"
     e = sphere_joint(data, model, sigmas, first)
     if touches:

@@ -114,8 +114,8 @@ class Profiler(Job[PlanningContext]):
             wiring.connect(procedure, touch=wiring.out("torch.touch"))
         wiring.feed("profiler.trigger", procedure.GetOutputPort("trigger"))
         ports = JobPorts(
-            (procedure.GetOutputPort("job"),),
-            procedure.GetOutputPort("state"),
+            commands=(procedure.GetOutputPort("job"),),
+            state=procedure.GetOutputPort("state"),
             velocity=procedure.GetOutputPort("creep"),
             logged={"torch": wiring.out("cheat.torch")} if known("cheat.torch") else {},
         )

@@ -28,7 +28,7 @@ STEP_M = 5e-4  # of torch and profiler, between those that are checked against t
 FASTER = 1.2  # than the mean speed in a step of STEP_RAD: no point of the rig is
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PlanningContext:
     """Nominal or, later, calibrated poses: X_FS, the tip in F, the sphere's centre in B; the nominal workpiece at X_BP."""
 

@@ -219,12 +219,12 @@ class ProfilerProcedure(LeafSystem):
         q_goal = s.goals[0].q if s.goals else None
         output.set_value(
             JobCommand(
-                s.phase,
-                mode,
-                s.goal_id,
-                q_goal,
-                s.sequence,
-                s.step,
+                phase=s.phase,
+                mode=mode,
+                goal_id=s.goal_id,
+                q_goal=q_goal,
+                scan_sequence=s.sequence,
+                scan_purpose=s.step,
                 finished=s.phase in ENDS,
                 held=s.phase == "held",
                 reason=s.reason or None,

@@ -12,7 +12,7 @@ from weldcal.systems.jobs.profiler.planning_context import PlanningContext
 from weldcal.systems.messages import Message
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerState(Message):
     """State and data of the procedure; `step` is the present one: edge, sphere, touch, pass, torch."""
 

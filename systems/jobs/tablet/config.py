@@ -28,7 +28,7 @@ class PenConfig:
     stiffness_N_per_m: float = 300.0
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class TabletConfig:
     """`tablet:` nominal pose of the page (first landmark, x to the right, y down the page, z into it), and the motion."""
 

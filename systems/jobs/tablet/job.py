@@ -23,7 +23,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class AddedVisit(AddedJob):
     """The systems of the job, the nominal tablet and camera; `known` is the ground truth of a simulation."""
 
@@ -102,20 +102,20 @@ class Tablet(Job[TabletPlan]):
         )
         wiring.feed("wrist_camera.trigger", procedure.GetOutputPort("trigger"))
         ports = JobPorts(
-            (procedure.GetOutputPort("job"),),
-            procedure.GetOutputPort("state"),
-            procedure.GetOutputPort("descent"),
+            commands=(procedure.GetOutputPort("job"),),
+            state=procedure.GetOutputPort("state"),
+            velocity=procedure.GetOutputPort("descent"),
             shown={"picture": wiring.out("wrist_camera.picture")},
         )
         return AddedVisit(
-            plan,
-            tablet_of(scenario),
-            camera_of(scenario),
-            procedure,
-            station,
-            station.truth.tablet,
-            ports,
-            plan.maximum_time_s,
+            plan=plan,
+            tablet=tablet_of(scenario),
+            camera=camera_of(scenario),
+            procedure=procedure,
+            station=station,
+            known=station.truth.tablet,
+            ports=ports,
+            maximum_time_s=plan.maximum_time_s,
         )
 
 

@@ -25,7 +25,7 @@ _MODES = {
 }  # the command mode in which the arbiter selects the servo velocity
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TabletPlan:
     """Joint goals (rad): camera pose, above each landmark (n, 6), home; descent speed (m/s) and time limits (s)."""
 
@@ -49,7 +49,7 @@ class Touched(Message):
     time: float = np.nan
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TabletState(Message):
     """State of the procedure."""
 
@@ -71,7 +71,7 @@ class TabletState(Message):
         return self.phase in ENDS
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TabletSeen:
     """Inputs of the procedure at one tick."""
 
@@ -217,10 +217,10 @@ class TabletProcedure(LeafSystem):
         s = self.stands(context)
         output.set_value(
             JobCommand(
-                s.phase,
-                _MODES.get(s.phase, "hold"),
-                s.goal_id,
-                s.q_goal,
+                phase=s.phase,
+                mode=_MODES.get(s.phase, "hold"),
+                goal_id=s.goal_id,
+                q_goal=s.q_goal,
                 finished=s.finished,
                 held=s.phase == "held",
                 reason=s.reason or None,

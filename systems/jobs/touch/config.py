@@ -11,7 +11,7 @@ FEWEST, MOST = 3, 60
 _POSITIVE = ("aside_mm", "clearance_mm", "descent_mm_s", "press_mm", "deepest_mm")
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class TouchConfig:
     """`touch:` places on the part beside its groove, and how the tip goes down to them."""
 

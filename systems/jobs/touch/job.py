@@ -61,13 +61,13 @@ class AddedTouches(AddedJob):
         assert tool is not None
         force = tool.axial_stiffness_N_per_m * max(float(felt.deflection_T[2]), 0.0)
         return Touch(
-            name,
-            PLANE,
-            forward_kinematics(self.station.arm, felt.q),
-            np.asarray(tool.X_FT.multiply(felt.deflection_T)),
-            tool.tip_radius_m - tool.indentation(force),
-            felt.place.p_C,
-            felt.place.n_C,
+            id=name,
+            feature=PLANE,
+            X_BF=forward_kinematics(self.station.arm, felt.q),
+            p_FT=np.asarray(tool.X_FT.multiply(felt.deflection_T)),
+            radius=tool.tip_radius_m - tool.indentation(force),
+            p_C=felt.place.p_C,
+            direction_C=felt.place.n_C,
             sigma_scan=max(felt.place.sigma_m, 2.5e-5),
             q=felt.q,
         )
@@ -133,7 +133,12 @@ class TouchJob(Job[TouchPlanning]):
         wiring.feed("scanner.trigger", procedure.GetOutputPort("trigger"))
         wiring.feed("finger_camera.streaming", procedure.GetOutputPort("streaming"))
         shown = {"scan": wiring.out("scanner.scan")}
-        ports = JobPorts((command,), procedure.GetOutputPort("state"), procedure.GetOutputPort("descent"), shown=shown)
+        ports = JobPorts(
+            commands=(command,),
+            state=procedure.GetOutputPort("state"),
+            velocity=procedure.GetOutputPort("descent"),
+            shown=shown,
+        )
         result = load_result(Path(config.result))
         return AddedTouches(result, station, config.points, procedure, ports, motion.maximum_time_s)
 

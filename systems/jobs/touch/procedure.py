@@ -50,7 +50,7 @@ class Felt(Message):
     deflection_T: Vector
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TouchState(Message):
     """State of the procedure; `frames` are readings since the phase began, `zero` the free tip's mean."""
 
@@ -74,7 +74,7 @@ class TouchState(Message):
         return self.phase in ENDS
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TouchSeen:
     """Inputs of the procedure at one tick."""
 
@@ -264,10 +264,10 @@ class TouchProcedure(LeafSystem):
         s = self.touch_state(context)
         output.set_value(
             JobCommand(
-                s.phase,
-                _MODES.get(s.phase, "hold"),
-                s.goal_id,
-                s.q_goal,
+                phase=s.phase,
+                mode=_MODES.get(s.phase, "hold"),
+                goal_id=s.goal_id,
+                q_goal=s.q_goal,
                 scan_sequence=s.scan,
                 scan_purpose="workpiece",
                 scan_label="workpiece",

@@ -92,7 +92,11 @@ class FlangeEstimator(BackgroundSystem):
         capture = believed_capture(scan, newest, self._delay_s)
         X_BF = self._history.Eval(context).pose_at(self._arm, capture)
         base = FlangeEstimate(
-            scan.sequence, capture, "stream", arrival_time=scan.arrival_time, device_time=scan.device_time
+            sequence=scan.sequence,
+            capture_time=capture,
+            purpose="stream",
+            arrival_time=scan.arrival_time,
+            device_time=scan.device_time,
         )
         if X_BF is None:
             done = dc.replace(base, reason="the arm's pose at the time of the frame is not known")
@@ -164,7 +168,9 @@ def estimate_flange(
     guess_radius_m: float,
 ) -> FlangeEstimate:
     """Fit the feature in one scan; for an unusable scan the result holds the reason, and no exception is raised."""
-    base = FlangeEstimate(scan.sequence, scan.capture_time, job.scan_purpose, job.scan_label)
+    base = FlangeEstimate(
+        sequence=scan.sequence, capture_time=scan.capture_time, purpose=job.scan_purpose, label=job.scan_label
+    )
     if X_BF is None:
         return dc.replace(base, reason="the arm's pose at the time of the scan is not known")
     X_CR = X_BC.InvertAndCompose(X_BF @ X_FR)

@@ -32,7 +32,7 @@ from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Verifica
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
 
-@dc.dataclass(frozen=True)
+@dc.dataclass(frozen=True, kw_only=True)
 class CalibratorConfig:
     """The stop criterion of the live calibration (m) and the work point p_BWork (3,) in B at which the error is evaluated; the
     cost of Algorithm 1 (section 4.2: work radius, m, and axes)."""

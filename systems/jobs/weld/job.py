@@ -71,7 +71,7 @@ class WeldingPorts:
     logged: dict[str, OutputPort] = field(default_factory=dict)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class WeldJob(AddedJob):
     """The systems of the job and the data that they were built from."""
 
@@ -215,11 +215,27 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             "servo_report": welding.report,
         }
         ports = JobPorts(
-            (command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged, results, shown
+            commands=(command,),
+            state=state,
+            velocity=welding.velocity,
+            torch_wanted=welding.torch_wanted,
+            margin=welding.margin,
+            logged=logged,
+            results=results,
+            shown=shown,
         )
         return WeldJob(
-            *(scenario, plan, X_FR, config, sequencer, calibrator, monitor, welding, ports),
-            *(times.maximum_time_s, times.seams),
+            scenario=scenario,
+            poses=plan,
+            X_FR=X_FR,
+            servo_config=config,
+            sequencer=sequencer,
+            calibrator=calibrator,
+            monitor=monitor,
+            welding=welding,
+            ports=ports,
+            maximum_time_s=times.maximum_time_s,
+            seams=times.seams,
         )
 
 
@@ -230,16 +246,16 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
     assert station.tool is not None
     assert station.cad is not None
     return SeamPlanning(
-        station.arm,
-        station.tool,
-        station.cad,
-        spec.pose_guess.pose(),
-        config,
-        np.deg2rad(scenario.home_deg),
-        welding.clearance_mm * 1e-3,
-        None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
-        scenario.planning.planning_method(),
-        station.surroundings,
+        arm=station.arm,
+        tool=station.tool,
+        workpiece=station.cad,
+        X_BP_guess=spec.pose_guess.pose(),
+        config=config,
+        q_near=np.deg2rad(scenario.home_deg),
+        clearance_m=welding.clearance_mm * 1e-3,
+        seam_length_m=None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
+        method=scenario.planning.planning_method(),
+        surroundings=station.surroundings,
     )
 
 

@@ -26,7 +26,15 @@ def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_
         return status
     corrected = tuple(corrected_observation(status.correction, o) for o in status.observations)
     solve = partial(solve_jointly, start=estimate.X_BC, correct_scanner=correct_scanner)
-    plain = Plain(status.observations, corrected, {}, estimate, estimate.scanner, correct_scanner, solve)
+    plain = Plain(
+        observations=status.observations,
+        corrected=corrected,
+        patterns={},
+        estimate=estimate,
+        correction=estimate.scanner,
+        correct_scanner=correct_scanner,
+        solve=solve,
+    )
     try:
         if kind == "local":
             found = refine_locally(plain, seed=0)
@@ -35,7 +43,7 @@ def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_
             found = refine_arm(kind, plain, np.array(status.joints), chain_of(arm), note=note, seed=0)
         return dc.replace(status, estimate=found.estimate, refinement=_message(kind, found, arm))
     except WeldcalError as error:
-        return dc.replace(status, refinement=Refinement(kind, f"The calibration is not refined: {error}"))
+        return dc.replace(status, refinement=Refinement(kind=kind, sentence=f"The calibration is not refined: {error}"))
 
 
 def _message(kind: str, found: Refined, arm: ArmModel) -> Refinement:
@@ -43,12 +51,12 @@ def _message(kind: str, found: Refined, arm: ArmModel) -> Refinement:
     if found.stack is not None:
         corrected = with_link_transforms(arm, found.stack, "", "The refined kinematics")
     return Refinement(
-        kind,
-        found.sentence,
-        found.accepted,
-        corrected,
-        found.field,
-        found.kinematics,
-        found.arm,
-        found.document(kind),
+        kind=kind,
+        sentence=found.sentence,
+        accepted=found.accepted,
+        arm=corrected,
+        local_field=found.field,
+        kinematics=found.kinematics,
+        arm_errors=found.arm,
+        document=found.document(kind),
     )

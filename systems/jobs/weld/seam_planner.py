@@ -41,7 +41,7 @@ TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the ch
 HIGHER = (1.0, 2.0, 4.0)  # of the clearance above the seam, until the moves are clear
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class SeamPlanning:
     """What a seam is planned from besides the scan: arm, tool, nominal part and its expected pose, and the job's limits."""
 
@@ -187,15 +187,15 @@ def plan_seam(
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
     return PlannedSeam(
-        scan.sequence,
-        seam,
-        found.X_BP,
-        found.rms_m,
-        found.confidence,
-        q_start,
-        q_above,
-        q_retract,
-        points_B,
+        sequence=scan.sequence,
+        seam=seam,
+        X_BP=found.X_BP,
+        rms_m=found.rms_m,
+        confidence=found.confidence,
+        q_start=q_start,
+        q_above=q_above,
+        q_retract=q_retract,
+        points_B=points_B,
         sigma_m=found.sigma_m,
         summary=found.summary,
         arm_sigma_m=share.sigma_m,
@@ -366,15 +366,15 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
         return PlannedSeam(sequence=sequence, reason=str(error))
     points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
     return PlannedSeam(
-        sequence,
-        seam,
-        planning.X_BP_guess,
-        0.0,
-        1.0,
-        q_start,
-        q_above,
-        q_retract,
-        points_B,
+        sequence=sequence,
+        seam=seam,
+        X_BP=planning.X_BP_guess,
+        rms_m=0.0,
+        confidence=1.0,
+        q_start=q_start,
+        q_above=q_above,
+        q_retract=q_retract,
+        points_B=points_B,
         summary="the pose of the part is from the fixture's drawing; the scan was not used",
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,

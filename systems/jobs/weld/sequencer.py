@@ -19,7 +19,7 @@ from weldcal.systems.motion.goals import stands_at
 SCAN_TIMEOUT_S = 8.0
 
 
-@dc.dataclass(frozen=True)
+@dc.dataclass(frozen=True, kw_only=True)
 class JobPlan:
     """Parameters of the job (mm where a reason text shows them)."""
 
@@ -38,7 +38,7 @@ class JobPlan:
     seams: int = 1
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class Seen(Message):
     """Inputs of the sequencer at one tick."""
 

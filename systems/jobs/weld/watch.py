@@ -40,10 +40,16 @@ def add_watch(
     estimator = wiring.add(
         "streamed_flange_estimator",
         FlangeEstimator(
-            station.arm, X_FR, standard, stated or c.mounting_guess.pose(), c.guess_radius_mm * 1e-3, station.background, 0.004,
-            delay_s,
+            arm=station.arm,
+            X_FR=X_FR,
+            standard=standard,
+            X_BC_guess=stated or c.mounting_guess.pose(),
+            guess_radius_m=c.guess_radius_mm * 1e-3,
+            background=station.background,
+            period_s=0.004,
+            delay_s=delay_s,
         ),
-    )  # fmt: skip
+    )
     monitor = wiring.add(
         "drift_monitor", DriftMonitor(station.arm, X_FR, watched, WELD_DRIFT, period_s=0.004, delay_s=delay_s)
     )

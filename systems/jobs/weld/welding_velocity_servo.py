@@ -29,7 +29,7 @@ _NOWHERE = np.full(3, np.nan)
 PHASE_CODES = {phase: float(k) for k, phase in enumerate(Phase)}
 
 
-@dc.dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False, kw_only=True)
 class ServoReport(Message):
     """The servo's state for the sequencer, the viewer and the log; phase is IDLE outside a weld."""
 
@@ -119,15 +119,15 @@ class WeldingVelocityServo(LeafSystem):
         holds = self._hold.HasValue(context) and bool(self._hold.Eval(context)[0] > 0.5)
         memory, held, command = interruptible_step(memory, old.interruption, sample, planned.seam, config, holds)
         report = ServoReport(
-            str(command.phase),
-            command.torch_on,
-            command.reason,
-            command,
-            memory,
-            sample.time,
-            sample.X_BT,
-            planned.sequence,
-            held,
+            phase=str(command.phase),
+            torch_on=command.torch_on,
+            reason=command.reason,
+            command=command,
+            state=memory,
+            time=sample.time,
+            X_BT=sample.X_BT,
+            plan=planned.sequence,
+            interruption=held,
         )
         state.get_mutable_abstract_state(self._state).set_value(report)
 

@@ -40,8 +40,23 @@ def result() -> CalibrationResult:
         covariance=np.diag([1e-8, 2e-8, 3e-8, 4e-9, 5e-9, 6e-9]),
         held_out_mm={"median": 0.2, "mean": 0.3, "p95": 0.5},
         tilt_deg={"median": 0.08, "p95": None},
-        poses=(PoseRecord("a", True, "", 0.1, 0.2, 0.01, 0.02), PoseRecord("b", False, "no plane")),
-        icp=(IcpRecord("a", "point_to_point", (0.0, 0.1, 0.2), (0.1, 0.2, 0.3), 0.37, ("rotation",), 0.4),),
+        poses=(
+            PoseRecord(
+                id="a", used=True, reason="", residual_mm=0.1, held_out_mm=0.2, tilt_deg=0.01, held_out_tilt_deg=0.02
+            ),
+            PoseRecord(id="b", used=False, reason="no plane"),
+        ),
+        icp=(
+            IcpRecord(
+                id="a",
+                method="point_to_point",
+                rotation_deg=(0.0, 0.1, 0.2),
+                translation_mm=(0.1, 0.2, 0.3),
+                translation_norm_mm=0.37,
+                unseen=("rotation",),
+                true_error_mm=0.4,
+            ),
+        ),
         unobservable=("a bias",),
         warnings=("one",),
         robot="ur10e",

@@ -57,7 +57,14 @@ def _cell(
         x, y = R_CR.matrix()[:, 0], R_CR.matrix()[:, 1]
         J = needs.jacobian(seen)
         ratio = 2.0 / float(x @ J @ x + y @ J @ y) + NOISE_RATIO * rng.standard_normal()
-        patterns[f"p{k:02d}"] = HolePattern(np.zeros((4, 3)), np.zeros(4), p_C, RigidTransform(R_CR, p_C), ratio, 0.0)
+        patterns[f"p{k:02d}"] = HolePattern(
+            holes_C=np.zeros((4, 3)),
+            angles_rad=np.zeros(4),
+            center_C=p_C,
+            X_CR=RigidTransform(R_CR, p_C),
+            ratio=ratio,
+            rms_m=0.0,
+        )
     return observations, patterns
 
 

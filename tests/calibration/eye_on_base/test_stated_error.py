@@ -35,9 +35,13 @@ def calibrated(n: int, seed: int) -> CalibrationResult:
         make_observations(n, seed, sigma=SIGMA), SolveConfig(leave_one_out=False, hypotheses=40)
     )
     return CalibrationResult(
-        estimate.X_BC, estimate.covariance, {}, {}, tuple(PoseRecord(str(k), True) for k in range(n)),
+        X_BC=estimate.X_BC,
+        covariance=estimate.covariance,
+        held_out_mm={},
+        tilt_deg={},
+        poses=tuple(PoseRecord(id=str(k), used=True) for k in range(n)),
         sigma_position_mm=1e3 * estimate.sigma_position_m,
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +90,14 @@ def test_the_region_grows_where_the_flange_is_turned_beyond_the_calibration() ->
         scans = make_observations(14, seed, sigma=1e-4, turn=0.0)
         estimate = estimate_eye_on_base(scans, SolveConfig(leave_one_out=False, hypotheses=40))
         result = CalibrationResult(
-            estimate.X_BC, estimate.covariance, {}, {}, tuple(PoseRecord(str(k), True) for k in range(14)),
-            sigma_position_mm=1e3 * estimate.sigma_position_m, orientations=orientations_of(scans),
-        )  # fmt: skip
+            X_BC=estimate.X_BC,
+            covariance=estimate.covariance,
+            held_out_mm={},
+            tilt_deg={},
+            poses=tuple(PoseRecord(id=str(k), used=True) for k in range(14)),
+            sigma_position_mm=1e3 * estimate.sigma_position_m,
+            orientations=orientations_of(scans),
+        )
         (new,) = make_observations(1, 10_000 + seed, sigma=1e-4, turn=0.0)
         same = scatter_elsewhere(result, [new])
         assert same == pytest.approx(estimate.sigma_position_m, rel=1e-6)

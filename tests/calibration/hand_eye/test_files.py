@@ -174,7 +174,7 @@ def test_two_robots_want_their_own_equation(tmp_path: Path) -> None:
 
 def test_pairs_know_their_equation() -> None:
     F, G, _, _ = eye_in_hand(3, np.random.default_rng(2))
-    np.testing.assert_allclose(PosePairs("a", F, G, "eye_on_base").F, inverse(F))
+    np.testing.assert_allclose(PosePairs(source="a", robot=F, camera=G, mode="eye_on_base").F, inverse(F))
 
 
 def test_a_table_of_another_spreadsheet_is_the_same_table(tmp_path: Path, poses: tuple[Array, Array]) -> None:

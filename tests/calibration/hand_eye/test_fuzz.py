@@ -40,7 +40,7 @@ def test_a_mistake_is_named_or_at_least_not_answered_with_confidence(mistake: st
 
 
 def pairs_of(F: Array, G: Array) -> PosePairs:
-    return PosePairs("made up", F, G, "eye_in_hand")
+    return PosePairs(source="made up", robot=F, camera=G, mode="eye_in_hand")
 
 
 def test_a_camera_that_hardly_moves_is_no_mistake_in_units() -> None:

@@ -34,7 +34,7 @@ def cell(mode: str, offsets: Array, seed: int = 0, n: int = 40) -> tuple[PosePai
     X, Y = random_poses(2, rng, 1.5)
     F = real if mode == "eye_in_hand" else inverse(real)
     camera = inverse(F @ X) @ Y @ noise(n, rng, TURN, SHIFT)
-    return PosePairs("cell.npz", stated, camera, mode, q=q), arm, X
+    return PosePairs(source="cell.npz", robot=stated, camera=camera, mode=mode, q=q), arm, X
 
 
 def refined(mode: str, offsets: Array, kind: str = "joints") -> tuple[JointRefinement, HandEyeResult, Array]:

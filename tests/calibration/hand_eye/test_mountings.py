@@ -36,8 +36,8 @@ def make_observations(name: str, kind: str, n: int = 20) -> tuple[list[TargetObs
     X_CM = target @ noise(n, rng, TURN, SHIFT)
     samples = [
         TargetObservation(
-            as_transform(X_BF[i]),
-            X_CM[i, :3, 3],
+            X_BF=as_transform(X_BF[i]),
+            p_CM=X_CM[i, :3, 3],
             n_CM=X_CM[i, :3, 2] if kind == "normals" else None,
             R_CM=RotationMatrix(as_transform(X_CM[i]).rotation()) if kind == "poses" else None,
             X_BL=as_transform(X_BL[i]) if "arm" in name else None,
@@ -98,7 +98,7 @@ def test_mountings_say_their_directions() -> None:
         get_mounting("eye_in_foot")
     samples, _ = make_observations("eye_on_arm_target_on_base", "poses", 6)
     with pytest.raises(InputError, match="pose of the link"):
-        calibrate("eye_on_arm_target_on_base", [TargetObservation(s.X_BF, s.p_CM) for s in samples])
+        calibrate("eye_on_arm_target_on_base", [TargetObservation(X_BF=s.X_BF, p_CM=s.p_CM) for s in samples])
 
 
 def test_the_next_pose_keeps_its_promise() -> None:
@@ -112,7 +112,7 @@ def test_the_next_pose_keeps_its_promise() -> None:
     problem = full_problem(F, seen(F))
     mounting = get_mounting("eye_in_hand")
     samples = [
-        TargetObservation(as_transform(a), b[:3, 3], R_CM=as_transform(b).rotation())
+        TargetObservation(X_BF=as_transform(a), p_CM=b[:3, 3], R_CM=as_transform(b).rotation())
         for a, b in zip(F, problem.G, strict=True)
     ]
     result = calibrate("eye_in_hand", samples)
@@ -130,7 +130,7 @@ def test_the_next_pose_keeps_its_promise() -> None:
     for poses in (more, again):
         G = inverse(poses @ X) @ Y @ noise(len(poses), np.random.default_rng(4), TURN, SHIFT)
         both = [
-            TargetObservation(as_transform(a), b[:3, 3], R_CM=as_transform(b).rotation())
+            TargetObservation(X_BF=as_transform(a), p_CM=b[:3, 3], R_CM=as_transform(b).rotation())
             for a, b in zip(poses, G, strict=True)
         ]
         found = calibrate("eye_in_hand", both)

@@ -61,7 +61,7 @@ def test_derivatives_agree_with_differences() -> None:
     A, B, C, X, Y, Z = co_manipulation(6, rng, 0.3, 0.1)
     full = np.array([True, True, True, False, False, False])
     normal = np.array([False, False, False, True, True, False])
-    problem = Problem(A, B, C, full, normal, None, (True, True, True))
+    problem = Problem(F=A, G=B, H=C, full=full, normal=normal, covariance=None, free=(True, True, True))
     centre = np.array([0.1, -0.2, 0.05])
     state = (X, Y, Z)
     lin = linearise(problem, state, centre)
@@ -219,7 +219,9 @@ def points(
     else:  # any turn about the normal: it must not matter
         blind[:, :3, :3] = G[:, :3, :3] @ exp_rotation(np.linspace(0.0, 5.0, n)[:, None] * [0.0, 0.0, 1.0])
     H = np.broadcast_to(IDENTITY, (n, 4, 4))
-    problem = Problem(F, blind, H, np.zeros(n, dtype=bool), np.full(n, normals), None, free)
+    problem = Problem(
+        F=F, G=blind, H=H, full=np.zeros(n, dtype=bool), normal=np.full(n, normals), covariance=None, free=free
+    )
     return solve_problem(problem, known, config=QUICK)
 
 

@@ -29,7 +29,8 @@ def calibrated(n: int, seed: int, stated: float = 1.0) -> tuple[Problem, State, 
     G[:, :3, :3] = G[:, :3, :3] @ exp_rotation(TURN * rng.normal(size=(n, 3)))
     C = stated**2 * np.diag([TURN**2] * 3 + [SHIFT**2] * 3)
     seen = [
-        TargetObservation(as_transform(f), g[:3, 3], n_CM=g[:3, 2], covariance=C) for f, g in zip(F, G, strict=True)
+        TargetObservation(X_BF=as_transform(f), p_CM=g[:3, 3], n_CM=g[:3, 2], covariance=C)
+        for f, g in zip(F, G, strict=True)
     ]
     known: State = (X, Y, IDENTITY)
     problem = problem_of(get_mounting("eye_in_hand"), seen, {"Y": as_transform(Y)})
@@ -68,7 +69,8 @@ def test_an_open_direction_stays_open() -> None:
     G = inverse(F @ X) @ Y
     C = np.diag([TURN**2] * 3 + [SHIFT**2] * 3)
     seen = [
-        TargetObservation(as_transform(f), g[:3, 3], n_CM=g[:3, 2], covariance=C) for f, g in zip(F, G, strict=True)
+        TargetObservation(X_BF=as_transform(f), p_CM=g[:3, 3], n_CM=g[:3, 2], covariance=C)
+        for f, g in zip(F, G, strict=True)
     ]
     problem = problem_of(get_mounting("eye_in_hand"), seen, {})
     known: State = (X, Y, IDENTITY)
@@ -82,6 +84,14 @@ def test_an_open_direction_stays_open() -> None:
 
 def test_observations_that_state_nothing_are_refused() -> None:
     problem, known, result, _ = calibrated(5, 0)
-    bare = Problem(problem.F, problem.G, problem.H, problem.full, problem.normal, None, problem.free)
+    bare = Problem(
+        F=problem.F,
+        G=problem.G,
+        H=problem.H,
+        full=problem.full,
+        normal=problem.normal,
+        covariance=None,
+        free=problem.free,
+    )
     with pytest.raises(InputError, match="state its covariance"):
         with_stated_noise(bare, known, result)

@@ -37,7 +37,9 @@ def recording(
         p_C[late] = (X @ p_C[late].T).T
         n_C[late] = n_C[late] @ X.rotation().matrix().T
         frames = replace(frames, p_C=p_C, n_C=n_C)
-    result = CalibrationResult(X_BC, np.diag([1e-9] * 3 + [1e-9] * 3), {}, {}, ())
+    result = CalibrationResult(
+        X_BC=X_BC, covariance=np.diag([1e-9] * 3 + [1e-9] * 3), held_out_mm={}, tilt_deg={}, poses=()
+    )
     return result, frames, motion
 
 
@@ -83,7 +85,7 @@ def test_a_calibrations_clock_serves_where_the_arm_rests() -> None:
     resting = ContinuousMotion(_rest(motion))
     found = synchronise(still, resting, result.X_BC)
     assert found.delay_s is None
-    clock = ScannerClock(ARRIVAL, 0.141, 1e-3, 0.015, 0.0)
+    clock = ScannerClock(kind=ARRIVAL, offset_s=0.141, sigma_s=1e-3, jitter_s=0.015, reference_s=0.0)
     found = synchronise(still, resting, result.X_BC, known=clock)
     assert found.source == "calibration"
     assert found.times == pytest.approx(frames.arrival - 0.141)

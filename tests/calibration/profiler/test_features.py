@@ -133,9 +133,15 @@ def calibrated(w: int) -> tuple[SphereData, SphereEstimate]:
     arm = DhArm.checked(d["dh_nominal"] * [MM, np.radians(1.0), MM, np.radians(1.0)])
     profiles = [p * MM for p in d["scan_prof"][w].astype(float)]
     data = SphereData(
-        poses(d["scan_T"][w]), profiles, float(d["radius"]) * MM, poses(d["touch_T"][w]), d["tip_nominal"][w] * MM,
-        arm, d["scan_q"][w], d["touch_q"][w],
-    )  # fmt: skip
+        poses=poses(d["scan_T"][w]),
+        profiles=profiles,
+        radius_m=float(d["radius"]) * MM,
+        touches=poses(d["touch_T"][w]),
+        tip=d["tip_nominal"][w] * MM,
+        arm=arm,
+        q=d["scan_q"][w],
+        touch_q=d["touch_q"][w],
+    )
     return data, sphere_joint(data, "affine+joints")
 
 

@@ -26,7 +26,7 @@ def some() -> SphereData:
 
 
 def scans_of(data: SphereData, radius_m: float) -> SphereData:
-    return SphereData(data.poses, data.profiles, radius_m)
+    return SphereData(poses=data.poses, profiles=data.profiles, radius_m=radius_m)
 
 
 def sphere_file(path: Path, data: SphereData, radius_m: float) -> Path:
@@ -78,7 +78,7 @@ def test_the_diameter_for_the_radius_ends_the_command_and_writes_nothing(tmp_pat
 def test_the_real_spheres_diameter_is_refused_and_its_radius_is_not() -> None:
     z = np.load(DATA / "real_sphere15_a.npz")
     parts = np.split(z["xz"] * MM, np.cumsum(z["n"])[:-1])
-    scans = SphereData(poses(z["T_base_flange"]), [p[::8] for p in parts], 40 * MM)
+    scans = SphereData(poses=poses(z["T_base_flange"]), profiles=[p[::8] for p in parts], radius_m=40 * MM)
     check_radius(scans, SphereSigmas(), None)
     with pytest.raises(RadiusError, match=r"a sphere of 40\.\d\d mm radius.*that is its diameter"):
         check_radius(scans_of(scans, 80 * MM), SphereSigmas(), None)

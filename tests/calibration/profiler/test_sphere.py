@@ -188,7 +188,9 @@ def test_one_axis_of_turning_leaves_a_translation_open_for_the_joint_method() ->
     a = np.linspace(-1.0, 1.0, 40)
     profiles = [np.column_stack([q * np.sin(a), 0.21 - q * np.cos(a)]) for q in r]
     with pytest.raises(DegenerateMotion, match="translation along"):
-        sphere_joint(SphereData(FlangePoses(R, t), profiles, RADIUS_M), "rigid", SIGMAS, init=start)
+        sphere_joint(
+            SphereData(poses=FlangePoses(R, t), profiles=profiles, radius_m=RADIUS_M), "rigid", SIGMAS, init=start
+        )
 
 
 def test_a_wrong_radius_is_named() -> None:
@@ -263,9 +265,15 @@ def published_data(w: int) -> SphereData:
     arm = DhArm.checked(d["dh_nominal"] * [MM, np.radians(1.0), MM, np.radians(1.0)])
     profiles = [p * MM for p in d["scan_prof"][w].astype(float)]
     return SphereData(
-        poses(d["scan_T"][w]), profiles, float(d["radius"]) * MM, poses(d["touch_T"][w]), d["tip_nominal"][w] * MM,
-        arm, d["scan_q"][w], d["touch_q"][w],
-    )  # fmt: skip
+        poses=poses(d["scan_T"][w]),
+        profiles=profiles,
+        radius_m=float(d["radius"]) * MM,
+        touches=poses(d["touch_T"][w]),
+        tip=d["tip_nominal"][w] * MM,
+        arm=arm,
+        q=d["scan_q"][w],
+        touch_q=d["touch_q"][w],
+    )
 
 
 def published_error_mm(w: int, points_F: np.ndarray, tip: np.ndarray, arm: SphereEstimate | None = None) -> float:
@@ -328,7 +336,7 @@ def test_on_the_fixed_files_the_joint_method_keeps_its_targets() -> None:
 def test_on_real_profiles_what_is_left_out_is_foretold_and_no_more_model_is_taken_than_helps() -> None:
     z = np.load(DATA / "real_sphere15_a.npz")
     parts = np.split(z["xz"] * MM, np.cumsum(z["n"])[:-1])
-    data = SphereData(poses(z["T_base_flange"]), [p[::8] for p in parts], 40 * MM)
+    data = SphereData(poses=poses(z["T_base_flange"]), profiles=[p[::8] for p in parts], radius_m=40 * MM)
     assert leave_one_out_m(data, "rigid").mean() <= 0.152 * MM
     choice = choose_model(data)
     assert choice.model == "rigid"

@@ -112,7 +112,10 @@ def test_equation_10_read_literally_loses_the_camera() -> None:
 
 def test_the_published_error_is_taken_at_the_camera_where_a_turn_of_the_flange_is_a_shift() -> None:
     X_CF = RigidTransform(RollPitchYaw(3.1, 0.1, 0.4), [0.02, -0.03, 0.6])
-    v = PublishedVerification(face_at(X_CF, 3), X_BC @ X_CF, *published_model(STANDARD, 4000), max_distance_m=0.01)
+    model_F, normals_F = published_model(STANDARD, 4000)
+    v = PublishedVerification(
+        points_C=face_at(X_CF, 3), X_BF=X_BC @ X_CF, model_F=model_F, normals_F=normals_F, max_distance_m=0.01
+    )
     tilt = np.radians(0.3)
     X_FC = X_CF.inverse()
     wrong = X_BC @ X_CF @ RigidTransform(RollPitchYaw(tilt, 0, 0), [0, 0, 0]) @ X_FC
@@ -138,8 +141,16 @@ def test_the_pipeline_runs_as_a_whole_and_compensation_flatters_its_own_pose() -
     circles, faces, refused = find_centres(clouds, parameters, segmented=True)
     assert [id for id, _ in refused] == ["blank"]
     pairs = [o for o in published_pairs(circles, poses) if o.id != "s7"]
-    model = published_model(STANDARD)
-    verifier = PublishedVerification(faces["s7"], poses["s7"], *model, "point_to_point", 0.01, 1.0)
+    model_F, normals_F = published_model(STANDARD)
+    verifier = PublishedVerification(
+        points_C=faces["s7"],
+        X_BF=poses["s7"],
+        model_F=model_F,
+        normals_F=normals_F,
+        method="point_to_point",
+        max_distance_m=0.01,
+        unit_m=1.0,
+    )
     assert verifier(all_pairs(pairs)).found
     state = run_published([pairs[i] for i in np.random.default_rng(0).permutation(7)], verifier, parameters)
     assert state.X_BC is not None

@@ -111,7 +111,16 @@ def test_informative_poses_know_more_than_the_first_ones() -> None:
         scans = [world.observations[i] for i in rows]
         fit = fit_kinematics(scans, world.q[rows], arm_errors(ARM, "links"), X_BC, ScannerCorrection())
         # at the same scatter
-        at = KinematicsFit(fit.X_BC, fit.correction, fit.u, fit.covariance, 1e-9, 1e-3, 1.0, fit.errors)
+        at = KinematicsFit(
+            X_BC=fit.X_BC,
+            correction=fit.correction,
+            u=fit.u,
+            covariance=fit.covariance,
+            sigma_position_m=1e-9,
+            sigma_normal_rad=1e-3,
+            redundancy=1.0,
+            errors=fit.errors,
+        )
         C = at.predicted(world.new, world.new_q) / fit.sigma_position_m**2
         spread.append(float(np.sqrt(np.trace(C, axis1=1, axis2=2)).mean()))
     assert spread[0] < 0.85 * spread[1]

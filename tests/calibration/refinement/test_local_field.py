@@ -133,7 +133,13 @@ def test_the_bootstrap_interval_holds_the_median_of_as_many_new_errors() -> None
 def test_the_field_moves_what_x_bc_makes_of_a_scan_by_itself() -> None:
     scan = _scans(1, 6)[0]
     field = LocalField(
-        np.array([scan.p_BR]), np.array([np.eye(3)]), np.array([[1e-3, -2e-3, 5e-4]]), 0.1, 1.0, 1e-3, 1e-6
+        places=np.array([scan.p_BR]),
+        turns=np.array([np.eye(3)]),
+        residuals=np.array([[1e-3, -2e-3, 5e-4]]),
+        length_m=0.1,
+        turn_rad=1.0,
+        sigma_field_m=1e-3,
+        sigma_scan_m=1e-6,
     )
     (moved,) = field.applied(X_BC, [scan])
     np.testing.assert_allclose(X_BC @ scan.p_CR - X_BC @ moved.p_CR, [1e-3, -2e-3, 5e-4], rtol=1e-4)

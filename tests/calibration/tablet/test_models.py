@@ -18,7 +18,16 @@ from weldcal.tools.studies.tablet.paper import published_touches
 from weldcal.tools.studies.tablet.world import TabletNoise, TabletTrial, simulate_trial
 
 SYNTH = SHARED_DATA / "profiler/tablet_synth.npz"
-EXACT = TabletNoise(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.5, 0.0)
+EXACT = TabletNoise(
+    depth_scale=1.0,
+    depth_m=0.0,
+    depth_step_m=0.0,
+    pixel=0.0,
+    pixel_step=0.0,
+    hand_step_m=0.0,
+    touch_px=2.5,
+    tilt_deg=0.0,
+)
 ROUNDED = PlanarConfig(step_m=1e-3)
 
 
@@ -79,9 +88,17 @@ def test_unseen_queries_of_the_shared_trials_are_met_within_the_target() -> None
     linear, squares, rounded = [], [], []
     for k in range(len(s["uv"])):
         touches = TabletTouches(
-            s["uv"][k], 1e-3 * s["depth"][k], 1e-3 * s["hand"][k], np.radians(s["theta_deg"]), s["delta_px"][k], s["tablet_px"],
-            1e-3 * float(s["mm_per_px"]), np.full(2, s["f"]), s["c"], 1e-3 * s["hand_capture"],
-        )  # fmt: skip
+            uv_px=s["uv"][k],
+            depth_m=1e-3 * s["depth"][k],
+            hand_m=1e-3 * s["hand"][k],
+            theta_rad=np.radians(s["theta_deg"]),
+            delta_px=s["delta_px"][k],
+            landmark_px=s["tablet_px"],
+            pitch_m=1e-3 * float(s["mm_per_px"]),
+            focal_px=np.full(2, s["f"]),
+            centre_px=s["c"],
+            hand_capture_m=1e-3 * s["hand_capture"],
+        )
         t = TabletTrial(touches, s["uv_q"][k], 1e-3 * s["depth_q"][k], s["theta_q"][k], 1e-3 * s["hand_q"][k])
         asked = fit_linear(touches).hand_to_touch(t.query_rays, t.query_theta_rad)
         linear.append(1e3 * np.linalg.norm(asked - t.query_hand_m, axis=1).mean())

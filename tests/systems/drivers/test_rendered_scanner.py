@@ -64,11 +64,30 @@ def a_scene(builder: DiagramBuilder) -> SceneGraph:
 def scan_of_the_plate(width: int = 824, height: int = 616) -> Scan:
     """What the driver's own chain of camera and scanner returns."""
     builder = DiagramBuilder()
-    config = RenderedScanner("ideal", width, height, [0.0, 0.0, DISTANCE_M], [180.0, 0.0, 0.0], 0.0, 0.0, 0.0)
+    config = RenderedScanner(
+        preset="ideal",
+        width=width,
+        height=height,
+        xyz_m=[0.0, 0.0, DISTANCE_M],
+        rpy_deg=[180.0, 0.0, 0.0],
+        mounting_translation_mm=0.0,
+        mounting_rotation_deg=0.0,
+        exposure_s=0.0,
+    )
     scene = a_scene(builder)
     still: Any = None  # nobody moves in it
-    world = SimulatedWorld(still, scene, still, None, (), PictureScene(scene, SCANNER_RENDERER, {}, still), None)
-    build = StationBuild(builder, the_arm(), WeldingTool(), Q_HOME, np.random.default_rng(0), parts=(world,))
+    world = SimulatedWorld(
+        plant=still,
+        scene_graph=scene,
+        arm=still,
+        tool=None,
+        tip_joints=(),
+        scanner_view=PictureScene(scene, SCANNER_RENDERER, {}, still),
+        second=None,
+    )
+    build = StationBuild(
+        builder=builder, arm=the_arm(), tool=WeldingTool(), q_start=Q_HOME, rng=np.random.default_rng(0), parts=(world,)
+    )
     assert ApplyDriverConfig(config, build).IsNearlyEqualTo(X_BC, 1e-12)
     builder.ExportInput(build.inputs["scanner.trigger"], "trigger")
     builder.ExportOutput(build.outputs["scanner.scan"], "scan")

@@ -47,7 +47,7 @@ def moved(q: Array, dz_m: float) -> Array:
 
 
 def test_a_touch_has_the_joints_of_the_first_sample_inside_the_sphere() -> None:
-    world, touches = TouchProbe(ARM, sphere_below(0.0005), normally_closed=False), Touches()
+    world, touches = TouchProbe(arm=ARM, truth=sphere_below(0.0005), normally_closed=False), Touches()
     depths = 0.0005 - 0.001 * np.abs(np.linspace(-1.0, 1.0, 2 * round(0.001 / (SPEED_M_S * STEP_S)) + 1))
     q, seen = Q, []
     for k, depth in enumerate(np.concatenate([depths, depths])):  # down by 1 mm and up again, twice
@@ -83,7 +83,7 @@ def test_bounce_belongs_to_its_touch_and_a_spike_is_none(levels: str, number: in
 
 
 def test_a_contact_that_opens_and_closes_all_the_time_chatters() -> None:
-    world, touches = TouchProbe(ARM, sphere_below(0.01), normally_closed=False), Touches()
+    world, touches = TouchProbe(arm=ARM, truth=sphere_below(0.01), normally_closed=False), Touches()
     world.set_how("chatters")
     told = next(k for k in range(100) if touches.add(k * STEP_S, world.step(Q), Q) or touches.chatters)
     assert told * STEP_S < 0.06  # 0.4 mm of a descent
@@ -93,7 +93,7 @@ def test_a_contact_that_opens_and_closes_all_the_time_chatters() -> None:
 
 def test_a_broken_cable_is_a_touch_of_a_normally_closed_probe_only() -> None:
     for normally_closed in (False, True):
-        world = TouchProbe(ARM, sphere_below(0.01), normally_closed)
+        world = TouchProbe(arm=ARM, truth=sphere_below(0.01), normally_closed=normally_closed)
         config = UrTouchProbe("127.0.0.1", 3, normally_closed)
         assert not config.closed(int(world.step(Q)) << 3)
         world.set_how("cut")

@@ -30,7 +30,9 @@ from weldcal.systems.motion.pose_recorder import PoseHistory
 
 RING = get_flange("tool-ring-63")
 X_BC = RigidTransform(RollPitchYaw(np.pi, 0.0, -np.pi / 2), [0.65, 0.0, 0.95])
-CONFIG = CalibratorConfig(0.2e-3, 6, 10, np.array([0.65, 0.0, 0.05]))
+CONFIG = CalibratorConfig(
+    required_error_m=0.2e-3, minimum_scans=6, maximum_scans=10, p_BWork=np.array([0.65, 0.0, 0.05])
+)
 JOB = JobCommand(scan_sequence=1, scan_purpose="calibrate", scan_label="pose01")
 
 
@@ -46,9 +48,19 @@ def seen(k: int, error_m: float = 0.0, purpose: str = "calibrate") -> FlangeEsti
     X_CR = X_BC.inverse() @ ring_pose(k)
     center = X_CR.translation() + error_m * np.random.default_rng(100 + k).uniform(-1.0, 1.0, 3)
     fit = FlangeFit(
-        center, X_CR.rotation().matrix()[:, 2], np.eye(3) * 2e-5**2, 3e-4, 1e-5, 2e-5, 0.0315, None, 5000, 200, 0.9
+        center_C=center,
+        normal_C=X_CR.rotation().matrix()[:, 2],
+        center_covariance=np.eye(3) * 2e-5**2,
+        normal_sigma=3e-4,
+        plane_rms_m=1e-5,
+        rim_rms_m=2e-5,
+        outer_radius_m=0.0315,
+        bore_radius_m=None,
+        n_points=5000,
+        n_rim=200,
+        coverage=0.9,
     )
-    return FlangeEstimate(k, 0.1 * k, purpose, f"pose{k:02d}", fit)
+    return FlangeEstimate(sequence=k, capture_time=0.1 * k, purpose=purpose, label=f"pose{k:02d}", fit=fit)
 
 
 def digested(count: int, error_m: float = 0.0, config: CalibratorConfig = CONFIG) -> CalibrationStatus:
@@ -191,7 +203,7 @@ def test_too_few_scans_say_so_and_promise_nothing() -> None:
 
 def test_a_scan_without_a_ring_is_refused_by_name_and_still_counts_as_one() -> None:
     status = digested(4)
-    bad = FlangeEstimate(5, 0.5, "calibrate", "pose05", reason="no rim was seen")
+    bad = FlangeEstimate(sequence=5, capture_time=0.5, purpose="calibrate", label="pose05", reason="no rim was seen")
     status = digest(status, bad, ring_pose(5), RING, CONFIG)
     assert status.refused == (("pose05", "no rim was seen"),)
     assert (status.sequence, status.calibration_scans, len(status.observations)) == (5, 5, 4)
@@ -262,7 +274,7 @@ def test_the_calibrator_takes_each_estimate_once() -> None:
     (observation,) = status.observations
     assert observation.X_BR.IsNearlyEqualTo(forward_kinematics(the_arm(), Q_HOME), 1e-12)
     system.GetInputPort("flange_estimate").FixValue(
-        context, AbstractValue.Make(FlangeEstimate(2, 0.2, "calibrate", "b"))
+        context, AbstractValue.Make(FlangeEstimate(sequence=2, capture_time=0.2, purpose="calibrate", label="b"))
     )
     simulator.AdvanceTo(0.2)
     assert system.status(context).refused[0][0] == "b"

@@ -37,16 +37,16 @@ PLANNED = PlannedSeam(
     sequence=99, seam=SEAM, q_start=np.full(6, 0.1), q_above=np.full(6, 0.2), q_retract=np.full(6, 0.3)
 )
 ESTIMATE = CalibrationEstimate(
-    RigidTransform(),
-    np.eye(6) * 1e-10,
-    np.ones(4, bool),
-    np.zeros(4),
-    np.zeros(4),
-    HeldOut(np.zeros(4), np.zeros(4)),
-    1e-4,
-    1e-3,
-    (),
-    (),
+    X_BC=RigidTransform(),
+    covariance=np.eye(6) * 1e-10,
+    inliers=np.ones(4, bool),
+    position_residuals_m=np.zeros(4),
+    tilt_residuals_rad=np.zeros(4),
+    held_out=HeldOut(np.zeros(4), np.zeros(4)),
+    sigma_position_m=1e-4,
+    sigma_normal_rad=1e-3,
+    unobservable=(),
+    warnings=(),
 )
 
 
@@ -56,14 +56,14 @@ class World:
     def __init__(self, plan: JobPlan = PLAN, state: JobState | None = None) -> None:
         self.plan, self.state, self.time = plan, state or JobState(), 0.0
         self.seen = Seen(
-            0.0,
-            UrStatus(),
-            0,
-            Q_HOME,
-            NextPose(0, 0, "pose01", Q_HOME),
-            CalibrationStatus(),
-            PlannedSeam(),
-            ServoReport(),
+            time=0.0,
+            robot=UrStatus(),
+            settled_goal=0,
+            q=Q_HOME,
+            next_pose=NextPose(0, 0, "pose01", Q_HOME),
+            calibration=CalibrationStatus(),
+            seam=PlannedSeam(),
+            servo=ServoReport(),
         )
 
     @property
@@ -125,8 +125,8 @@ def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     assert not world.command.process_on
     assert world.arrive() == "weld"
     assert (world.command.mode, world.command.process_on, world.command.streaming) == ("weld", True, True)
-    assert world.look(5.0, servo=ServoReport("TRACK", True)) == "weld"
-    assert world.look(20.0, servo=ServoReport("DONE")) == "retract"
+    assert world.look(5.0, servo=ServoReport(phase="TRACK", torch_on=True)) == "weld"
+    assert world.look(20.0, servo=ServoReport(phase="DONE")) == "retract"
     assert (world.command.process_on, world.command.streaming) == (False, False)
     assert world.arrive() == "home"
     assert world.arrive() == "done"
@@ -146,7 +146,7 @@ def test_every_seam_is_scanned_planned_and_welded_in_turn() -> None:
         assert world.look(0.3, seam=dc.replace(PLANNED, sequence=number + 1)) == "approach_above"
         assert world.arrive() == "approach"
         assert world.arrive() == "weld"
-        assert world.look(20.0, servo=ServoReport("DONE")) == "retract"
+        assert world.look(20.0, servo=ServoReport(phase="DONE")) == "retract"
         assert world.arrive() == ("home" if number else "park")
         world.seen = dc.replace(world.seen, servo=ServoReport())
     assert world.arrive() == "done"
@@ -293,8 +293,8 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         "The plate is not there",
     ),
     "no seam and no reason": ("scan_workpiece", 0.1, {"seam": PlannedSeam(sequence=4)}, "No seam could be planned"),
-    "weld fault": ("weld", 0.1, {"servo": ServoReport("FAULT", reason="Tag hidden: clean it.")}, "Tag hidden"),
-    "weld fault without a reason": ("weld", 0.1, {"servo": ServoReport("FAULT")}, "The welding servo stopped"),
+    "weld fault": ("weld", 0.1, {"servo": ServoReport(phase="FAULT", reason="Tag hidden: clean it.")}, "Tag hidden"),
+    "weld fault without a reason": ("weld", 0.1, {"servo": ServoReport(phase="FAULT")}, "The welding servo stopped"),
 }
 
 
@@ -319,7 +319,7 @@ def test_a_held_job_stays_held_when_the_cause_is_gone() -> None:
     world = in_phase("weld", mode="weld", process_on=True)
     world.look(0.1, robot=UrStatus(fault="stopped"))
     held = world.state
-    world.look(5.0, robot=UrStatus(), settled_goal=5, servo=ServoReport("DONE"))
+    world.look(5.0, robot=UrStatus(), settled_goal=5, servo=ServoReport(phase="DONE"))
     assert world.state is held
 
 

@@ -121,7 +121,16 @@ def _offset_file(path: Path, offset_rad: float) -> Path:
     nothing = arm_errors(load_chain("ur10e"), "joints")
     u = np.zeros(len(nothing.which))
     u[nothing.names.index("elbow_joint offset")] = offset_rad / nothing.scale[0]
-    fit = KinematicsFit(RigidTransform(), ScannerCorrection(), u, np.eye(1), 1.0, 1.0, 1.0, nothing)
+    fit = KinematicsFit(
+        X_BC=RigidTransform(),
+        correction=ScannerCorrection(),
+        u=u,
+        covariance=np.eye(1),
+        sigma_position_m=1.0,
+        sigma_normal_rad=1.0,
+        redundancy=1.0,
+        errors=nothing,
+    )
     path.write_text(kinematics_text(fit, "an elbow's zero"))
     return path
 

@@ -52,7 +52,7 @@ def scenario(frames: int = 45) -> Scenario:
 def an_outcome() -> MotionOutcome:
     """A run by its command, which writes the results too."""
     folder = Path(tempfile.mkdtemp())
-    return run_motion_live(scenario(), RunOptions("motion", folder, 3, recording=False), no_progress)
+    return run_motion_live(scenario(), RunOptions(scenario="motion", out=folder, seed=3, recording=False), no_progress)
 
 
 def a_run() -> Run[AddedMotion]:
@@ -153,7 +153,7 @@ def test_a_frame_is_on_the_port_after_its_delay_and_the_same_in_every_run() -> N
 def test_capture_is_believed_by_the_device_once_a_frame_is_known() -> None:
     first = StreamedScan(1, arrival_time=10.15, device_time=500.0)
     assert believed_capture(first, FlangeEstimate(), 0.14) == pytest.approx(10.01)
-    before = FlangeEstimate(1, 10.01, device_time=500.0)
+    before = FlangeEstimate(sequence=1, capture_time=10.01, device_time=500.0)
     late = StreamedScan(2, arrival_time=10.25, device_time=500.05)
     assert believed_capture(late, before, 0.14) == pytest.approx(10.06)
     early = StreamedScan(2, arrival_time=10.18, device_time=500.05)  # less late than thought: the clock is corrected

@@ -61,7 +61,15 @@ def planned(
     """What the system makes of one scan; the guess of the plate's place is off by some millimetres and a degree."""
     error = RigidTransform(RollPitchYaw(0.0, 0.0, np.radians(1.0)), [0.004 + offset_m, -0.003, 0.0])
     planning = SeamPlanning(
-        the_arm(), TOOL, STRAIGHT, X_BP @ error, config, Q_HOME, CLEARANCE_M, 0.1, method or PlanningMethod()
+        arm=the_arm(),
+        tool=TOOL,
+        workpiece=STRAIGHT,
+        X_BP_guess=X_BP @ error,
+        config=config,
+        q_near=Q_HOME,
+        clearance_m=CLEARANCE_M,
+        seam_length_m=0.1,
+        method=method or PlanningMethod(),
     )
     system = SeamPlanner(planning, X_BC)
     simulator = Simulator(system)
@@ -94,7 +102,16 @@ def test_a_weld_may_take_only_a_part_of_the_seam() -> None:
 
 
 def test_a_seam_too_short_to_be_touched_is_refused_before_the_arm_goes_there(config: ServoConfig) -> None:
-    planning = SeamPlanning(the_arm(), TOOL, STRAIGHT, X_BP, config, Q_HOME, CLEARANCE_M, 0.001)
+    planning = SeamPlanning(
+        arm=the_arm(),
+        tool=TOOL,
+        workpiece=STRAIGHT,
+        X_BP_guess=X_BP,
+        config=config,
+        q_near=Q_HOME,
+        clearance_m=CLEARANCE_M,
+        seam_length_m=0.001,
+    )
     found = plan_drawn_seam(planning, 1)
     assert found.seam is None
     assert "only 1 mm long: too short for the touch-on" in str(found.reason)
@@ -155,7 +172,16 @@ def test_the_plan_holds_the_arms_way_to_it(plan: PlannedSeam, config: ServoConfi
 
 def test_the_plan_states_what_errors_of_the_arm_do(plan: PlannedSeam, config: ServoConfig) -> None:
     """The same of a scanned and of a drawn seam; less where a refinement has found the links' errors."""
-    planning = SeamPlanning(the_arm(), TOOL, STRAIGHT, X_BP, config, Q_HOME, CLEARANCE_M, 0.1)
+    planning = SeamPlanning(
+        arm=the_arm(),
+        tool=TOOL,
+        workpiece=STRAIGHT,
+        X_BP_guess=X_BP,
+        config=config,
+        q_near=Q_HOME,
+        clearance_m=CLEARANCE_M,
+        seam_length_m=0.1,
+    )
     drawn = plan_drawn_seam(planning, 1)
     assert 2e-5 < plan.arm_sigma_m < 2e-4
     assert drawn.arm_sigma_m == pytest.approx(plan.arm_sigma_m, rel=0.05)

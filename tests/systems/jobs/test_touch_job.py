@@ -96,7 +96,16 @@ class Bench:
             deflection = np.array([0.0, 0.0, max(self.face_m - self.height, 0.0) + 1e-4])
             sample = DeflectionSample(self.time, RigidTransform(), deflection, True)
             felt = Deformation(self.frame, sample)
-            seen = TouchSeen(self.time, Q_HOME, self.state.goal_id, UrStatus(), self.hold, self.plan, felt, self.height)
+            seen = TouchSeen(
+                time=self.time,
+                q=Q_HOME,
+                settled_goal=self.state.goal_id,
+                robot=UrStatus(),
+                hold=self.hold,
+                plan=self.plan,
+                finger=felt,
+                height=self.height,
+            )
             self.state = next_touch_state(self.state, seen, MOTION)
             if self.state.finished or (until and self.state.phase == until):
                 break
@@ -155,7 +164,15 @@ def test_the_touches_of_a_true_calibration_agree_with_the_scan_and_go_through_th
     (tmp_path / "touches.csv").write_text(touches_text(touches))
     read = read_touches(tmp_path / "touches.csv")
     assert station.truth.X_BC is not None
-    result = CalibrationResult(station.truth.X_BC, 1e-10 * np.eye(6), {}, {}, (), sigma_position_mm=0.02, robot="ur10e")
+    result = CalibrationResult(
+        X_BC=station.truth.X_BC,
+        covariance=1e-10 * np.eye(6),
+        held_out_mm={},
+        tilt_deg={},
+        poses=(),
+        sigma_position_mm=0.02,
+        robot="ur10e",
+    )
     for each in (touches, read):
         assert np.abs(judge_touches(result, each).error_m).max() < 2e-5
 

@@ -44,7 +44,7 @@ def knocked(knock_s: float, speed_factor: float, fps: float) -> DemoResult:
         return found
 
     cell.job.stage = stop_when_measured
-    return measure(run_cell(cell), RunOptions("straight_groove", Path("unused")))
+    return measure(run_cell(cell), RunOptions(scenario="straight_groove", out=Path("unused")))
 
 
 def test_a_scanner_knocked_before_the_weld_holds_the_job() -> None:

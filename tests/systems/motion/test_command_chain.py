@@ -165,7 +165,13 @@ class Servo:
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.X_BT = touch_start_pose(SEAM, config)
-        feed(self.system, self.context, planned_seam=PlannedSeam(1, SEAM), position_measured=Q_HOME, sample_time=0.0)
+        feed(
+            self.system,
+            self.context,
+            planned_seam=PlannedSeam(sequence=1, seam=SEAM),
+            position_measured=Q_HOME,
+            sample_time=0.0,
+        )
         feed(self.system, self.context, job=JobCommand(), deformation=self.deformation(0.0, True))
 
     def deformation(self, time: float, valid: bool) -> Deformation:
@@ -265,7 +271,7 @@ def test_a_job_that_takes_the_weld_back_leaves_no_motion_behind() -> None:
 )
 def test_the_torch_needs_the_jobs_consent_in_the_same_tick(job: JobCommand, on: float) -> None:
     servo = Servo()
-    burning = ServoReport("TRACK", True)
+    burning = ServoReport(phase="TRACK", torch_on=True)
     servo.context.SetAbstractState(0, burning)
     feed(servo.system, servo.context, job=job)
     assert np.all(servo.out("torch_on") == on)

@@ -39,9 +39,21 @@ def estimate(
     n = X_CR.rotation().matrix()[:, 2] + SIGMA_RAD * rng.standard_normal(3)
     center = X_CR.translation() + SIGMA_M * rng.standard_normal(3)
     fit = FlangeFit(
-        center, n / np.linalg.norm(n), SIGMA_M**2 * np.eye(3), SIGMA_RAD, 1e-4, 1e-4, 0.0315, None, 1000, 100, 1.0
+        center_C=center,
+        normal_C=n / np.linalg.norm(n),
+        center_covariance=SIGMA_M**2 * np.eye(3),
+        normal_sigma=SIGMA_RAD,
+        plane_rms_m=1e-4,
+        rim_rms_m=1e-4,
+        outer_radius_m=0.0315,
+        bore_radius_m=None,
+        n_points=1000,
+        n_rim=100,
+        coverage=1.0,
     )
-    return FlangeEstimate(k, t, "stream", fit=fit if seen else None, arrival_time=t + DELAY_S)
+    return FlangeEstimate(
+        sequence=k, capture_time=t, purpose="stream", fit=fit if seen else None, arrival_time=t + DELAY_S
+    )
 
 
 @pytest.fixture(scope="module")
@@ -137,10 +149,10 @@ def watched(clock: ScannerClock | None, at_0_s: float, late_s: Array) -> DriftSt
     "clock",
     [
         None,
-        ScannerClock(DEVICE, -1000.12, 1e-4, 3e-4, 1000.0),
-        ScannerClock(DEVICE, 55.0, 1e-4, 3e-4, 1000.0),
-        ScannerClock(DEVICE, -1000.0, 1e-4, 3e-4, 1000.0),
-        ScannerClock(ARRIVAL, DELAY_S + 0.02, 1e-2, 0.015, 0.0),
+        ScannerClock(kind=DEVICE, offset_s=-1000.12, sigma_s=1e-4, jitter_s=3e-4, reference_s=1000.0),
+        ScannerClock(kind=DEVICE, offset_s=55.0, sigma_s=1e-4, jitter_s=3e-4, reference_s=1000.0),
+        ScannerClock(kind=DEVICE, offset_s=-1000.0, sigma_s=1e-4, jitter_s=3e-4, reference_s=1000.0),
+        ScannerClock(kind=ARRIVAL, offset_s=DELAY_S + 0.02, sigma_s=1e-2, jitter_s=0.015, reference_s=0.0),
     ],
     ids=["unknown", "another start", "another day", "this run", "arrivals"],
 )

@@ -42,7 +42,15 @@ class Welding:
 
     def report(self, phase: Phase, *, torch_on: bool) -> None:
         command = WeldingCommand(ON_THE_WAY, torch_on, phase, None, Diagnostics())
-        report = ServoReport(str(phase), torch_on, None, command, None, 0.0, RigidTransform())
+        report = ServoReport(
+            phase=str(phase),
+            torch_on=torch_on,
+            reason=None,
+            command=command,
+            state=None,
+            time=0.0,
+            X_BT=RigidTransform(),
+        )
         self.context("welding_servo").SetAbstractState(0, report)
 
     def arm(self, q: np.ndarray, fault: float = 0.0) -> None:

@@ -62,18 +62,18 @@ class Job:
         self.viewer, self.views = Viewer(), Views()
         shown = {"planned_seam": AbstractValue.Make(PlannedSeam())}
         self.director = CameraDirector(
-            self.viewer,
-            self.views,
-            CELL_VIEW,
-            shown,
-            RigidTransform(),
-            X_BC,
-            None,
-            WORK,  # type: ignore[arg-type]
+            meshcat=self.viewer,
+            views=self.views,
+            cell=CELL_VIEW,
+            shown=shown,
+            X_WB=RigidTransform(),
+            X_BC_guess=X_BC,
+            tool=None,
+            work_B=WORK,  # type: ignore[arg-type]
         )
         self.context = self.director.CreateDefaultContext()
         self.director.GetInputPort("planned_seam").FixValue(
-            self.context, AbstractValue.Make(PlannedSeam(1, SEAM_CURVE))
+            self.context, AbstractValue.Make(PlannedSeam(sequence=1, seam=SEAM_CURVE))
         )
 
     def phase(self, name: str) -> str:

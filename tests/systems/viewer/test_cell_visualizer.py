@@ -92,7 +92,14 @@ class Viewer:
         self.meshcat = meshcat
         guess = RigidTransform([0.65, 0.0, 0.95])
         self.system = CellVisualizer(
-            meshcat, TOOL, guess, 0.0315, VisualizationConfig(cloud_points=50), PLATE.mesh, get_scanner("phoxi_m"), WORK
+            meshcat=meshcat,
+            tool=TOOL,
+            X_BC_guess=guess,
+            circle_radius_m=0.0315,
+            config=VisualizationConfig(cloud_points=50),
+            cad=PLATE.mesh,
+            scanner=get_scanner("phoxi_m"),
+            work_B=WORK,
         )
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
@@ -135,17 +142,17 @@ def test_a_scan_appears_when_it_comes(viewer: Viewer) -> None:
 
 
 FIT = FlangeFit(
-    np.array([0.0, 0.0, 0.6]),
-    np.array([0.0, 0.0, -1.0]),
-    np.eye(3) * 1e-10,
-    1e-4,
-    1e-5,
-    1e-5,
-    0.0315,
-    None,
-    900,
-    90,
-    0.9,
+    center_C=np.array([0.0, 0.0, 0.6]),
+    normal_C=np.array([0.0, 0.0, -1.0]),
+    center_covariance=np.eye(3) * 1e-10,
+    normal_sigma=1e-4,
+    plane_rms_m=1e-5,
+    rim_rms_m=1e-5,
+    outer_radius_m=0.0315,
+    bore_radius_m=None,
+    n_points=900,
+    n_rim=90,
+    coverage=0.9,
 )
 X_BC = RigidTransform(RollPitchYaw(np.pi, 0.0, -np.pi / 2), [0.65, 0.0, 0.95])
 
@@ -158,23 +165,42 @@ def calibrated(sigma_m: float, inliers: list[bool], above_m: float = 0.0) -> Cal
     covariance = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * sigma_m**2
     zeros = np.zeros(n)
     estimate = CalibrationEstimate(
-        X_BC, covariance, np.array(inliers), zeros, zeros, HeldOut(zeros, zeros), 1e-4, 1e-3, (), ()
+        X_BC=X_BC,
+        covariance=covariance,
+        inliers=np.array(inliers),
+        position_residuals_m=zeros,
+        tilt_residuals_rad=zeros,
+        held_out=HeldOut(zeros, zeros),
+        sigma_position_m=1e-4,
+        sigma_normal_rad=1e-3,
+        unobservable=(),
+        warnings=(),
     )
-    return CalibrationStatus(n, n, seen, estimate=estimate)
+    return CalibrationStatus(sequence=n, calibration_scans=n, observations=seen, estimate=estimate)
 
 
 def test_a_fitted_circle_appears_with_its_number_and_none_without_a_fit(viewer: Viewer) -> None:
-    viewer.show(flange_estimate=FlangeEstimate(1, 0.0, "calibrate", "pose01", reason="no rim was seen"))
+    viewer.show(
+        flange_estimate=FlangeEstimate(
+            sequence=1, capture_time=0.0, purpose="calibrate", label="pose01", reason="no rim was seen"
+        )
+    )
     viewer.run(0.15)
     assert not viewer.has("estimate/circle/01")
-    viewer.show(flange_estimate=FlangeEstimate(2, 0.0, "calibrate", "pose02", FIT))
+    viewer.show(
+        flange_estimate=FlangeEstimate(sequence=2, capture_time=0.0, purpose="calibrate", label="pose02", fit=FIT)
+    )
     viewer.run(0.15)
     assert viewer.has("estimate/circle/02/number")
 
 
 def test_circles_fade_with_age_and_refused_ones_are_dashed(viewer: Viewer) -> None:
     for k in range(1, 7):
-        viewer.show(flange_estimate=FlangeEstimate(k, 0.0, "calibrate", f"pose{k:02d}", FIT))
+        viewer.show(
+            flange_estimate=FlangeEstimate(
+                sequence=k, capture_time=0.0, purpose="calibrate", label=f"pose{k:02d}", fit=FIT
+            )
+        )
         viewer.run(0.15)
     circles = viewer.system._drawn.circles
     assert [circles[k].showing for k in range(1, 7)] == ["old", "old", "recent", "recent", "recent", "new"]
@@ -213,7 +239,11 @@ def test_a_face_that_is_seen_too_near_the_scanner_is_above_where_the_arm_puts_it
 
 def test_the_newest_face_is_coloured_once_the_calibration_has_used_it(viewer: Viewer) -> None:
     face = FIT.center_C + np.random.default_rng(0).normal(0.0, 1e-3, (200, 3))
-    viewer.show(flange_estimate=FlangeEstimate(4, 0.0, "calibrate", "pose04", FIT, face))
+    viewer.show(
+        flange_estimate=FlangeEstimate(
+            sequence=4, capture_time=0.0, purpose="calibrate", label="pose04", fit=FIT, points_C=face
+        )
+    )
     viewer.run(0.15)
     assert not viewer.has("estimate/face/04")
     viewer.show(calibration_status=calibrated(1e-4, [True] * 4))
@@ -225,11 +255,11 @@ SEAM = SeamCurve.from_points(np.column_stack([np.full(30, 0.65), np.linspace(-0.
 
 
 def test_the_planned_seam_appears_with_the_drawing_where_it_was_found(viewer: Viewer) -> None:
-    viewer.show(planned_seam=PlannedSeam(1, SEAM), job_state=JobState(JobCommand(phase="approach_above")))
+    viewer.show(planned_seam=PlannedSeam(sequence=1, seam=SEAM), job_state=JobState(JobCommand(phase="approach_above")))
     viewer.run(0.15)
     assert viewer.has("seam/planned")
     assert not viewer.has("cad"), "no registration, no drawing"
-    viewer.show(planned_seam=PlannedSeam(2, SEAM, RigidTransform([0.65, 0.0, 0.02])))
+    viewer.show(planned_seam=PlannedSeam(sequence=2, seam=SEAM, X_BP=RigidTransform([0.65, 0.0, 0.02])))
     viewer.run(0.15)
     assert viewer.has("cad")
     assert not viewer.has("seam/torch/000")
@@ -244,12 +274,18 @@ def tracking(time: float, s: float, torch_on: bool) -> ServoReport:
     felt = Measurement(time, SEAM.position(s + 0.06), delta, p_BT)
     state = WeldingState(phase=Phase.TRACK, measurement=felt)
     return ServoReport(
-        "TRACK", torch_on, None, command, state, time, RigidTransform(RollPitchYaw(0, 0, np.pi / 2), p_BT)
+        phase="TRACK",
+        torch_on=torch_on,
+        reason=None,
+        command=command,
+        state=state,
+        time=time,
+        X_BT=RigidTransform(RollPitchYaw(0, 0, np.pi / 2), p_BT),
     )
 
 
 def test_the_weld_grows_piece_by_piece_with_the_arrow_of_the_deflection(viewer: Viewer) -> None:
-    viewer.show(planned_seam=PlannedSeam(1, SEAM, RigidTransform()))
+    viewer.show(planned_seam=PlannedSeam(sequence=1, seam=SEAM, X_BP=RigidTransform()))
     for k in range(25):
         viewer.show(servo_report=tracking(0.1 * k, 0.0008 * k, k > 3))
         viewer.run(0.1)

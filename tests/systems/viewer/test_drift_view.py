@@ -25,7 +25,21 @@ def test_scanner_and_ring_are_drawn_where_they_are_believed() -> None:
     view = DriftView(meshcat, 0.03, VisualizationConfig(), period_s=0.1)
     context = view.CreateDefaultContext()
     view.GetInputPort("drift").FixValue(context, AbstractValue.Make(status(30)))
-    fit = FlangeFit(np.ones(3), np.array([0.0, 0.0, -1.0]), np.eye(3), 1e-3, 1e-4, 1e-4, 0.03, None, 1000, 100, 1.0)
-    view.GetInputPort("flange_estimate").FixValue(context, AbstractValue.Make(FlangeEstimate(1, 0.0, fit=fit)))
+    fit = FlangeFit(
+        center_C=np.ones(3),
+        normal_C=np.array([0.0, 0.0, -1.0]),
+        center_covariance=np.eye(3),
+        normal_sigma=1e-3,
+        plane_rms_m=1e-4,
+        rim_rms_m=1e-4,
+        outer_radius_m=0.03,
+        bore_radius_m=None,
+        n_points=1000,
+        n_rim=100,
+        coverage=1.0,
+    )
+    view.GetInputPort("flange_estimate").FixValue(
+        context, AbstractValue.Make(FlangeEstimate(sequence=1, capture_time=0.0, fit=fit))
+    )
     view._draw(context)
     assert all(meshcat.HasPath(f"{ROOT}/{name}") for name in ("scanner/axis0", "ring"))

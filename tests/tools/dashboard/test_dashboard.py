@@ -36,7 +36,19 @@ from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
 
 STEPS = (("Calibrate", ("scan_pose", "move_to_pose")), ("Weld", ("weld",)), ("Go home", ("home",)))
 SECONDS = {"scan": 3.0, "Weld": 20.0, "Go home": 6.0}
-FACTS = Facts("s_groove", "simulated", True, STEPS, 0.15, 12, 6, SECONDS, 8.0, 2.0, (0.4, 5.0))
+FACTS = Facts(
+    title="s_groove",
+    robot="simulated",
+    settable_pace=True,
+    steps=STEPS,
+    required_mm=0.15,
+    maximum_scans=12,
+    minimum_scans=6,
+    seconds=SECONDS,
+    weld_speed_mm_s=8.0,
+    wanted_deflection_mm=2.0,
+    band_mm=(0.4, 5.0),
+)
 SEAM = SeamCurve.from_points(np.linspace([0.5, 0.0, 0.0], [0.6, 0.0, 0.0], 40))
 SIZES = {"desktop": (1440, 900), "tablet": (1024, 768), "phone": (390, 844)}
 
@@ -55,11 +67,24 @@ def welding(live: LiveView, sigma_min: float = 0.3) -> None:
     """In the middle of a seam of 100 mm."""
     now = Diagnostics(e_t=0.04e-3, s_torch=0.05, delta_n=1.9e-3)
     command = WeldingCommand(np.zeros(6), True, Phase.TRACK, None, now)
-    report = ServoReport("TRACK", True, None, command, None, 40.0, RigidTransform())
-    shown = {"servo_report": report, "planned_seam": PlannedSeam(1, SEAM)}
+    report = ServoReport(
+        phase="TRACK", torch_on=True, reason=None, command=command, state=None, time=40.0, X_BT=RigidTransform()
+    )
+    shown = {"servo_report": report, "planned_seam": PlannedSeam(sequence=1, seam=SEAM)}
     live.moment = Moment(40.0, JobCommand(phase="weld", mode="weld"), shown, sigma_min)
     s = np.linspace(0.0, 0.05, 60)
-    live.weld[:] = [WeldRow(30.0 + 100.0 * x, x, x + 0.03, 4e-4 * math.sin(60.0 * x), 1.9e-3, 8e-3, True) for x in s]
+    live.weld[:] = [
+        WeldRow(
+            time=30.0 + 100.0 * x,
+            s_torch=x,
+            s_tip=x + 0.03,
+            offset=4e-4 * math.sin(60.0 * x),
+            deflection=1.9e-3,
+            speed=8e-3,
+            torch_on=True,
+        )
+        for x in s
+    ]
 
 
 @pytest.fixture
@@ -128,7 +153,7 @@ def run_in_thread(
         monkeypatch.setattr("weldcal.tools.dashboard.server.PORTS", ())
         scenario, found = load_scenario("straight_groove", MOVE_ONLY), []
         scenario.job.weld, scenario.job.speed_factor = False, 0.15
-        options = RunOptions("straight_groove", tmp_path, browser=True, realtime=True)
+        options = RunOptions(scenario="straight_groove", out=tmp_path, browser=True, realtime=True)
 
         def wait(*_: object) -> None:
             if not addresses.empty() or told.is_set():

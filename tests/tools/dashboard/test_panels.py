@@ -39,7 +39,17 @@ from weldcal.tools.dashboard.server import Dashboard
 from weldcal.tools.dashboard.source import DashboardSource
 
 FIT = FlangeFit(
-    np.array([0.02, -0.03, 0.7]), np.array([0.0, 0.0, -1.0]), np.eye(3), 1e-3, 1e-4, 1e-4, 0.0315, None, 1000, 100, 1.0
+    center_C=np.array([0.02, -0.03, 0.7]),
+    normal_C=np.array([0.0, 0.0, -1.0]),
+    center_covariance=np.eye(3),
+    normal_sigma=1e-3,
+    plane_rms_m=1e-4,
+    rim_rms_m=1e-4,
+    outer_radius_m=0.0315,
+    bore_radius_m=None,
+    n_points=1000,
+    n_rim=100,
+    coverage=1.0,
 )
 
 
@@ -57,44 +67,44 @@ PLACE = Place(np.zeros(6), np.zeros(3), np.zeros(3), 0.0, np.zeros(3), np.zeros(
 PROFILER = tuple((name, (key,)) for key, name in PROFILER_STEPS.items())
 JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
     "mounting": (
-        Facts("eye_in_hand", steps=MOUNTING_STEPS, required_mm=0.2, maximum_scans=10),
+        Facts(title="eye_in_hand", steps=MOUNTING_STEPS, required_mm=0.2, maximum_scans=10),
         {
-            "state": MountingState("move", visit=11, purpose="verify", label="aside01"),
+            "state": MountingState(phase="move", visit=11, purpose="verify", label="aside01"),
             "status": MountingStatus(
-                7, history=((4, 9e-4), (5, 4e-4), (6, 1.8e-4)), held_out=(HeldOut("aside01", 3e-4, 0.0),), next_best=BEST
+                sequence=7, history=((4, 9e-4), (5, 4e-4), (6, 1.8e-4)), held_out=(HeldOut("aside01", 3e-4, 0.0),), next_best=BEST
             ),
         },
         "Verify",
         "aside01, held out: the calibration is 0.30 mm off there",
     ),
     "motion": (
-        Facts("motion", steps=MOTION_STEPS, maximum_scans=300),
+        Facts(title="motion", steps=MOTION_STEPS, maximum_scans=300),
         {
-            "state": MotionState("collect"),
+            "state": MotionState(phase="collect"),
             "record": MotionRecord(2, refused=(("frame07", "no flange in the scan"),), waits_s=(0.04, 0.05)),
         },
         "Collect frames",
         "frame07: no flange in the scan",
     ),
     "monitor": (
-        Facts("monitor", steps=WATCH_STEPS, maximum_scans=300),
-        {"state": MotionState("collect"), "drift": drifted(True)},
+        Facts(title="monitor", steps=WATCH_STEPS, maximum_scans=300),
+        {"state": MotionState(phase="collect"), "drift": drifted(True)},
         "Watch",
         "Error of the calibration",
     ),
     "tablet": (
-        Facts("tablet", steps=TABLET_STEPS, maximum_scans=12),
+        Facts(title="tablet", steps=TABLET_STEPS, maximum_scans=12),
         {
-            "state": TabletState("descend", landmark=2, touches=(Touched(0, np.zeros(2), np.zeros(6)), Touched(1, np.array([120.0, 3.5]), np.zeros(6)))),
+            "state": TabletState(phase="descend", landmark=2, touches=(Touched(0, np.zeros(2), np.zeros(6)), Touched(1, np.array([120.0, 3.5]), np.zeros(6)))),
         },
         "Touch",
         "landmark 2 at 120.0, 3.5 px",
     ),
     "touch": (
-        Facts("touch", steps=TOUCH_STEPS, maximum_scans=8, press_mm=1.0, height=lambda felt: 1e-3 * felt.q[0]),
+        Facts(title="touch", steps=TOUCH_STEPS, maximum_scans=8, press_mm=1.0, height=lambda felt: 1e-3 * felt.q[0]),
         {
             "state": TouchState(
-                "descend", places=(PLACE,) * 8, index=2, zero=np.zeros(3), frames=tuple(np.array([0.0, 0.0, 1e-4 * k]) for k in range(9)),
+                phase="descend", places=(PLACE,) * 8, index=2, zero=np.zeros(3), frames=tuple(np.array([0.0, 0.0, 1e-4 * k]) for k in range(9)),
                 felt=tuple(Felt(PLACE, np.full(6, height), np.zeros(3)) for height in (0.05, -0.12)),
             ),
         },
@@ -102,8 +112,8 @@ JOBS: dict[str, tuple[Facts, dict[str, Any], str, str]] = {
         "place 2: the face is 0.120 mm below the scanned one",
     ),
     "profiler": (
-        Facts("profiler_edge", steps=PROFILER),
-        {"state": ProfilerState("move", step="edge", taken=(Taken("edge", np.zeros(6), PROFILE),))},
+        Facts(title="profiler_edge", steps=PROFILER),
+        {"state": ProfilerState(phase="move", step="edge", taken=(Taken("edge", np.zeros(6), PROFILE),))},
         "Scan the edge",
         "Last profile",
     ),
@@ -164,7 +174,7 @@ def test_a_job_of_another_package_has_neither(source: DashboardSource) -> None:
 
 def test_a_scanner_that_moved_is_a_warning_and_a_step_of_its_curve(source: DashboardSource) -> None:
     calm = DashboardSource(LiveView(), Person(), Facts(steps=WATCH_STEPS))
-    calm.live.moment = Moment(2.0, JobCommand(), {"state": MotionState("collect"), "drift": drifted(False)})
+    calm.live.moment = Moment(2.0, JobCommand(), {"state": MotionState(phase="collect"), "drift": drifted(False)})
     assert calm.values()["panel"]["warning"] == ""
     moved = told(source, "monitor")["panel"]
     assert moved["warning"]
@@ -215,14 +225,16 @@ def organised(rows: int = 120, columns: int = 160) -> Scan:
 def test_the_picture_of_a_scan_has_a_ring_where_the_flange_was_found() -> None:
     scan = organised()
     plain = depth_picture(scan, None).astype(int)
-    ringed = depth_picture(scan, FlangeEstimate(3, 0.0, fit=FIT)).astype(int)
+    ringed = depth_picture(scan, FlangeEstimate(sequence=3, capture_time=0.0, fit=FIT)).astype(int)
     assert plain[:30, :30].max() < 60, "nothing was seen there"
     changed = np.argwhere(np.abs(ringed - plain).max(axis=2) > 40)
     scale = plain.shape[1] / 160
     expected = scale * np.array([59.5 + 200.0 * -0.03 / 0.7, 79.5 + 200.0 * 0.02 / 0.7])
     np.testing.assert_allclose(changed.mean(axis=0), expected, atol=2.0)
     np.testing.assert_allclose(np.ptp(changed[:, 1]), scale * 2 * 200.0 * 0.0315 / 0.7, atol=5.0)
-    assert np.array_equal(depth_picture(scan, FlangeEstimate(2, 0.0, fit=FIT)), plain), "the ring of another scan"
+    assert np.array_equal(depth_picture(scan, FlangeEstimate(sequence=2, capture_time=0.0, fit=FIT)), plain), (
+        "the ring of another scan"
+    )
 
 
 def test_the_page_gets_the_newest_scan_as_a_png(page: Dashboard, source: DashboardSource) -> None:

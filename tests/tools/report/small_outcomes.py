@@ -62,11 +62,16 @@ COVARIANCE = np.diag([1e-4] * 3 + [5e-5] * 3) ** 2
 OBSERVATIONS = make_observations(10, 3)
 ESTIMATE = estimate_eye_on_base(OBSERVATIONS, SolveConfig(hypotheses=40))
 RESULT = CalibrationResult(
-    ESTIMATE.X_BC,
-    ESTIMATE.covariance,
-    error_summary(1e3 * ESTIMATE.held_out.position_m),
-    {"median": 0.01, "p95": 0.03},
-    tuple(PoseRecord(o.id, True, "", 0.1, 0.2, 0.01, 0.02) for o in OBSERVATIONS),
+    X_BC=ESTIMATE.X_BC,
+    covariance=ESTIMATE.covariance,
+    held_out_mm=error_summary(1e3 * ESTIMATE.held_out.position_m),
+    tilt_deg={"median": 0.01, "p95": 0.03},
+    poses=tuple(
+        PoseRecord(
+            id=o.id, used=True, reason="", residual_mm=0.1, held_out_mm=0.2, tilt_deg=0.01, held_out_tilt_deg=0.02
+        )
+        for o in OBSERVATIONS
+    ),
     warnings=("A <warning> of this calibration.",),
     robot="ur10e",
     flange="iso9409-1-50-4-m6",
@@ -81,9 +86,21 @@ def calibrate() -> Made:
     counts = np.arange(4, 10)
     curve = Convergence(counts, *(1e-4 * np.ones((2, len(counts))) for _ in range(3)))
     report = CalibrationReport(
-        RESULT, ESTIMATE, tuple(OBSERVATIONS), None, {}, (("p99", "No flange was found."),), (), None, curve,
-        error_summary(np.array([0.2])), 1.0, OUT, ("Add a pose near (1, 2, 3).",), limit_mm=2.0,
-    )  # fmt: skip
+        result=RESULT,
+        estimate=ESTIMATE,
+        observations=tuple(OBSERVATIONS),
+        scanner=None,
+        fits={},
+        refused=(("p99", "No flange was found."),),
+        outliers=(),
+        algorithm1=None,
+        convergence=curve,
+        k_fold_mm=error_summary(np.array([0.2])),
+        seconds=1.0,
+        out=OUT,
+        advice=("Add a pose near (1, 2, 3).",),
+        limit_mm=2.0,
+    )
     return report.first, calibration_report(report, dataset="scans")
 
 
@@ -92,8 +109,18 @@ def verify() -> Made:
     poses = tuple(PoseError(o.id, 0.1 + 0.01 * k, 0.02, k < 3) for k, o in enumerate(OBSERVATIONS))
     verdict = Verdict(CARE, 0.4, "The median error is within the limit. But: something.")
     report = VerifyReport(
-        RESULT, None, tuple(OBSERVATIONS), {}, poses, (("p99", "Empty."),), ("Take new scans.",), {}, OUT, verdict, "given"
-    )  # fmt: skip
+        result=RESULT,
+        correction=None,
+        observations=tuple(OBSERVATIONS),
+        fits={},
+        poses=poses,
+        refused=(("p99", "Empty."),),
+        warnings=("Take new scans.",),
+        hashes={},
+        out=OUT,
+        verdict=verdict,
+        source="given",
+    )
     return report.first, verify_report(report, dataset="others")
 
 
@@ -105,16 +132,29 @@ def motion() -> Made:
     p_C = np.array([o.p_CR for o in make_observations(n, 1)])
     estimate = SimpleNamespace(
         X_BC=RESULT.X_BC,
-        clock=ScannerClock("arrival", 0.03, 1e-4, 1e-3, 0.0, reason="There is no other."),
+        clock=ScannerClock(kind="arrival", offset_s=0.03, sigma_s=1e-4, jitter_s=1e-3, reference_s=0.0, reason="There is no other."),
         start=SimpleNamespace(delays=np.linspace(0.0, 0.1, 20), rms_m=1e-3 * np.ones(20), delay_s=0.03),
         inliers=np.ones(n, bool), capture=np.linspace(0.0, 3.0, n), residual_m=values[0], along_m=values[1], before_m=values[2],
         held_out_m=values[3],
     )  # fmt: skip
     frames = ObservedFrames(
-        tuple(map(str, range(n))), np.linspace(0.0, 3.0, n), None, p_C, np.tile([0.0, 0.0, 1.0], (n, 1)),
-        np.tile(1e-9 * np.eye(3), (n, 1, 1)), 1e-3 * np.ones(n),
-    )  # fmt: skip
-    report = MotionReport(RESULT, cast(Any, estimate), frames, (("31", "No flange."),), (), 1.0, OUT)
+        ids=tuple(map(str, range(n))),
+        arrival=np.linspace(0.0, 3.0, n),
+        device=None,
+        p_C=p_C,
+        n_C=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        covariance=np.tile(1e-9 * np.eye(3), (n, 1, 1)),
+        normal_sigma=1e-3 * np.ones(n),
+    )
+    report = MotionReport(
+        result=RESULT,
+        estimate=cast(Any, estimate),
+        frames=frames,
+        refused=(("31", "No flange."),),
+        outliers=(),
+        seconds=1.0,
+        out=OUT,
+    )
     return report.first, motion_report(report, dataset="moving")
 
 
@@ -123,9 +163,19 @@ def monitor() -> Made:
     n = 60
     rng = np.random.default_rng(0)
     event = DriftEvent(
-        MOVED, 2.0, 0.05, 2.3, np.array([1e-3, 0.0, 0.0]), np.zeros(3), COVARIANCE, X, "translation", 80.0, 30.0,
-        "the scanner or the base has moved",
-    )  # fmt: skip
+        kind=MOVED,
+        time_s=2.0,
+        time_sigma_s=0.05,
+        found_s=2.3,
+        translation_m=np.array([1e-3, 0.0, 0.0]),
+        rotation_rad=np.zeros(3),
+        covariance=COVARIANCE,
+        X_BC_after=X,
+        model="translation",
+        statistic=80.0,
+        threshold=30.0,
+        cause="the scanner or the base has moved",
+    )
     clock = SimpleNamespace(
         clock=SimpleNamespace(kind="arrival"), delay_s=0.1, sigma_s=1e-3, jitter_s=1e-3, source="recording"
     )
@@ -136,7 +186,16 @@ def monitor() -> Made:
         statistic=np.linspace(1.0, 80.0, n), threshold=30.0, events=(event,), X_BC=X, covariance=COVARIANCE, since_s=2.0,
         clock=clock, noise=SimpleNamespace(jitter_s=1e-3), dropped=(("q", "No flange: 3"),), rms_m=2e-4, rms_after_m=1e-4,
     )  # fmt: skip
-    report = MonitorReport(cast(Any, watched), RESULT, None, event.cause, 1e-3, (), 1.0, OUT)
+    report = MonitorReport(
+        watched=cast(Any, watched),
+        calibration=RESULT,
+        recalibrated=None,
+        cause=event.cause,
+        false_alarms_per_hour=1e-3,
+        warnings=(),
+        seconds=1.0,
+        out=OUT,
+    )
     return report.first, monitor_page(report, recording="moving")
 
 
@@ -156,7 +215,14 @@ def hand_eye() -> Made:
     comparison = (MethodRow("weldcal", 0.01, 0.1), MethodRow("TSAI", float("nan"), float("nan")))
     mounting = get_mounting("eye_in_hand")
     report = HandEyeReport(
-        _hand_eye(), mounting, comparison, None, (), 0.1, advice="Like sample 3, turned.", folder=OUT
+        result=_hand_eye(),
+        mounting=mounting,
+        comparison=comparison,
+        next_pose=None,
+        files=(),
+        seconds=0.1,
+        advice="Like sample 3, turned.",
+        folder=OUT,
     )
     return report.first, hand_eye_report(report, "samples.npz", "ab" * 32)
 
@@ -211,10 +277,16 @@ def _demo(estimate: Any, *, held: bool) -> Made:
     if held:
         run.held, run.reason = True, "The tag was lost."
     status = CalibrationStatus(
-        11, 10, tuple(OBSERVATIONS), (("p77", "No ring."),), estimate, 9e-5,
-        history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)), verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
-    )  # fmt: skip
-    result = DemoResult(RunOptions("calibrate_only", OUT), run, status, None, None)
+        sequence=11,
+        calibration_scans=10,
+        observations=tuple(OBSERVATIONS),
+        refused=(("p77", "No ring."),),
+        estimate=estimate,
+        predicted_error_m=9e-5,
+        history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)),
+        verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
+    )
+    result = DemoResult(RunOptions(scenario="calibrate_only", out=OUT), run, status, None, None)
     return result.first, demo_report(result, demo_pictures(result), recording=True)
 
 
@@ -228,21 +300,41 @@ def held() -> Made:
     return _demo(None, held=True)
 
 
-RECORD = ProfilerRecord("sphere, affine", X.rotation().matrix(), np.array([0.03, -0.07, 0.16]), COVARIANCE)
+RECORD = ProfilerRecord(
+    method="sphere, affine",
+    rotation=X.rotation().matrix(),
+    translation=np.array([0.03, -0.07, 0.16]),
+    covariance=COVARIANCE,
+)
 
 
 def profiler() -> Made:
     """`profiler sphere` with a tolerance that it misses."""
     points = np.random.default_rng(0).uniform([-0.02, 0.15], [0.02, 0.2], (100, 2))
     found = {"scans": 20, "model": "affine", "rms_mm": 0.05, "without_sphere": [3], "warnings": ["Check the radius."]}
-    made = ProfilerFile(RECORD, found, points, np.linspace(0.1, 0.4, 19), "sphere.npz", OUT, 0.2)
+    made = ProfilerFile(
+        record=RECORD,
+        found=found,
+        points=points,
+        held_out_mm=np.linspace(0.1, 0.4, 19),
+        source="sphere.npz",
+        out=OUT,
+        limit_mm=0.2,
+    )
     return made.first, profiler_report(made)
 
 
 def seam() -> Made:
     """`profiler seam`."""
     found = {"scans": 20, "found": 19, "without_groove": [4], "rms_mm": 0.05, "error_95_mm": 0.12, "method": "sphere"}
-    made = ProfilerSeam(RECORD, found, np.random.default_rng(0).uniform(0.0, 100.0, (19, 3)), "groove.npz", OUT, OUT)
+    made = ProfilerSeam(
+        record=RECORD,
+        found=found,
+        root_mm=np.random.default_rng(0).uniform(0.0, 100.0, (19, 3)),
+        source="groove.npz",
+        calibration=OUT,
+        out=OUT,
+    )
     return made.first, seam_report(made)
 
 
@@ -256,8 +348,16 @@ def profiler_live() -> Made:
         edge=edge, sphere=None, seam=None, edge_scans=scans, sphere_scans=(), seam_scans=(), touches=()
     )
     run = _run("profiler_edge", state=lambda root: state)
-    outcome = LiveOutcome(PoseOutcome(0.1, 0.01, 0.1, 0.01, np.ones(6), 6.0), None, None, None, None, None, None)
-    live = ProfilerLive(RunOptions("profiler_edge", OUT), run, outcome)
+    outcome = LiveOutcome(
+        edge=PoseOutcome(0.1, 0.01, 0.1, 0.01, np.ones(6), 6.0),
+        sphere=None,
+        tip_mm=None,
+        center_mm=None,
+        points=None,
+        curve=None,
+        torch=None,
+    )
+    live = ProfilerLive(RunOptions(scenario="profiler_edge", out=OUT), run, outcome)
     page = live_report(live.summary(), outcome, cast(Any, state), run, first=live.first, recording=False)
     return live.first, page
 
@@ -267,9 +367,17 @@ def tablet() -> Made:
     n = 9
     covariance = COVARIANCE.tolist()
     result = TabletResult(
-        "wrist", {"x": 0.1}, covariance, [0.1] * n, [0.2 + 0.01 * k for k in range(n)], X, covariance, [0.0, 0.0, 0.15],
-        (1e-9 * np.eye(3)).tolist(), data_sha256={"touches.csv": "ab" * 32},
-    )  # fmt: skip
+        model="wrist",
+        parameters={"x": 0.1},
+        covariance=covariance,
+        residual_mm=[0.1] * n,
+        leave_one_out_mm=[0.2 + 0.01 * k for k in range(n)],
+        X_FC=X,
+        X_FC_covariance=covariance,
+        p_FP_m=[0.0, 0.0, 0.15],
+        p_FP_covariance=(1e-9 * np.eye(3)).tolist(),
+        data_sha256={"touches.csv": "ab" * 32},
+    )
     grid = 0.05 * np.array([(i, j) for i in range(3) for j in range(3)], dtype=float)
     shown = Shown(grid, 1e-4 * random_poses(n, np.random.default_rng(1))[:, :2, 3], tuple(map(str, range(n))))
     first = tablet_screen(result, np.zeros(0), 0.5, NO_TOLERANCE)
@@ -281,9 +389,35 @@ def finger() -> Made:
     from weldcal.tools.commands.finger_calibrate import FingerReport, finger_page
     from weldcal.welding.finger.calibration import Intrinsics, TipCalibration
 
-    camera = Intrinsics(np.diag([900.0, 900.0, 1.0]), np.zeros(5), 640, 480, 0.2, 0.3, 20, 5, 1.0)
-    tip = TipCalibration(1.0, 1e-3, None, np.array([0.0, 1e-4, np.nan]), {"x": 900.0}, 2e-5, ("pressed along x only",))
-    report = FingerReport(camera, tip, ("lost.png",), 10.0, (0.0, 1.0, 30.0), 8, 0.05)
+    camera = Intrinsics(
+        K=np.diag([900.0, 900.0, 1.0]),
+        distortion=np.zeros(5),
+        width=640,
+        height=480,
+        rms_px=0.2,
+        held_out_px=0.3,
+        used=20,
+        held_out=5,
+        focal_sigma_px=1.0,
+    )
+    tip = TipCalibration(
+        scale=1.0,
+        scale_sigma=1e-3,
+        rotation_deg=None,
+        seat_m=np.array([0.0, 1e-4, np.nan]),
+        stiffness_N_per_m={"x": 900.0},
+        held_out_m=2e-5,
+        unknown=("pressed along x only",),
+    )
+    report = FingerReport(
+        camera=camera,
+        tip=tip,
+        without_board=("lost.png",),
+        tag_size_mm=10.0,
+        tag_at_rest_mm=(0.0, 1.0, 30.0),
+        touches=8,
+        limit_mm=0.05,
+    )
     return report.first, finger_page(report, Path("pictures"))
 
 

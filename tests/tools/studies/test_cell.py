@@ -19,7 +19,15 @@ from weldcal.tools.studies.cell.study import (
 )
 
 GOOD = CellRun(
-    "s_groove", "guarded", 0, True, "", point_sd_mm=0.01, torch_mean_mm=0.05, torch_max_mm=0.2, real_time_factor=1.4
+    scenario="s_groove",
+    law="guarded",
+    seed=0,
+    completed=True,
+    reason="",
+    point_sd_mm=0.01,
+    torch_mean_mm=0.05,
+    torch_max_mm=0.2,
+    real_time_factor=1.4,
 )
 
 
@@ -46,7 +54,12 @@ def test_one_bad_run_misses_its_target(worse: dict[str, float], missed: list[str
 
 
 def test_runs_without_a_weld_miss_every_target() -> None:
-    assert not any(ok for *_, ok in hold_against([CellRun("s_groove", "guarded", 0, False, "held")]))
+    assert not any(
+        ok
+        for *_, ok in hold_against(
+            [CellRun(scenario="s_groove", law="guarded", seed=0, completed=False, reason="held")]
+        )
+    )
 
 
 @pytest.mark.parametrize("wrong", [{"scenarios": ("nowhere",)}, {"law": "magic"}])

@@ -34,7 +34,19 @@ def test_a_trial_says_what_the_change_was() -> None:
 
 def test_a_turn_about_the_line_of_sight_shows_least() -> None:
     trials = [
-        Trial("turn", k, view, 1.0, 0.0, 0.0, 0.0, "", 0, shown, shown)
+        Trial(
+            kind="turn",
+            seed=k,
+            along_view=view,
+            found_after_s=1.0,
+            time_error_s=0.0,
+            translation_error_mm=0.0,
+            rotation_error_deg=0.0,
+            named="",
+            false_alarms=0,
+            shown=shown,
+            told=shown,
+        )
         for k, (view, shown) in enumerate(((1.0, 0.5), (0.1, 9.0)))
     ]
     near, far = found_by_angle(trials)

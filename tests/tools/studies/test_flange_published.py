@@ -148,7 +148,9 @@ def recorded(folder: Path) -> Path:
         X_CR = RigidTransform(RollPitchYaw(np.pi - 0.1, 0.05, rng.uniform(-0.3, 0.3)), p)
         noise = 3e-5 * rng.standard_normal(face.shape)
         poses[f"s{k:02}"], clouds[f"s{k:02}"] = X_BC @ X_CR, (X_CR @ (face + noise).T).T
-    header = DatasetHeader(1, "aubo_i5", standard.designation, "phoxi_s", "eye_on_base")
+    header = DatasetHeader(
+        schema=1, robot="aubo_i5", flange=standard.designation, scanner="phoxi_s", configuration="eye_on_base"
+    )
     save_dataset(folder, header, poses, clouds)
     return folder
 

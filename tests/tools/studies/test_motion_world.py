@@ -114,7 +114,7 @@ def test_delays_have_a_floor_a_tail_and_the_stated_mean() -> None:
 
 
 def test_the_recording_is_read_back_and_the_truth_lies_outside(tmp_path: Path) -> None:
-    request = DataRequest(tmp_path, seed=3, frames=4, width=267, surroundings=False)
+    request = DataRequest(folder=tmp_path, seed=3, frames=4, width=267, surroundings=False)
     said = write_motion_data(request, lambda *_: None)
     read = load_motion_dataset(tmp_path / "dataset")
     truth = json.loads((tmp_path / "truth.json").read_text())
@@ -156,4 +156,4 @@ def test_what_happens_to_the_cell() -> None:
     assert cold == 5e-4
     assert warm < 1e-7
     with pytest.raises(InputError, match="--knock takes 4 or 7 numbers"):
-        DataRequest(Path("x"), knock="1,2").options()
+        DataRequest(folder=Path("x"), knock="1,2").options()

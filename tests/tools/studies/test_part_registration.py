@@ -34,7 +34,17 @@ def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(tmp_path: Path, monkeypa
         part = subject("lap")
         true = scan_scene(part.mesh, study.get_scanner("phoxi_m", 824), 6000, objects=4, fingers=1).X_BP
         off = true @ RigidTransform([0.001, 0.0, 0.0])
-        said = PartRegistration(off, np.eye(6) * 1e-8, 1e-4, 1.0, 0.0, 1.0, 1.0, 0.0, "high confidence")
+        said = PartRegistration(
+            X_BP=off,
+            covariance=np.eye(6) * 1e-8,
+            rms_m=1e-4,
+            agreement=1.0,
+            violation=0.0,
+            seen=1.0,
+            confidence=1.0,
+            runner_up=0.0,
+            summary="high confidence",
+        )
         return said, type("Joint", (), {"seam": part.seam, "share": 1.0})
 
     monkeypatch.setattr(study, "locate_part", confident)

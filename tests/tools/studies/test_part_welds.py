@@ -60,7 +60,7 @@ def test_a_bent_seam_is_noted_where_the_arm_matters() -> None:
     assert "calibration.refine: links" in note
     assert of_plan(0.00007).arm_note == ()
     assert of_plan(math.nan).arm_note == ()
-    refined = Refinement("links", "", True, arm=cast(Any, object()))
+    refined = Refinement(kind="links", sentence="", accepted=True, arm=cast(Any, object()))
     (note,) = of_plan(0.00021, refined).arm_note
     assert "What the refinement leaves" in note
     assert "Calibrate" not in note

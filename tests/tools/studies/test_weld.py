@@ -174,7 +174,10 @@ def test_a_turn_no_torch_can_follow_is_refused_and_welded_in_pieces() -> None:
 
 def test_figures_that_a_run_lacks_count_as_missed() -> None:
     case = Case("straight")
-    good, broken = RunMetrics(True, "DONE", "", 300.0, max_mm=0.1), RunMetrics(False, "FAULT", "why", 20.0)
+    good, broken = (
+        RunMetrics(completed=True, phase="DONE", reason="", reached_mm=300.0, max_mm=0.1),
+        RunMetrics(completed=False, phase="FAULT", reason="why", reached_mm=20.0),
+    )
     target = Target("max_mm", 0.15)
     assert hold_against(target, [CaseResult(case, (0,), (good,))]).met
     both = hold_against(target, [CaseResult(case, (0, 1), (good, broken))])

@@ -12,7 +12,7 @@ from weldcal.tools.studies.motion.world import MotionOptions
 
 def test_a_wrist_link_is_tracked_as_well_as_the_flange(tmp_path: Path) -> None:
     options = MotionOptions(
-        "ur10e", size=(400, 300), frames=12, noise_mm=0.25, exposure_samples=2, surroundings=False, seed=1
+        robot="ur10e", size=(400, 300), frames=12, noise_mm=0.25, exposure_samples=2, surroundings=False, seed=1
     )
     found, targets = run_whole_body(tmp_path, options)
     assert found["state"] == "done"

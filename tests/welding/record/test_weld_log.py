@@ -158,5 +158,15 @@ def test_the_rows_of_several_welds_are_told_apart_by_their_touch() -> None:
     phases = [Phase.TOUCH, Phase.TOUCH, Phase.TRACK, Phase.COAST, Phase.TRACK, Phase.FINISH, Phase.TOUCH, Phase.TRACK]
     n, none = len(phases), np.zeros(0)
     codes = np.array([PHASE_CODES[phase] for phase in phases])
-    log = WeldLog(np.arange(n), {"phase": codes}, np.ones(n, bool), *[none] * 6)
+    log = WeldLog(
+        time=np.arange(n),
+        telemetry={"phase": codes},
+        torch_on=np.ones(n, bool),
+        p_BTip=none,
+        p_BRobot=none,
+        R_BT=none,
+        p_BTorch=none,
+        deflection_T=none,
+        sigma_min=none,
+    )
     assert [part.nonzero()[0].tolist() for part in welds(log)] == [[0, 1, 2, 3, 4, 5], [6, 7]]

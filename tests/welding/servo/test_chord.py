@@ -46,7 +46,7 @@ def moved(name: str, p_tip: Array, alpha: float, psi_tip: float, psi_torch: floa
     torch = p_tip - D * direction(alpha)
     t = direction(psi_torch)
     n = np.cross(UP, t)
-    target = TorchTarget(torch - offset * n, t, n, UP, 0.0, 0.0, np.zeros(2))
+    target = TorchTarget(point=torch - offset * n, tangent=t, normal=n, up=UP, arc=0.0, s=0.0, residual=np.zeros(2))
     config = replace(CONFIG, law=name)
     return motion_law(get_law(name))(
         WeldingState(), tool(p_tip, alpha), seam_at(p_tip, psi_tip), target, (0.0, 0.0), config, config.period_s

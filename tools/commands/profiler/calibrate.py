@@ -81,8 +81,14 @@ def calibrate_edge(
             found["warnings"] = [
                 f"The points lie {found['mean_distance_mm']:.1f} mm from one edge on average. Scan one edge only, and check unit and poses."
             ]
-        pose = linear.rotation, linear.translation
-        return ProfilerRecord("edge, linear", *pose, figures=found, data_sha256=file.digest), found
+        record = ProfilerRecord(
+            method="edge, linear",
+            rotation=linear.rotation,
+            translation=linear.translation,
+            figures=found,
+            data_sha256=file.digest,
+        )
+        return record, found
     if not sigmas.stated and "sigma" in file.arrays:
         robot, x, z = (float(v) for v in file.arrays["sigma"])
         sigmas = Sigmas(robot, x, z)
@@ -164,9 +170,15 @@ def sphere_data(
     if q is not None:
         check_number(poses, (len(q),), "joint vectors q")
     return SphereData(
-        poses[np.array(kept)], profiles, radius, felt, tip if felt is not None else None, table,
-        None if q is None else q[kept], file.arrays.get("touch_q"),
-    )  # fmt: skip
+        poses=poses[np.array(kept)],
+        profiles=profiles,
+        radius_m=radius,
+        touches=felt,
+        tip=tip if felt is not None else None,
+        arm=table,
+        q=None if q is None else q[kept],
+        touch_q=file.arrays.get("touch_q"),
+    )
 
 
 def parse_tip(text: str) -> Floats | None:
@@ -212,7 +224,7 @@ def calibrate_sphere(
         raise InputError(f"The model is one of {', '.join(MODELS)}, not '{model}'.")
     s = SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m)
     found: dict[str, Any] = {"scans": len(data.poses), "touches": 0 if data.touches is None else len(data.touches)}
-    scans = SphereData(data.poses, data.profiles, data.radius_m)
+    scans = SphereData(poses=data.poses, profiles=data.profiles, radius_m=data.radius_m)
     rigid = _rigid(scans, s)
     check_radius(scans, s, rigid)
     _refuse_inverse_poses(scans, rigid, s)
@@ -293,7 +305,9 @@ def _warnings(e: SphereEstimate, data: SphereData, s: SphereSigmas) -> list[str]
 
 
 def _without_arm(data: SphereData) -> SphereData:
-    return SphereData(data.poses, data.profiles, data.radius_m, data.touches, data.tip)
+    return SphereData(
+        poses=data.poses, profiles=data.profiles, radius_m=data.radius_m, touches=data.touches, tip=data.tip
+    )
 
 
 def calibrate_compensate(
@@ -336,8 +350,15 @@ def calibrate_compensate(
         "centre_after_mm": off(best.rotation, best.translation),
         "wrong_sides": list(wrong_sides(R, t, centers, translated)),
     }
-    name, pose = "sphere, linear and compensated", (best.rotation, best.translation)
-    return ProfilerRecord(name, *pose, tip=felt.tip, figures=found, data_sha256=file.digest), found
+    record = ProfilerRecord(
+        method="sphere, linear and compensated",
+        rotation=best.rotation,
+        translation=best.translation,
+        tip=felt.tip,
+        figures=found,
+        data_sha256=file.digest,
+    )
+    return record, found
 
 
 def _figures(e: ProfilerEstimate) -> dict[str, Any]:

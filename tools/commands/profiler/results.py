@@ -80,7 +80,15 @@ def _finish(
     limit_mm: float | None,
 ) -> tuple[ProfilerFile, dict[str, Any]]:  # fmt: skip
     points = points[np.isfinite(points).all(axis=1)]
-    made = ProfilerFile(record, found, points[:: max(1, len(points) // _MANY)], held_mm, source, out, limit_mm)
+    made = ProfilerFile(
+        record=record,
+        found=found,
+        points=points[:: max(1, len(points) // _MANY)],
+        held_out_mm=held_mm,
+        source=source,
+        out=out,
+        limit_mm=limit_mm,
+    )
     written = write_calibration(record, out)
     write_atomic(out / "report.html", profiler_report(made))
     return made, {**found, **written}

@@ -58,6 +58,14 @@ def finish_seam(
     """Write the report of a mapped seam, from the seam.csv beside it."""
     columns = np.genfromtxt(out / "seam.csv", delimiter=",", names=True)
     root = np.column_stack([np.atleast_1d(columns[f"root_{a}_mm"]) for a in "xyz"])
-    seam = ProfilerSeam(load_record(calibration), found, root, source, calibration, out, limit_mm)
+    seam = ProfilerSeam(
+        record=load_record(calibration),
+        found=found,
+        root_mm=root,
+        source=source,
+        calibration=calibration,
+        out=out,
+        limit_mm=limit_mm,
+    )
     write_atomic(out / "report.html", seam_report(seam))
     return seam

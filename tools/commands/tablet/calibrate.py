@@ -25,7 +25,7 @@ from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tablet import Shown, calibration_report, marked_picture
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TabletInputs:
     """The files of one visit, and the known quantities."""
 
@@ -43,7 +43,7 @@ class TabletInputs:
     limit_mm: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TabletCalibration:
     """The result, the data of its report, the fit with full poses where it is one; else the rounding step of the hand and the
     errors at the file's queries; and the duration."""
@@ -140,7 +140,7 @@ def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
         warnings=found.warnings,
         data_sha256={inputs.file.name: file_hash(inputs.file)},
     )
-    return TabletCalibration(result, shown, step_m=step_m, held_out_mm=found.held_out_mm(best))
+    return TabletCalibration(result=result, shown=shown, step_m=step_m, held_out_mm=found.held_out_mm(best))
 
 
 def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
@@ -194,7 +194,7 @@ def _wrist(inputs: TabletInputs) -> TabletCalibration:
         warnings=(*visit.warnings, *wrist_diagnostics(visit.data, fit, visit.names)),
         data_sha256={path.name: file_hash(path) for path in files if path is not None},
     )
-    return TabletCalibration(result, shown, fit)
+    return TabletCalibration(result=result, shown=shown, wrist=fit)
 
 
 def _wrist_parameters(fit: WristFit) -> dict[str, float]:

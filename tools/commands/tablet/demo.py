@@ -91,10 +91,10 @@ def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCa
     write_visit(run, folder)
     done = calibrate_tablet(
         TabletInputs(
-            folder / "touches.csv",
-            folder / "poses.csv",
-            folder / "camera.yaml",
-            folder / "picture.png",
+            file=folder / "touches.csv",
+            poses=folder / "poses.csv",
+            camera=folder / "camera.yaml",
+            image=folder / "picture.png",
             pen_radius_m=1e-3 * tablet.pen.radius_mm,
         ),
         folder,

@@ -24,7 +24,7 @@ from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.report.tablet import Page
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ManyVisits:
     """The fits of all visits, the refused visits with the reason, and the model chosen for all."""
 
@@ -153,7 +153,9 @@ def fit_many(file: Path, read: PlanarFile, sign: Sign, step_m: float) -> ManyVis
     if first is not None and not fitted:
         raise first
     model, errors = best_model(fitted)
-    return ManyVisits(file, tuple(fitted), tuple(refused), model, errors, step_m)
+    return ManyVisits(
+        file=file, visits=tuple(fitted), refused=tuple(refused), model=model, errors_mm=errors, step_m=step_m
+    )
 
 
 def _number(value: float) -> float | None:

@@ -49,7 +49,7 @@ class NoWorld(WeldcalError):
     """The process that plays the world has not begun."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WiredWorld:
     """A running world: its process, those of scanner and finger camera, the cell's scenario file, and the file of its truth."""
 
@@ -154,7 +154,15 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
             bridges["finger camera"] = PictureBridge((host, STREAM_PORT + BRIDGED), stream, stream_clock)
             for bridge in bridges.values():
                 stack.callback(bridge.close)
-        yield WiredWorld(process, host, cell, played.truth_file, children[0], children[-1], bridges)
+        yield WiredWorld(
+            process=process,
+            host=host,
+            cell=cell,
+            truth_file=played.truth_file,
+            scanner=children[0],
+            finger=children[-1],
+            bridges=bridges,
+        )
 
 
 @contextmanager

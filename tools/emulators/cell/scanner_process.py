@@ -29,7 +29,7 @@ POSE_LIMIT_S = 30.0
 LONGEST_LINE = 4096
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScannerSetup:
     """What the scanner's process is started with. It listens at `host`:`port` and writes into `folder`."""
 

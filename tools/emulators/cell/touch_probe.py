@@ -14,7 +14,7 @@ CHATTER_FRAMES = 2
 HOWS = ("", "cut", "stuck", "chatters")
 
 
-@dataclass
+@dataclass(kw_only=True)
 class TouchProbe:
     """What the input reads. `how`: cut (the cable is broken), stuck (the contact stays closed), chatters (the contact opens and closes
     every few frames, touched or not), or "" (right).

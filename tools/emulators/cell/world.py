@@ -55,7 +55,7 @@ SET_POINTS = ("wire_feed", "arc_voltage")  # keys of the cell's robot
 Truth = dict[str, object]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Wires:
     """Where the devices are, as the cell's scenario names them."""
 
@@ -106,18 +106,18 @@ def wires_of(cell: Scenario) -> Wires:
             raise InputError(f"The world has one controller: write touch_probe.host: {robot.host}, as robot.host.")
     x, y, z = robot.payload_cog_m
     return Wires(
-        loopback_address(robot.host),
-        robot.pace,
-        robot.payload_kg,
-        (x, y, z),
-        robot.process_output,
-        robot.arc_input,
-        robot.arc_fault_input,
-        Path(scanner.folder),
-        None if streams else (loopback_address(trigger.hostname or ""), trigger.port or 0),
-        (loopback_address(stream.hostname or ""), stream.port or 0) if stream.scheme else None,
-        {name: point for name in SET_POINTS if (point := getattr(robot, name)) is not None},
-        probe,
+        host=loopback_address(robot.host),
+        pace=robot.pace,
+        payload_kg=robot.payload_kg,
+        payload_cog_m=(x, y, z),
+        process_output=robot.process_output,
+        arc_input=robot.arc_input,
+        fault_input=robot.arc_fault_input,
+        folder=Path(scanner.folder),
+        trigger=None if streams else (loopback_address(trigger.hostname or ""), trigger.port or 0),
+        stream=(loopback_address(stream.hostname or ""), stream.port or 0) if stream.scheme else None,
+        set_points={name: point for name in SET_POINTS if (point := getattr(robot, name)) is not None},
+        touch_probe=probe,
     )
 
 
@@ -244,7 +244,7 @@ def _probe_of(physics: Physics, config: UrTouchProbe | None) -> TouchProbe | Non
     truth = physics.station.truth.profiler
     if truth is None:
         raise InputError("A cell with a touch_probe needs a world with a sphere, such as profiler_sphere.")
-    return TouchProbe(physics.station.arm, truth, config.normally_closed)
+    return TouchProbe(arm=physics.station.arm, truth=truth, normally_closed=config.normally_closed)
 
 
 def run_world(
@@ -295,7 +295,15 @@ def run_world(
             devices.append(f"as they stream (process {scanner.pid})")
         else:
             device = SCANNER if isinstance(cell.scanner, FolderScanner) else PROFILER
-            setup = ScannerSetup(world_name, arm, seed, *wires.trigger, wires.folder, device)
+            setup = ScannerSetup(
+                scenario=world_name,
+                arm=arm,
+                seed=seed,
+                host=wires.trigger[0],
+                port=wires.trigger[1],
+                folder=wires.folder,
+                device=device,
+            )
             scanner = _start(context, stack, run_scanner, setup)
             devices.append(f"trigger {setup.host}:{setup.port} (process {scanner.pid})")
         physics = Physics(world, arm, seed, millimetres)
@@ -312,14 +320,14 @@ def run_world(
         controller.payload.mass, controller.payload.center = wires.payload_kg, list(wires.payload_cog_m)
         length = cell.welding.seam_length_mm
         inside = _World(
-            controller,
-            physics,
-            wires,
-            scanner.pipe,
-            (camera, finger.pipe) if finger is not None and isinstance(camera, RenderedFingerCamera) else None,
-            streamer,
-            None if length is None else 1e-3 * length,
-            write,
+            controller=controller,
+            physics=physics,
+            wires=wires,
+            scanner=scanner.pipe,
+            finger=(camera, finger.pipe) if finger is not None and isinstance(camera, RenderedFingerCamera) else None,
+            streamer=streamer,
+            wanted_m=None if length is None else 1e-3 * length,
+            write=write,
         )
         emulation = Emulation(
             controller,

@@ -125,7 +125,14 @@ class Emulation:
         real_time = RealTimeServer(controller, heard)
         external = ExternalControl(controller)
         control = ControlServer(
-            controller, self._network, self._rtde, external, self._checker, self._lockstep, self._world, more_faults
+            controller=controller,
+            network=self._network,
+            rtde=self._rtde,
+            external=external,
+            checker=self._checker,
+            lockstep=self._lockstep,
+            world=self._world,
+            more_faults=more_faults,
         )
         self._servers = (self._rtde, self._primary, secondary, real_time, external)
         ports = [(self._rtde, RTDE_PORT), (self._primary, PRIMARY_PORT), (secondary, SECONDARY_PORT)]

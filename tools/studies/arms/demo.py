@@ -25,7 +25,7 @@ def run_arm(arm: str, folder: str, seed: int, seam_mm: float, robot: str | None)
     """Write an arm's scenario into its folder and run the demo there; its row of COLUMNS."""
     scenario = Path(folder) / f"{arm}.yaml"
     write_atomic(scenario, arm_scenario(arm, seam_mm))
-    options = RunOptions(str(scenario), Path(folder), seed, recording=False, robot=robot)
+    options = RunOptions(scenario=str(scenario), out=Path(folder), seed=seed, recording=False, robot=robot)
     try:
         found = run_demo(options).summary()
     except WeldcalError as error:

@@ -21,7 +21,7 @@ COLUMNS = (
 
 def run_seed(scenario: str, folder: str, seed: int) -> Mapping[str, object]:
     """One demo in its own folder, without a recording; its JSON object."""
-    return run_demo(RunOptions(scenario, Path(folder), seed, recording=False)).summary()
+    return run_demo(RunOptions(scenario=scenario, out=Path(folder), seed=seed, recording=False)).summary()
 
 
 def run_seeds(scenario: str, farm: Farm, seeds: range) -> dict[str, object]:

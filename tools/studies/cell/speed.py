@@ -18,7 +18,7 @@ def run_cell_benchmark(out: Path, seed: int = 0, progress: Progress = no_progres
     """
     scenario = load_scenario("s_groove")
     scenario.welding.seam_length_mm = SEAM_MM
-    options = RunOptions("s_groove", out, seed, recording=False)
+    options = RunOptions(scenario="s_groove", out=out, seed=seed, recording=False)
     result = run_scenario(scenario, options, progress)
     run = result.run
     camera = scenario.finger_camera

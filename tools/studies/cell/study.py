@@ -44,7 +44,7 @@ class CellStudyOptions:
     law: str = "guarded"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CellRun:
     """One weld. Lengths in mm: seam points sideways and in height against where the tool's numbers say a seated tip is
     felt (sd about a smooth line through themselves, and mean); torch against the true line, sideways and in space; its speed's
@@ -147,7 +147,7 @@ def weld_once(name: str, seed: int, options: CellStudyOptions, progress: Progres
     watch = PhaseCpu(progress)
     run = run_cell(build_cell(scenario, seed), watch.progress)
     watch.progress("", 1.0)
-    result = measure(run, RunOptions(name, options.folder, seed, recording=False))
+    result = measure(run, RunOptions(scenario=name, out=options.folder, seed=seed, recording=False))
     lasted = sum(b[1] - a[1] for a, b in zip(run.phases, run.phases[1:], strict=False) if a[0] == "weld")
     cpu = watch.seconds.get("weld", np.nan) / lasted if lasted else np.nan
     return figures(result, name, options.law, seed, cpu)
@@ -158,13 +158,13 @@ def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: 
     run, weld = result.run, result.weld
     felt: FeltSeam | None = felt_seam(run.cell, run.root)
     if weld is None or weld.error is None or weld.speed is None or felt is None:
-        return CellRun(name, law, seed, False, run.reason or "nothing was welded")
+        return CellRun(scenario=name, law=law, seed=seed, completed=False, reason=run.reason or "nothing was welded")
     return CellRun(
-        name,
-        law,
-        seed,
-        not run.held,
-        run.reason or "",
+        scenario=name,
+        law=law,
+        seed=seed,
+        completed=not run.held,
+        reason=run.reason or "",
         point_sd_mm=1e3 * scatter(felt.lateral),
         point_spread_mm=1e3 * float(felt.lateral.std()),
         point_offset_mm=1e3 * float(felt.lateral.mean()),

@@ -22,7 +22,7 @@ ARMS = ("ur10e", "ur5e")
 FLANGE = "iso9409-1-50-4-m6"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class World:
     """A cell in which scans are taken: the arm as its controller believes it, as it is, the camera and its errors."""
 
@@ -84,7 +84,17 @@ def make_world(seed: int, *, alike: bool = False) -> World:
         q = answers[np.argmin(np.abs(np.angle(np.exp(1j * (answers - near)))).sum(axis=1))]
         if np.abs(np.angle(np.exp(1j * (q - near)))).max() < 2.2:
             found.append(q)
-    return World(rng, name, believed, true, zeros, X_BC, guess, warp, np.array(found))
+    return World(
+        rng=rng,
+        name=name,
+        believed=believed,
+        true=true,
+        zeros=zeros,
+        X_BC=X_BC,
+        guess=guess,
+        warp=warp,
+        q=np.array(found),
+    )
 
 
 def _off(chain: Chain, rng: np.random.Generator, length: float) -> Chain:
@@ -123,11 +133,18 @@ def observe(
     normals = np.einsum("kij,kj->ki", exp_rotation(turn), m)
     noise = 6e-5 * far * blur * np.exp(rng.normal(0.0, 0.12, n))
     return Case(
-        tuple(f"scan{k + 1:02d}" for k in range(n)),
-        chain_poses(world.believed, world.q) if believed is None else believed,
-        seen, normals / np.linalg.norm(normals, axis=1)[:, None], time=np.cumsum(rng.uniform(8.0, 15.0, n)), noise=noise,
-        coverage=np.clip(rng.normal(0.97, 0.02, n), 0.0, 1.0), robot=world.name, guess=world.guess, guess_radius=0.06, flange=FLANGE,
-    )  # fmt: skip
+        ids=tuple(f"scan{k + 1:02d}" for k in range(n)),
+        X_BF=chain_poses(world.believed, world.q) if believed is None else believed,
+        c=seen,
+        m=normals / np.linalg.norm(normals, axis=1)[:, None],
+        time=np.cumsum(rng.uniform(8.0, 15.0, n)),
+        noise=noise,
+        coverage=np.clip(rng.normal(0.97, 0.02, n), 0.0, 1.0),
+        robot=world.name,
+        guess=world.guess,
+        guess_radius=0.06,
+        flange=FLANGE,
+    )
 
 
 def true_poses(world: World) -> Array:

@@ -161,8 +161,23 @@ def calibration(rng: Rng) -> Files:
         covariance=A[:6] @ A[:6].T,
         held_out_mm={"median": 0.2, "mean": 0.3, "p95": 0.5},
         tilt_deg={"median": 0.08, "p95": None},
-        poses=(PoseRecord("a", True, "", 0.1, 0.2, 0.01, 0.02), PoseRecord("b", False, "no plane")),
-        icp=(IcpRecord("a", "point_to_point", (0.0, 0.1, 0.2), (0.1, 0.2, 0.3), 0.37, ("rotation",), 0.4),),
+        poses=(
+            PoseRecord(
+                id="a", used=True, reason="", residual_mm=0.1, held_out_mm=0.2, tilt_deg=0.01, held_out_tilt_deg=0.02
+            ),
+            PoseRecord(id="b", used=False, reason="no plane"),
+        ),
+        icp=(
+            IcpRecord(
+                id="a",
+                method="point_to_point",
+                rotation_deg=(0.0, 0.1, 0.2),
+                translation_mm=(0.1, 0.2, 0.3),
+                translation_norm_mm=0.37,
+                unseen=("rotation",),
+                true_error_mm=0.4,
+            ),
+        ),
         unobservable=("a bias",),
         warnings=("one",),
         robot="ur10e",
@@ -192,9 +207,15 @@ def profiler_record(rng: Rng) -> Files:
     table = np.column_stack([rng.uniform(0.0, 0.5, (6, 3)), np.zeros(6)])
     R = Rotation.random(rng=rng).as_matrix()
     record = ProfilerRecord(
-        "sphere, joint", R, rng.uniform(-0.1, 0.1, 3), 1e-8 * np.eye(6), tip=np.array([0.0, 0.0, 0.15]),
-        arm=DhArm.checked(table), figures={"scans": 12, "warnings": ["one"]}, data_sha256="cd" * 32,
-    )  # fmt: skip
+        method="sphere, joint",
+        rotation=R,
+        translation=rng.uniform(-0.1, 0.1, 3),
+        covariance=1e-8 * np.eye(6),
+        tip=np.array([0.0, 0.0, 0.15]),
+        arm=DhArm.checked(table),
+        figures={"scans": 12, "warnings": ["one"]},
+        data_sha256="cd" * 32,
+    )
     return _saved(lambda folder: save_record(record, folder), "profiler.yaml")
 
 
@@ -202,10 +223,21 @@ def tablet_record(rng: Rng) -> Files:
     """tablet.yaml of a wrist camera."""
     X = RigidTransform(RollPitchYaw(*rng.uniform(-1.0, 1.0, 3)), [0.05, 0.0, 0.03])
     result = TabletResult(
-        "wrist", {"x": 0.1, "y": 0.2}, [[1e-8, 0.0], [0.0, 1e-8]], [0.1, 0.2, 0.1], [0.1, None, 0.2], X,
-        (1e-8 * np.eye(6)).tolist(), [0.0, 0.0, 0.15], (1e-8 * np.eye(3)).tolist(), None, {"pnp": 0.2}, ("a",), ("b",),
-        {"touches.csv": "ef" * 32},
-    )  # fmt: skip
+        model="wrist",
+        parameters={"x": 0.1, "y": 0.2},
+        covariance=[[1e-8, 0.0], [0.0, 1e-8]],
+        residual_mm=[0.1, 0.2, 0.1],
+        leave_one_out_mm=[0.1, None, 0.2],
+        X_FC=X,
+        X_FC_covariance=(1e-8 * np.eye(6)).tolist(),
+        p_FP_m=[0.0, 0.0, 0.15],
+        p_FP_covariance=(1e-8 * np.eye(3)).tolist(),
+        two_stages=None,
+        other_models={"pnp": 0.2},
+        unobservable=("a",),
+        warnings=("b",),
+        data_sha256={"touches.csv": "ef" * 32},
+    )
     return _saved(lambda folder: save_tablet_result(result, folder), "tablet.yaml")
 
 

@@ -30,7 +30,7 @@ Calibrated = tuple[CalibrationEstimate, RigidTransform, Array]
 """An estimate, the true X_BC, and where the estimate puts the work point (3,) m in B."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Coverage:
     """Of ``runs`` calibrations from ``poses`` observations each: how often the truth lies within the stated 95 % region of
     X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both means
@@ -98,7 +98,14 @@ def seen_by_a_wrong_scanner(
         x, y = np.linalg.svd(np.asarray(o.n_C)[None])[2][1:]
         ratio = 2.0 / float(x @ J @ x + y @ J @ y) + SIGMA_RATIO * rng.standard_normal()
         R = RotationMatrix(np.column_stack([x, np.cross(o.n_C, x), o.n_C]))
-        patterns[o.id] = HolePattern(np.zeros((4, 3)), np.zeros(4), seen, RigidTransform(R, seen), ratio, 0.0)
+        patterns[o.id] = HolePattern(
+            holes_C=np.zeros((4, 3)),
+            angles_rad=np.zeros(4),
+            center_C=seen,
+            X_CR=RigidTransform(R, seen),
+            ratio=ratio,
+            rms_m=0.0,
+        )
     return out, patterns
 
 
@@ -126,7 +133,13 @@ def study_coverage(poses: int, runs: int, seed: int = 0, progress: Progress = no
         return estimate, X_BC, estimate.X_BC @ WORK_C
 
     pose, point = _inside(calibrate, f"calibrations from {poses} scans", runs, progress)
-    return Coverage(poses, runs, pose, point, float(np.mean(stated) / np.mean(true)) if runs else np.nan)
+    return Coverage(
+        poses=poses,
+        runs=runs,
+        pose=pose,
+        point=point,
+        held_out_over_true=float(np.mean(stated) / np.mean(true)) if runs else np.nan,
+    )
 
 
 def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
@@ -143,7 +156,7 @@ def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = n
         return estimate, X_BC, estimate.X_BC @ found.correction.points(as_measured(WORK_C))
 
     pose, point = _inside(calibrate, f"corrected calibrations from {poses} scans", runs, progress)
-    return Coverage(poses, runs, pose, point, float("nan"), corrected=True)
+    return Coverage(poses=poses, runs=runs, pose=pose, point=point, held_out_over_true=float("nan"), corrected=True)
 
 
 def _inside(calibrate: Callable[[int], Calibrated], name: str, runs: int, progress: Progress) -> tuple[float, float]:

@@ -18,7 +18,7 @@ WAYS = ("plate", "border", "missing")
 SAME_PLACE_M = 0.001  # a flange reported farther from where it is, is another thing taken for it
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Found:
     """Of ``frames`` with the flange and as many without: numbers of those found, mistaken (elsewhere) and imagined, centre
     errors (k,) m and their sizes in stated sigmas per axis (k,) of those found, and the reasons given for the missed."""
@@ -92,7 +92,15 @@ def study_frames(
             imagined += 1
         except FlangeNotFound:
             pass
-    return Found(frames, len(errors), mistaken, imagined, np.array(errors), np.array(normalised), tuple(missed))
+    return Found(
+        frames=frames,
+        found=len(errors),
+        mistaken=mistaken,
+        imagined=imagined,
+        errors_m=np.array(errors),
+        normalised=np.array(normalised),
+        missed=tuple(missed),
+    )
 
 
 @dataclass(frozen=True, eq=False)

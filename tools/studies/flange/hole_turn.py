@@ -19,7 +19,7 @@ from weldcal.tools.studies.flange.frames import flange_frame
 _WRONG_RAD = float(np.radians(10.0))  # half of the least symmetry that a pattern has is more
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HoleTurn:
     """Of ``scans`` with these holes filled: with no pattern found, with its rotation left open, and with one rotation stated:
     ``right`` or ``wrong`` (more than 10 degrees off), and the mean square of the right ones' errors in stated sigmas."""
@@ -83,7 +83,17 @@ def study_hole_turn(
         right = np.abs(e[:, 0]) < _WRONG_RAD
         square = np.square(e[right, 0] / e[right, 1])
         mean = float(square.mean()) if right.any() else float("nan")
-        rows.append(HoleTurn(name, scans, none, left_open, int(right.sum()), int((~right).sum()), mean))
+        rows.append(
+            HoleTurn(
+                filled=name,
+                scans=scans,
+                no_pattern=none,
+                left_open=left_open,
+                right=int(right.sum()),
+                wrong=int((~right).sum()),
+                mean_normalised=mean,
+            )
+        )
     return rows
 
 

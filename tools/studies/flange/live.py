@@ -139,7 +139,7 @@ SCENARIO = "calibrate_only"
 TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LiveRow:
     """One seed: scans used, error of a point at the work point (m) and of the rotation (rad), what the estimate expected of the
     former (rms), the least that these poses, arm and scanner allow (rms), and the same calibration with noise redrawn."""
@@ -196,14 +196,14 @@ def study_live(
         least = np.diag(bound_covariance(found, station))
         rows.append(
             LiveRow(
-                seed,
-                len(found),
-                error.at_work_m,
-                error.rotation_rad,
-                status.predicted_error_m,
-                float(np.sqrt(least[3:].sum())),
-                float(np.sqrt(least[:3].sum())),
-                redraw(found, station, redraws, seed),
+                seed=seed,
+                scans=len(found),
+                at_work_m=error.at_work_m,
+                rotation_rad=error.rotation_rad,
+                expected_m=status.predicted_error_m,
+                least_m=float(np.sqrt(least[3:].sum())),
+                least_rad=float(np.sqrt(least[:3].sum())),
+                redrawn=redraw(found, station, redraws, seed),
             )
         )
     return rows

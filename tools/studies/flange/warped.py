@@ -68,7 +68,14 @@ def warped_observations(
         name = f"p{k:02d}"
         observations.append(Observation(name, X_BC @ RigidTransform(R_CR, true), p_C, normal / np.linalg.norm(normal)))
         ratio = 0.5 * float(np.linalg.norm(x) + np.linalg.norm(y)) + NOISE_RATIO * rng.standard_normal()
-        patterns[name] = HolePattern(np.zeros((4, 3)), np.zeros(4), p_C, RigidTransform(R_CR, p_C), ratio, 0.0)
+        patterns[name] = HolePattern(
+            holes_C=np.zeros((4, 3)),
+            angles_rad=np.zeros(4),
+            center_C=p_C,
+            X_CR=RigidTransform(R_CR, p_C),
+            ratio=ratio,
+            rms_m=0.0,
+        )
     return observations, patterns
 
 
@@ -111,5 +118,11 @@ def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Cov
         true.append(float(np.mean(new_errors(device, estimate, scanner))))
     pose, point = inside / max(runs, 1)
     return Coverage(
-        poses, runs, float(pose), float(point), float(np.mean(stated) / np.mean(true)), corrected=True, warped=True
+        poses=poses,
+        runs=runs,
+        pose=float(pose),
+        point=float(point),
+        held_out_over_true=float(np.mean(stated) / np.mean(true)),
+        corrected=True,
+        warped=True,
     )

@@ -117,7 +117,9 @@ def _seen(
         c = _distorted(p, bend) + _CENTRE_M * rng.normal(size=3)
         out.append(_observation(f"{name}{i}", stated[i], c, z))
         X_CR = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), c)
-        patterns[out[-1].id] = HolePattern(np.zeros((4, 3)), np.zeros(4), c, X_CR, ratio, 0.0)
+        patterns[out[-1].id] = HolePattern(
+            holes_C=np.zeros((4, 3)), angles_rad=np.zeros(4), center_C=c, X_CR=X_CR, ratio=ratio, rms_m=0.0
+        )
     return out, patterns
 
 
@@ -143,7 +145,16 @@ def study_station(world: Station, kind: str = "links", prior: FactoryPrior | Non
     arm = load_chain("ur10e")
     sought: ArmErrors = arm_errors(arm, kind, prior)
     X_BC, correction = calibrate_by_choice(world.observations, world.patterns)
-    nothing = KinematicsFit(X_BC, correction, np.zeros(len(sought.which)), np.eye(1), 1e-4, 1e-3, 1.0, sought)
+    nothing = KinematicsFit(
+        X_BC=X_BC,
+        correction=correction,
+        u=np.zeros(len(sought.which)),
+        covariance=np.eye(1),
+        sigma_position_m=1e-4,
+        sigma_normal_rad=1e-3,
+        redundancy=1.0,
+        errors=sought,
+    )
     holes = from_holes(world.observations, world.patterns)
     fit = fit_kinematics(
         world.observations, world.q, sought, X_BC, correction, holes=holes, considered=unsought(arm, kind)

@@ -33,7 +33,7 @@ _PLAIN = HandEyeConfig(folds=0)
 _TOLERANCE = (0.02, 0.01, 0.05)  # share, degrees, millimetres: how much of a tie still counts as one
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DatasetRow:
     """One set of others: held-out deg and mm, OpenCV's best of each column, what was flagged and left open."""
 
@@ -103,17 +103,17 @@ def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: b
     mm = {m: 1e3 * h.rms_translation for m, h in theirs.items() if np.isfinite(h.translation).all()} or none
     by_deg, by_mm = min(deg, key=lambda m: deg[m]), min(mm, key=lambda m: mm[m])
     row = DatasetRow(
-        name,
-        len(F),
-        ours.held_out.rms_deg,
-        1e3 * ours.held_out.rms_translation,
-        deg[by_deg],
-        by_deg,
-        mm[by_mm],
-        by_mm,
-        tuple(int(i) for i in np.nonzero(~ours.inliers)[0]),
-        ours.unobservable,
-        ours.method,
+        name=name,
+        n=len(F),
+        deg=ours.held_out.rms_deg,
+        mm=1e3 * ours.held_out.rms_translation,
+        best_deg=deg[by_deg],
+        best_deg_by=by_deg,
+        best_mm=mm[by_mm],
+        best_mm_by=by_mm,
+        flagged=tuple(int(i) for i in np.nonzero(~ours.inliers)[0]),
+        unobservable=ours.unobservable,
+        method=ours.method,
     )
     if truth is None:
         return row

@@ -75,7 +75,7 @@ def random_world(rng: np.random.Generator, mistake: str | None = None) -> World:
         bad = rng.choice(n, int(rng.integers(1, 1 + n // 5)), replace=False)
         G[bad] = G[bad] @ pose(exp_rotation(rng.normal(size=(len(bad), 3)) * 0.5), rng.normal(size=(len(bad), 3)) * 0.1)
     robot, camera = _MISTAKES[mistake](hand, G, rng)
-    return World(PosePairs("world", robot, camera, mode), motion, mistake, X)
+    return World(PosePairs(source="world", robot=robot, camera=camera, mode=mode), motion, mistake, X)
 
 
 def judge(world: World, config: HandEyeConfig | None = None) -> Verdict:

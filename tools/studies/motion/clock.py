@@ -26,7 +26,7 @@ _DRIFT, _EPOCH_S = 2e-5, 1.0e6  # of a device's clock
 Estimator = Callable[..., MotionEstimate]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ClockRuns:
     """Runs of one kind (``device`` times or arrivals), each of ``duration_s``: errors (N, 7) of X_BC's six and the offset (rad, m, s)
     and the same in sigmas ``scaled`` (N, 7); ``nees`` (N,) of X_BC over its six; ``own_ms`` (N,) error of the offset against the mean
@@ -88,8 +88,9 @@ def run_clock_study(
         for k in range(runs):
             progress(name, (k + runs * device) / (2 * runs))
             rows.append(_one(device, duration_s, np.random.default_rng([seed, k, int(device)]), k % 2 == 1, estimate))
-        parts = [np.array([row[i] for row in rows]) for i in range(7)]
-        found[name] = ClockRuns(device, duration_s, *parts)
+        columns = (np.array([row[i] for row in rows]) for i in range(7))
+        names = ("errors", "scaled", "nees", "own_ms", "work_mm", "turn_deg", "exact")
+        found[name] = ClockRuns(device=device, duration_s=duration_s, **dict(zip(names, columns, strict=True)))
     if folder is not None:
         write_atomic(folder / "motion_clock.md", clock_table(found))
     return found

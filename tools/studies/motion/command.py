@@ -11,7 +11,7 @@ from weldcal.tools.studies.motion.disturbance import Disturbance, Vector
 from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DataRequest:
     """A recording to be simulated, in the words of the command line: mm, ms and degrees; "" for what does not happen."""
 

@@ -13,7 +13,7 @@ Vector = tuple[float, float, float]
 _STILL: Vector = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Disturbance:
     """Times in s after the start, lengths in mm in axes of the base, angles (roll, pitch, yaw) in degrees; zeros: nothing happens.
 

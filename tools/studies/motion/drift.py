@@ -28,7 +28,7 @@ _CREEP_START_S = 60.0
 _TOLD_EVERY = 200  # frames
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Trial:
     """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was measured.
     ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of the first WITHIN_S
@@ -260,12 +260,34 @@ def _trial(
     early = sum(e.found_s < at for e in events)
     later = [e for e in events if e.found_s >= at]
     if not later:
-        return Trial(kind, seed, view, *(4 * (float("nan"),)), "", early, shown, told)
+        nan = float("nan")
+        return Trial(
+            kind=kind,
+            seed=seed,
+            along_view=view,
+            found_after_s=nan,
+            time_error_s=nan,
+            translation_error_mm=nan,
+            rotation_error_deg=nan,
+            named="",
+            false_alarms=early,
+            shown=shown,
+            told=told,
+        )
     e = later[0]
     return Trial(
-        kind, seed, view, e.found_s - at, e.time_s - at, 1e3 * float(np.linalg.norm(e.translation_m - shift)),
-        float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))), e.model, early, shown, told,
-    )  # fmt: skip
+        kind=kind,
+        seed=seed,
+        along_view=view,
+        found_after_s=e.found_s - at,
+        time_error_s=e.time_s - at,
+        translation_error_mm=1e3 * float(np.linalg.norm(e.translation_m - shift)),
+        rotation_error_deg=float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))),
+        named=e.model,
+        false_alarms=early,
+        shown=shown,
+        told=told,
+    )
 
 
 def _percent(hits: NDArray[np.bool_]) -> float:

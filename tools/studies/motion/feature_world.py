@@ -31,7 +31,7 @@ class Change:
     scale: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WorldConfig:
     """What differs between worlds: size of the work (m), speed (m/s), time between frames (s), jitter of the stamps: ``device`` a
     clock of 0.1 ms, ``arrival`` a skewed transport of 15 ms; sigmas of systematic errors of the arm (rad) and the scanner (m)."""

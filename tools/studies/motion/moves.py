@@ -91,13 +91,13 @@ def observed_frames(
     arrival = capture + DELAY_S - _SHAPE * scale + rng.gamma(_SHAPE, scale, len(p))
     told = np.round((capture - epoch_s) / (1.0 + drift), 6) if device else None
     frames = ObservedFrames(
-        tuple(f"f{k:04d}" for k in range(len(p))),
-        arrival,
-        told,
-        seen,
-        normal,
-        covariance,
-        np.full(len(p), NORMAL_SIGMA),
+        ids=tuple(f"f{k:04d}" for k in range(len(p))),
+        arrival=arrival,
+        device=told,
+        p_C=seen,
+        n_C=normal,
+        covariance=covariance,
+        normal_sigma=np.full(len(p), NORMAL_SIGMA),
     )
     return frames, capture
 

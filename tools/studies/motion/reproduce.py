@@ -61,7 +61,13 @@ def _evaluated(
     found = estimate_in_motion(observed, motion)
     by_arrival = estimate_in_motion(
         ObservedFrames(
-            observed.ids, observed.arrival, None, observed.p_C, observed.n_C, observed.covariance, observed.normal_sigma
+            ids=observed.ids,
+            arrival=observed.arrival,
+            device=None,
+            p_C=observed.p_C,
+            n_C=observed.n_C,
+            covariance=observed.covariance,
+            normal_sigma=observed.normal_sigma,
         ),
         motion,
         held_out=False,

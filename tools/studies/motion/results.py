@@ -69,7 +69,7 @@ class Quality:
     edge_mm: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MotionStudy:
     """All that was found. Errors of X_BC: mm at the cube's centre and at the camera's origin, degrees.
     ``icp_share`` of a shift along x, y and z that point-to-point ICP reports."""

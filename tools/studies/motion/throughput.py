@@ -39,7 +39,7 @@ _FPS, _MEDIAN_MS = 20.0, 50.0
 _PAPER = "10 million points per second arrive; real-time processing is left to powerful hardware (section 4.4)"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Throughput:
     """Frames offered, estimated, without a fit and dropped in ``seconds``; times from arrival to estimate (ms); how late the arm's
     500 Hz loop ran (ms)."""
@@ -117,7 +117,14 @@ def _replayed(
     recorder, queue = builder.AddSystem(PoseRecorder()), builder.AddSystem(FrameQueue(2, _POLL_S))
     estimator = builder.AddSystem(
         FlangeEstimator(
-            world.arm, RigidTransform(), world.flange, world.X_BC_nominal, 0.06, background, _POLL_S, delay_s
+            arm=world.arm,
+            X_FR=RigidTransform(),
+            standard=world.flange,
+            X_BC_guess=world.X_BC_nominal,
+            guess_radius_m=0.06,
+            background=background,
+            period_s=_POLL_S,
+            delay_s=delay_s,
         )
     )
     job = builder.AddSystem(ConstantValueSource(AbstractValue.Make(JobCommand())))
@@ -160,5 +167,13 @@ def _replayed(
     offered = int((0.1 + seconds - delay_s) * _FPS)
     pixels = world.scanner.width * world.scanner.height
     return Throughput(
-        pixels, spent, offered, len(waits), refused, dropped, tuple(waits), tuple(behind), os.getloadavg()[0]
+        pixels=pixels,
+        seconds=spent,
+        offered=offered,
+        estimated=len(waits),
+        refused=refused,
+        dropped=dropped,
+        wait_ms=tuple(waits),
+        behind_ms=tuple(behind),
+        load_average=os.getloadavg()[0],
     )

@@ -36,7 +36,13 @@ def run_whole_body(
     tell: Progress = progress or (lambda stage, fraction: None)
     world = MotionWorld(options)
     result = CalibrationResult(
-        world.X_BC, _SIGMA**2 * np.eye(6), {}, {}, (), robot=options.robot, flange=world.flange.designation
+        X_BC=world.X_BC,
+        covariance=_SIGMA**2 * np.eye(6),
+        held_out_mm={},
+        tilt_deg={},
+        poses=(),
+        robot=options.robot,
+        flange=world.flange.designation,
     )
     found: dict[str, Watched] = {}
     with tempfile.TemporaryDirectory() as folder:

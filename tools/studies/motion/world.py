@@ -32,7 +32,7 @@ _DEPTH_STEP_M = 1e-5  # of the stored depths: a tenth of the smallest noise
 _POSE_DIGITS, _JOINT_DIGITS = 6, 6  # decimals of the stream's numbers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MotionOptions:
     """What is simulated. Lengths m, times s; ``size`` (width, height) resizes the scanner's image.
 

@@ -17,7 +17,7 @@ Floats = npt.NDArray[np.float64]
 Corners = Sequence[tuple[float, float]]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MadePart:
     """A part in mm: its shape, its joint, points (N,3) on the seam's root in the order of travel, roughly (up to 0.3 mm), and
     the exact length of the root.
@@ -154,7 +154,14 @@ def grooved_plate() -> MadePart:
     w = 8.0 * math.tan(math.radians(22.5))
     groove = prism([(-101, -w * 1.25, 2), (-101, w * 1.25, 2), (-101, 0, -8)], (202, 0, 0))
     shape = less(box((-100, -60, -20), (200, 120, 20)), groove)
-    return MadePart("grooved_plate", shape, "v_groove", _straight((-100, 0, -8), (100, 0, -8)), 200.0, 45.0)
+    return MadePart(
+        name="grooved_plate",
+        shape=shape,
+        joint="v_groove",
+        line_mm=_straight((-100, 0, -8), (100, 0, -8)),
+        length_mm=200.0,
+        opening_deg=45.0,
+    )
 
 
 def curved_groove() -> MadePart:
@@ -163,7 +170,14 @@ def curved_groove() -> MadePart:
     ring = turned([(r - w, 0, 2), (r + w, 0, 2), (r, 0, -8)], (0, 0, 0), (0, 0, 1), 2.0 * math.pi)
     shape = less(box((90, -90, -20), (100, 180, 20)), ring)
     low, high = -math.asin(90.0 / r), math.asin(90.0 / r)
-    return MadePart("curved_groove", shape, "v_groove", _arc(r, low, high, -8.0), r * (high - low), 60.0)
+    return MadePart(
+        name="curved_groove",
+        shape=shape,
+        joint="v_groove",
+        line_mm=_arc(r, low, high, -8.0),
+        length_mm=r * (high - low),
+        opening_deg=60.0,
+    )
 
 
 def pipe_on_plate() -> MadePart:
@@ -171,7 +185,14 @@ def pipe_on_plate() -> MadePart:
     pipe = less(cylinder((0, 0, -1), 80.0, 61.0), cylinder((0, 0, -2), 72.0, 70.0))
     shape = fused(box((-120, -120, -12), (240, 240, 12)), pipe)
     line = _arc(80.0, math.radians(-150.0), math.radians(-30.0), 0.0)
-    return MadePart("pipe_on_plate", shape, "fillet", line, 80.0 * math.radians(120.0), 90.0)
+    return MadePart(
+        name="pipe_on_plate",
+        shape=shape,
+        joint="fillet",
+        line_mm=line,
+        length_mm=80.0 * math.radians(120.0),
+        opening_deg=90.0,
+    )
 
 
 def box_corner() -> MadePart:
@@ -181,14 +202,29 @@ def box_corner() -> MadePart:
         prism([(-90, 0, -10), (-90, -10, -10), (-90, -10, -70), (-90, 0, -70)], (180, 0, 0)),
     )
     line = _straight((-90, 0, -10), (90, 0, -10))
-    return MadePart("box_corner", shape, "v_groove", line, 180.0, 90.0, (0.0, -1.0, 1.0))
+    return MadePart(
+        name="box_corner",
+        shape=shape,
+        joint="v_groove",
+        line_mm=line,
+        length_mm=180.0,
+        opening_deg=90.0,
+        up=(0.0, -1.0, 1.0),
+    )
 
 
 def bracket() -> MadePart:
     """An angle bracket with two holes and a gusset beyond the seam's end."""
     shape = fused(box((-80, -50, -10), (160, 100, 10)), box((-80, 20, 0), (160, 10, 60)))
     shape = less(shape, cylinder((-40, -25, -20), 8.0, 40.0), cylinder((40, -25, -20), 8.0, 40.0))
-    return MadePart("bracket", shape, "fillet", _straight((-80, 20, 0), (80, 20, 0)), 160.0, 90.0)
+    return MadePart(
+        name="bracket",
+        shape=shape,
+        joint="fillet",
+        line_mm=_straight((-80, 20, 0), (80, 20, 0)),
+        length_mm=160.0,
+        opening_deg=90.0,
+    )
 
 
 def bent_sheet() -> MadePart:
@@ -203,19 +239,40 @@ def bent_sheet() -> MadePart:
     shape = fused(sheet, web)
     a = np.linspace(-math.asin(80.0 / 300.0), math.asin(80.0 / 300.0), 33)
     line = np.column_stack([300.0 * np.sin(a), np.full(len(a), -4.0), 300.0 * np.cos(a)]) - [0.0, 0.0, 300.0]
-    return MadePart("bent_sheet", moved(shape, (0, 0, -300)), "fillet", line, 600.0 * math.asin(80.0 / 300.0), 90.0)
+    return MadePart(
+        name="bent_sheet",
+        shape=moved(shape, (0, 0, -300)),
+        joint="fillet",
+        line_mm=line,
+        length_mm=600.0 * math.asin(80.0 / 300.0),
+        opening_deg=90.0,
+    )
 
 
 def lap() -> MadePart:
     """A sheet of 6 mm on another: the seam runs along the upper sheet's edge."""
     shape = assembly(box((-100, -80, -6), (200, 100, 6)), box((-100, 0, 0), (200, 80, 6)))
-    return MadePart("lap", shape, "lap", _straight((-100, 0, 0), (100, 0, 0)), 200.0, 90.0)
+    return MadePart(
+        name="lap",
+        shape=shape,
+        joint="lap",
+        line_mm=_straight((-100, 0, 0), (100, 0, 0)),
+        length_mm=200.0,
+        opening_deg=90.0,
+    )
 
 
 def straight_web() -> MadePart:
     """A T of a plate and a web of 10 mm, one solid."""
     shape = fused(box((-100, -60, -10), (200, 120, 10)), box((-100, -5, 0), (200, 10, 50)))
-    return MadePart("straight_web", shape, "fillet", _straight((-100, -5, 0), (100, -5, 0)), 200.0, 90.0)
+    return MadePart(
+        name="straight_web",
+        shape=shape,
+        joint="fillet",
+        line_mm=_straight((-100, -5, 0), (100, -5, 0)),
+        length_mm=200.0,
+        opening_deg=90.0,
+    )
 
 
 def curved_web() -> MadePart:
@@ -224,19 +281,36 @@ def curved_web() -> MadePart:
     web = turned([(190, 0, -1), (200, 0, -1), (200, 0, 45), (190, 0, 45)], (0, 0, 0), (0, 0, 1), 2.0 * half)
     shape = fused(box((130, -100, -10), (120, 200, 10)), turned_about_z(web, -half))
     line = _arc(200.0, -half, half, 0.0)
-    return MadePart("curved_web", shape, "fillet", line, 400.0 * half, 90.0)
+    return MadePart(
+        name="curved_web", shape=shape, joint="fillet", line_mm=line, length_mm=400.0 * half, opening_deg=90.0
+    )
 
 
 def butt() -> MadePart:
     """Two plates side by side with a gap of 3 mm."""
     shape = assembly(box((-100, 1.5, -10), (200, 60, 10)), box((-100, -61.5, -10), (200, 60, 10)))
-    return MadePart("butt", shape, "butt", _straight((-100, 0.2, 0), (100, 0.2, 0)), 200.0, 180.0, (0.0, 0.0, 1.0))
+    return MadePart(
+        name="butt",
+        shape=shape,
+        joint="butt",
+        line_mm=_straight((-100, 0.2, 0), (100, 0.2, 0)),
+        length_mm=200.0,
+        opening_deg=180.0,
+        up=(0.0, 0.0, 1.0),
+    )
 
 
 def two_solids() -> MadePart:
     """A T as an assembly: the web stands on the plate as a body of its own."""
     shape = assembly(box((-90, -60, -10), (180, 120, 10)), box((-90, 0, 0), (180, 8, 60)))
-    return MadePart("two_solids", shape, "fillet", _straight((-90, 0, 0), (90, 0, 0)), 180.0, 90.0)
+    return MadePart(
+        name="two_solids",
+        shape=shape,
+        joint="fillet",
+        line_mm=_straight((-90, 0, 0), (90, 0, 0)),
+        length_mm=180.0,
+        opening_deg=90.0,
+    )
 
 
 def bevelled_plates() -> MadePart:
@@ -245,7 +319,15 @@ def bevelled_plates() -> MadePart:
     right = prism([(-90, -0.5, -12), (-90, -60, -12), (-90, -60, 0), (-90, -0.5 - w, 0)], (180, 0, 0))
     left = prism([(-90, 0.5, -12), (-90, 60, -12), (-90, 60, 0), (-90, 0.5 + w, 0)], (180, 0, 0))
     line = _straight((-90, 0, -12), (90, 0, -12))
-    return MadePart("bevelled_plates", assembly(left, right), "v_groove", line, 180.0, 60.0, (0.0, 0.0, 1.0))
+    return MadePart(
+        name="bevelled_plates",
+        shape=assembly(left, right),
+        joint="v_groove",
+        line_mm=line,
+        length_mm=180.0,
+        opening_deg=60.0,
+        up=(0.0, 0.0, 1.0),
+    )
 
 
 def moved(shape: Any, by: Sequence[float]) -> Any:

@@ -51,7 +51,7 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Trial:
     """How the parts lie and are found: deviations of the true part, and the source of its pose; and what is known of the arm.
 
@@ -75,8 +75,15 @@ class Trial:
         if refine not in REFINEMENTS:
             raise InputError(f"--refine must be {', '.join(REFINEMENTS[:-1])} or {REFINEMENTS[-1]}, not '{refine}'.")
         if located_by == "drawing":
-            return cls(located_by, translation_mm=1.0, rotation_deg=0.3, seam_mm=seam_mm, refine=refine, arm_mm=arm_mm)
-        return cls(located_by, seam_mm=seam_mm, refine=refine, arm_mm=arm_mm)
+            return cls(
+                located_by=located_by,
+                translation_mm=1.0,
+                rotation_deg=0.3,
+                seam_mm=seam_mm,
+                refine=refine,
+                arm_mm=arm_mm,
+            )
+        return cls(located_by=located_by, seam_mm=seam_mm, refine=refine, arm_mm=arm_mm)
 
     def calibration(self) -> Mapping[str, object]:
         """The keys of the scenario's calibration, besides the guess of the mounting."""
@@ -162,7 +169,7 @@ def run_part_welds(
         def shown(stage: str, share: float, k: int = k, name: str = name) -> None:
             progress(f"{name}: {stage}", (k + share) / len(runs))
 
-        options = RunOptions(str(cell), folder / f"seed{seed}", seed, recording=False)
+        options = RunOptions(scenario=str(cell), out=folder / f"seed{seed}", seed=seed, recording=False)
         result = run_scenario(trial.scenario(cell), options, shown)
         result.run.raise_if_interrupted()
         summary = result.summary()

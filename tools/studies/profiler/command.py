@@ -47,7 +47,15 @@ def run_profiler_study(options: ProfilerStudyOptions, progress: Progress) -> Pro
     first = next(iter(trials_of(names[0])))
     e = first.joint()
     cloud = ball_points(first, e.rotation, e.translation)
-    study = ProfilerStudy(options, names, tuple(rows), tuple(results), cloud, tuple(fixed), time.monotonic() - start)
+    study = ProfilerStudy(
+        options=options,
+        names=names,
+        edge=tuple(rows),
+        sphere=tuple(results),
+        ball=cloud,
+        fixed=tuple(fixed),
+        wall_seconds=time.monotonic() - start,
+    )
     write_json(options.folder / "table.json", study.summary())
     write_atomic(options.folder / "report.html", profiler_report(study))
     return study

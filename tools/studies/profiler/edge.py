@@ -1,7 +1,7 @@
 """Tables 1 to 3 of the edge paper, and the calibration's own error, by its method and by the joint method."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -40,7 +40,7 @@ PRINTED_RADIUS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EdgeRow:
     """One set, number of rotations and method: rms errors over the trials, and the paper's own three criteria (mm, deg)."""
 
@@ -103,7 +103,8 @@ def edge_rows(
         v = np.array(values)
         off = float(np.abs(v[:, 8] - 20.0).mean())
         figures = [*np.sqrt((v[:, :4] ** 2).mean(axis=0)).tolist(), *v[:, 4:].mean(axis=0).tolist(), off]
-        rows.append(EdgeRow(name, n, method, len(v), *figures))
+        columns = [field.name for field in fields(EdgeRow)]
+        rows.append(EdgeRow(**dict(zip(columns, (name, n, method, len(v), *figures), strict=True))))
     return rows
 
 

@@ -138,7 +138,7 @@ def _degenerate(folder: Path) -> Iterator[Target]:
         solved: list[tuple[EdgeError, EdgeError]] = []
         silent = {"the paper's method": 0, "joint": 0}
         for R, t, p in zip(*arrays, strict=True):
-            trial = EdgeTrial(FlangePoses(R, t * MM), p * MM, truth, NOISE["nominal"])
+            trial = EdgeTrial(poses=FlangePoses(R, t * MM), points=p * MM, truth=truth, noise=NOISE["nominal"])
             with suppress(WeldcalError):
                 found = edge_linear(R, t * MM, p * MM)
                 linear = trial.error(found.rotation, found.translation)
@@ -202,6 +202,8 @@ def _arcs(folder: Path) -> Iterator[Target]:
 def _real(folder: Path) -> Iterator[Target]:
     with np.load(folder / "real_sphere15_a.npz") as z:
         T, parts = z["T_base_flange"], np.split(z["xz"] * MM, np.cumsum(z["n"])[:-1])
-    data = SphereData(FlangePoses(T[:, :3, :3], T[:, :3, 3] * MM), [p[::8] for p in parts], 40 * MM)
+    data = SphereData(
+        poses=FlangePoses(T[:, :3, :3], T[:, :3, 3] * MM), profiles=[p[::8] for p in parts], radius_m=40 * MM
+    )
     off = float(np.sqrt((leave_one_out_m(data, "rigid") ** 2).mean())) / MM
     yield Target("real sphere, the scan left out, rms", "mm", off, 0.152)

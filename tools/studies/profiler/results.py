@@ -20,7 +20,7 @@ class ProfilerStudyOptions:
     quick: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerStudy:
     """Everything that the study computed.
 

@@ -42,7 +42,7 @@ TRIALS = {"free": 20}
 WORLDS, GROOVES, BOSSES = 8, 3, 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SeedStudy:
     """All lines, the mean squared error in units of the bound (6 expected) of the edge's trials, and how long it took."""
 
@@ -101,7 +101,15 @@ def run_profiler_seeds(folder: Path, first: int, count: int, data: Path | None, 
         TargetLine(what, unit, target, tuple(f[what] for f in found), fixed.get(what))
         for what, unit, target in [*edge_targets(TARGETS), *sphere_targets()]
     )
-    study = SeedStudy(folder, first, count, lines, float(np.mean(nees)), len(nees), time.monotonic() - start)
+    study = SeedStudy(
+        folder=folder,
+        first=first,
+        count=count,
+        lines=lines,
+        nees=float(np.mean(nees)),
+        trials=len(nees),
+        wall_seconds=time.monotonic() - start,
+    )
     write_json(folder / "seeds.json", study.summary())
     write_atomic(folder / "seeds.svg", over_seeds(study.lines).decode())
     return study

@@ -49,7 +49,7 @@ class EdgeError(NamedTuple):
     nees: float = float("nan")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class EdgeTrial:
     """One calibration by an edge.
 
@@ -137,9 +137,14 @@ def fixed_edge_trials(folder: Path, name: str) -> Iterator[EdgeTrial]:
     for k in range(len(R)):
         j = k % len(ball)
         yield EdgeTrial(
-            FlangePoses(R[k], t[k]), p[k], truth, NOISE[level], FlangePoses(ball_R[j], ball_t[j]), ball[j],
-            None if wrong is None else wrong[k],
-        )  # fmt: skip
+            poses=FlangePoses(R[k], t[k]),
+            points=p[k],
+            truth=truth,
+            noise=NOISE[level],
+            ball_poses=FlangePoses(ball_R[j], ball_t[j]),
+            ball=ball[j],
+            wrong=None if wrong is None else wrong[k],
+        )
 
 
 def made_edge_trials(name: str, count: int, seed: int) -> Iterator[EdgeTrial]:
@@ -203,7 +208,7 @@ def _observed(poses: FlangePoses, truth: EdgeState, noise: EdgeNoise, rng: np.ra
     reported = FlangePoses(
         poses.rotation, poses.translation + noise.robot_m * rng.standard_normal(poses.translation.shape)
     )
-    return EdgeTrial(reported, points, truth, noise)
+    return EdgeTrial(poses=reported, points=points, truth=truth, noise=noise)
 
 
 def _arcs(arc: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:

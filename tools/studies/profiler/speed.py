@@ -27,7 +27,7 @@ SAME_DEG, SAME_MM = 0.01, 0.01  # from the optimum that a start at the truth lea
 Answer = tuple[Floats, Floats]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SpeedRow:
     """A method on sets of one kind: wall and processor seconds (median and largest), how often the optimum was found, rms error."""
 

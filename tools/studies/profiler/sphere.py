@@ -42,7 +42,7 @@ class WorldData:
     sigmas: SphereSigmas | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WorldResult:
     """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and the frustum."""
 
@@ -112,9 +112,15 @@ def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
     arm = DhArm.checked(d["dh_nominal"] * [MM, np.radians(1.0), MM, np.radians(1.0)])
     for w in range(min(count, len(d["scan_T"]))):
         data = SphereData(
-            _poses(d["scan_T"][w]), [p * MM for p in d["scan_prof"][w].astype(float)], float(d["radius"]) * MM,
-            _poses(d["touch_T"][w]), d["tip_nominal"][w] * MM, arm, d["scan_q"][w], d["touch_q"][w],
-        )  # fmt: skip
+            poses=_poses(d["scan_T"][w]),
+            profiles=[p * MM for p in d["scan_prof"][w].astype(float)],
+            radius_m=float(d["radius"]) * MM,
+            touches=_poses(d["touch_T"][w]),
+            tip=d["tip_nominal"][w] * MM,
+            arm=arm,
+            q=d["scan_q"][w],
+            touch_q=d["touch_q"][w],
+        )
         tests = SphereTests(d["test_q_view"][w], d["test_m"][w] * MM, d["test_q_touch"][w], d["test_point"][w])
         groove = boss = None
         if w < len(g["q"]):
@@ -144,8 +150,12 @@ def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
     felt = fit_touch_sphere(data.touches.rotation, data.touches.translation, data.tip, data.radius_m)
     best = compensate(linear, R, t, centers, felt.center)
     return {
-        METHODS[0]: ProfilerRecord(METHODS[0], linear.rotation, linear.translation, tip=data.tip),
-        METHODS[1]: ProfilerRecord(METHODS[1], best.rotation, best.translation, tip=data.tip),
+        METHODS[0]: ProfilerRecord(
+            method=METHODS[0], rotation=linear.rotation, translation=linear.translation, tip=data.tip
+        ),
+        METHODS[1]: ProfilerRecord(
+            method=METHODS[1], rotation=best.rotation, translation=best.translation, tip=data.tip
+        ),
         **joint_records(world),
     }
 
@@ -190,7 +200,9 @@ def measured(
     if world.boss is not None and boss:
         cloud = cloud_of(record, arm, *world.boss)
         found = fit_frustum(cloud)
-    return WorldResult(k, method, points, seam, each, found, cloud)
+    return WorldResult(
+        world=k, method=method, points_mm=points, seam_mm=seam, seam_each_mm=each, boss=found, cloud=cloud
+    )
 
 
 def _flange(record: ProfilerRecord, arm: DhArm, q: Floats) -> FlangePoses:

@@ -23,7 +23,7 @@ REACH_RAD = np.radians(70.0)  # of the arc that is seen, from its top
 ABOUT = np.array([0.0, 0.2])  # the middle of the sensor's field
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WorldErrors:
     """One sigma of each cause (m, rad): lengths, joints and twists of the arm, sag per metre of lever, sensor, tip, repeatability."""
 
@@ -40,7 +40,7 @@ class WorldErrors:
 CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, twist_rad=0.0, sag_rad_m=0.0, affine=0.0, tip_m=0.0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Cell:
     """Where a world's arm stands: its table, joints at which the tool points downwards, the sphere's centre (3,) m, and where
     the groove's and the frustum's frames lie, the groove turned about z."""
@@ -61,9 +61,14 @@ def files_cell() -> Cell:
     ) * [1e-3, np.radians(1.0), 1e-3, np.radians(1.0)]  # fmt: skip
     center = np.array([0.93, 0.06, 0.26])
     return Cell(
-        DhArm(rows), np.array([0.0, 0.35, 0.25, 0.0, 0.95, 0.0]), center, np.array([0.78, 0.06, 0.23]), 0.0,
-        center - [0.0, 0.0, 0.03], 45.0,
-    )  # fmt: skip
+        arm=DhArm(rows),
+        home=np.array([0.0, 0.35, 0.25, 0.0, 0.95, 0.0]),
+        center=center,
+        groove=np.array([0.78, 0.06, 0.23]),
+        groove_turn_deg=0.0,
+        boss=center - [0.0, 0.0, 0.03],
+        boss_yaw_deg=45.0,
+    )
 
 
 def ur10e_cell() -> Cell:
@@ -71,7 +76,13 @@ def ur10e_cell() -> Cell:
     center = np.array([-0.75, 0.12, 0.18])
     home = np.radians([0.0, -110.0, 120.0, -100.0, -90.0, 0.0])
     return Cell(
-        DhArm.of(load_arm("ur10e")), home, center, np.array([-0.75, -0.03, 0.15]), 90.0, center - [0.0, 0.0, 0.03], 57.0
+        arm=DhArm.of(load_arm("ur10e")),
+        home=home,
+        center=center,
+        groove=np.array([-0.75, -0.03, 0.15]),
+        groove_turn_deg=90.0,
+        boss=center - [0.0, 0.0, 0.03],
+        boss_yaw_deg=57.0,
     )
 
 
@@ -85,7 +96,7 @@ class SphereTests:
     point: Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SphereWorld:
     """One robot with one profiler and one torch: `nominal` is what is believed, the rest is how it is."""
 
@@ -270,8 +281,15 @@ def sphere_trial(
     felt += world.errors.repeatability_m * rng.standard_normal(felt.shape)
     touch_q = world.touching(felt, looking_down(rng, touches, 15.0, 15.0))
     data = SphereData(
-        world.believed(q), list(profiles), RADIUS_M, world.believed(touch_q), world.tip_believed, world.nominal, q, touch_q
-    )  # fmt: skip
+        poses=world.believed(q),
+        profiles=list(profiles),
+        radius_m=RADIUS_M,
+        touches=world.believed(touch_q),
+        tip=world.tip_believed,
+        arm=world.nominal,
+        q=q,
+        touch_q=touch_q,
+    )
     tests = None
     if views:
         points = world.center + np.repeat(

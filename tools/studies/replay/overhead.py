@@ -110,7 +110,9 @@ def seconds(folder: Path, seed: int, *, record: bool, progress: Progress) -> tup
     """Computing time s of one run, the size of its recording (MB, 0 without one), and the run's own length s."""
     scenario = load_scenario("s_groove", f"{SHORT}\n{FEW}")
     before = time.process_time()
-    result = run_scenario(scenario, RunOptions("s_groove", folder, seed, recording=False, record=record), progress)
+    result = run_scenario(
+        scenario, RunOptions(scenario="s_groove", out=folder, seed=seed, recording=False, record=record), progress
+    )
     used, path = time.process_time() - before, folder / RECORDING
     size = path.stat().st_size / 1e6 if record else 0.0
     path.unlink(missing_ok=True)

@@ -115,13 +115,15 @@ def _simulated(kind: Kind, seed: int, out: Path) -> DemoResult:
     scenario = load_scenario(kind.scenario, kind.overrides)
     if kind.fault == "hole" and scenario.workpiece is not None:
         scenario.workpiece.hole_from_mm = HOLE_MM
-    return _run(scenario, RunOptions(kind.scenario, out, seed, recording=False, record=True))
+    return _run(scenario, RunOptions(scenario=kind.scenario, out=out, seed=seed, recording=False, record=True))
 
 
 def _emulated(kind: Kind, seed: int, out: Path) -> DemoResult:
     scenario = load_scenario(kind.scenario, kind.overrides)
     with emulator_process(q=np.deg2rad(scenario.home_deg).tolist(), lockstep=LOCKSTEP_S) as controller:
-        options = RunOptions(kind.scenario, out, seed, robot=controller.host, pace=1.0, recording=False, record=True)
+        options = RunOptions(
+            scenario=kind.scenario, out=out, seed=seed, robot=controller.host, pace=1.0, recording=False, record=True
+        )
         return _run(scenario, options, kind.phase, lambda: _fault(controller, kind.fault))
 
 
@@ -135,7 +137,7 @@ def _wired(kind: Kind, seed: int, out: Path) -> DemoResult:
             "scanner": f"scanner: !FolderScanner {{folder: {out / 'world' / 'scans'}, trigger: 'tcp://{host}:5020', "
             "preset: phoxi_m, width: 824, height: 616, scan_timeout_s: 2.0}",
         }.get(kind.fault, "")
-        options = RunOptions(str(world.cell), out, seed, recording=False, record=True)
+        options = RunOptions(scenario=str(world.cell), out=out, seed=seed, recording=False, record=True)
         return _run(
             load_scenario(str(world.cell), quick),
             options,

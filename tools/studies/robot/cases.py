@@ -28,7 +28,7 @@ class Action:
     after_s: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Case:
     """A fault. `must` is STOP (at rest within `rest_s`, one of `faults` reported, nothing moves until a new start), GO, either,
     or REFUSE: thrown in before the start, which must be refused. The arm begins with its last joint at `wrist_3` (rad)."""
@@ -130,7 +130,7 @@ def _stops(
 ) -> Case:
     """A fault that must stop the arm and be reported as one of these."""
     named = frozenset({faults}) if isinstance(faults, Fault) else faults
-    return Case(name, throw, STOP, named, repair, short=short, **settings)
+    return Case(name=name, throw=throw, must=STOP, faults=named, repair=repair, short=short, **settings)
 
 
 def _paused(name: str, throw: Callable[[Bench], float], play_s: float, *, short: bool = True) -> Case:
@@ -142,23 +142,23 @@ def _either(
     name: str, throw: Callable[[Bench], float], faults: Iterable[Fault], *repair: Action, short: bool = True
 ) -> Case:
     """A fault in which the arm may go on, or stop and report one of these."""
-    return Case(name, throw, GO_OR_STOP, frozenset(faults), repair, short=short)
+    return Case(name=name, throw=throw, must=GO_OR_STOP, faults=frozenset(faults), repair=repair, short=short)
 
 
 def _refused(name: str, throw: Callable[[Bench], float], says: str, *, short: bool = True) -> Case:
     """A state of the controller in which a start must be refused with a sentence that contains `says`."""
-    return Case(f"start {name}", throw, REFUSE, says=says, short=short)
+    return Case(name=f"start {name}", throw=throw, must=REFUSE, says=says, short=short)
 
 
 RUNNING: tuple[Case, ...] = (
     # the link
-    Case("no state for 20 ms", _fault("drop", seconds=0.02), GO, short=False),
-    Case("state 30 ms late for 0.3 s", _fault("delay", seconds=0.03, **{"for": 0.3}), GO, repair=CLEAR),
-    Case("10 % of the states lost", _fault("drop_p", p=0.1), GO, repair=CLEAR),
-    Case("states in torn pieces", _fault("partial_writes", bytes=7), GO, repair=CLEAR),
-    Case("controller's frames jitter by 5 ms", _fault("jitter", seconds=0.005), GO, repair=CLEAR),
-    Case("controller's clock 100 ppm fast", _fault("clock_skew", ppm=100), GO),
-    Case("dashboard connection reset", _fault("reset_tcp", kind="dashboard"), GO, short=False),
+    Case(name="no state for 20 ms", throw=_fault("drop", seconds=0.02), must=GO, short=False),
+    Case(name="state 30 ms late for 0.3 s", throw=_fault("delay", seconds=0.03, **{"for": 0.3}), must=GO, repair=CLEAR),
+    Case(name="10 % of the states lost", throw=_fault("drop_p", p=0.1), must=GO, repair=CLEAR),
+    Case(name="states in torn pieces", throw=_fault("partial_writes", bytes=7), must=GO, repair=CLEAR),
+    Case(name="controller's frames jitter by 5 ms", throw=_fault("jitter", seconds=0.005), must=GO, repair=CLEAR),
+    Case(name="controller's clock 100 ppm fast", throw=_fault("clock_skew", ppm=100), must=GO),
+    Case(name="dashboard connection reset", throw=_fault("reset_tcp", kind="dashboard"), must=GO, short=False),
     _either("script connection reset", _fault("reset_tcp", kind="script"), LINK),
     _stops("no state for 100 ms", _fault("drop", seconds=0.1), LINK),
     _stops("no state any more", _fault("drop", seconds=1e9), LINK, CLEAR, short=False),
@@ -183,10 +183,10 @@ RUNNING: tuple[Case, ...] = (
     _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
     _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
     # the guard slows the arm, and the next number gives it its speed back
-    Case("numbers 15 ms late", _fault("mute_input", seconds=0.015), GO, may_rest=True),
-    Case("numbers 30 ms late", _fault("mute_input", seconds=0.030), GO, may_rest=True, short=False),
-    Case("numbers 60 ms late", _fault("mute_input", seconds=0.060), GO, may_rest=True, short=False),
-    Case("numbers 120 ms late", _fault("mute_input", seconds=0.120), GO, may_rest=True),
+    Case(name="numbers 15 ms late", throw=_fault("mute_input", seconds=0.015), must=GO, may_rest=True),
+    Case(name="numbers 30 ms late", throw=_fault("mute_input", seconds=0.030), must=GO, may_rest=True, short=False),
+    Case(name="numbers 60 ms late", throw=_fault("mute_input", seconds=0.060), must=GO, may_rest=True, short=False),
+    Case(name="numbers 120 ms late", throw=_fault("mute_input", seconds=0.120), must=GO, may_rest=True),
     _either("one byte wrong in a package", _fault("corrupt", n=1), ALL, *CLEAR),
     _either("bytes wrong in 20 packages", _fault("corrupt", n=20), ALL, *CLEAR, short=False),
     _either("one package of a wrong size", _fault("wrong_size", n=1), ALL, *CLEAR),
@@ -196,8 +196,8 @@ RUNNING: tuple[Case, ...] = (
     ),
     _stops("controller's clock jumps 10 s back", _fault("timestamp_jump", seconds=-10.0), Fault.CLOCK_JUMPED),
     # the robot
-    Case("reduced mode", _fault("reduced"), GO, repair=(Action("normal"),)),
-    Case("tool contact", _fault("tool_contact", n=1), GO, short=False),
+    Case(name="reduced mode", throw=_fault("reduced"), must=GO, repair=(Action("normal"),)),
+    Case(name="tool contact", throw=_fault("tool_contact", n=1), must=GO, short=False),
     _either("pendant switched to local", _fault("local_mode"), ALL, Action("remote")),
     _stops("protective stop", _fault("protective_stop"), Fault.PROTECTIVE_STOP, UNLOCK),
     _stops("emergency stop on the robot", _fault("estop"), Fault.EMERGENCY_STOP, POWER),
@@ -240,11 +240,17 @@ RUNNING: tuple[Case, ...] = (
         "process off by somebody else", _output(False), Fault.PROCESS_OUTPUT, process=True, burns_s=0.01, random=False
     ),
     # the guard writes the output in the same frame: it never goes on
-    Case("process on in another program", _fault("foreign_program", script=SETS_OUTPUT), GO, wired=True, random=False),
     Case(
-        "numbers 30 ms late, process on",
-        _fault("mute_input", seconds=0.030),
-        GO,
+        name="process on in another program",
+        throw=_fault("foreign_program", script=SETS_OUTPUT),
+        must=GO,
+        wired=True,
+        random=False,
+    ),
+    Case(
+        name="numbers 30 ms late, process on",
+        throw=_fault("mute_input", seconds=0.030),
+        must=GO,
         process=True,
         burns_s=1e9,
         random=False,
@@ -259,7 +265,7 @@ RUNNING: tuple[Case, ...] = (
         random=False,
     ),
     # this computer
-    Case("cell silent for 0.2 s", lambda b: b.send(lambda qd: None, 0.2), GO, may_rest=True),
+    Case(name="cell silent for 0.2 s", throw=lambda b: b.send(lambda qd: None, 0.2), must=GO, may_rest=True),
     _stops("cell silent for 0.7 s", lambda b: b.send(lambda qd: None, 0.7), Fault.COMMAND_LATE, watch_s=1.0),
     _stops(
         "cell silent for ever", lambda b: b.send(lambda qd: None, 1e9), Fault.COMMAND_LATE, short=False, watch_s=1.0
@@ -277,8 +283,15 @@ RUNNING: tuple[Case, ...] = (
     _stops("worker killed", lambda b: b.signal_worker(signal.SIGKILL), Fault.WORKER_DIED),
     _stops("worker crashes", lambda b: b.signal_worker(signal.SIGSEGV), Fault.WORKER_DIED, short=False),
     _stops("worker stopped (SIGSTOP)", lambda b: b.signal_worker(signal.SIGSTOP), Fault.WORKER_DIED),
-    Case("worker stands still for 60 ms", _stands_still(0.060), GO, may_rest=True, random=False),
-    Case("worker stands still for 120 ms", _stands_still(0.120), GO, may_rest=True, random=False, short=False),
+    Case(name="worker stands still for 60 ms", throw=_stands_still(0.060), must=GO, may_rest=True, random=False),
+    Case(
+        name="worker stands still for 120 ms",
+        throw=_stands_still(0.120),
+        must=GO,
+        may_rest=True,
+        random=False,
+        short=False,
+    ),
     # nobody is left who could stop the paused program: what was commanded must be worth nothing when somebody presses Play
     _paused("computer dies, pause, Play after 3 s", _dies_and_is_paused, 3.0),
     _paused("pause, computer dies, Play after 3 s", _is_paused_and_dies, 3.0),

@@ -42,7 +42,7 @@ _SPEED_OFF = 0.1 * SPEED_M_S
 ENDED_S = 3.0  # a worker without its cell brakes, ends the program and closes its connections
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Outcome:
     """The result of one fault. Times count from the fault; `problems` is empty where the result is as required."""
 
@@ -95,7 +95,9 @@ def run_case(bench: Bench, case: Case, *, hasty: bool = False, attempts: int = S
         finally:
             bench.end(kill=hasty)
             recover(bench)
-    return Outcome(case.name, case.must, "failed", "", reason, problems=(reason,), retries=retries)
+    return Outcome(
+        name=case.name, must=case.must, did="failed", fault="", sentence=reason, problems=(reason,), retries=retries
+    )
 
 
 def recover(bench: Bench) -> None:
@@ -124,7 +126,9 @@ def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
             speed = _speed_of_the_way(bench)
             problems = [] if abs(speed - SPEED_M_S) < _SPEED_OFF else [f"its speed is {speed:.4f} m/s"]
             problems += _burnt(bench, case, at)
-            return Outcome(case.name, case.must, "went on", "", "", problems=tuple(problems))
+            return Outcome(
+                name=case.name, must=case.must, did="went on", fault="", sentence="", problems=tuple(problems)
+            )
     time.sleep(max(0.0, case.watch_s - GOING_S - (HASTE_S if hasty else 0.0)))
     return _stopped(bench, case, at, children, PLAYED_S - (HASTE_S if hasty else 0.0))
 
@@ -172,7 +176,18 @@ def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played
     problems += _burnt(bench, case, at)
     rest_ms, travel_mm = (None if value is None else 1e3 * float(value) for value in (rest, travel))
     name = fault.name if fault else ""
-    return Outcome(case.name, case.must, "stopped", name, sentence, rest_ms, travel_mm, seen, played, tuple(problems))
+    return Outcome(
+        name=case.name,
+        must=case.must,
+        did="stopped",
+        fault=name,
+        sentence=sentence,
+        rest_after_ms=rest_ms,
+        travel_mm=travel_mm,
+        seen_after_ms=seen,
+        played=played,
+        problems=tuple(problems),
+    )
 
 
 def _burnt(bench: Bench, case: Case, at: float) -> list[str]:
@@ -211,7 +226,7 @@ def _at_start(bench: Bench, case: Case) -> Outcome:
     found = bench.at_rest_after(at, REST_S)
     if not found["ok"]:
         problems.append("it moved")
-    return Outcome(case.name, case.must, "refused", "", sentence, problems=tuple(problems))
+    return Outcome(name=case.name, must=case.must, did="refused", fault="", sentence=sentence, problems=tuple(problems))
 
 
 def _alive(process: int) -> bool:

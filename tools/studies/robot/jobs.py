@@ -36,7 +36,7 @@ def busy_programs(count: int) -> Iterator[None]:
             program.wait()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class JobTiming:
     """One job: its seed, state and reason, the lateness of its velocities, the slowest rate, and its figures (mm)."""
 
@@ -129,20 +129,28 @@ def _job(described: Any, out: Path, name: str, seed: int) -> JobTiming:
     q_home = np.deg2rad(described.home_deg)
     kinematics = None if described.kinematics is None else Path(described.kinematics)
     with emulator_process(q=q_home.tolist(), kinematics=kinematics) as controller:
-        options = RunOptions(name, out, seed, robot=controller.host, pace=1.0, recording=False)
+        options = RunOptions(scenario=name, out=out, seed=seed, robot=controller.host, pace=1.0, recording=False)
         try:
             result = run_scenario(described, options)
         except WeldcalError as error:  # the start was refused
-            return JobTiming(seed, "refused", str(error), Lateness(), 0.0, 0.0, {})
+            return JobTiming(
+                seed=seed,
+                state="refused",
+                reason=str(error),
+                lateness=Lateness(),
+                slowest_percent=0.0,
+                slowed_s=0.0,
+                figures={},
+            )
     result.run.raise_if_interrupted()
     summary, clock = result.summary(), result.run.clock
     assert clock is not None
     return JobTiming(
-        seed,
-        str(summary["state"]),
-        str(summary.get("reason") or ""),
-        clock.lateness,
-        100.0 * clock.slowest_rate,
-        clock.slowed_s,
-        summary,
+        seed=seed,
+        state=str(summary["state"]),
+        reason=str(summary.get("reason") or ""),
+        lateness=clock.lateness,
+        slowest_percent=100.0 * clock.slowest_rate,
+        slowed_s=clock.slowed_s,
+        figures=summary,
     )

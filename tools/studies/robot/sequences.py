@@ -15,7 +15,7 @@ SEEN_S = 1.2  # a fault that must stop the arm is reported by then
 ANY_REPAIR = tuple({action.name: action for case in RUNNING for action in case.repair}.values())
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Sequence:
     """What happened in one sequence, and what the emulator's checker has counted."""
 
@@ -48,7 +48,7 @@ class Sequence:
 def run_sequence(bench: Bench, seed: int, seconds: float) -> Sequence:
     """Inject random faults for this long; the result is what the checker counted."""
     before = bench.emulator.ask(check="summary")
-    rng, done = np.random.default_rng(seed), Sequence(seed)
+    rng, done = np.random.default_rng(seed), Sequence(seed=seed)
     cases = [case for case in RUNNING if case.random]
     started = time.monotonic()
     while time.monotonic() < started + seconds:

@@ -42,7 +42,7 @@ STEP_S = 0.5
 STEPS = (1.0, 0.0, -1.0, 0.0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Tap:
     """Stands between the arm's LeafSystem and its link, and notes when what passes. Times in s of the monotonic clock."""
 
@@ -218,7 +218,7 @@ def run_robot_benchmark(
             prepared = PrepareRobot(UrRtde(host=emulator.host), load_arm())
             link = cast(UrLink, prepared.handle)
             if tap is None:
-                tap = Tap(link)
+                tap = Tap(link=link)
             else:
                 tap.restart(link)
             try:

@@ -27,7 +27,17 @@ def run_tablet_study(options: TabletOptions, progress: Progress) -> TabletStudy:
     models = compare_models(touches)
     progress("simulated trials", 0.7)
     unseen = held_out(options.seed, options.trials, min(options.trials, PUBLISHED_TRIALS))
-    study = TabletStudy(options, stages, cost, dh, signs, models, unseen, fit_linear(touches), time.monotonic() - start)
+    study = TabletStudy(
+        options=options,
+        stages=stages,
+        cost=cost,
+        dh=dh,
+        signs=signs,
+        models=models,
+        unseen=unseen,
+        linear=fit_linear(touches),
+        wall_seconds=time.monotonic() - start,
+    )
     progress("report", 0.99)
     write_json(options.folder / "table.json", study.summary())
     write_atomic(options.folder / "report.html", tablet_report(study))

@@ -30,7 +30,7 @@ class TabletOptions:
     trials: int = 60
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TabletStudy:
     """Everything that the study computed."""
 

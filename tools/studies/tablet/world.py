@@ -17,7 +17,7 @@ from weldcal.tools.studies.tablet.paper import (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TabletNoise:
     """Noise of the simulated devices, as the paper's data suggest it: a depth camera that reads 1.5 % short and 0.8 mm
     noisy, blobs of 0.15 px read to whole pixels, hands read to whole millimetres, touches 2.5 px off the dot, a table level within 0.7 deg."""

@@ -131,7 +131,7 @@ def _calibrated(observations: list[Observation]) -> CalibrationResult:
         covariance=e.covariance,
         held_out_mm={"p95": 1e3 * float(np.percentile(e.held_out.position_m, 95))},
         tilt_deg={},
-        poses=tuple(PoseRecord(o.id, bool(k)) for o, k in zip(observations, e.inliers, strict=True)),
+        poses=tuple(PoseRecord(id=o.id, used=bool(k)) for o, k in zip(observations, e.inliers, strict=True)),
         robot="ur10e",
         sigma_position_mm=1e3 * e.sigma_position_m,
         sigma_normal_deg=float(np.degrees(e.sigma_normal_rad)),
@@ -176,7 +176,16 @@ def _touch(
     else:
         seen = seen + (_SPHERE_M if kind == SPHERE else _POINT_M) * rng.normal(size=3)
     taught = 0.0 if kind == POINT else _TIP_RADIUS
-    return Touch(id, kind, X_BF, _TIP, taught, seen, direction, _SPHERE if kind == SPHERE else 0.0)
+    return Touch(
+        id=id,
+        feature=kind,
+        X_BF=X_BF,
+        p_FT=_TIP,
+        radius=taught,
+        p_C=seen,
+        direction_C=direction,
+        feature_radius=_SPHERE if kind == SPHERE else 0.0,
+    )
 
 
 def _seen_direction(scanner: _Scanner, p: Array, n: Array, sigma: float, rng: np.random.Generator) -> Array:

@@ -13,7 +13,7 @@ from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Budget:
     """Errors of one world, SI units.
 
@@ -46,9 +46,9 @@ class Budget:
     unknown: Unknowns = NOTHING_UNKNOWN
 
 
-NOMINAL = Budget("nominal")
+NOMINAL = Budget(name="nominal")
 HARD = Budget(
-    "hard",
+    name="hard",
     tag_sigma_m=0.10e-3,
     tag_gain=1.08,
     latency_s=0.060,
@@ -60,7 +60,24 @@ HARD = Budget(
     plan_warp_m=1.0e-3,
     plan_noise_m=0.30e-3,
 )
-PERFECT = Budget("perfect", 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2e-3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+PERFECT = Budget(
+    name="perfect",
+    tag_sigma_m=0.0,
+    tag_gain=1.0,
+    tag_yaw_rad=0.0,
+    tag_bias_m=0.0,
+    latency_s=0.0,
+    lag_s=0.0,
+    friction=0.0,
+    roughness_m=0.0,
+    roughness_length_m=2e-3,
+    plan_shift_m=0.0,
+    plan_angle_rad=0.0,
+    plan_height_m=0.0,
+    plan_warp_m=0.0,
+    plan_smoothing_m=0.0,
+    plan_noise_m=0.0,
+)
 KINEMATIC = replace(PERFECT, name="kinematic", lag_s=0.020, tag_sigma_m=0.02e-3)
 QUIETER = tuple(replace(KINEMATIC, name=f"kinematic_{um}um", tag_sigma_m=1e-6 * um) for um in (0, 5, 10))
 

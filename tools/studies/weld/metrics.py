@@ -15,7 +15,7 @@ from weldcal.welding.servo.state import Phase
 _WELDING = [PHASES.index(p) for p in (Phase.TRACK, Phase.COAST, Phase.FINISH)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunMetrics:
     """Figures of one run; mm, mm/s, rad/s and degrees, since people read them. NaN where there is none.
 
@@ -79,7 +79,7 @@ def judge(
     moving = np.isin(phase, _WELDING)
     reason = run.reason or ""
     if moving.sum() < 10:
-        return RunMetrics(False, str(run.phase), reason, 0.0)
+        return RunMetrics(completed=False, phase=str(run.phase), reason=reason, reached_mm=0.0)
     length = run.torch_line.length
     torch = run.points("torch")[moving]
     error = path_error(torch, run.torch_line)
@@ -89,7 +89,7 @@ def judge(
     omega, speed = run.column("omega_rad_s")[moving], run.column("tip_speed_m_s")[moving]
     extremes = {"omega_rad_s": float(np.max(np.abs(omega))), "tip_speed_mm_s": 1e3 * float(np.max(np.abs(speed)))}
     if not on_seam.any():
-        return RunMetrics(False, str(run.phase), reason, 1e3 * reached, **extremes)
+        return RunMetrics(completed=False, phase=str(run.phase), reason=reason, reached_mm=1e3 * reached, **extremes)
     s, side, height = error.s[on_seam], np.abs(error.lateral[on_seam]), np.abs(error.height[on_seam])
     figures: dict[str, float] = {
         "mean_mm": 1e3 * float(side.mean()),
@@ -116,7 +116,7 @@ def judge(
     lit = np.flatnonzero(np.diff(burning.astype(int)) == 1)
     whole = len(lit) == 1 and float(error.s[lit[0] + 1]) <= 10e-3 and float(error.s[burning][-1]) >= length - 10e-3
     completed = run.phase == Phase.DONE and whole and figures["max_mm"] < 5.0
-    return RunMetrics(completed, str(run.phase), reason, 1e3 * reached, **figures)
+    return RunMetrics(completed=completed, phase=str(run.phase), reason=reason, reached_mm=1e3 * reached, **figures)
 
 
 def _speed(run: StudyRun, weld_speed_m_s: float, s: Array, moving: NDArray[np.bool_]) -> dict[str, float]:

@@ -17,7 +17,7 @@ TURNS = ("turn_120_r20", "turn_120_r5", "turn_150_r10", "u_r20", "u_r30", "u_r10
 CHORDS = (0.040, 0.060, 0.080)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TurnResult:
     """One seam and chord: the true seam's chord map, and how the weld of its nominal plan ended.
 
@@ -73,15 +73,15 @@ def run_turn(seam: str, chord_m: float, seed: int) -> TurnResult:
     figures = judge(run, case.speed_m_s, chord_m)
     refused = figures.phase == "FAULT" and not run.column("torch_on").any() and "infeasible" in figures.reason
     result = TurnResult(
-        seam,
-        1e3 * chord_m,
-        float(np.degrees(report.chart.max_turn)),
-        1e3 * report.chart.back_up_m,
-        report.feasible,
-        refused,
-        figures.phase,
-        figures.reason,
-        figures.max_mm,
+        seam=seam,
+        chord_mm=1e3 * chord_m,
+        turn_deg=float(np.degrees(report.chart.max_turn)),
+        back_up_mm=1e3 * report.chart.back_up_m,
+        possible=report.feasible,
+        refused=refused,
+        phase=figures.phase,
+        reason=figures.reason,
+        max_mm=figures.max_mm,
     )
     if not refused or not report.splits:
         return result

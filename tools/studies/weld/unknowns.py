@@ -1,7 +1,7 @@
 """What of the weld study's world differs from what the servo believes: time stamps, wedge, tip, seat and lag."""
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
@@ -11,7 +11,7 @@ Range = tuple[float, float]
 _NONE = (0.0, 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Unknowns:
     """Ranges (low, high) from which a seed draws one world, evenly; SI units. The servo is told none of it.
 
@@ -37,7 +37,7 @@ class Unknowns:
 NOTHING_UNKNOWN = Unknowns()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class World:
     """One draw: as in Unknowns; `lag_share` NaN where the budget's lag holds."""
 
@@ -69,4 +69,5 @@ class World:
 def draw_world(unknowns: Unknowns, seed: int) -> World:
     """The world of a seed, from a generator of its own: the other errors of a run do not change with it."""
     rng = np.random.default_rng((seed, 1))
-    return World(*(math.nan if r is None else float(rng.uniform(*r)) for r in astuple(unknowns)))
+    ranges = zip((field.name for field in fields(World)), astuple(unknowns), strict=True)
+    return World(**{name: math.nan if r is None else float(rng.uniform(*r)) for name, r in ranges})

@@ -89,7 +89,7 @@ def run_job(
     with world.control() as controller:
         before = controller.ask(check="summary")
         with _thrown(world, happening, stage, thrown):
-            result = run_scenario(scenario, RunOptions("wired", folder, seed, recording=False), watch)
+            result = run_scenario(scenario, RunOptions(scenario="wired", out=folder, seed=seed, recording=False), watch)
         result.run.raise_if_interrupted()
         ended = time.monotonic()
         held = result.state != "done"

@@ -28,7 +28,7 @@ class GrooveUncertain(WeldcalError):
     """The groove was found, but its position is not accurate enough to weld."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GrooveConfig:
     """Limits of the groove extraction.
 
@@ -62,7 +62,7 @@ class Profile:
     depth_sigma: float = 0.30
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class GrooveSeam:
     """A measured V-groove, sampled every millimetre of arc length from its start; metres, radians, in the cloud's frame A.
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from weldcal.welding.locate.planes import Floats, Mask, into, point_pitch, robust_plane, upward_planes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SearchConfig:
     """Thresholds for a face and for a groove in it; metres and radians.
 

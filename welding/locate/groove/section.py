@@ -26,7 +26,7 @@ SLOPE_SIGMA = 0.06  # relative, of a slice about the common profile: 2 deg betwe
 DEPTH_SIGMA = 0.10
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Section:
     """A fitted cross-section; metres, slopes as rise over run, left then right where there are two.
 

@@ -24,7 +24,7 @@ BEYOND_M = 0.004
 SAME_FACE_COS = 0.95
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Agreement:
     """Shares of the rays that are predicted to meet the part.
 
@@ -96,13 +96,13 @@ def agreement(
         near, _ = cKDTree(into(X_BP, points[met])).query(s, distance_upper_bound=max(0.005, 2.0 * spacing))
         seen = float(np.mean(np.isfinite(near)))
     return Agreement(
-        float(met.sum() / total),
-        float(passed.sum() / total),
-        float(hidden.sum() / total),
-        seen,
-        int(met.sum()),
-        _goes_on(scan, model, X_BP, eye, tolerance_m),
-        verdict,
+        met=float(met.sum() / total),
+        passed=float(passed.sum() / total),
+        hidden=float(hidden.sum() / total),
+        seen=seen,
+        n_met=int(met.sum()),
+        goes_on=_goes_on(scan, model, X_BP, eye, tolerance_m),
+        verdict=verdict,
     )
 
 

@@ -308,7 +308,15 @@ def _result(best: _Judged, runner_up: float, model: PartModel, matters_P: Floats
         np.clip((a.met / max(1e-9, 1.0 - a.hidden) - a.passed) * (1.0 - max(0.0, runner_up - 0.7)), 0.0, 1.0)
     )
     found = PartRegistration(
-        best.X_BP, best.fit.covariance, best.fit.rms_m, a.met, a.passed, a.seen, confidence, runner_up, ""
+        X_BP=best.X_BP,
+        covariance=best.fit.covariance,
+        rms_m=best.fit.rms_m,
+        agreement=a.met,
+        violation=a.passed,
+        seen=a.seen,
+        confidence=confidence,
+        runner_up=runner_up,
+        summary="",
     )
     at = model.points[::300] if matters_P is None else np.asarray(matters_P)
     sigma = float(np.sqrt(np.mean(np.square(found.sigma_at(at)))))
@@ -319,5 +327,13 @@ def _result(best: _Judged, runner_up: float, model: PartModel, matters_P: Floats
         f"{100 * a.seen:.0f} % of its visible surface is seen; {what} is known to {1e3 * sigma:.2f} mm"
     )
     return PartRegistration(
-        best.X_BP, best.fit.covariance, best.fit.rms_m, a.met, a.passed, a.seen, confidence, runner_up, summary
+        X_BP=best.X_BP,
+        covariance=best.fit.covariance,
+        rms_m=best.fit.rms_m,
+        agreement=a.met,
+        violation=a.passed,
+        seen=a.seen,
+        confidence=confidence,
+        runner_up=runner_up,
+        summary=summary,
     )

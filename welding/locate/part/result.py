@@ -22,7 +22,7 @@ class AmbiguousPart(WorkpieceNotFound):
     """The scan agrees with several poses of the part; the text names the directions that are free."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PartConfig:
     """Limits of the search and of the decision.
 
@@ -54,7 +54,7 @@ class PartConfig:
     seed: int = 0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PartRegistration:
     """The pose X_BP of a part, and how well the scan agrees with it.
 

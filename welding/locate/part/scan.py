@@ -30,7 +30,7 @@ class Plane:
     extent_m: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PreparedScan:
     """Points (N,3) m in base with normals towards the scanner, a coarse copy, the planes in it, and the scanner's position.
 
@@ -106,7 +106,9 @@ def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) 
 
     p, n = turned(cloud)
     q, m = turned(few)
-    return PreparedScan(p, n, q, m, planes, eye, pitch, measured)
+    return PreparedScan(
+        points=p, normals=n, coarse=q, coarse_normals=m, planes=planes, eye=eye, pitch_m=pitch, measured=measured
+    )
 
 
 def _planes(points: Floats, normals: Floats, rng: np.random.Generator) -> list[Plane]:

@@ -129,7 +129,14 @@ class FolderSource(Source[Datum]):
             with suppress(OSError):
                 path.unlink()
                 path.with_suffix(SIDECAR).unlink(missing_ok=True)
-        return Delivery(datum, arrived, device, captured, request=self._request, note=f"{path.name}, time from {where}")
+        return Delivery(
+            datum=datum,
+            arrived=arrived,
+            device_time=device,
+            unix_time=captured,
+            request=self._request,
+            note=f"{path.name}, time from {where}",
+        )
 
     def _sidecar(self, path: Path) -> tuple[float | None, int | None, float | None, str]:
         """Capture time (Unix, s), request's number, the time of the scanner's own clock (s), and where the time is from."""

@@ -19,7 +19,7 @@ from weldcal.systems.drivers.sensors.wired_camera import (
 from weldcal.systems.drivers.station_build import StationBuild
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class GenicamFingerCamera(WiredFingerCamera):
     """`!GenicamFingerCamera`: the maker's GenTL producer, the device, and its features; `exposure_ms` sets ExposureTime."""
 

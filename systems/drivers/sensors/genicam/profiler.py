@@ -22,7 +22,7 @@ from weldcal.systems.drivers.station_build import StationBuild
 _METRES = {"m": 1.0, "mm": 1e-3}
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class GenicamProfiler(WiredProfiler):
     """`!GenicamProfiler`: the maker's GenTL producer, the device, and its features.
 

@@ -15,7 +15,7 @@ from weldcal.systems.drivers.station_build import StationBuild
 GENICAM_UNIT_M = 1e-3  # of a device that does not say its unit
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class GenicamScanner(WiredScanner):
     """`!GenicamScanner`: the maker's GenTL producer, the device, and its features.
 

@@ -48,7 +48,13 @@ class GenicamSource(Source[Datum]):
             datum = self.datum(taken.components)
         except Garbage as error:
             raise Garbage(f"in frame {taken.number}: {error}") from error
-        return Delivery(datum, taken.arrived, taken.device_time, number=taken.number, request=self._request)
+        return Delivery(
+            datum=datum,
+            arrived=taken.arrived,
+            device_time=taken.device_time,
+            number=taken.number,
+            request=self._request,
+        )
 
     def close(self) -> None:
         """See Source."""

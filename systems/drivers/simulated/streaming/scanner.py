@@ -31,7 +31,7 @@ from weldcal.systems.messages import Message, ScanStream, StreamedScan
 _KEPT = 8  # arrived frames on the port
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class StreamingScanner(RenderedScanner):
     """`!StreamingScanner`: a scanner that streams. Timing is the preset's where it is null; the shutter is global.
 

@@ -80,7 +80,7 @@ class Check:
     checked: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Preflight:
     """All checks, and the values read for them (None where not read): arm_q (6,) rad, tcp_pose and tcp_offset (6,) as
     x, y, z (m) and a rotation vector (rad), the controller's version, the robot's kinematics and the arm with it,

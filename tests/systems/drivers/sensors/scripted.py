@@ -45,7 +45,7 @@ class Scripted:
         found = self.script.popleft()
         if isinstance(found, Exception):
             raise found
-        return found if isinstance(found, Delivery) else Delivery(found, time.monotonic())
+        return found if isinstance(found, Delivery) else Delivery(datum=found, arrived=time.monotonic())
 
     def close(self) -> None:
         self.closed += 1

@@ -55,7 +55,7 @@ def test_the_newest_frames_are_kept_and_those_nobody_looked_at_are_counted(
 
 def test_gaps_in_the_devices_own_count_are_losses(started: Acquisition[Any], device: Scripted) -> None:
     now = time.monotonic()
-    device.script.extend(Delivery(picture(n), now, number=n) for n in (5, 6, 9, 10))
+    device.script.extend(Delivery(datum=picture(n), arrived=now, number=n) for n in (5, 6, 9, 10))
     assert wait_until(lambda: started.counts.received == 5)
     assert started.counts.lost == 2
     numbers = [f.number for f in started.frames()]
@@ -139,10 +139,10 @@ def test_any_exception_of_a_devices_library_is_a_loss_and_the_thread_goes_on(
 
 def test_late_frames_are_a_fault(started: Acquisition[Any], device: Scripted) -> None:
     for k in range(5):
-        device.script.append(Delivery(picture(k), time.monotonic(), device_time=100.0 + time.monotonic()))
+        device.script.append(Delivery(datum=picture(k), arrived=time.monotonic(), device_time=100.0 + time.monotonic()))
     assert wait_until(lambda: started.counts.received == 6)
     assert "late" not in (started.fault(time.monotonic()) or "")
-    device.script.append(Delivery(picture(9), time.monotonic(), device_time=98.0 + time.monotonic()))
+    device.script.append(Delivery(datum=picture(9), arrived=time.monotonic(), device_time=98.0 + time.monotonic()))
     assert wait_until(lambda: "is late: a frame came 2.0 s after its time" in (started.fault(time.monotonic()) or ""))
 
 
@@ -150,10 +150,10 @@ def test_frames_of_a_time_in_which_nobody_could_read_are_not_late(started: Acqui
     before = time.time()
     time.sleep(0.4)
     started.excuse(0.4)
-    device.script.append(Delivery(picture(2), time.monotonic(), unix_time=before))
+    device.script.append(Delivery(datum=picture(2), arrived=time.monotonic(), unix_time=before))
     assert wait_until(lambda: started.counts.received == 2)
     assert "late" not in (started.fault(time.monotonic()) or "")
-    device.script.append(Delivery(picture(3), time.monotonic() + 2.0, unix_time=time.time() + 0.01))
+    device.script.append(Delivery(datum=picture(3), arrived=time.monotonic() + 2.0, unix_time=time.time() + 0.01))
     assert wait_until(lambda: "is late" in (started.fault(time.monotonic()) or ""))
 
 
@@ -167,7 +167,7 @@ def test_a_request_is_sent_once_and_its_answer_found(device: Scripted) -> None:
         assert acquisition.answer(1) is None
         assert wait_until(lambda: acquisition.fault(time.monotonic()) is not None)
         assert acquisition.fault(time.monotonic()) == "The scripted device did not deliver scan 1 within 0.2 s."
-        device.script.append(Delivery(picture(3), time.monotonic(), request=1))
+        device.script.append(Delivery(datum=picture(3), arrived=time.monotonic(), request=1))
         assert wait_until(lambda: acquisition.answer(1) is not None)
         assert acquisition.fault(time.monotonic()) is None
         assert device.asked == [1]

@@ -99,7 +99,15 @@ def test_a_folder_that_takes_long_to_list_is_listed_a_tenth_of_the_time(
         return complete(files)
 
     monkeypatch.setattr(NewFiles, "complete", slow)
-    source = FolderSource("scanner", str(tmp_path), "", (".npz",), Path.read_bytes, 0.0, False)
+    source = FolderSource(
+        name="scanner",
+        folder=str(tmp_path),
+        trigger="",
+        suffixes=(".npz",),
+        read=Path.read_bytes,
+        settle_s=0.0,
+        remove_read=False,
+    )
     source.open()
     while len(listings) < 5:
         assert source.next(0.02) is None

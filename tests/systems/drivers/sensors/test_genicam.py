@@ -183,7 +183,7 @@ def test_a_library_that_crashes_is_a_lost_device_and_the_next_process_opens_it_a
 
 def test_two_devices_of_one_producer_are_open_at_a_time(start: Start) -> None:
     _, first = scanner(streams=True)
-    camera = GenicamFingerCamera(400, 400, rate_hz=20.0, producer=producer(), device="2", frozen_s=5.0)
+    camera = GenicamFingerCamera(width=400, height=400, rate_hz=20.0, producer=producer(), device="2", frozen_s=5.0)
     second = acquire_pictures(camera, camera.source())  # in a process of its own, as in a cell
     start(first, True)
     start(second, True)

@@ -32,7 +32,9 @@ class Host:
 def frame(number: int, captured: float) -> Frame[Any]:
     """A frame that the device has taken at this time of the host."""
     stamp = Stamp(captured, "host")
-    return Frame(number, CLOUD, captured + DELAY_S, stamp, device_time=DEVICE_0_S + captured - 50.0)
+    return Frame(
+        number=number, datum=CLOUD, arrived=captured + DELAY_S, stamp=stamp, device_time=DEVICE_0_S + captured - 50.0
+    )
 
 
 def device_times(clock: WallClock | None, frames: list[Frame[Any]]) -> list[float | None]:

@@ -128,7 +128,7 @@ def test_a_scanner_that_delivers_nothing_holds_the_job_by_its_name(tmp_path: Pat
 def test_a_closed_station_lets_its_devices_go(tmp_path: Path) -> None:
     before = threading.active_count()
     with mjpeg_camera() as camera:
-        config = VideoFingerCamera(64, 48, rate_hz=50.0, source=camera.url)
+        config = VideoFingerCamera(width=64, height=48, rate_hz=50.0, source=camera.url)
         wired = FolderScanner(folder=str(tmp_path), width=824, height=616)
         cell = build_cell(scenario(scanner=wired, finger_camera=config))
         names = {system.get_name() for system in cell.station.diagram.GetSystems()}
@@ -216,7 +216,7 @@ def test_a_diagram_that_stood_does_not_blame_the_device() -> None:
 def test_pictures_have_the_diagrams_time_though_it_runs_slower_and_stands() -> None:
     """The Diagram runs at a third of the wall's pace, then stands for a while."""
     with mjpeg_camera() as camera:
-        config = VideoFingerCamera(64, 48, rate_hz=50.0, source=camera.url, stamps="host")
+        config = VideoFingerCamera(width=64, height=48, rate_hz=50.0, source=camera.url, stamps="host")
         acquisition = acquire_pictures(config, config.open_source())
         acquisition.start(2.0, first_frame=True)
         builder = DiagramBuilder()

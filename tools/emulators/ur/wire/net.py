@@ -17,7 +17,7 @@ DIAL_LIMIT_S = 0.02
 TORN_S = 0.001
 
 
-@dataclass
+@dataclass(kw_only=True)
 class LinkFaults:
     """What is wrong with one connection; times are on the host's monotonic clock (s)."""
 

@@ -80,7 +80,7 @@ class SplitRow:
     reported: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CloudsOutcome:
     """A folder of scans. ``table1_camera``, ``table1_flange`` (n, 6): e_icp of the all-circles H with each scan as the
     verification, at the camera (roll, pitch, yaw, x, y, z) and at the flange; ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11)
@@ -115,7 +115,7 @@ class CloudsOutcome:
         return 1e3 * float(np.median([getattr(r, f"halves_{method}_m") for r in self.circles]))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Material:
     """What both methods see of one folder: our observations and the published circles of the same scans, and the CAD."""
 
@@ -132,7 +132,15 @@ class Material:
         face = self.faces[id]
         keep = np.random.default_rng(0).permutation(len(face))[:ICP_POINTS]
         kind: Method = "point_to_plane" if method == "plane" else "point_to_point"
-        return PublishedVerification(face[np.sort(keep)], self.data.poses[id], *self.model, kind, 0.01, 1.0)
+        return PublishedVerification(
+            points_C=face[np.sort(keep)],
+            X_BF=self.data.poses[id],
+            model_F=self.model[0],
+            normals_F=self.model[1],
+            method=kind,
+            max_distance_m=0.01,
+            unit_m=1.0,
+        )
 
 
 def study_clouds(
@@ -183,9 +191,20 @@ def study_clouds(
         for m, found in results.items()
     )
     return CloudsOutcome(
-        name, title, len(ids), material.seen.refused, held, tuple(rows), camera, flange, sights, np.array(path),
-        np.array(path_true), table, n_fit,
-    )  # fmt: skip
+        name=name,
+        title=title,
+        n=len(ids),
+        refused=material.seen.refused,
+        verification=held,
+        circles=tuple(rows),
+        table1_camera=camera,
+        table1_flange=flange,
+        sights=sights,
+        path=np.array(path),
+        path_true=np.array(path_true),
+        splits=table,
+        n_fit=n_fit,
+    )
 
 
 def read_material(data: Dataset, standard: FlangeStandard, seed: int) -> Material:
@@ -195,7 +214,13 @@ def read_material(data: Dataset, standard: FlangeStandard, seed: int) -> Materia
     clouds = {id: data.cloud(id) for id in data.clouds if id in good}
     circles, faces, _ = find_centres(clouds, segmented=True, seed=seed)
     return Material(
-        data, standard, seen, faces, published_pairs(circles, data.poses), good, published_model(standard, 8000)
+        data=data,
+        standard=standard,
+        seen=seen,
+        faces=faces,
+        circles=published_pairs(circles, data.poses),
+        good=good,
+        model=published_model(standard, 8000),
     )
 
 

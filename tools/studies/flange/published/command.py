@@ -78,7 +78,13 @@ def run_study(options: StudyOptions, progress: Progress) -> Study:
             )
             clouds.append(outcome)
     study = Study(
-        options, simulation, tuple(pairs), tuple(clouds), tuple(kinect), tuple(notes), time.monotonic() - start
+        options=options,
+        simulation=simulation,
+        pairs=tuple(pairs),
+        clouds=tuple(clouds),
+        kinect=tuple(kinect),
+        notes=tuple(notes),
+        wall_seconds=time.monotonic() - start,
     )
     drawn = pictures(study)
     for name, picture in drawn.items():

@@ -42,7 +42,7 @@ class StoredRuns:
         return RigidTransform(R, np.mean([X.translation() for X in ends], axis=0))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PairsOutcome:
     """One robot of which centre pairs are known. Errors in m at the flange centre, gross outliers (named) not scored.
 
@@ -108,9 +108,19 @@ def study_pairs(
     svd = _svd_folds(pairs, good, repeats, seed)
     ours = k_fold(good, folds=min(5, len(good)), repeats=repeats, seed=seed)
     return PairsOutcome(
-        name, title, len(pairs), outliers, table1, runs, np.concatenate(own), np.concatenate(true), np.array(medians),
-        matched, svd, ours[np.isfinite(ours)],
-    )  # fmt: skip
+        name=name,
+        title=title,
+        n=len(pairs),
+        outliers=outliers,
+        table1=table1,
+        runs=runs,
+        own_pool=np.concatenate(own),
+        true=np.concatenate(true),
+        run_medians=np.array(medians),
+        matched=matched,
+        svd=svd,
+        ours=ours[np.isfinite(ours)],
+    )
 
 
 def find_pools(H: tuple[RigidTransform, ...], pairs: list[Observation]) -> list[tuple[int, ...] | None]:
@@ -147,7 +157,7 @@ def _svd_folds(pairs: list[Observation], good: list[Observation], repeats: int, 
     return np.concatenate(errors)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class KinectOutcome:
     """Errors (m) at the wrist ring: ``residual`` of the all-pairs SVD, ``held_out`` of it and ``ours`` of the robust fit in 5 folds,
     ``compensated`` of H e with the paper's own e (Eq. (21)); ``shift_m`` how far that e moves the middle of the workspace, and
@@ -174,12 +184,12 @@ def study_kinect(name: str, pairs: list[Observation], *, repeats: int, seed: int
     ours = k_fold(pairs, folds=5, repeats=repeats, seed=seed)
     middle = np.mean([o.p_CR for o in pairs], axis=0)
     return KinectOutcome(
-        name,
-        len(pairs),
-        position_errors(X, pairs),
-        _svd_folds(pairs, pairs, repeats, seed),
-        ours[np.isfinite(ours)],
-        position_errors(X @ e, pairs),
-        float(np.linalg.norm(e @ middle - middle)),
-        float(np.linalg.norm(e.translation())),
+        name=name,
+        n=len(pairs),
+        residual=position_errors(X, pairs),
+        held_out=_svd_folds(pairs, pairs, repeats, seed),
+        ours=ours[np.isfinite(ours)],
+        compensated=position_errors(X @ e, pairs),
+        shift_m=float(np.linalg.norm(e @ middle - middle)),
+        at_camera_m=float(np.linalg.norm(e.translation())),
     )

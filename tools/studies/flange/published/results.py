@@ -29,7 +29,7 @@ class StudyOptions:
     quick: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Study:
     """All outcomes; ``notes`` are sentences about data that were missing or not usable."""
 

@@ -45,7 +45,7 @@ class Errors:
     at_tcp: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Simulation:
     """``levels_m`` (L,) noise; standard deviations (L, 6) and means (L, 6) of all pairs and of Algorithm 1 judged by the truth
     (Fig. 9); ``history`` (75 - 3, K, 6) of it at 1 mm (Fig. 10) with ``history_tcp`` (75 - 3, K) m, the mean true error;
@@ -183,15 +183,15 @@ def simulate(*, levels: int = 50, realisations: int = 100, seed: int = 0, progre
     mean = {k: np.array([x.e.mean(axis=0) for x in v]) for k, v in spread.items()}
     std = {k: np.array([x.e.std(axis=0, ddof=1) for x in v]) for k, v in spread.items()}
     return Simulation(
-        sigmas,
-        mean["all"],
-        std["all"],
-        mean["truth"],
-        std["truth"],
-        np.array([x.e for x in path]),
-        np.array([x.at_tcp.mean(axis=1) for x in path]),
-        {name: costs[name] for name in COSTS},
-        best_of_three,
+        levels_m=sigmas,
+        all_mean=mean["all"],
+        all_std=std["all"],
+        truth_mean=mean["truth"],
+        truth_std=std["truth"],
+        history=np.array([x.e for x in path]),
+        history_tcp=np.array([x.at_tcp.mean(axis=1) for x in path]),
+        costs={name: costs[name] for name in COSTS},
+        best_of_three=best_of_three,
     )
 
 
