@@ -19,7 +19,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
 from weldcal.tools.outcomes.calibration import error_summary
-from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, after_hold
 from weldcal.tools.outcomes.motion import motion_screen
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import render, write_atomic
@@ -71,9 +71,7 @@ class MotionOutcome:
         if e is None:
             expected = Expected("error in the middle of the frames, 95 %", "not known", "there is no calibration")
             found = Findings(against=against or ["There is no calibration."], unseen=0)
-            return FirstScreen(
-                found, expected, Next("Settle the reason, then run the job again."), more={"pose": "none was found"}
-            )
+            return FirstScreen(found, expected, after_hold(run.ended_by_operator), more={"pose": "none was found"})
         seen = self.record.seen
         p_C = np.array([fit.center_C for _, fit in seen])
         return motion_screen(

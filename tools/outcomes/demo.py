@@ -19,6 +19,7 @@ from weldcal.tools.outcomes.first_screen import (
     Next,
     ShownPose,
     Tolerance,
+    after_hold,
     refused_note,
     work_point_expected,
 )
@@ -152,7 +153,8 @@ class DemoResult:
     def _next(self) -> Next:
         folder, robot = self.folder, self.robot != "simulated"
         if self.state == "held":
-            return Next(
+            return after_hold(
+                self.run.ended_by_operator,
                 "Settle the reason; nothing goes on by itself. The doctor looks at scans and weld.",
                 f"weldcal doctor {folder}",
             )

@@ -17,6 +17,7 @@ from weldcal.tools.outcomes.first_screen import (
     FirstScreen,
     Next,
     Tolerance,
+    after_hold,
     expected_error,
     point_covariance,
     refused_note,
@@ -82,7 +83,7 @@ class MountingReport:
         what = f"error {1e3 * self.job.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
         if result is None:
             found = Findings(against=against or ["There is no result."], unseen=0)
-            after = Next("Settle the reason, then run the job again.")
+            after = after_hold(self.run.ended_by_operator)
             return FirstScreen(
                 found, Expected(what, "not known", "there is no calibration"), after, more={"pose": "none was found"}
             )

@@ -20,6 +20,7 @@ from weldcal.tools.outcomes.first_screen import (
     Next,
     ShownPose,
     Tolerance,
+    after_hold,
     point_covariance,
 )
 from weldcal.tools.outcomes.options import RunOptions
@@ -207,7 +208,7 @@ class ProfilerLive:
             against=against, tolerance=tolerance, no_tolerance=_NO_KEY, unseen=unseen, concerns=concerns
         )
         if held:
-            after = Next("Settle the reason, then run the job again.")
+            after = after_hold(self.run.ended_by_operator)
         else:
             after = Next(
                 "Take the same scans with your own profiler and calibrate from the file.",

@@ -6,7 +6,7 @@ import numpy as np
 
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.models.arrays import Array
-from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance, after_hold
 
 WORDS = "pose of the camera C in the robot's flange F"
 NO_KEY = "No scenario key states how exact a touch must be: compare the error with what your job allows."
@@ -48,13 +48,11 @@ def visits_screen(
     return FirstScreen(found, expected, _next(tolerance), (), more)
 
 
-def run_screen(first: FirstScreen | None, reason: str, found: Mapping[str, object]) -> FirstScreen:
-    """Of a run in simulation: its calibration's (None: it was held before), with the errors that the simulation knows."""
+def run_screen(first: FirstScreen | None, reason: str, found: Mapping[str, object], ended: bool = False) -> FirstScreen:
+    """Of a run in simulation: its calibration's (None: it was held before, or the operator `ended` it), with the errors that the simulation knows."""
     if first is None:
         lost = Findings(against=[reason or "The job was held."], unseen=0)
-        return FirstScreen(
-            lost, NOTHING, Next("Settle the reason, then run the job again."), more={"pose": "none was found"}
-        )
+        return FirstScreen(lost, NOTHING, after_hold(ended), more={"pose": "none was found"})
     unseen = found["unseen_touch_mm"]
     assert isinstance(unseen, Mapping)
     truth = (

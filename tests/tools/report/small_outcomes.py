@@ -234,7 +234,7 @@ def _run(name: str, **job: Any) -> Any:
     context = SimpleNamespace(get_time=lambda: 10.0)
     cell = SimpleNamespace(scenario=scenario, job=SimpleNamespace(**job))
     return SimpleNamespace(
-        cell=cell, root=context, held=False, reason=None, clock=None, seconds=10.0, wall_seconds=5.0,
+        cell=cell, root=context, held=False, ended_by_operator=False, reason=None, clock=None, seconds=10.0, wall_seconds=5.0,
         phases=[("start", 0.0, 0.0), ("scan_pose", 1.0, 0.5), ("done", 9.0, 4.5)], timing=lambda: timing,
     )  # fmt: skip
 
