@@ -224,6 +224,23 @@ def test_a_job_that_is_held_ends_with_1_and_says_why(capsys: pytest.CaptureFixtu
     assert "The tag was not seen." in said.err
 
 
+@pytest.mark.parametrize(
+    ("options", "stated"), [((), False), (("--browser",), True), (("--share",), True), (("--no-browser",), False)]
+)
+def test_json_says_that_it_opens_no_page(
+    options: tuple[str, ...], stated: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stop(*_: object) -> None:
+        raise InputError("Far enough.")
+
+    monkeypatch.setattr("weldcal.tools.commands.procedures.run_procedure", stop)
+    arguments = ["demo", "--json", *options, "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["weldcal", *arguments])
+    found = CliRunner().invoke(app, arguments)
+    assert "Far enough." in found.stderr
+    assert ("no page is opened" in found.stderr) == stated
+
+
 def test_what_no_scan_can_show_and_the_pose_does_not_need_is_no_row(capsys: pytest.CaptureFixture[str]) -> None:
     summary = {"state": "done", "unobservable": ["A rotation of the flange about its own axis."]}
     first = FirstScreen(Findings(unseen=8), Expected("error", "0.2 mm", "8 poses"), Next("Verify it."))

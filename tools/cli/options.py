@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -136,6 +137,10 @@ class Call:
     def live(self) -> dict[str, Any]:
         """The options of a live run; with --json no browser is opened."""
         found = {name: self.given[name] for name in (*LIVE, "record") if name in self.given}
+        if self.json and (found.get("share") or "--browser" in sys.argv):
+            console.emit_warning(
+                "With --json no page is opened: --browser and --share have no effect. Omit --json to see the run."
+            )
         return found | ({"browser": found["browser"] and not self.json} if "browser" in found else {})
 
     def folder(self, command: str, name: str) -> Path:
