@@ -22,7 +22,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools import console
 from weldcal.tools.cli.app import app
 from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
-from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
 
 HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
 

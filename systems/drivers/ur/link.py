@@ -21,7 +21,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.errors import RobotRefused
 from weldcal.systems.drivers.ur.faults import Fault, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
-from weldcal.systems.drivers.ur.shared import STATE, Memory, TornRead
+from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
 from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.wire.dashboard import stop_program
@@ -31,7 +31,6 @@ from weldcal.systems.messages import UrStatus
 START_LIMIT_S = 20.0
 CLOSE_LIMIT_S = 5.0
 HEARTBEAT_LIMIT_S = 0.15
-_AT = {name: i for i, name in enumerate(STATE)}
 PLAYING, PAUSING, PAUSED = 2, 3, 4
 
 
@@ -113,7 +112,7 @@ class UrLink:
             self._process.stdin.close()
         self._number = 0
         self._died: tuple[Fault, float] | None = None
-        self._last: tuple[float, ...] | None = None
+        self._last: Published | None = None
         self._stopper: threading.Thread | None = None
         self._finalizer = weakref.finalize(self, _kill, self._process)
 
@@ -163,12 +162,12 @@ class UrLink:
         while time.monotonic() < until:
             found = link._memory.state.read()
             if found is not None:
-                if found[_AT["phase"]] == Phase.OBEYING:
+                if found.phase == Phase.OBEYING:
                     return link
-                if found[_AT["fault"]]:
-                    fault = Fault(int(found[_AT["fault"]]))
+                if found.fault:
+                    fault = Fault(found.fault)
                     link._end()
-                    raise RobotRefused(sentence(fault, found[_AT["detail"]]))
+                    raise RobotRefused(sentence(fault, found.detail))
             if link._process.poll() is not None:
                 break
             time.sleep(0.01)
@@ -178,9 +177,13 @@ class UrLink:
 
     def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
         """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number. Never blocks."""
-        self._number += 1
-        self._memory.command.write([float(self._number), time.monotonic(), 0.0, float(process), *map(float, qd)])
+        self._give(qd, process=process)
         return self._number
+
+    def _give(self, qd: NDArray[np.float64], *, stop: bool = False, process: bool = False) -> None:
+        self._number += 1
+        command = Given(number=self._number, host_time=time.monotonic(), stop=stop, process=process, qd=qd)
+        self._memory.command.write(command)
 
     def rest(self) -> None:
         """Command zero velocity, with the process off, until the next command."""
@@ -194,7 +197,7 @@ class UrLink:
         """The controller's time (s) of the newest sample; 0 before the first. Never blocks."""
         with contextlib.suppress(TornRead):
             self._last = self._memory.state.read() or self._last
-        return 0.0 if self._last is None else self._last[_AT["robot_time"]]
+        return 0.0 if self._last is None else self._last.robot_time
 
     def state(self) -> LinkState:
         """The newest state. Never blocks.
@@ -208,42 +211,41 @@ class UrLink:
         if found is None:
             raise RuntimeError("the link has not started")
         now = time.monotonic()
-        fault, detail, fault_time = Fault(int(found[_AT["fault"]])), found[_AT["detail"]], found[_AT["fault_time"]]
-        if fault is Fault.NONE and self._died is None and found[_AT["phase"]] != Phase.ENDED:
+        fault, detail, fault_time = Fault(found.fault), found.detail, found.fault_time
+        if fault is Fault.NONE and self._died is None and found.phase != Phase.ENDED:
             limits = self._config.limits
-            quiet = now - found[_AT["heartbeat"]] > max(HEARTBEAT_LIMIT_S / limits.pace, limits.stale_s)
+            quiet = now - found.heartbeat > max(HEARTBEAT_LIMIT_S / limits.pace, limits.stale_s)
             if quiet or self._process.poll() is not None:
                 self._died = (Fault.WORKER_DIED, now)
                 _kill(self._process)
         if fault is Fault.NONE and self._died is not None:
             fault, fault_time = self._died
-        paused = found[_AT["runtime_state"]] in (PAUSING, PAUSED)
+        paused = found.runtime_state in (PAUSING, PAUSED)
         if fault is not Fault.NONE and (paused or ACTIONS.get(fault, Action.LEAVE) in (Action.STOP, Action.LEAVE)):
             self._see_to_the_stop()
-        q, qd = (np.array(found[_AT[name] : _AT[name] + 6]) for name in ("q0", "qd0"))
-        sampled_at = found[_AT["host_time"]]
+        sampled_at = found.host_time
         return LinkState(
-            q=q,
-            qd=qd,
-            robot_time=found[_AT["robot_time"]],
+            q=found.q,
+            qd=found.qd,
+            robot_time=found.robot_time,
             sampled_at=sampled_at,
             age_s=now - sampled_at,
             fault=fault,
             fault_time=fault_time,
-            sent=int(found[_AT["number"]]),
-            heard=int(found[_AT["echo"]]),
-            echo_latency_s=found[_AT["echo_latency"]],
-            worst_period_s=found[_AT["worst_period"]],
-            late_periods=int(found[_AT["late_periods"]]),
-            clock_residual_s=found[_AT["residual"]],
-            clock_drift=found[_AT["drift"]],
-            process_on=found[_AT["process"]] > 0.5,
-            arc=None if found[_AT["arc"]] < -0.5 else found[_AT["arc"]] > 0.5,
+            sent=int(found.number),
+            heard=int(found.echo),
+            echo_latency_s=found.echo_latency,
+            worst_period_s=found.worst_period,
+            late_periods=found.late_periods,
+            clock_residual_s=found.clock_residual,
+            clock_drift=found.clock_drift,
+            process_on=found.process_on,
+            arc=None if found.arc < 0 else found.arc > 0,
             detail=detail,
-            robot_mode=int(found[_AT["robot_mode"]]),
-            safety_mode=int(found[_AT["safety_mode"]]),
-            program_running=found[_AT["runtime_state"]] == PLAYING and fault is Fault.NONE,
-            speed_scaling=found[_AT["speed_scaling"]],
+            robot_mode=found.robot_mode,
+            safety_mode=found.safety_mode,
+            program_running=found.runtime_state == PLAYING and fault is Fault.NONE,
+            speed_scaling=found.speed_scaling,
         )
 
     def close(self) -> None:
@@ -251,12 +253,11 @@ class UrLink:
         if not self._finalizer.alive:
             return
         if self._process.poll() is None:
-            self._number += 1
-            self._memory.command.write([float(self._number), time.monotonic(), 1.0, 0.0, *[0.0] * 6])
+            self._give(np.zeros(6), stop=True)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(CLOSE_LIMIT_S / self._config.limits.pace)
         last = self._memory.state.read() or self._last
-        paused = last is not None and last[_AT["runtime_state"]] in (PAUSING, PAUSED)
+        paused = last is not None and last.runtime_state in (PAUSING, PAUSED)
         if self._process.returncode != 0 or paused:
             self._stop_program()
         if self._stopper is not None:

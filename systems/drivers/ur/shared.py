@@ -3,6 +3,9 @@
 import mmap
 import struct
 import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -12,6 +15,9 @@ _COUNT_BYTES = 8
 _CHECK = struct.Struct("<I")
 _TRIES = 50
 RING_ROWS = 1024  # 2 s at 500 Hz
+JOINTS = {"numbers": 6}  # metadata of a field that holds one number a joint
+
+T = TypeVar("T")
 
 
 class TornRead(RuntimeError):
@@ -70,6 +76,67 @@ class Block:
         raise TornRead("the shared memory could not be read consistently")
 
 
+class Record(Generic[T]):
+    """A block that holds the fields of a dataclass: float, int, bool, or an Array with its size as in JOINTS.
+
+    The layout is generated from the fields, so that both processes agree whatever their order is.
+    """
+
+    def __init__(self, memory: mmap.mmap, offset: int, kind: type[T]) -> None:
+        self._kind, self._parts = kind, tuple(_parts(kind))
+        self._block = Block(memory, offset, _numbers(kind))
+
+    @staticmethod
+    def size(kind: type[Any]) -> int:
+        """Bytes of a block that holds the fields of this dataclass."""
+        return Block.size(_numbers(kind))
+
+    def write(self, record: T) -> None:
+        """Replace all fields."""
+        values: list[float] = []
+        for name, _, count, _ in self._parts:
+            value = getattr(record, name)
+            if count is None:
+                values.append(value)
+            else:
+                values.extend(value)
+        self._block.write(values)
+
+    def read(self) -> T | None:
+        """The newest record; None where nothing has been written yet.
+
+        Raises:
+            TornRead: the writer changed the block during each attempt.
+        """
+        found = self._block.read()
+        if found is None:
+            return None
+        return self._kind(
+            **{
+                name: convert(found[at]) if count is None else np.array(found[at : at + count])
+                for name, at, count, convert in self._parts
+            }
+        )
+
+
+def _parts(kind: type[Any]) -> Iterator[tuple[str, int, int | None, Callable[[float], Any]]]:
+    """Of each field: its name, the index of its first number, how many numbers an Array has, and its type."""
+    at = 0
+    for item in fields(kind):
+        count: int | None = item.metadata.get("numbers")
+        if count is None and item.type not in (float, int, bool):
+            raise TypeError(f"{kind.__name__}.{item.name} is neither a number nor an array of a stated size")
+        yield item.name, at, count, item.type if callable(item.type) else float
+        at += 1 if count is None else count
+
+
+def _numbers(kind: type[Any]) -> tuple[str, ...]:
+    """A name for each number of the block."""
+    return tuple(
+        name if count is None else f"{name}{i}" for name, _, count, _ in _parts(kind) for i in range(count or 1)
+    )
+
+
 class JointRing:
     """The last joint positions with the host time (s, monotonic) at which the robot took them; one writer."""
 
@@ -108,45 +175,56 @@ class JointRing:
         return np.asarray((1.0 - w) * np.array(q0) + w * np.array(q1))
 
 
-COMMAND = ("number", "host_time", "stop", "process", *(f"qd{i}" for i in range(6)))
-STATE = (
-    "heartbeat",  # host time of the worker's last pass
-    "phase",  # Phase of the worker
-    "host_time",  # host time at which the robot took the sample
-    "robot_time",
-    *(f"q{i}" for i in range(6)),
-    *(f"qd{i}" for i in range(6)),
-    "robot_mode",
-    "safety_mode",
-    "runtime_state",
-    "speed_scaling",
-    "fault",
-    "detail",
-    "fault_time",
-    "number",  # of the newest command that was sent on
-    "sent_time",
-    "echo",  # newest number that the guard script has read
-    "echo_latency",
-    "worst_period",
-    "late_periods",  # passes that came more than 20 ms late
-    "process",  # 1 where the process output is on, as the controller reports it
-    "residual",  # of the clock fit, s
-    "drift",
-    "arc",  # 1 established, 0 not, -1: not wired
-)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Given:
+    """A command of the cell."""
+
+    number: int
+    host_time: float  # at which it was given
+    stop: bool
+    process: bool  # the process output is enabled
+    qd: Array = field(metadata=JOINTS)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Published:
+    """The state that the worker publishes in each pass; times in s."""
+
+    heartbeat: float  # host time of the worker's last pass
+    phase: int  # Phase of the worker
+    host_time: float  # host time at which the robot took the sample
+    robot_time: float
+    q: Array = field(metadata=JOINTS)
+    qd: Array = field(metadata=JOINTS)
+    robot_mode: int
+    safety_mode: int
+    runtime_state: int
+    speed_scaling: float
+    fault: int
+    detail: float  # of the fault
+    fault_time: float
+    number: float  # of the newest command that was sent on
+    sent_time: float
+    echo: float  # newest number that the guard script has read
+    echo_latency: float
+    worst_period: float
+    late_periods: int  # passes that came more than 20 ms late
+    process_on: bool  # the process output, as the controller reports it
+    clock_residual: float  # of the clock fit
+    clock_drift: float
+    arc: int  # 1 established, 0 not, -1: not wired
 
 
 class Memory:
     """The shared memory: one anonymous file, mapped by both processes."""
 
     def __init__(self, descriptor: int) -> None:
-        command, state = Block.size(COMMAND), Block.size(STATE)
         self._map = mmap.mmap(descriptor, self.size())
-        self.command = Block(self._map, 0, COMMAND)
-        self.state = Block(self._map, command, STATE)
-        self.ring = JointRing(self._map, command + state)
+        self.command = Record(self._map, 0, Given)
+        self.state = Record(self._map, Record.size(Given), Published)
+        self.ring = JointRing(self._map, Record.size(Given) + Record.size(Published))
 
     @staticmethod
     def size() -> int:
         """Bytes to reserve."""
-        return Block.size(COMMAND) + Block.size(STATE) + JointRing.size()
+        return Record.size(Given) + Record.size(Published) + JointRing.size()

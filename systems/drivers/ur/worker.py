@@ -20,7 +20,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.precedence import take_priority
 from weldcal.systems.drivers.ur.robot import Refused, Robot
-from weldcal.systems.drivers.ur.shared import Memory, TornRead
+from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import (
     PLAYING,
     STOPPING,
@@ -92,7 +92,7 @@ class Worker:
         self._gas_on = False
         self._points = SetPoints()
         self._ringed = -1.0
-        self._newest: tuple[float, ...] | None = None
+        self._newest: Given | None = None
         self._rest_since: float | None = None
         self._braking_since: float | None = None
 
@@ -142,14 +142,13 @@ class Worker:
         found = self._newest
         if found is None:
             return Command(orphaned=orphaned)
-        number, given_at, stop, process, *qd = found
         return Command(
-            number=int(number),
-            given_at=given_at,
-            qd=np.array(qd),
-            stop=bool(stop),
+            number=found.number,
+            given_at=found.host_time,
+            qd=found.qd,
+            stop=found.stop,
             orphaned=orphaned,
-            process=bool(process),
+            process=found.process,
         )
 
     def _with_torch(self, command: Command, robot: Robot, sample: RobotSample) -> Command:
@@ -183,9 +182,9 @@ class Worker:
             if old and (command.qd.any() or waited_for):
                 return  # the controller waits for the cell's next command
             self._driven = command.number
-            # while the cell computes without a limit the arm may stay at rest, but the process is not enabled
-            in_time = now - command.given_at <= self._config.limits.late_s
-            if not robot.send(command.scaled_qd, ACCELERATION, command.process and in_time, command.armed and in_time):
+            # The supervisor ends a late command with the torch on. Set points that wait for the torch are no fault: they go to zero.
+            armed = command.armed and now - command.given_at <= self._config.limits.late_s
+            if not robot.send(command.scaled_qd, ACCELERATION, command.process, armed):
                 self._phase = Phase.STOPPED  # the next sample shows the cause
         elif decision.action is Action.STOP:
             robot.forget()
@@ -216,19 +215,63 @@ class Worker:
             self._memory.ring.append(host_time, sample.q.tolist())
             self._ringed = sample.robot_time
         number, sent_at, echo = robot.numbers
-        values = [time.monotonic(), self._phase, host_time, sample.robot_time, *sample.q, *sample.qd]
-        values += [sample.robot_mode, sample.safety_mode, sample.runtime_state, sample.speed_scaling]
-        values += [decision.fault, decision.detail, self._fault_time, number, sent_at, echo, robot.echo_latency]
-        values += [self._worst, self._late, robot.process_on, robot.clock.residual_s, robot.clock.drift]
-        values.append(-1.0 if sample.arc is None else float(sample.arc))
-        self._memory.state.write([float(value) for value in values])
+        self._memory.state.write(
+            Published(
+                heartbeat=time.monotonic(),
+                phase=self._phase,
+                host_time=host_time,
+                robot_time=sample.robot_time,
+                q=sample.q,
+                qd=sample.qd,
+                robot_mode=sample.robot_mode,
+                safety_mode=sample.safety_mode,
+                runtime_state=sample.runtime_state,
+                speed_scaling=sample.speed_scaling,
+                fault=decision.fault,
+                detail=decision.detail,
+                fault_time=self._fault_time,
+                number=number,
+                sent_time=sent_at,
+                echo=echo,
+                echo_latency=robot.echo_latency,
+                worst_period=self._worst,
+                late_periods=self._late,
+                process_on=robot.process_on,
+                clock_residual=robot.clock.residual_s,
+                clock_drift=robot.clock.drift,
+                arc=-1 if sample.arc is None else sample.arc,
+            )
+        )
 
     def refuse(self, fault: Fault) -> None:
         """Publish the fault that made the start fail."""
-        values = [0.0] * len(self._memory.state.names)
-        values[0], values[1] = time.monotonic(), Phase.ENDED
-        values[self._memory.state.names.index("fault")] = float(fault)
-        self._memory.state.write(values)
+        self._memory.state.write(
+            Published(
+                heartbeat=time.monotonic(),
+                phase=Phase.ENDED,
+                host_time=0.0,
+                robot_time=0.0,
+                q=np.zeros(6),
+                qd=np.zeros(6),
+                robot_mode=0,
+                safety_mode=0,
+                runtime_state=0,
+                speed_scaling=0.0,
+                fault=fault,
+                detail=0.0,
+                fault_time=0.0,
+                number=0,
+                sent_time=0.0,
+                echo=0,
+                echo_latency=0.0,
+                worst_period=0.0,
+                late_periods=0,
+                process_on=False,
+                clock_residual=0.0,
+                clock_drift=0.0,
+                arc=0,
+            )
+        )
 
 
 def main() -> None:

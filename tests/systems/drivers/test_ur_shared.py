@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses as dc
 import mmap
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from weldcal.systems.drivers.ur.shared import COMMAND, RING_ROWS, STATE, Block, JointRing, Memory, TornRead
+from weldcal.systems.drivers.ur.shared import (
+    JOINTS,
+    RING_ROWS,
+    Block,
+    Given,
+    JointRing,
+    Memory,
+    Published,
+    Record,
+    TornRead,
+)
 
 NAMES = ("number", *(f"x{i}" for i in range(20)))
 
@@ -184,14 +196,58 @@ def test_the_ring_is_never_torn(descriptor: int) -> None:
         process.wait()
 
 
+def filled(kind: type[Any], first: float) -> Any:
+    """A record in which every number is another one, from `first` on."""
+    values: dict[str, Any] = {}
+    for item in dc.fields(kind):
+        start = first + 10.0 * len(values)
+        values[item.name] = np.arange(6.0) + start if item.metadata else item.type(start)  # type: ignore[operator]
+    return kind(**values)
+
+
+def assert_same(found: Any, written: Any) -> None:
+    for item in dc.fields(written):
+        given, back = getattr(written, item.name), getattr(found, item.name)
+        assert type(back) is type(given), item.name
+        np.testing.assert_array_equal(back, given, err_msg=item.name)
+
+
 def test_blocks_and_ring_do_not_overlap(tmp_path: Path) -> None:
     with (tmp_path / "memory").open("w+b") as file:
         file.truncate(Memory.size())
         memory, other = Memory(file.fileno()), Memory(file.fileno())
     for k in range(RING_ROWS + 1):
-        memory.command.write([1.0 + k] * len(COMMAND))
-        memory.state.write([2.0 + k] * len(STATE))
+        memory.command.write(filled(Given, 1.0 + k))
+        memory.state.write(filled(Published, 2.0 + k))
         memory.ring.append(3.0 + k, [4.0] * 6)
-    assert other.command.read() == (1.0 + RING_ROWS,) * len(COMMAND)
-    assert other.state.read() == (2.0 + RING_ROWS,) * len(STATE)
+    assert_same(other.command.read(), filled(Given, 1.0 + RING_ROWS))
+    assert_same(other.state.read(), filled(Published, 2.0 + RING_ROWS))
     assert other.ring.samples()[-1, 0] == 3.0 + RING_ROWS
+
+
+def remade(kind: type[Any], order: Sequence[int], added: bool) -> type[Any]:
+    """The same record with its fields in another order, and with a field more in the middle."""
+    given = dc.fields(kind)
+    columns: list[Any] = [(f.name, f.type, dc.field(metadata=dict(f.metadata))) for f in (given[k] for k in order)]
+    if added:
+        columns.insert(len(columns) // 2, ("added", np.ndarray, dc.field(metadata=JOINTS)))
+    return dc.make_dataclass(kind.__name__, columns, frozen=True, eq=False, kw_only=True)
+
+
+@pytest.mark.parametrize("kind", [Given, Published])
+@pytest.mark.parametrize("added", [False, True])
+def test_fields_in_any_order_and_one_more_come_back_by_name(kind: type[Any], added: bool, descriptor: int) -> None:
+    n = len(dc.fields(kind))
+    for seed in range(5):
+        other = remade(kind, np.random.default_rng(seed).permutation(n).tolist(), added)
+        memory = mmap.mmap(descriptor, 0)
+        written = filled(other, 1.0)
+        Record(memory, 64, other).write(written)
+        assert_same(Record(memory, 64, other).read(), written)
+    assert Record.size(other) == Record.size(kind) + added * 2 * 8 * 6
+
+
+def test_a_field_that_has_no_layout_is_refused(descriptor: int) -> None:
+    kind = dc.make_dataclass("Kind", [("name", str)])
+    with pytest.raises(TypeError, match=r"Kind\.name is neither a number nor an array"):
+        Record(mmap.mmap(descriptor, 0), 0, kind)

@@ -1,0 +1,273 @@
+"""The size and the shape of the source tree do not grow past what they have reached. BOUNDS is the place to change."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, cached_property
+
+import pytest
+
+from tests.contract.test_imports import FILES, imported, nodes
+from tests.places import ROOT
+
+# A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
+BOUNDS = {
+    "modules": 763,  # files with code in the five folders
+    "code lines": 84_500,  # without blank lines, comments and docstrings
+    "lines of studies": 18_700,  # in tools/studies, all lines
+    "tests that import studies": 66,  # outside tests/tools/studies
+    "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
+    "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only
+    "import closure of calibrate": 117,  # modules with code that the command needs, directly or not
+    "import cycles": 0,  # modules that import themselves through others, imports under TYPE_CHECKING included
+    "full folders": 1,  # outside tools/, with more than FULLEST_FOLDER modules
+}
+LONGEST_CALL = 6
+FULLEST_FOLDER = 15
+CALIBRATE = "weldcal.tools.commands.calibrate"
+SHOWN = 20  # places in a failure
+
+Places = list[str]
+
+
+class Sources:
+    """Parsed files by their path below the project's root."""
+
+    def __init__(self, texts: Mapping[str, str]) -> None:
+        self.texts = texts
+        self.trees = {path: ast.parse(text, filename=path) for path, text in texts.items()}
+        self.modules = {_module(path): path for path in texts if not path.startswith("tests/")}
+
+    def code(self) -> dict[str, ast.Module]:
+        """The files of the package that hold more than a docstring."""
+        found = {path: self.trees[path] for path in self.modules.values()}
+        return {path: tree for path, tree in found.items() if any(not isinstance(node, ast.Expr) for node in tree.body)}
+
+    def needed(self, module: str) -> set[str]:
+        """The modules that a module imports, at its top or inside a function."""
+        names = [name for dotted in imported(self.trees[self.modules[module]]) for name in (dotted, _parent(dotted))]
+        return {name for name in names if name in self.modules} - {module}
+
+    @cached_property
+    def graph(self) -> dict[str, set[str]]:
+        """The modules that each module imports."""
+        return {module: self.needed(module) for module in self.modules}
+
+
+def _module(path: str) -> str:
+    return "weldcal." + path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def _parent(dotted: str) -> str:
+    return dotted.rpartition(".")[0]
+
+
+def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
+    """The modules that can be reached from one by at least one import."""
+    found: set[str] = set()
+    new = set(graph.get(start, ()))
+    while new:
+        found |= new
+        new = {target for module in new for target in graph[module]} - found
+    return found
+
+
+def _prose(tree: ast.Module) -> set[int]:
+    """The lines of all docstrings."""
+    lines: set[int] = set()
+    for node in nodes(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
+            first = node.body[0]
+            if (
+                isinstance(first, ast.Expr)
+                and isinstance(first.value, ast.Constant)
+                and isinstance(first.value.value, str)
+            ):
+                lines |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    return lines
+
+
+def _code_lines(text: str, tree: ast.Module) -> int:
+    prose = _prose(tree)
+    lines = (line.strip() for number, line in enumerate(text.splitlines(), 1) if number not in prose)
+    return sum(bool(line) and not line.startswith("#") for line in lines)
+
+
+def _by_size(lengths: Mapping[str, int]) -> tuple[int, Places]:
+    return sum(lengths.values()), [f"{path}: {n}" for path, n in sorted(lengths.items(), key=lambda item: -item[1])]
+
+
+def _classes(sources: Sources) -> Iterator[tuple[str, ast.ClassDef]]:
+    for path in sources.modules.values():
+        for node in nodes(sources.trees[path]):
+            if isinstance(node, ast.ClassDef):
+                yield path, node
+
+
+def _fields(node: ast.ClassDef) -> int:
+    return sum(isinstance(part, ast.AnnAssign) and "ClassVar" not in ast.unparse(part.annotation) for part in node.body)
+
+
+def modules(sources: Sources) -> tuple[int, Places]:
+    """The files with code."""
+    found = sorted(sources.code())
+    return len(found), found
+
+
+def code_lines(sources: Sources) -> tuple[int, Places]:
+    """The lines of code, the longest files first."""
+    return _by_size({path: _code_lines(sources.texts[path], tree) for path, tree in sources.code().items()})
+
+
+def study_lines(sources: Sources) -> tuple[int, Places]:
+    """The lines of the studies, the longest first."""
+    studies = (path for path in sources.modules.values() if path.startswith("tools/studies/"))
+    return _by_size({path: len(sources.texts[path].splitlines()) for path in studies})
+
+
+def study_users(sources: Sources) -> tuple[int, Places]:
+    """The tests that import a study without testing it."""
+    tests = sorted(path for path in sources.trees if path.startswith("tests/"))
+    outside = [path for path in tests if not path.startswith("tests/tools/studies/")]
+    found = [
+        path
+        for path in outside
+        if any(f"{name}.".startswith("weldcal.tools.studies.") for name in imported(sources.trees[path]))
+    ]
+    return len(found), found
+
+
+def positional_calls(sources: Sources) -> tuple[int, Places]:
+    """The constructor calls, in the package and in tests, whose arguments are told apart by their order alone."""
+    names = {node.name for _, node in _classes(sources)}
+    found = [
+        f"{path}:{node.lineno} {called} ({len(node.args)})"
+        for path, tree in sources.trees.items()
+        for node in nodes(tree)
+        if isinstance(node, ast.Call) and len(node.args) > LONGEST_CALL
+        if (called := getattr(node.func, "id", getattr(node.func, "attr", ""))) in names
+    ]
+    return len(found), found
+
+
+def positional_dataclasses(sources: Sources) -> tuple[int, Places]:
+    """The large dataclasses whose constructors take positional arguments."""
+    found = [
+        f"{path}:{node.lineno} {node.name} ({_fields(node)})"
+        for path, node in _classes(sources)
+        for decorator in map(ast.unparse, node.decorator_list)
+        if "dataclass" in decorator and "kw_only=True" not in decorator and _fields(node) > LONGEST_CALL
+    ]
+    return len(found), found
+
+
+def calibrate_closure(sources: Sources) -> tuple[int, Places]:
+    """The modules with code that `weldcal calibrate` needs."""
+    code = {_module(path) for path in sources.code()}
+    assert CALIBRATE in code, f"{CALIBRATE} is not there: name the module of the command"
+    found = sorted((_reached(sources.graph, CALIBRATE) | {CALIBRATE}) & code)
+    return len(found), found
+
+
+def cycles(sources: Sources) -> tuple[int, Places]:
+    """The modules that import themselves through others."""
+    graph = sources.graph
+    found = [module for module in sorted(graph) if module in _reached(graph, module)]
+    return len(found), found
+
+
+def full_folders(sources: Sources) -> tuple[int, Places]:
+    """The folders outside tools/ with too many modules."""
+    folders = [path.rpartition("/")[0] for path in sources.code() if not path.endswith("/__init__.py")]
+    counts = {folder: folders.count(folder) for folder in sorted(set(folders)) if folder.split("/")[0] != "tools"}
+    found = [f"{folder}: {n}" for folder, n in counts.items() if n > FULLEST_FOLDER]
+    return len(found), found
+
+
+MEASURES: dict[str, Callable[[Sources], tuple[int, Places]]] = {
+    "modules": modules,
+    "code lines": code_lines,
+    "lines of studies": study_lines,
+    "tests that import studies": study_users,
+    "positional calls": positional_calls,
+    "positional dataclasses": positional_dataclasses,
+    "import closure of calibrate": calibrate_closure,
+    "import cycles": cycles,
+    "full folders": full_folders,
+}
+
+
+def verdict(figure: str, sources: Sources, bound: int) -> str:
+    """Empty where a figure keeps its bound; else the figure, its bound and the places."""
+    value, places = MEASURES[figure](sources)
+    if value <= bound:
+        return ""
+    more = [f"... and {len(places) - SHOWN} more"] if len(places) > SHOWN else []
+    return "\n  ".join([f"{figure}: {value}, and the bound is {bound}.", *places[:SHOWN], *more])
+
+
+@cache
+def tree() -> Sources:
+    """The project's own files."""
+    tests = {path.relative_to(ROOT).as_posix(): path for path in sorted((ROOT / "tests").rglob("*.py"))}
+    return Sources({name: path.read_text(encoding="utf-8") for name, path in {**FILES, **tests}.items()})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forgotten() -> Iterator[None]:
+    """The parsed files are not kept for the tests after these."""
+    yield
+    tree.cache_clear()
+    nodes.cache_clear()
+
+
+@pytest.mark.parametrize("figure", BOUNDS)
+def test_a_figure_keeps_its_bound(figure: str) -> None:
+    problem = verdict(figure, tree(), BOUNDS[figure])
+    assert not problem, problem
+
+
+SMALL = {
+    "tools/commands/calibrate.py": '"""Doc."""\nfrom weldcal.models import used\n',
+    "models/used.py": '"""Doc."""\n# a comment\n\nX = 1\n',
+    "models/__init__.py": '"""Nothing but a docstring."""\n',
+    "tests/models/test_used.py": "from weldcal.models.used import X\n",
+    "tests/tools/studies/test_study.py": "from weldcal.tools.studies import study\n",
+}
+SEVEN = "".join(f"    f{k}: int\n" for k in range(7))
+OFFENDERS = {
+    "modules": {"models/more.py": "Y = 2\n"},
+    "code lines": {"models/used.py": '"""Doc."""\nX = 1\nY = 2\n'},
+    "lines of studies": {"tools/studies/study.py": '"""Doc."""\n'},
+    "tests that import studies": {"tests/models/test_used.py": "from weldcal.tools.studies.study import run\n"},
+    "positional calls": {
+        "models/used.py": "class A:\n    pass\n",
+        "tests/models/test_used.py": "import weldcal.models.used as u\nu.A(1, 2, 3, 4, 5, 6, 7)\n",
+    },
+    "positional dataclasses": {"models/used.py": f"@dataclass(frozen=True)\nclass A:\n{SEVEN}"},
+    "import closure of calibrate": {
+        "models/used.py": "def f():\n    from weldcal.models.more import Y\n",
+        "models/more.py": "Y = 2\n",
+    },
+    "import cycles": {"models/used.py": "from weldcal.tools.commands import calibrate\n"},
+    "full folders": {f"calibration/m{k}.py": "Y = 2\n" for k in range(16)},
+}
+
+
+@pytest.mark.parametrize("figure", BOUNDS)
+def test_a_figure_that_grows_is_named_with_its_places(figure: str) -> None:
+    small, grown = Sources(SMALL), Sources({**SMALL, **OFFENDERS[figure]})
+    value, _ = MEASURES[figure](small)
+    assert verdict(figure, small, value) == ""
+    problem = verdict(figure, grown, value)
+    assert problem.startswith(f"{figure}: "), problem
+    assert f"the bound is {value}" in problem
+    assert len(problem.splitlines()) > 1, "the places are named"
+
+
+def test_what_is_allowed_raises_no_figure() -> None:
+    allowed = f"@dataclass(frozen=True, kw_only=True)\nclass A:\n{SEVEN}\n\nA(f0=1, f1=2)\nprint(1, 2, 3, 4, 5, 6, 7)\n"
+    sources = Sources({**SMALL, "models/used.py": allowed})
+    assert [MEASURES[figure](sources)[0] for figure in ("positional calls", "positional dataclasses")] == [0, 0]
+    assert MEASURES["modules"](sources)[0] == 2
