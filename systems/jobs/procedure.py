@@ -1,4 +1,4 @@
-"""Procedure: base of the jobs' state machines; phases, moves, timeouts, the operator's hold and guarded motion are here, once."""
+"""Procedure: base of the jobs' state machines: phases, moves, timeouts, the operator's hold, guarded motion."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -19,7 +19,10 @@ from weldcal.welding.servo.guards import ArmGuardConfig, guarded_joint_velocity
 ENDS = ("done", "held")
 GUARD = ArmGuardConfig()
 SPEED_SHARE = 0.5  # of the joints' speed limits, which a guarded motion may use, as in the SingularityGuard
-SLOWED = "The arm was slowed near a singular position or at a joint's speed limit: choose another home_deg, or move the target."
+SLOWED = (
+    "The arm was slowed near a singular position or at a joint's speed limit: choose another home_deg, or move the "
+    "target."
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,8 +93,8 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
 
     Attributes:
         inputs: the class of its inputs.
-        steps: for each phase the method that computes the next state. In a phase of `moves` it is called once the arm is
-            at rest at the goal, in another phase at each tick.
+        steps: for each phase the method that computes the next state. In a phase of `moves` it is called once the
+            arm is at rest at the goal, in another phase at each tick.
         moves: phases in which the FlangeMover drives the arm to the goal.
         driven: phases in which `drive`, or the welding servo, drives the arm.
         flags: for each further output port the phases in which it is 1.
@@ -161,7 +164,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def read(self, *optional: str, **ports: Any) -> None:
-        """Declare further input ports, each with a value of its type (a number: a vector of one), under the inputs' names.
+        """Declare further input ports under the inputs' names, each with a value of its type (a number: a vector of one).
 
         A port among `optional` may stay open: then its value is the one given here.
         """
@@ -271,8 +274,8 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
     def guarded(self, s: StateOf, now: InputsOf, arm: ArmModel, p_FP: Array, V: Array) -> tuple[StateOf, Array]:
         """Joint velocity (6,) rad/s for a spatial velocity of a point of the flange, as the SingularityGuard allows it.
 
-        Away from singularities it is the solution of the Jacobian's equations. Near one the arm is slowed along the same
-        line, and at one the procedure is held with a reason.
+        Away from singularities it is the solution of the Jacobian's equations. Near one the arm is slowed along the
+        same line, and at one the procedure is held with a reason.
 
         Args:
             s: the state.
@@ -290,7 +293,7 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return (s if s.slowed else replace(s, slowed=SLOWED)), found.q_dot
 
     def watched(self, s: StateOf, now: InputsOf, arm: ArmModel, p_FP: Array, q_dot: Array) -> tuple[StateOf, Array]:
-        """A joint velocity (6,) rad/s along a planned path, whose time is fixed: the guard holds it, and does not slow it."""
+        """A joint velocity (6,) rad/s along a planned path. Its time is fixed: the guard holds it and does not slow it."""
         limit = SPEED_SHARE * arm.velocity_limit
         J = jacobian(arm, now.q, p_FP)
         found = guarded_joint_velocity(J, J @ q_dot, limit, GUARD)
@@ -302,8 +305,8 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return self.held(
             s,
             now,
-            f"The arm came too near to a singular position in the phase '{self.where(s)}' (least singular value {sigma_min:.3f}): choose "
-            "another home_deg, or move the target.",
+            f"The arm came too near to a singular position in the phase '{self.where(s)}' (least singular value "
+            f"{sigma_min:.3f}): choose another home_deg, or move the target.",
         )
 
     def _why_stop(self, s: StateOf, now: InputsOf) -> str:
@@ -316,8 +319,8 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
             return f"The operator ended the job in phase '{self.where(s)}'."
         if now.time > self._maximum_time_s:
             return (
-                f"The job took longer than its {self._maximum_time_s:.0f} s, in the phase '{self.where(s)}': allow more with "
-                f"{self.maximum_time_key}."
+                f"The job took longer than its {self._maximum_time_s:.0f} s, in the phase '{self.where(s)}': allow more "
+                f"with {self.maximum_time_key}."
             )
         return ""
 

@@ -222,8 +222,8 @@ class ProfilerProcedure(Procedure[ProfilerState, ProfilerInputs]):
         return self.held(
             s,
             now,
-            f"The torch touches something in the step '{self.where(s)}', while it should be free: look for what is in the way, and at the "
-            "touch probe, its cable and input.",
+            f"The torch touches something in the step '{self.where(s)}', while it should be free: look for what is in "
+            "the way, and at the touch probe, its cable and input.",
         )
 
     def drive(self, s: ProfilerState, now: ProfilerInputs) -> tuple[ProfilerState, Array]:

@@ -1,4 +1,4 @@
-"""The tablet job and its plan: the camera takes one picture of the tablet, then the pen touches each of its landmarks."""
+"""The tablet job and its plan: one picture of the tablet, then the pen touches each of its landmarks."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""IterativeCalibrator: estimates X_BC until its expected error is small enough; CalibrationPosePlanner: the next pose."""
+"""IterativeCalibrator: estimates X_BC until its error is small enough; CalibrationPosePlanner: the next pose."""
 
 import dataclasses as dc
 from functools import partial
