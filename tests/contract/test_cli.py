@@ -22,6 +22,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools import console
 from weldcal.tools.cli.app import app
 from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
 
 HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
 
@@ -252,6 +253,32 @@ def test_a_job_that_is_held_ends_with_1_and_says_why(capsys: pytest.CaptureFixtu
     said = capsys.readouterr()
     assert json.loads(said.out)["state"] == "held"
     assert "The tag was not seen." in said.err
+
+
+@pytest.mark.parametrize(
+    ("options", "stated"), [((), False), (("--browser",), True), (("--share",), True), (("--no-browser",), False)]
+)
+def test_json_says_that_it_opens_no_page(
+    options: tuple[str, ...], stated: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stop(*_: object) -> None:
+        raise InputError("Far enough.")
+
+    monkeypatch.setattr("weldcal.tools.commands.procedures.run_procedure", stop)
+    arguments = ["demo", "--json", *options, "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["weldcal", *arguments])
+    found = CliRunner().invoke(app, arguments)
+    assert "Far enough." in found.stderr
+    assert ("no page is opened" in found.stderr) == stated
+
+
+def test_what_no_scan_can_show_and_the_pose_does_not_need_is_no_row(capsys: pytest.CaptureFixture[str]) -> None:
+    summary = {"state": "done", "unobservable": ["A rotation of the flange about its own axis."]}
+    first = FirstScreen(Findings(unseen=8), Expected("error", "0.2 mm", "8 poses"), Next("Verify it."))
+    report("calibrate", Outcome(summary, first=first), Call("calibrate", {}, ExitStack()))
+    assert "unobservable" not in capsys.readouterr().out
+    report("calibrate", Outcome(summary, first=first), Call("calibrate", {"json": True}, ExitStack()))
+    assert "unobservable" in capsys.readouterr().out
 
 
 def test_a_person_reads_short_values_with_their_units_and_every_refusal() -> None:

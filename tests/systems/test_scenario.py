@@ -370,6 +370,10 @@ def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
         ("arm: aubo_i5", "'aubo_i5' is none of them"),
         ("arm: ur3e\nrobot: !UrRtde {payload_kg: 3.5}", "the payload of a ur3e is 3 kg"),
         ("home_deg: [.nan, 0, 0, 0, 0, 0]", "home_deg must be finite"),
+        (
+            "home_deg: [0.0, -80.0, 200.0, -120.0, -90.0, 0.0]",
+            "home_deg puts joint 3 of the ur10e at 200 deg, and its limits are -180 to 180 deg: give an angle between them.",
+        ),
         ("calibration: {work_point_m: [1, 2]}", "calibration.work_point_m must hold 3 numbers, not 2"),
         ("robot: !UrRtde {payload_cog_m: [1, 2]}", "robot.payload_cog_m must hold 3 numbers, not 2"),
         ("robot: !UrRtde {payload_kg: -1}", "robot.payload_kg must not be negative"),

@@ -6,7 +6,7 @@ import platform
 import time
 import webbrowser
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -66,7 +66,13 @@ RECORDED = (*LIVE, "record")
 
 def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:
     """The options of a run; its folder is named after the command and the scenario."""
-    return RunOptions(scenario=scenario, out=call.folder(command, scenario), seed=call.seed, **{**call.live, **more})
+    return RunOptions(
+        scenario=scenario,
+        out=call.folder(command, scenario),
+        seed=call.seed,
+        keep_page=call.keep_page,
+        **{**call.live, **more},
+    )
 
 
 def named_once(name: str | None, scenario: str, preset: str) -> str:
@@ -190,7 +196,8 @@ def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> 
     from weldcal.tools.dashboard.server import Dashboard  # Flask takes a moment to load
 
     source = DashboardSource(LiveView(), person)
-    with closing(Dashboard(source, meshcat.web_url(), options.share)) as dashboard:
+    with ExitStack() as stack:
+        dashboard = stack.enter_context(closing(Dashboard(source, meshcat.web_url(), options.share)))
         console.emit_address("dashboard", dashboard.url)
         if dashboard.shared_url is not None:
             console.emit_address("read-only for the network", dashboard.shared_url)
@@ -201,6 +208,8 @@ def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> 
         finally:
             if not source.ended:
                 source.end(held=True, reason="The run has failed: the reason is in the terminal.", replays=False)
+        if options.keep_page is not None:
+            options.keep_page(source.conclude, stack.pop_all().close)
 
 
 def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTransform) -> None:
