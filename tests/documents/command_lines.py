@@ -53,7 +53,7 @@ SHORT = (
     (r"reproduce flange (\S+)", r"reproduce flange \1 --quick"),
     (r"reproduce flange-sphere$", "reproduce flange-sphere --scans 20 --draws 3"),
     (r"reproduce profiler$", "reproduce profiler --quick"),
-    (r"reproduce profiler-seeds$", "reproduce profiler-seeds --seeds 2"),
+    (r"benchmark profiler --what seeds$", "benchmark profiler --what seeds --seeds 2"),
     (r"reproduce tablet$", "reproduce tablet --trials 4"),
 )
 
