@@ -75,11 +75,7 @@ def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cas
 
 def _figures(results: Results) -> Figures:
     quiet = whole(results)["quiet"]
-    trials = [
-        Trial(**{name: float("nan") if value is None else value for name, value in r.items()})
-        for r in results.values()
-        if r["kind"] != "quiet"
-    ]
+    trials = [Trial(**_numbers(r)) for r in results.values() if r["kind"] != "quiet"]
     knocks = [t for t in trials if t.kind != "creep"]
     found = np.array([t.found_after_s for t in knocks])
     creeps = np.array([t.found_after_s for t in trials if t.kind == "creep"])
@@ -113,6 +109,11 @@ def _figures(results: Results) -> Figures:
         "threshold": quiet["threshold"],
         "targets": [{**t._asdict(), "met": t.met} for t in targets],
     }
+
+
+def _numbers(result: Mapping[str, Any]) -> dict[str, Any]:
+    """A trial's fields; JSON has null for NaN."""
+    return {name: float("nan") if value is None else value for name, value in result.items()}
 
 
 def _targets(figures: Figures) -> list[Target]:
