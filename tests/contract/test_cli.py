@@ -207,6 +207,37 @@ def test_every_failure_is_a_sentence(failure: Exception, words: str, capsys: pyt
     assert "Traceback" not in said.err
 
 
+def test_ctrl_c_ends_with_130_and_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as end, console.boundary(json_wanted=True, debug=False):
+        raise KeyboardInterrupt
+    assert end.value.exit_code == 130
+    said = capsys.readouterr()
+    assert said.err.startswith("weldcal: The operator ended the command.")
+    assert len(said.err.splitlines()) == 1
+    assert json.loads(said.out)["state"] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ["weld", "--scenario", "straight_grove"],
+            "There is no scenario 'straight_grove': did you mean 'straight_groove'?",
+        ),
+        (["weld", "--robot", "emulatd"], "There is no robot 'emulatd': did you mean 'emulated'?"),
+        (["hand-eye", "ax-yb", "poses.csv", "--robot", "ur10ee"], "There is no arm 'ur10ee'; did you mean 'ur10e'?"),
+        (["benchmark", "part-welds", "--part", "bracke"], "There is no part 'bracke': did you mean 'bracket'?"),
+    ],
+)
+def test_a_slip_of_the_keyboard_gets_the_nearest_name(
+    arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    finished = CliRunner().invoke(app, arguments)
+    assert finished.exit_code == 1
+    assert words in finished.stderr
+
+
 def test_debug_shows_where_it_happened(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit), console.boundary(json_wanted=False, debug=True):
         raise RuntimeError("bad luck")

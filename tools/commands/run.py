@@ -19,6 +19,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.keys import nearest
 from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
@@ -55,6 +56,7 @@ from weldcal.tools.report.run import RunOptions
 SIMULATED, EMULATED = "simulated", "emulated"
 EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this pace they do with other load
 SLOWEST_PACE = 0.05
+ALMOST = 0.8  # likeness to "emulated" from which on a word is a slip and not the name of a host
 GRAVITY = 9.82  # m/s^2, as a controller has it
 RECORDING: Final = "recording.mcap"
 _PACKAGES = ("drake", "numpy", "scipy", "open3d", "opencv-python-headless", "numba")
@@ -267,6 +269,9 @@ def chosen_robot(
         return
     kind, _, address = word.partition("@")
     if kind != EMULATED:
+        near = nearest(word, (SIMULATED, EMULATED), ALMOST)
+        if near is not None:
+            raise InputError(f"There is no robot '{word}': did you mean '{near}'? Or give the address of a controller.")
         host = controller_address(word)
         if pace is not None and not is_loopback(host):
             raise InputError(

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
+from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.next_scan import next_scan
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
@@ -82,7 +82,7 @@ class DemoResult:
     def warnings(self) -> tuple[str, ...]:
         """What the job warned of and did not hold for."""
         sequencer = self.run.cell.job.sequencer
-        return sequencer.job_state(sequencer.GetMyContextFromRoot(self.run.root)).warnings
+        return sequencer.state_in(sequencer.GetMyContextFromRoot(self.run.root)).warnings
 
     @property
     def first(self) -> FirstScreen:

@@ -25,7 +25,7 @@ from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.mounting.job import FOOT, AddedMounting
-from weldcal.systems.jobs.mounting.messages import MountingStatus
+from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
     Expected,

@@ -14,7 +14,7 @@ from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.estimates import pose_sigmas
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
-from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
     Expected,

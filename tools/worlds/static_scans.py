@@ -13,9 +13,9 @@ from weldcal.models.arrays import Array
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import ScannerPreset, depth_to_points, get_scanner
 from weldcal.tools.console import Progress
-from weldcal.tools.studies.motion.moving_scene import MovingScene, arm_bodies
-from weldcal.tools.studies.motion.robot_path import leaning
-from weldcal.tools.studies.motion.world import MotionWorld, facing
+from weldcal.tools.worlds.motion import MotionWorld, facing
+from weldcal.tools.worlds.moving_scene import MovingScene, arm_bodies
+from weldcal.tools.worlds.robot_path import leaning
 
 GRID, SIDE_M, HEIGHT_M, PERTURBED_M = 4, 0.2, 0.22, 0.02
 _STILL = ScannerStream(exposure_s=0.0)

@@ -1,15 +1,21 @@
-"""Workpieces under a simulated profiler: meshes of the S-shaped V-groove and the frustum."""
+"""Workpieces under a simulated profiler: the S-shaped V-groove and the frustum; whole worlds with both, simulated or from files."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.profilers import ProfilerPreset, cast_profiles, make_scene
-from weldcal.tools.studies.profiler.worlds import SphereWorld
+from weldcal.tools.worlds.profiler import SphereTests, SphereTrial, SphereWorld, sphere_trial
 
+MM = 1e-3
 LENGTH_M, SWING_M, DEPTH_M = 0.300, 0.025, 0.060
 HALF_M = DEPTH_M * np.tan(np.radians(22.5))
 STATIONS = 25
@@ -129,3 +135,57 @@ def scan_boss(world: SphereWorld, seed: int, profiles: int = 90) -> tuple[Floats
     q = world.joints(*world.viewing(np.tile(R, (profiles, 1, 1)), np.tile([0.0, 0.0, 0.205], (profiles, 1)), at))
     clean = _seen(world, boss_mesh(), turn, place, world.repeated(q, rng), _perfect(0.144, 320))
     return q, world.measured(clean, rng)
+
+
+@dataclass(frozen=True, eq=False)
+class WorldData:
+    """One world: what is calibrated from, and what is measured afterwards where there is any."""
+
+    trial: SphereTrial
+    groove: GrooveScan | None = None
+    boss: tuple[Floats, Floats] | None = None
+    sigmas: SphereSigmas | None = None
+
+
+def made_worlds(count: int, seed: int, grooves: int, bosses: int) -> Iterator[WorldData]:
+    """Made from seeds, as the fixed files were; no two seeds share a world."""
+    for k in range(count):
+        one = 1000 * seed + k
+        world = SphereWorld.like_the_files(one)
+        groove = scan_groove(world, one) if k < grooves else None
+        yield WorldData(sphere_trial(world, one), groove, scan_boss(world, one) if k < bosses else None)
+
+
+def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
+    """Of the fixed files.
+
+    Raises:
+        InputError: they are not there.
+    """
+    for name in ("sphere", "groove", "boss"):
+        if not (folder / f"{name}.npz").is_file():
+            raise InputError(f"There is no {name}.npz in '{folder}': omit --data to make worlds from seeds.")
+    d, g, b = (dict(np.load(folder / f"{name}.npz")) for name in ("sphere", "groove", "boss"))
+    arm = DhArm.checked(d["dh_nominal"] * [MM, np.radians(1.0), MM, np.radians(1.0)])
+    for w in range(min(count, len(d["scan_T"]))):
+        data = SphereData(
+            poses=_poses(d["scan_T"][w]),
+            profiles=[p * MM for p in d["scan_prof"][w].astype(float)],
+            radius_m=float(d["radius"]) * MM,
+            touches=_poses(d["touch_T"][w]),
+            tip=d["tip_nominal"][w] * MM,
+            arm=arm,
+            q=d["scan_q"][w],
+            touch_q=d["touch_q"][w],
+        )
+        tests = SphereTests(d["test_q_view"][w], d["test_m"][w] * MM, d["test_q_touch"][w], d["test_point"][w])
+        groove = boss = None
+        if w < len(g["q"]):
+            groove = GrooveScan(g["q"][w], g["prof"][w].astype(float) * MM, g["feat"][w] * MM, g["q_touch"][w])
+        if w < len(b["q"]):
+            boss = b["q"][w], b["prof"][w].astype(float) * MM
+        yield WorldData(SphereTrial(data, d["scan_sign"][w], d["scan_kind"][w] == 0, tests), groove, boss)
+
+
+def _poses(T: Floats) -> FlangePoses:
+    return FlangePoses(T[:, :3, :3], T[:, :3, 3] * MM)

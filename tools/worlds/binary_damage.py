@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.tools.studies.files.text_mutations import Damage, Rng, any_text
+from weldcal.tools.worlds.text_damage import Damage, Rng, any_text
 
 _HUGE = ("0", "-1", "59", "61", "100000000", "5000000000", "99999999999999999999", "1.5", "x", "")
 

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 
 Vector = tuple[float, float, float]
@@ -84,3 +85,36 @@ class Disturbance:
 
 def _pose(mm: Vector, deg: Vector) -> RigidTransform:
     return RigidTransform(RollPitchYaw(np.radians(deg)), 1e-3 * np.array(mm))
+
+
+def disturbance_of(knock: str = "", creep: str = "", base: str = "", warm_up: str = "") -> Disturbance:
+    """What happens while the scanner streams, from the numbers of the command line; "" for nothing.
+
+    Raises:
+        InputError: a text is no such list of numbers.
+    """
+    knocked = _numbers(knock, "--knock", (4, 7))
+    creeping = _numbers(creep, "--creep", (4,))
+    based = _numbers(base, "--base", (4, 7))
+    warming = _numbers(warm_up, "--warm-up", (2, 3))
+    return Disturbance(
+        knock_s=knocked[0], knock_mm=_vector(knocked[1:4]), knock_deg=_vector(knocked[4:7]),
+        creep_s=creeping[0], creep_mm_per_min=_vector(creeping[1:4]),
+        base_s=based[0], base_mm=_vector(based[1:4]), base_deg=_vector(based[4:7]),
+        warm_up_s=warming[0], warm_up_scale=1e-6 * warming[1], warm_up_gradient_per_m=1e-6 * warming[2],
+    )  # fmt: skip
+
+
+def _numbers(text: str, name: str, counts: tuple[int, ...]) -> tuple[float, ...]:
+    """Seven numbers, zeros behind those given."""
+    try:
+        given = tuple(float(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        given = (float("nan"),)
+    if text and (len(given) not in counts or not all(abs(v) < 1e6 for v in given)):
+        raise InputError(f"{name} takes {' or '.join(map(str, counts))} numbers with commas between, and is '{text}'.")
+    return given + (0.0,) * (7 - len(given))
+
+
+def _vector(values: tuple[float, ...]) -> Vector:
+    return values[0], values[1], values[2]

@@ -1,4 +1,4 @@
-"""Draws motions through corners of a cube, and what a streaming scanner sees of them."""
+"""Draws motions through corners of a cube, what a streaming scanner measures of them, and what chance alone makes of its errors."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.geometry.se3 import inverse
+from weldcal.calibration.geometry.se3 import difference, exp_rotation, inverse, skew
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.planning.moves import ROBOT, Moves, closed_moves
 from weldcal.models.arms.chain import chain_inverse, load_chain
@@ -21,6 +21,7 @@ CENTRE_SIGMA_M = (
 )  # of a centre, across and along the normal: 0.5 mm of noise in some ten thousand points
 NORMAL_SIGMA = 5e-4
 FRAME_S, DELAY_S, JITTER_S = 0.05, 0.140, 0.015
+_STEP_S, _ROUNDS = 1e-4, 3  # of the exact fit
 _SHAPE = 4.0  # of the gamma law of the transport's tail: skewness 1
 
 
@@ -154,3 +155,44 @@ def hand_moves(
             near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
             q.append(near)
     return closed_moves(np.array(q), linear=linear), X_FC, X_BT
+
+
+def exact_errors(frames: ObservedFrames, capture: Array, moves: Moves, X_BC: RigidTransform) -> Array:
+    """Errors (7,) of X_BC's six and of the clock's offset in sigmas, by least squares with the true motion and noise.
+
+    The capture times (N,) s are known but for an offset and a drift, as those of a device are. An estimator can do no better, so that
+    what this differs from the normal law by is the draw.
+    """
+    X = moves.at(capture)
+    rate = (moves.at(capture + _STEP_S) - moves.at(capture - _STEP_S)) / (2.0 * _STEP_S)
+    p, n = X[:, :3, 3], X[:, :3, 2]
+    A = _tangents(n)
+    At = np.swapaxes(A, 1, 2)
+    g = np.concatenate([rate[:, :3, 3], np.einsum("nij,nj->ni", At, rate[:, :3, 2])], axis=1)
+    found = X_BC
+    N = np.eye(8)
+    offset = 0.0
+    for _ in range(_ROUNDS):
+        R, t = found.rotation().matrix(), np.asarray(found.translation())
+        y = np.concatenate([frames.p_C @ R.T + t - p, np.einsum("nij,nj->ni", At, frames.n_C @ R.T - n)], axis=1)
+        J = np.zeros((len(capture), 5, 8))
+        J[:, :3, :3], J[:, :3, 3:6] = -skew(frames.p_C @ R.T), np.eye(3)
+        J[:, 3:, :3] = -At @ skew(frames.n_C @ R.T)
+        J[:, :, 6], J[:, :, 7] = -g, -g * (capture - capture.mean())[:, None]
+        W = np.zeros((len(capture), 5, 5))
+        W[:, :3, :3] = np.linalg.inv(R @ frames.covariance @ R.T)
+        W[:, 3, 3] = W[:, 4, 4] = 1.0 / frames.normal_sigma**2
+        N = np.einsum("nia,nij,njb->ab", J, W, J)
+        step = -np.linalg.solve(N, np.einsum("nia,nij,nj->a", J, W, y))
+        turn = RotationMatrix.ProjectToRotationMatrix(exp_rotation(step[:3]) @ R)
+        found, offset = RigidTransform(turn, t + step[3:6]), float(step[6])
+    error = np.append(-difference(found.GetAsMatrix4(), X_BC.GetAsMatrix4()), offset)
+    return np.asarray(error / np.sqrt(np.diag(np.linalg.inv(N))[:7]))
+
+
+def _tangents(n: Array) -> Array:
+    """Two unit vectors (N, 3, 2) at right angles to normals n (N, 3)."""
+    other = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    x = np.cross(n, other)
+    x /= np.linalg.norm(x, axis=1)[:, None]
+    return np.stack([x, np.cross(n, x)], axis=2)

@@ -24,9 +24,9 @@ from weldcal.models.scanner_streams import ScannerStream, get_stream
 from weldcal.models.scanners import ScannerPreset, depth_to_points, get_scanner
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.motion.disturbance import Disturbance
-from weldcal.tools.studies.motion.moving_scene import Body, MovingScene, arm_bodies
-from weldcal.tools.studies.motion.robot_path import RobotPath, cube_poses, path_through, reachable_start
+from weldcal.tools.worlds.disturbance import Disturbance
+from weldcal.tools.worlds.moving_scene import Body, MovingScene, arm_bodies
+from weldcal.tools.worlds.robot_path import RobotPath, cube_poses, path_through, reachable_start
 
 _DEPTH_STEP_M = 1e-5  # of the stored depths: a tenth of the smallest noise
 _POSE_DIGITS, _JOINT_DIGITS = 6, 6  # decimals of the stream's numbers

@@ -1,28 +1,42 @@
-"""Damaged files for every reader, in child processes: accepted or refused by a sentence, or something that must not be."""
+"""`weldcal benchmark fuzz-files`: damaged files for every reader, read in a child process."""
 
 import json
-import os
-import selectors
-import shutil
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 
 from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.files.cases import CRASH, GOOD, HANG, MEMORY, Verdict, damaged, lay_out
-from weldcal.tools.studies.files.readers import READERS, Reader
+from weldcal.tools.worlds.damaged_files import (
+    GOOD,
+    READERS,
+    Reader,
+    damaged,
+    lay_out,
+)
+from weldcal.tools.worlds.damaged_reading import Child
 
-WATCHDOG_S = 10.0
-WORKER = ("-m", "weldcal.tools.studies.files.worker")
-_START_S = 120.0  # to import everything, on a slow computer
 _KEPT = 20  # offending files of each reader and verdict
+
+
+@command("benchmark fuzz-files", short_help="Give every file reader damaged files.")
+def benchmark_fuzz_files(
+    call: Call,
+    cases: Annotated[int, option("--cases", "N", "Damaged files for each reader.", min=1)] = 1000,
+    readers: Annotated[
+        list[str] | None, option("--readers", "NAME", "Only this reader; repeat for more.", show_default="all")
+    ] = None,
+) -> Outcome:
+    """Damage files of every format by its own grammar: each reader must accept or refuse them by a sentence, in 10 s and 1 GB."""
+    wanted = chosen(readers or ())
+    result = fuzz_files(wanted, cases, call.seed, call.folder("benchmark", "fuzz-files"), call.progress)
+    rows = {name: ", ".join(f"{n} {said}" for said, n in count.most_common()) for name, count in result.counts.items()}
+    return Outcome(result.summary(), values={}, rows=rows)
 
 
 @dataclass(frozen=True)
@@ -84,7 +98,7 @@ def fuzz_files(
     counts = {reader.name: Counter[str]() for reader in readers}
     slowest = dict.fromkeys(counts, 0.0)
     findings: list[Finding] = []
-    with TemporaryDirectory() as place, _Child(Path(place)) as child:
+    with TemporaryDirectory() as place, Child(Path(place)) as child:
         for n, reader in enumerate(readers):
             for case in range(cases):
                 verdict, seconds = child.ask(reader, seed, case)
@@ -107,72 +121,3 @@ def _keep(reader: Reader, seed: int, case: int, out: Path) -> str:
     folder = out / f"{reader.name}-{case}"
     lay_out(folder, files, reader.target, place)
     return str(folder)
-
-
-class _Child:
-    """A worker process, started anew after it hung, died or took too much memory."""
-
-    def __init__(self, place: Path) -> None:
-        self._place = place
-        self._process: subprocess.Popen[str] | None = None
-
-    def __enter__(self) -> "_Child":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._end()
-
-    def ask(self, reader: Reader, seed: int, case: int) -> tuple[Verdict, float]:
-        """The verdict of a case, and how many seconds it took with making its files."""
-        limit = WATCHDOG_S if self._process is not None else WATCHDOG_S + _START_S
-        process = self._process or self._start()
-        assert process.stdin is not None
-        try:
-            process.stdin.write(f"{reader.name} {seed} {case}\n")
-            process.stdin.flush()
-        except BrokenPipeError:
-            self._end()
-            return Verdict(CRASH, "the worker ended before the case"), 0.0
-        answer = self._line(process, limit)
-        if answer is None:
-            hung = process.poll() is None
-            self._end()
-            if hung:
-                return Verdict(HANG, f"no answer within {WATCHDOG_S:g} s"), WATCHDOG_S
-            return Verdict(CRASH, f"exit {process.returncode}"), 0.0
-        said: dict[str, Any] = json.loads(answer)
-        if said["said"] == MEMORY:  # the next case begins with little
-            self._end()
-        return Verdict(said["said"], said["detail"]), said["seconds"]
-
-    def _start(self) -> subprocess.Popen[str]:
-        shutil.rmtree(self._place, ignore_errors=True)
-        self._place.mkdir()
-        command = [sys.executable, "-P", *WORKER, str(self._place)]
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
-        )
-        return self._process
-
-    def _line(self, process: subprocess.Popen[str], limit: float) -> str | None:
-        """The next line of the worker; None where none comes in time, or the worker ends."""
-        assert process.stdout is not None
-        with selectors.DefaultSelector() as selector:
-            selector.register(process.stdout, selectors.EVENT_READ)
-            if not selector.select(limit):
-                return None
-        line = process.stdout.readline()
-        if not line:
-            process.wait()
-        return line or None
-
-    def _end(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-            self._process = None
