@@ -264,12 +264,28 @@ def test_json_says_that_it_opens_no_page(
     def stop(*_: object) -> None:
         raise InputError("Far enough.")
 
-    monkeypatch.setattr("weldcal.tools.commands.procedures.run_procedure", stop)
+    monkeypatch.setattr("weldcal.tools.commands.demo.run_procedure", stop)
     arguments = ["demo", "--json", *options, "--out", str(tmp_path)]
     monkeypatch.setattr("sys.argv", ["weldcal", *arguments])
     found = CliRunner().invoke(app, arguments)
     assert "Far enough." in found.stderr
     assert ("no page is opened" in found.stderr) == stated
+
+
+def test_a_runs_page_shows_its_result_before_it_closes() -> None:
+    happened: list[str] = []
+    first = FirstScreen(Findings(unseen=8), Expected("error", "0.2 mm", "8 poses"), Next("Verify it."))
+
+    def show(what: FirstScreen | None, folder: Path | None) -> None:
+        happened.append(f"shown {what is first}")
+
+    call = Call("demo", {}, ExitStack())
+    call.keep_page(lambda *_: happened.append("the first run's"), lambda: happened.append("closed first"))
+    call.keep_page(show, lambda: happened.append("closed"))
+    report("demo", Outcome({"state": "done"}, first=first), call)
+    call.close_page()
+    call.close_page()
+    assert happened == ["closed first", "shown True", "closed"]
 
 
 def test_what_no_scan_can_show_and_the_pose_does_not_need_is_no_row(capsys: pytest.CaptureFixture[str]) -> None:

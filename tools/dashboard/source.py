@@ -33,6 +33,8 @@ from weldcal.tools.report.first_screen import FirstScreen
 BY = "the dashboard"
 PAGES = ("recording.html", "report.html")
 """What the page shows of a run that has ended."""
+LEFT_OUT = ("verdict", "next", "rotation vector", "quaternion wxyz", "4 x 4, m")
+"""Rows of the first screen that the page shows elsewhere, or leaves to the report."""
 PACE_OVER_S = 2.0
 
 
@@ -63,12 +65,12 @@ class DashboardSource:
         """Take the result: the first screen and the folder that holds report.html and recording.html; None: there is none."""
         if folder is not None:
             self.files = {name: folder / name for name in PAGES if (folder / name).exists()}
-        rows = {} if first is None else first.rows()
+        rows = {} if first is None else {n.strip(): t for n, t in first.rows().items() if n.strip() not in LEFT_OUT}
         self.result = {
             "verdict": None if first is None else first.verdict,
             "tone": "" if first is None else first.tone,
             "reason": "" if first is None else first.reason,
-            "rows": [[name.strip(), text] for name, text in rows.items() if name.strip() not in ("verdict", "next")],
+            "rows": [[name, text] for name, text in rows.items()],
             "files": list(self.files),
             "folder": "" if folder is None else str(folder.absolute()),
         }

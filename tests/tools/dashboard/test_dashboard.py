@@ -296,7 +296,8 @@ def test_the_page_keeps_result_report_and_replay_when_the_program_has_ended(
     assert not browser.run("return document.getElementById('live_view').offsetHeight"), "its server is gone"
     bar = "const r = document.querySelector('.replay').getBoundingClientRect(); const f = loaded['recording.html'].getBoundingClientRect();"
     assert browser.run(bar + "return r.bottom <= f.top + 1 && f.height > 200"), "nothing covers REPLAY"
-    browser.screenshot(tmp_path / f"done_{size}.png")
+    pixels = browser.screenshot(tmp_path / f"done_{size}.png", until=lambda picture: colours(picture) > 60)
+    assert colours(pixels) > 60, "the replay is drawn"
     browser.run("choose('report.html')")
     assert browser.run(
         "return loaded['report.html'].contentWindow.ran === 1 && loaded['report.html'].offsetHeight > 200"

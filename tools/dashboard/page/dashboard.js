@@ -195,6 +195,7 @@ function choose(name) {
   chosen = name;
   for (const [other, frame] of Object.entries(loaded)) frame.hidden = other !== name;
   show("live_view", !loaded[name]);
+  if (loaded[name]) loaded[name].contentWindow.dispatchEvent(new Event("resize"));
   show("replay", name !== "report.html");
   for (const b of el("pages").children) b.setAttribute("aria-pressed", String(b.dataset.key === name));
 }
@@ -211,7 +212,7 @@ function load(name) {
     const b = element("button", PAGE_NAMES[name]);
     b.type = "button"; b.dataset.key = name;
     b.addEventListener("click", () => choose(name));
-    el("pages").append(b);
+    if (name === "recording.html") el("pages").prepend(b); else el("pages").append(b);
     show("pages", true);
     choose(name === "recording.html" || !chosen ? "recording.html" : chosen);
   };
