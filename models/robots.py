@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from weldcal.models.arms.chain import Chain, is_urdf, load_chain
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.keys import did_you_mean
 
 ISO_50, ISO_80 = "iso9409-1-50-4-m6", "iso9409-1-80-6-m8"
 CLOSED_FORM, NUMERIC = "closed form", "numeric"
@@ -204,7 +205,8 @@ def get_robot(name: str) -> Robot:
     key = name.strip().lower().replace("-", "_").replace(" ", "_")
     robot = ROBOTS.get(ALIASES.get(key, key))
     if robot is None:
-        raise InputError(f"Robot '{name}' is not known: use one of {', '.join(ROBOTS)}.")
+        listed = f"use one of {', '.join(ROBOTS)}."
+        raise InputError(f"Robot '{name}' is not known: {did_you_mean(key, (*ROBOTS, *ALIASES), listed)}")
     return robot
 
 

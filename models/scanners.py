@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from weldcal.models.depth_noise import Depth, DepthNoise, measured_points, noisy_depth
 from weldcal.models.errors import InputError
+from weldcal.models.keys import did_you_mean
 from weldcal.models.scanner_files import read_scanner_file
 
 Floats = npt.NDArray[np.float64]
@@ -184,7 +185,8 @@ def get_scanner(name: str, width: int | None = None, height: int | None = None) 
     else:
         preset = SCANNERS.get(name.strip().lower().replace("-", "_"))
     if preset is None:
-        raise InputError(f"Scanner '{name}' is not known: use one of {', '.join(SCANNERS)}, or a scanner file (.yaml).")
+        listed = f"use one of {', '.join(SCANNERS)}, or a scanner file (.yaml)."
+        raise InputError(f"Scanner '{name}' is not known: {did_you_mean(name, SCANNERS, listed)}")
     if width is None:
         if height is not None:
             raise InputError("A scanner is resized by its width: give the width too, or omit the height.")

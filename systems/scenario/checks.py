@@ -11,7 +11,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.jobs.discovery import job_of, jobs
-from weldcal.systems.scenario.numbers import check_numbers
+from weldcal.systems.scenario.numbers import check_home, check_numbers
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
 from weldcal.systems.scenario.workpiece import check_workpiece
 from weldcal.welding.servo.laws import get_law
@@ -100,6 +100,7 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     found = job_of(scenario)  # raises for the parts of two jobs
     check_numbers(scenario)
+    check_home(scenario.home_deg, scenario.arm)
     check_inputs(scenario)
     if found.key and scenario.base != PoseConfig():
         raise InputError(

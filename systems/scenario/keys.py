@@ -1,13 +1,11 @@
 """Names the keys and drivers of a scenario that its schema does not have, each with the nearest known one."""
 
 import dataclasses as dc
-from difflib import get_close_matches
 from types import UnionType
 from typing import Any, get_args, get_origin
 
 from weldcal.models.errors import InputError
-
-NEAREST = 0.6  # smallest likeness of a suggestion
+from weldcal.models.keys import nearest
 
 
 def check_keys(schema: type, document: Any, place: str = "") -> None:
@@ -44,8 +42,8 @@ def _check_value(kind: Any, value: Any, place: str) -> None:
 
 
 def _suggestion(word: str, known: Any, mark: str = "") -> str:
-    near = get_close_matches(word, list(known), n=1, cutoff=NEAREST)
-    if near:
-        return f"; the nearest one is '{mark}{near[0]}'"
+    near = nearest(word, known)
+    if near is not None:
+        return f"; the nearest one is '{mark}{near}'"
     listed = ", ".join(f"{mark}{name}" for name in known)
     return f"; known are {listed}"

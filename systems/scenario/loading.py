@@ -12,6 +12,7 @@ from pydrake.common.yaml import yaml_load, yaml_load_typed
 from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
+from weldcal.models.keys import did_you_mean
 from weldcal.models.limits import LARGEST_DOCUMENT
 from weldcal.models.scanners import get_scanner, is_scanner_file
 from weldcal.systems.drivers.config import DEVICES
@@ -72,7 +73,8 @@ def _read(name: str, before: tuple[Path, ...]) -> Scenario:
         asked = (
             f"{before[-1].name} extends '{name}', which does not exist" if before else f"There is no scenario '{name}'"
         )
-        raise InputError(f"{asked}: choose one of {', '.join(scenario_names())} or give a YAML file.")
+        listed = f"choose one of {', '.join(scenario_names())} or give a YAML file."
+        raise InputError(f"{asked}: {did_you_mean(name, scenario_names(), listed)}")
     if path.resolve() in before:
         raise InputError(f"{before[0].name} extends itself by way of {path.name}: remove one `extends`.")
     text = read_text(path, LARGEST_DOCUMENT)

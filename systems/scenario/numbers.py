@@ -5,6 +5,9 @@ import math
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin
 
+import numpy as np
+
+from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 
 POSITIVE = {
@@ -111,8 +114,25 @@ def _check(key: str, name: str, number: float) -> None:
     if not math.isfinite(number):
         raise InputError(f"{key} must be finite, not {number}.")
     if abs(number) > largest(name):
-        raise InputError(f"{key} is {number:g}; the largest possible size is {largest(name):g}.")
+        bound = f"at most {largest(name):g}" if number > 0.0 else f"at least {-largest(name):g}"
+        raise InputError(f"{key} is {number:g}; it may be {bound}.")
     if name in POSITIVE and number <= 0.0:
         raise InputError(f"{key} must be a positive number, not {number:g}.")
     if name in NOT_NEGATIVE and number < 0.0:
         raise InputError(f"{key} must not be negative, and it is {number:g}.")
+
+
+def check_home(home_deg: list[float], arm: str, key: str = "home_deg") -> None:
+    """Check that an arm can be at home; `key` is the scenario's name of ``home_deg`` (6,).
+
+    Raises:
+        InputError: a joint is outside its limits; the message names the first one.
+    """
+    model = load_arm(arm)
+    limits = np.degrees([model.position_lower, model.position_upper]).T
+    for joint, (angle, (low, high)) in enumerate(zip(home_deg, limits, strict=True), start=1):
+        if not low <= angle <= high:
+            raise InputError(
+                f"{key} puts joint {joint} of the {arm} at {angle:g} deg, and its limits are {low:g} to {high:g} deg: give an angle "
+                "between them."
+            )

@@ -36,8 +36,7 @@ from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated.tablet import GLASS, NIB, SimulatedTablet
-from weldcal.systems.jobs.tablet.config import TabletConfig
-from weldcal.systems.jobs.tablet.messages import TabletTruth
+from weldcal.systems.jobs.tablet.config import TabletConfig, TabletTruth
 
 _TEXELS_PER_MM = 8
 _PEN_MASS_KG = 0.02
