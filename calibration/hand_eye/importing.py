@@ -32,6 +32,7 @@ class StatedForms:
     robot_poses: str | None = None
     camera_poses: str | None = None
     unit: str | None = None
+    decide: bool = True  # whether the data choose the reading: not where the file holds motions
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,7 +85,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
     a, b = [pick(one, rows) for one, rows in ((robot.readings, rows_r), (camera.readings, rows_c))]
     _check_motion(a[0], robot, "robot")
     _check_motion(b[0], camera, "camera")
-    known = mounting in ("eye_in_hand", "eye_on_base")
+    known = stated.decide and mounting in ("eye_in_hand", "eye_on_base")
     decision, shift = _decided(a, b, mounting == "eye_in_hand", n) if known else (None, 0)
     if decision is None:
         A, B = a[0], b[0]

@@ -26,6 +26,8 @@ Flags = NDArray[np.bool_]
 
 _SPARE = 2.5  # numbers per unknown below which an answer cannot be checked
 
+_RIGID = 0.05  # deviation of a rotation from orthonormal that two printed decimals explain
+
 
 @dataclass(frozen=True)
 class HandEyeConfig:
@@ -315,7 +317,7 @@ def as_poses(value: ArrayLike | Sequence[RigidTransform], name: str) -> Array:
         raise InputError(f"'{name}' holds numbers that are not finite, first in pose {int(np.argmax(bad))}.")
     R = M[:, :3, :3]
     off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
-    wrong = (off > 1e-3) | (np.linalg.det(R) < 0.0) | (np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > 1e-9)
+    wrong = (off > _RIGID) | (np.linalg.det(R) < 0.0) | (np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > 1e-9)
     if wrong.any():
         raise InputError(
             f"Pose {int(np.argmax(wrong))} of '{name}' is not a rigid pose (rotation not orthonormal, mirrored, or last row not "

@@ -10,12 +10,14 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_corners, refine_with_corners
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
+from weldcal.calibration.hand_eye.importing import StatedForms
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
@@ -39,14 +41,33 @@ EQUATIONS = ("ax-xb", "ax-yb", "axb-ycz")
 FileArgument = Annotated[
     Path,
     typer.Argument(
-        help="npz (pairs, or streams hand and eye), CSV, JSON, or a sample file of easy_handeye2 or MoveIt.",
+        help="A file or folder with the robot's and the camera's poses (docs/datasets.md), or two pose streams.",
         show_default=False,
     ),
 ]
 MountingOption = Annotated[
     str | None, option("--mounting", "NAME", "eye_in_hand, eye_on_base ..., if the file does not name it.")
 ]
-UnitOption = Annotated[str | None, option("--unit", "UNIT", "Unit of the positions: m, mm or cm.", show_default="m")]
+UnitOption = Annotated[
+    str | None,
+    option(
+        "--unit",
+        "UNIT",
+        "Unit of all positions: m, mm, cm or inch.",
+        show_default="by the robot's reach and the motions",
+    ),
+]
+RobotPosesOption = Annotated[
+    str | None, option("--robot-poses", "NAME", "The file, folder, array or label that holds the robot's poses.")
+]
+CameraPosesOption = Annotated[
+    str | None, option("--camera-poses", "NAME", "The file, folder, array or label that holds the camera's poses.")
+]
+_FORM = "such as euler_xyz,deg, quaternion_wxyz or matrix,inverse. Without it the data choose."
+RobotFormOption = Annotated[str | None, option("--robot-form", "FORM", f"How the robot's poses are written, {_FORM}")]
+CameraFormOption = Annotated[
+    str | None, option("--camera-form", "FORM", f"How the camera's poses are written, {_FORM}")
+]
 RobotOption = Annotated[
     str | None,
     option("--robot", "NAME", "The arm, for example ur10e or my_arm.urdf: the next pose is then within its reach."),
@@ -63,10 +84,15 @@ def ax_xb(
     mounting: MountingOption = None,
     unit: UnitOption = None,
     motions: Annotated[bool, switch("--motions", "The file holds motions (A and B of A X = X B), not poses.")] = False,
+    robot_poses: RobotPosesOption = None,
+    camera_poses: CameraPosesOption = None,
+    robot_form: RobotFormOption = None,
+    camera_form: CameraFormOption = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = XB for the camera's pose. With poses, the target's pose is estimated too, so that each counts once."""
-    return _solve("ax-xb", call, file, mounting=mounting, unit=unit, motions=motions, limit_mm=limit_mm)
+    stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
+    return _solve("ax-xb", call, file, mounting=mounting, unit=unit, motions=motions, limit_mm=limit_mm, stated=stated)
 
 
 @command("hand-eye ax-yb", short_help="Solve AX = YB for the poses of camera and target.")
@@ -93,6 +119,10 @@ def ax_yb(
         Path | None,
         option("--kinematics", "FILE", "With --robot: the arm's own kinematics, such as calibrate --refine writes."),
     ] = None,
+    robot_poses: RobotPosesOption = None,
+    camera_poses: CameraPosesOption = None,
+    robot_form: RobotFormOption = None,
+    camera_form: CameraFormOption = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""
@@ -108,7 +138,16 @@ def ax_yb(
         refine=refine,
         kinematics=kinematics,
         limit_mm=limit_mm,
+        stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form),
     )
+
+
+def stated_forms(
+    robot_poses: str | None, camera_poses: str | None, robot_form: str | None, camera_form: str | None
+) -> StatedForms:
+    """What the options state of the two lists of poses."""
+    forms = [PoseForm() if form is None else PoseForm(rotation=form) for form in (robot_form, camera_form)]
+    return StatedForms(forms[0], forms[1], robot_poses, camera_poses)
 
 
 @command("hand-eye axb-ycz", short_help="Solve AXB = YCZ for two robots.")
@@ -151,6 +190,7 @@ def run_hand_eye(
     kinematics: Path | None = None,
     seed: int = 0,
     limit_mm: float | None = None,
+    stated: StatedForms | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> HandEyeReport:
     """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved. Writes report.html besides the exports.
@@ -182,7 +222,13 @@ def run_hand_eye(
 
         streams = synchronise(read_streams(file), mounting=mounting or "eye_in_hand", source=file.name)
         say(streams.sentence)
-    pairs = read_pairs(file, mounting=mounting, length=unit) if streams is None else streams.pairs
+    if streams is None:
+        stated = replace(stated or StatedForms(), decide=not motions)
+        pairs = read_pairs(file, mounting=mounting, length=unit, stated=stated)
+        for sentence in understood(pairs):
+            say(sentence)
+    else:
+        pairs = streams.pairs
     found = get_mounting(pairs.mode)
     if kinematics is not None and arm is not None:
         pairs = poses_of_arm(pairs, arm)
@@ -221,12 +267,12 @@ def run_hand_eye(
         result = _only_camera(result)
     # with corners or robot errors applied the poses are others, so that a comparison would be of two data
     comparison = () if motions or adopted else _compare(problem, result)
-    advice, sentence = None, ""
+    advice, advised = None, ""
     if not motions and equation != "ax-xb":
         view = view_of(problem.G, pairs.K if pairs.has_corners else None, scanner)
         advice = next_pose(problem, result, found, (IDENTITY,) * 3, arm=arm, view=view)
-        sentence = advice.sentence() if advice is not None else _no_advice(view, arm)
-    provenance = Provenance(file.name, sha256(_file(file).read_bytes()).hexdigest())
+        advised = advice.sentence() if advice is not None else _no_advice(view, arm)
+    provenance = Provenance(file.name, _digest(file))
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
     report = HandEyeReport(
@@ -237,7 +283,9 @@ def run_hand_eye(
         files=files,
         seconds=seconds,
         corners=" ".join(said),
-        advice=sentence,
+        advice=advised,
+        reading=pairs.reading,
+        read_notes=pairs.notes,
         streams=streams,
         limit_mm=limit_mm,
         folder=out,
@@ -264,8 +312,27 @@ def _no_advice(view: View, arm: Chain | None) -> str:
     return f"No further pose near those so far is visible{reach} (view: {view.source}). Move to a region with a better view."
 
 
-def _file(path: Path) -> Path:
-    return path / "pairs.npz" if path.is_dir() else path
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of the files of a folder in the order of their names."""
+    if path.is_file():
+        return sha256(path.read_bytes()).hexdigest()
+    whole = sha256()
+    for one in sorted(p for p in path.rglob("*") if p.is_file()):
+        whole.update(one.relative_to(path).as_posix().encode())
+        whole.update(one.read_bytes())
+    return whole.hexdigest()
+
+
+def understood(pairs: PosePairs) -> list[str]:
+    """How a file was understood, a line for each list, and the notes."""
+    lines = []
+    for who, found in pairs.reading.items():
+        out = len(found["left_out"])  # type: ignore[arg-type]
+        left = f", {out} left out" if out else ""
+        lines.append(
+            f"{who:<7}{found['file']}: {found['rows']} poses{left}, {found['form']}, read as {found['reading']} in {found['unit']}"
+        )
+    return [*lines, *pairs.notes]
 
 
 def _only_camera(result: HandEyeResult) -> HandEyeResult:

@@ -1,7 +1,7 @@
 """The result of `weldcal hand-eye` and its page: poses and how sure they are, errors of every sample, comparison of methods."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +44,8 @@ class HandEyeReport:
     streams: Synchronised | None = None
     limit_mm: float | None = None
     folder: Path | None = None
+    reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    read_notes: tuple[str, ...] = ()
 
     @property
     def first(self) -> FirstScreen:
@@ -57,6 +59,7 @@ class HandEyeReport:
         notes = (
             [f"{outliers} of {len(r.inliers)} poses disagree with the others and were not used."] if outliers else []
         )
+        notes += self.read_notes
         concerns = [*(f"Not observable: {text}" for text in r.unobservable), *r.warnings]
         found = Findings(tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
         after = Next(f"To know it better, add a pose. {self.advice}") if self.advice else Next(
@@ -85,6 +88,8 @@ class HandEyeReport:
             "warnings": list(r.warnings),
             "condition": r.condition,
             "method": r.method,
+            "reading": {who: dict(found) for who, found in self.reading.items()},
+            "notes": list(self.read_notes),
             "comparison": [{"method": c.method, "held_out_deg": c.deg, "held_out_mm": c.mm} for c in self.comparison],
             "next_pose": self.advice or None,
             "corners": self.corners or None,

@@ -222,7 +222,7 @@ def test_a_form_that_states_no_convention_keeps_every_reading(scans: Path, case:
     (scans / "poses.csv").write_text(content)
     data = load_dataset(scans)
     found = next(one for one in data.readings if one.form == form)
-    assert found.X == pytest.approx(X, abs=1e-9)
+    assert pytest.approx(X, abs=1e-9) == found.X
 
 
 def test_radians_called_degrees_and_a_wrong_unit_are_named(scans: Path) -> None:

@@ -22,12 +22,16 @@ AXES = (*MOVING, *(axes.lower() for axes in MOVING))
 def world(rng: np.random.Generator, n: int, degrees: float, mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Robot poses, camera poses and X of an eye in hand, by the equation itself."""
     A, X, Y = np.tile(np.eye(4), (n, 1, 1)), np.eye(4), np.eye(4)
-    A[:, :3, :3] = (Rotation.from_rotvec(rng.normal(size=(n, 3)) * rng.uniform(0.2, 1.0)) * Rotation.random(rng=rng)).as_matrix()
-    A[:, :3, 3] = rng.uniform(-0.3, 0.3, (n, 3)) + [0.5, 0.0, 0.4]
+    A[:, :3, :3] = (
+        Rotation.from_rotvec(rng.normal(size=(n, 3)) * rng.uniform(0.2, 1.0)) * Rotation.random(rng=rng)
+    ).as_matrix()
+    A[:, :3, 3] = rng.uniform([0.2, -0.3, 0.1], [0.8, 0.3, 0.7], (n, 3))
     X[:3, :3], X[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * 0.07
     Y[:3, :3], Y[:3, 3] = Rotation.random(rng=rng).as_matrix(), [0.6, 0.1, 0.0]
     B = np.linalg.inv(X) @ np.linalg.inv(A) @ Y
-    B[:, :3, :3] = B[:, :3, :3] @ Rotation.from_rotvec(rng.normal(size=(n, 3)) * np.radians(degrees) / np.sqrt(3.0)).as_matrix()
+    B[:, :3, :3] = (
+        B[:, :3, :3] @ Rotation.from_rotvec(rng.normal(size=(n, 3)) * np.radians(degrees) / np.sqrt(3.0)).as_matrix()
+    )
     B[:, :3, 3] += rng.normal(size=(n, 3)) * 1e-3 * mm / np.sqrt(3.0)
     return A, B, X
 
@@ -55,7 +59,9 @@ def test_the_right_reading_of_both_lists_is_found(seed: int) -> None:
     (robot, stated), (camera, other) = written(A, rng), written(B, rng)
     found = decide(readings(robot), readings(camera), eye_in_hand=True)
     assert found.determined
-    assert (found.best.robot.form, found.best.camera.form) == (stated, other) or found.best.X == pytest.approx(X, abs=0.05)
+    assert (found.best.robot.form, found.best.camera.form) == (stated, other) or pytest.approx(
+        X, abs=0.05
+    ) == found.best.X
 
 
 def test_few_noisy_poses_do_not_select_a_reading() -> None:
@@ -69,9 +75,11 @@ def test_few_noisy_poses_do_not_select_a_reading() -> None:
 
 
 def test_an_inverted_list_is_refused_with_the_three_ways_to_state_it(tmp_path: Path) -> None:
-    A, B, X = world(np.random.default_rng(2), 12, degrees=0.05, mm=0.3)
+    A, B, _ = world(np.random.default_rng(2), 12, degrees=0.05, mm=0.3)
     np.savez(tmp_path / "a.npz", A=np.linalg.inv(A), B=B)
-    with pytest.raises(InconsistentPoses, match=r"--mounting eye_on_base.*--robot-form matrix,inverse.*--camera-form matrix,inverse"):
+    with pytest.raises(
+        InconsistentPoses, match=r"--mounting eye_on_base.*--robot-form matrix,inverse.*--camera-form matrix,inverse"
+    ):
         read_pairs(tmp_path / "a.npz", mounting="eye_in_hand")
     assert read_pairs(tmp_path / "a.npz", mounting="eye_on_base").robot == pytest.approx(np.linalg.inv(A), abs=1e-12)
 

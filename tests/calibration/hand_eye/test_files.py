@@ -104,7 +104,9 @@ def test_a_bad_file_is_named_in_a_sentence(tmp_path: Path, poses: tuple[Array, A
     row = ",".join(map(str, numbers(F[0]) + numbers(G[0])))
     assert "add --mounting" in read_error(f"{HEADER}\n{row}", csv)
     assert "A number is missing" in read_error(f"{HEADER}\n{row.replace(row.split(',')[0], 'x', 1)}", csv)
-    assert "A number is missing" in read_error(f"{HEADER}\n" + ",".join(row.split(",")[:9]), csv, mounting="eye_in_hand")
+    assert "A number is missing" in read_error(
+        f"{HEADER}\n" + ",".join(row.split(",")[:9]), csv, mounting="eye_in_hand"
+    )
     assert "cannot be read as JSON" in read_error("{", tmp_path / "a.json")
     assert "holds no poses" in read_error("a: 1", tmp_path / "a.yaml", mounting="eye_in_hand")
     assert "holds no poses" in read_error(
