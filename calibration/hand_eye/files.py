@@ -19,8 +19,7 @@ from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import file_size
-from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER, file_size
 
 _NAMES = {
     "robot": ("A", "robot", "X_BF", "X_base_gripper"), "camera": ("B", "camera", "X_CM", "X_camera_target"),

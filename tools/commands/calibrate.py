@@ -21,8 +21,8 @@ from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.joint_angles import joint_angles
 from weldcal.calibration.refinement.refined import KINEMATICS_FILE, REFINEMENTS, Plain, Refined
+from weldcal.calibration.refinement.stated_arm import joint_angles
 from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.refinement.joint_angles import require_joint_angles
 from weldcal.calibration.refinement.refined import Plain, Refined, refine_arm, refine_locally
+from weldcal.calibration.refinement.stated_arm import require_joint_angles
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.errors import InputError

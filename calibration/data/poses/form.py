@@ -9,7 +9,7 @@ from weldcal.calibration.data.poses.rotations import notation, rotations
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import nearest_rotation, pose
 from weldcal.models.arrays import Array
-from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER
 
 _RIGID = 2e-3  # of a rotation's columns from orthonormal: three printed decimals
 

@@ -18,8 +18,7 @@ from weldcal.calibration.geometry.se3 import pose
 from weldcal.models.arrays import Array
 from weldcal.models.documents import as_number, parse_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text
-from weldcal.models.limits import DEEPEST, LARGEST_DOCUMENT, MOST_NODES
+from weldcal.models.files import DEEPEST, LARGEST_DOCUMENT, MOST_NODES, read_text
 
 ENDINGS = (".yml", ".yaml", ".json", ".xml")
 _PARTNERS = {"rotation": "translation", "rot": "trans", "rvecs": "tvecs", "rvec": "tvec", "r": "t"}

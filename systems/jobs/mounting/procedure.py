@@ -14,7 +14,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, UrStatus
-from weldcal.systems.motion.goals import stands_at
+from weldcal.systems.motion.clear_moves import stands_at
 
 ENDS = ("done", "held")
 

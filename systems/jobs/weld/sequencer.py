@@ -13,8 +13,8 @@ from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, UrStatus
+from weldcal.systems.motion.clear_moves import stands_at
 from weldcal.systems.motion.drift_monitor import DriftStatus
-from weldcal.systems.motion.goals import stands_at
 
 SCAN_TIMEOUT_S = 8.0
 

@@ -9,7 +9,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.scanners import get_scanner
-from weldcal.models.workpieces.bent_plate import bend, rolled
+from weldcal.models.workpieces.part import bend, rolled
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 from weldcal.tools.studies.seam_planning.scenes import Scene, scan_part
 from weldcal.tools.studies.seam_planning.trials import sideways

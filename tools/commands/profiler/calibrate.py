@@ -9,12 +9,12 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import matrix4
+from weldcal.calibration.errors import ArcNotFound, FeatureNotFound
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
-from weldcal.calibration.profiler.errors import ArcNotFound, FeatureNotFound
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
 from weldcal.calibration.profiler.plan import (
     Field,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.calibration.errors import InconsistentData
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
-from weldcal.calibration.profiler.errors import InconsistentData
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError, WeldcalError
 

@@ -8,7 +8,7 @@ import numpy as np
 from weldcal.calibration.eye_on_base.nested import calibrate_by_choice, mean_interval, nested_errors
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.validation import position_errors
-from weldcal.calibration.refinement.local_choice import choose_local
+from weldcal.calibration.refinement.local_field import choose_local
 from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.studies.flange.recorded import usable_scans

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import get_scanner
-from weldcal.models.workpieces.bent_plate import bend
+from weldcal.models.workpieces.part import bend
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 from weldcal.tools.studies.seam_planning.scenes import Scene, box, scan_part
 from weldcal.welding.locate.find_workpiece import find_workpiece
