@@ -44,6 +44,7 @@ class Run(Generic[JobOf]):
 
     `interrupted`: the reason where a person ended the run before its job. `clock`: the clock of a paced run, else None.
     `held_by_person`: how often a person held the run and let it go on. `host`: the computer's timing before the first motion.
+    `share`: the completed share of the job, 0 to 1; a run that is held does not advance it.
     """
 
     cell: Cell[JobOf]
@@ -55,6 +56,7 @@ class Run(Generic[JobOf]):
     clock: WallClock | None = None
     held_by_person: int = 0
     host: HostTiming | None = None
+    share: float = 0.0
 
     @property
     def root(self) -> Context:
@@ -179,9 +181,9 @@ def run_cell(
         if not run.phases or command.phase != run.phases[-1][0]:
             _keep_scan(run, root)
             run.phases.append((command.phase, root.get_time(), time.perf_counter() - start))
-            progress(*cell.job.stage(root, run.phases))
+            _tell(run, root, progress)
         elif due("progress", root.get_time()):
-            progress(*cell.job.stage(root, run.phases))
+            _tell(run, root, progress)
         if run.clock is None and has_panel and due("panel", root.get_time()):
             _keep_pace(run, root)
         if command.finished:
@@ -220,6 +222,14 @@ def run_cell(
         meshcat.StopRecording()
         meshcat.PublishRecording()
     return run
+
+
+def _tell(run: Run[JobOf], root: Context, progress: Progress) -> None:
+    """Report the stage and the completed share; a held job keeps the share that it had reached."""
+    stage, share = run.cell.job.stage(root, run.phases)
+    if not run.cell.job.command(root).held:
+        run.share = share
+    progress(stage, run.share)
 
 
 def _stand(run: Run[JobOf], progress: Progress) -> None:

@@ -16,7 +16,7 @@ from weldcal.systems.runner import Run, run_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.viewer.live import LiveView
-from weldcal.tools.outcomes.weld import weld_outcome
+from weldcal.tools.report.weld import weld_outcome
 
 HELD_AT_M, HELD_S = 0.012, 0.4
 STILL_RAD_S = 1e-3

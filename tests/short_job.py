@@ -19,14 +19,14 @@ from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.demo import run_scenario
-from weldcal.tools.commands.procedures import RUNNERS
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.commands.demo import RUNNERS
+from weldcal.tools.commands.weld import run_scenario
+from weldcal.tools.report.demo import DemoResult
+from weldcal.tools.report.run import RunOptions
 
 SEED = 5  # its planned poses lie near each other
 # The first 30 mm of the S groove, calibrated from as few scans as there may be; the scanner has noise and no other error, and the
-# arm is exact: as in `weldcal.tools.studies.perfect_world`.
+# arm is exact: as in `weldcal.tools.worlds.perfect_world`.
 SHORT_JOB = """
 robot: !SimulatedUr {repeatability_mm: 0.0, kinematic_error_mm: 0.0}
 scanner: !RenderedScanner

@@ -19,11 +19,12 @@ from weldcal.systems.cell import build_cell as build
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.commands.demo import run_procedure
 from weldcal.tools.commands.hand_eye import solve_pairs
-from weldcal.tools.commands.procedures import run_procedure
 from weldcal.tools.commands.verify import verify_dataset
-from weldcal.tools.outcomes.calibration import CalibrationReport, VerifyReport
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.calibration import CalibrationReport
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.verify import VerifyReport
 
 Floats = npt.NDArray[np.floating[Any]]
 FLANGE = "iso9409-1-50-4-m6"

@@ -180,16 +180,26 @@ def emit_address(name: str, url: str) -> None:
     typer.secho(f"{name}  {url}", err=True, bold=True)
 
 
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C or SIGTERM ended."""
+
+
 @contextmanager
 def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
     """Turns every failure inside the block into one sentence on stderr and exit code 1; with --json, into JSON too.
 
     Raises:
-        typer.Exit: with code 1, for a WeldcalError, an OSError or (named an internal error) anything else.
+        typer.Exit: with code 1, for a WeldcalError, an OSError or (named an internal error) anything else; with code 130 for Ctrl-C.
     """
     details: dict[str, object] = {}
+    code = 1
     try:
         yield
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+        sentence = (
+            "The operator ended the command. A result folder that it had begun is not complete: run the command again."
+        )
     except WeldcalError as problem:
         sentence, details = str(problem), getattr(problem, "details", {})
     except OSError as problem:
@@ -211,7 +221,7 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
     if json_wanted:
         emit_json({"state": "failed", "reason": sentence, **details})
     typer.secho(_sentence(sentence), err=True, fg=typer.colors.RED)
-    raise typer.Exit(1)
+    raise typer.Exit(code)
 
 
 SHARE_TOLD = 0.1

@@ -2,7 +2,7 @@
 
 Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the Bayesian
 information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a size that matters. The
-thresholds were fixed on simulated sets (tools/studies/doctor), other ones than those that its false alarms are counted on.
+thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its false alarms are counted on.
 
 With the flange's centre at the origin of its frame, a wrong rotation moves no centre; it shows only between the faces' normals and
 the poses' z axes. Then R_BC follows from the centres, and each misreading is judged by the normals.

@@ -25,8 +25,8 @@ from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.mesh import extrude
 from weldcal.models.scanners import get_scanner
 from weldcal.models.tools.loading import WELDING
-from weldcal.tools.scenarios.new_cell import write_cell
-from weldcal.tools.studies.touch.world import touch_world
+from weldcal.tools.commands.cell.new import write_cell
+from weldcal.tools.worlds.touch import touch_world
 
 # An angle bracket of plates 10 mm thick; lengths in mm. Its inner corner is the longest concave edge.
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])
@@ -68,13 +68,13 @@ def _two_robots(path: Path) -> None:
 
 
 def _bracket(path: Path) -> None:
-    from weldcal.tools.studies.part_welds.step_parts import PARTS, write_step
+    from weldcal.tools.worlds.parts.step_parts import PARTS, write_step
 
     write_step(PARTS["bracket"]().shape, path)
 
 
 def _bracket_scan(path: Path) -> None:
-    from weldcal.tools.studies.parts.scenes import scan_scene, subject
+    from weldcal.tools.worlds.parts.scenes import scan_scene, subject
 
     scene = scan_scene(subject("bracket").mesh, get_scanner("phoxi_m", width=412, height=308), 0)
     np.savez(path, points_B=scene.cloud_B, eye_B=scene.eye_B)
@@ -175,7 +175,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
         write_scans(path / f"cell_{k}" / f"2026-0{m}", 6, 10 * k + m) for k in (1, 2) for m in (1, 2)
     ],
     "my_result": _calibration,
-    "my_cell": lambda path: write_cell(path, "s_groove"),
+    "my_cell": lambda path: write_cell(path, "s_groove")[0],
     "short.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "short_cell.yaml": lambda path: path.write_text(f"extends: my_cell/cell.yaml\n{SHORT_JOB}", encoding="utf-8"),
     "short_wired.yaml": lambda path: path.write_text(f"extends: wired_s_groove\n{SHORT_WIRED}", encoding="utf-8"),

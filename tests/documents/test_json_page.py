@@ -13,7 +13,7 @@ from tests.documents.props import lay_out, needs_data
 from tests.places import ROOT, SHARED_DATA, require_data
 from tests.short_job import ShortJobs
 from weldcal.tools.cli.app import app
-from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
 
 PAGE = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
 EVERYWHERE = {"state", "first_screen"}

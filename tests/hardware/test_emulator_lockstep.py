@@ -22,7 +22,7 @@ from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, STREAM_PACKAGES, Lockstep
 from weldcal.tools.emulators.ur.wire.net import LinkFaults
-from weldcal.tools.studies.robot.bench import Bench, Stream
+from weldcal.tools.worlds.robot.bench import Bench, Stream
 
 BOUND_S = 0.5
 FRAME_S = 0.002

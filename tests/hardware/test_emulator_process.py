@@ -19,7 +19,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import UrLink
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.commands.run import chosen_robot
 from weldcal.tools.emulators.ur import addresses
 from weldcal.tools.emulators.ur.addresses import PORTS, first_taken, free_address, lock_path
 from weldcal.tools.emulators.ur.process import Emulator, emulator_process

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.mounting_live import run_mounting_live
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 
 ROBOT = "emulated"
 PACE = 1.0

@@ -27,8 +27,8 @@ from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.emulators.ur.versions import parse_version
-from weldcal.tools.studies.robot.bench import Bench
-from weldcal.tools.studies.robot.faults import recover
+from weldcal.tools.worlds.robot.bench import Bench
+from weldcal.tools.worlds.robot.fault_run import recover
 
 OUTPUT, VALVE = 3, 4
 FEED, VOLTAGE = Level(0, True, 0.4), Level(1, False, 0.75)

@@ -16,11 +16,11 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import run_scenario
-from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.commands.run import chosen_robot
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.demo import DemoResult
+from weldcal.tools.report.run import RunOptions
 
 # Both arms stand at the same planned poses, so the same picture is fitted twice: what may differ is a few pixels at the edge of
 # the flange, 0.02 mm of the fit (test_cell). The weld on a controller is test_wired_cell's.

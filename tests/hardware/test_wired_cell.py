@@ -25,10 +25,10 @@ from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import Emulator
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.demo import DemoResult
+from weldcal.tools.report.run import RunOptions
 
 SEED = 3
 SEAM_MM, SPEED_MM_S = 40.0, 16.0  # twice as fast as usual: before the arc is there the torch runs on by 1.3 mm

@@ -12,11 +12,11 @@ import pytest
 from pydrake.math import RigidTransform
 
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
-from weldcal.tools.commands.monitor_live import LiveMonitor, monitor_live
+from weldcal.tools.commands.monitor import LiveMonitor, monitor_live
 from weldcal.tools.commands.motion_live import MotionOutcome, run_motion_live
 from weldcal.tools.emulators.cell.process import Played, played_world
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, Emulator
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 
 SEED, FRAMES, WATCHED = 3, 60, 80
 KNOCK_MM = [0.9, 0.0, -1.2]

@@ -26,8 +26,8 @@ from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.emulators.cell.process import Played, played_world
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, Emulator
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.profiler import ProfilerLive
+from weldcal.tools.report.profiler_live import ProfilerLive
+from weldcal.tools.report.run import RunOptions
 
 SEED = 3
 FEW_EDGES = "profiler_job: {edge: {scans: 8, held_out: 1}}"

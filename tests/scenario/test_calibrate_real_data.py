@@ -23,7 +23,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.outcomes.calibration import CalibrationReport
+from weldcal.tools.report.calibration import CalibrationReport
 
 DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"

@@ -21,17 +21,18 @@ from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.jobs.weld.settings import job_plan
 from weldcal.systems.motion.clear_moves import clear_poses
+from weldcal.systems.person import Person
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Truth
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.demo import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.commands.run import JobRun
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import calibration_error, weld_outcome
-from weldcal.tools.studies.cell.study import figures
+from weldcal.tools.commands.weld import DemoResult, measure, run_scenario, run_weld, write_result
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.weld import calibration_error, weld_outcome
+from weldcal.tools.worlds.weld.cell_run import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.
@@ -360,6 +361,16 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
     write_result(result, JobRun(found, None, "simulated"))
     assert result.summary()["state"] == "held"
     assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_a_held_run_keeps_the_share_that_it_had_reached() -> None:
+    person, shares = Person(), []
+    person.end()
+    cell = build_cell(load_scenario("straight_groove", TOLD), person=person)
+    found = run_cell(cell, lambda stage, share: shares.append(share))
+    assert found.held
+    assert max(shares) < 0.5
+    assert JobRun(found, None, "simulated").share(0.985) == shares[-1]
 
 
 def test_an_error_in_the_run_lets_go_of_the_robot() -> None:

@@ -9,10 +9,10 @@ import pytest
 
 from tests.held_weld import HeldWeld, held_weld, short_weld
 from weldcal.systems.runner import Run
-from weldcal.tools.commands.record import RunRecorder
-from weldcal.tools.commands.replay import replay
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import weld_outcome
+from weldcal.tools.commands.replay import replay_recording
+from weldcal.tools.commands.run import RunRecorder
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.weld import weld_outcome
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +57,6 @@ def test_the_page_shows_how_far_the_seam_is_beside_the_plan(held: tuple[HeldWeld
 
 
 def test_a_hold_is_an_input_of_the_run(held: tuple[HeldWeld, Path]) -> None:
-    again = replay(held[1])
+    again = replay_recording(held[1])
     assert again.first is None, again.summary()
     assert again.phase == "done"

@@ -23,11 +23,11 @@ from weldcal.systems.messages import UrStatus
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.demo import kind_of
 from weldcal.tools.commands.mounting_live import run_mounting_live
-from weldcal.tools.commands.procedures import kind_of
 from weldcal.tools.commands.run import JobRun
-from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.mounting import MountingReport
+from weldcal.tools.report.run import RunOptions
 
 # few poses near home, a coarse image, a controller at a quarter of its rate: seconds instead of a minute
 QUICK = "robot: !SimulatedUr {control_period_s: 0.008}\n"

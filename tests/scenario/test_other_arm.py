@@ -12,10 +12,9 @@ from weldcal.models.arms.kinematics import link_frames, load_arm
 from weldcal.models.robots import get_robot
 from weldcal.models.tools.loading import WELDING
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.commands.demo import run_weld
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.studies.arms.demo import ARMS
-from weldcal.tools.studies.arms.scaled import arm_scenario
+from weldcal.tools.commands.weld import run_weld
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.worlds.scaled_arms import ARMS, arm_scenario
 
 HANGING = """
 arm: ur5e

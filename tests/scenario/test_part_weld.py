@@ -8,8 +8,8 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.part_welds.step_parts import PARTS
-from weldcal.tools.studies.part_welds.study import Trial, write_cell
+from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.step_parts import PARTS
 
 
 def test_two_fillets_are_welded_one_after_the_other_from_a_step_file(tmp_path: Path) -> None:

@@ -25,10 +25,10 @@ from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.procedures import RUNNERS, kind_of
+from weldcal.tools.commands.demo import RUNNERS, kind_of
 from weldcal.tools.commands.profiler.live import run_profiler_live
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.profiler import ProfilerLive
+from weldcal.tools.report.profiler_live import ProfilerLive
+from weldcal.tools.report.run import RunOptions
 
 # fewer scans and touches than shipped, and the first 60 mm of the seam
 SHORT = """

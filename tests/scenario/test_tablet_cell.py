@@ -21,10 +21,10 @@ from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import Station
-from weldcal.tools.commands.demo import known_camera, run_scenario
-from weldcal.tools.commands.procedures import kind_of, run_procedure
+from weldcal.tools.commands.demo import kind_of, run_procedure
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.commands.weld import known_camera, run_scenario
+from weldcal.tools.report.run import RunOptions
 
 # six landmarks and quick descents: half of the shipped scenario's time
 SHORT = "tablet: {rows: 2, across_mm: 60.0, down_mm: 60.0, turn_deg: 36.0, clearance_mm: 12.0, descent_mm_s: 25.0}"

@@ -27,7 +27,7 @@ from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
-from weldcal.tools.outcomes.calibration import VerifyReport
+from weldcal.tools.report.verify import VerifyReport
 
 DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"

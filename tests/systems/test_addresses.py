@@ -9,7 +9,7 @@ from weldcal.systems.addresses import AddressError, controller_address, is_loopb
 from weldcal.systems.drivers.ur.wire.line import Line
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.commands.run import chosen_robot
 from weldcal.tools.emulators.ur.main import run_emulator
 
 WRONG = {

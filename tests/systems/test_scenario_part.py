@@ -13,8 +13,8 @@ from weldcal.systems.jobs.weld.settings import job_plan, seated_tip, servo_confi
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
-from weldcal.tools.studies.part_welds.step_parts import PARTS
-from weldcal.tools.studies.part_welds.study import Trial, write_cell
+from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.step_parts import PARTS
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ from tests.systems.plugin_scanner import RayScanner
 from weldcal.systems.cell import build_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import run_scenario
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.commands.weld import run_scenario
+from weldcal.tools.report.demo import DemoResult
+from weldcal.tools.report.run import RunOptions
 
 
 def real_cell() -> Scenario:

@@ -14,7 +14,7 @@ from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFin
 from weldcal.systems.jobs.weld.settings import feature_standard, servo_config
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.commands.robots import robot_at
+from weldcal.tools.commands.run import robot_at
 
 LONGER = (("-60.0, 0.0, 171.5", "-80.0, 0.0, 173.0"), ("[0.0, 0.0, 170.0]", "[0.0, 0.0, 172.0]"))
 SMALL_RING = (("standard: tool-ring-63", "outer_mm: 50.0\n  bore_mm: 25.0"),)

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 import weldcal
 from tests.documents.scans import write_scans
 from weldcal.models.errors import InputError
-from weldcal.tools.commands.new import write_example
+from weldcal.tools.commands.cell.new import write_example
 
 
 def test_pairs_of_poses_give_the_camera() -> None:

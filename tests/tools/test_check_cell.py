@@ -19,8 +19,8 @@ from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamera
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.check_cell import CellReport, check_cell, edge_width_px
-from weldcal.tools.commands.check_robot import state_of
+from weldcal.tools.commands.cell.check import CellReport, edge_width_px, look_at_cell
+from weldcal.tools.commands.robot.check import state_of
 
 FACING = RigidTransform(RollPitchYaw(np.pi, 0.1, 0.3), [0.02, 0.01, 0.6])  # a flange before the scanner
 
@@ -43,7 +43,7 @@ def wired(**devices: object) -> Scenario:
 
 
 def test_a_simulated_cell_is_ready_and_nothing_of_it_moves() -> None:
-    found = check_cell(load_scenario("s_groove"), "s_groove")
+    found = look_at_cell(load_scenario("s_groove"), "s_groove")
     assert set(states(found).values()) == {"ok"}
     assert ("scanner", "flange") in states(found)
     assert ("finger_camera", "tag") in states(found)
@@ -91,7 +91,7 @@ def test_a_cell_by_wire_is_looked_at_device_by_device(
     program = FlangeProgram(tmp_path, flange_points)
     scanner = FolderScanner(folder=str(tmp_path), trigger=f"file:{program.trigger}", settle_s=0.02)
     camera = VideoFingerCamera(source=tag_camera.url, stamps="host")
-    found = check_cell(wired(scanner=scanner, finger_camera=camera), "mine")
+    found = look_at_cell(wired(scanner=scanner, finger_camera=camera), "mine")
     program.stop.set()
     assert states(found) == {
         ("robot", "robot"): "not checked",  # a driver without a preflight
@@ -113,7 +113,7 @@ def test_each_trouble_has_its_remedy(tmp_path: Path, flange_points: np.ndarray, 
     scanner = FolderScanner(folder=str(tmp_path), trigger=f"file:{program.trigger}", settle_s=0.02)
     tag_camera.blur_px = 12.0
     camera = VideoFingerCamera(source=tag_camera.url)
-    found = check_cell(wired(scanner=scanner, finger_camera=camera), "mine")
+    found = look_at_cell(wired(scanner=scanner, finger_camera=camera), "mine")
     program.stop.set()
     assert "Jog the arm until the flange faces the scanner" in remedy(found, "scanner", "flange")
     assert "focus" in remedy(found, "finger_camera", "tag")
@@ -121,7 +121,7 @@ def test_each_trouble_has_its_remedy(tmp_path: Path, flange_points: np.ndarray, 
         scanner=FolderScanner(folder=str(tmp_path / "none")),
         finger_camera=VideoFingerCamera(source="http://127.0.0.1:1/"),
     )
-    found = check_cell(dead, "mine")
+    found = look_at_cell(dead, "mine")
     assert "there is no folder" in remedy(found, "scanner", "scan")
     assert "switch the camera on" in remedy(found, "finger_camera", "pictures")
     assert found.first_problem == remedy(found, "scanner", "scan")

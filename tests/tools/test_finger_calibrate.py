@@ -19,7 +19,7 @@ from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamer
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.print_board import Board, board_sheet, write_board
+from weldcal.tools.commands.cell.board import Board, board_sheet, write_board
 from weldcal.welding.finger.calibration import calibrate_tip
 from weldcal.welding.finger.deformation import TagModel, detect_tag, tag_cells
 

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.part_welds.step_parts import PARTS
+from weldcal.tools.worlds.parts.step_parts import PARTS
 
 
 @pytest.fixture(scope="module")

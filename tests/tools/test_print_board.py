@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.print_board import PAPERS, Board, board_sheet, tag_sheet
+from weldcal.tools.commands.cell.board import PAPERS, Board, board_sheet, tag_sheet
 from weldcal.welding.finger.deformation import TagModel
 
 DPI = 600

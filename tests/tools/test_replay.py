@@ -20,7 +20,7 @@ from weldcal.systems.motion import flange_mover
 from weldcal.systems.recording.reader import read_recording
 from weldcal.systems.recording.writer import RecordingFailed, RecordingWriter
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.replay import replay
+from weldcal.tools.commands.replay import replay_recording
 
 # A short seam, from where the scanner is said to be, four times as fast as usual, with a tool from a file.
 SHORT = f"""
@@ -129,7 +129,7 @@ def test_a_recording_that_was_cut_off_is_replayed_to_there(
 ) -> None:
     whole = (recorded[0] / "recording.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: int(0.5 * len(whole))])
-    found = replay(tmp_path / "cut.mcap")
+    found = replay_recording(tmp_path / "cut.mcap")
     assert found.cut_off
     assert found.first is None, found.first
     assert found.seconds > 3.0
@@ -145,9 +145,9 @@ def test_what_is_no_recording_is_refused_in_a_sentence(
         with pytest.raises(
             InputError, match=r"is no recording of weldcal: give a recording\.mcap that --record has written"
         ):
-            replay(tmp_path / name)
+            replay_recording(tmp_path / name)
     with pytest.raises(InputError, match="There is no file"):
-        replay(tmp_path / "nothing.mcap")
+        replay_recording(tmp_path / "nothing.mcap")
 
 
 def test_a_full_disk_ends_in_a_sentence_and_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

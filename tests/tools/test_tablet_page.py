@@ -19,9 +19,9 @@ from tests.browser import Browser
 from tests.places import ROOT
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.tablet.page.serve import LARGEST_CSV, TabletServer, open_server, page, tablet_host
+from weldcal.tools.commands.tablet.serve import LARGEST_CSV, TabletServer, open_server, page, tablet_host
 
-PAGE = ROOT / "tools/commands/tablet/page/tablet.html"
+PAGE = ROOT / "tools/commands/tablet/tablet.html"
 WIDTH, HEIGHT = 1000, 700
 PX_PER_MM = 4.0
 

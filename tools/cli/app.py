@@ -1,65 +1,17 @@
-"""The command line: every command in its group, in the order of the help text."""
+"""The command line: every command that is found, in its group, in the order of the help text."""
 
 import signal
-from typing import Annotated
+from collections.abc import Iterable, Iterator, MutableMapping
+from typing import Annotated, Any, ClassVar
 
 import typer
+import typer.main
+from typer.core import TyperGroup
 
-from weldcal.tools.cli import (
-    benchmark,
-    benchmark_flange,
-    benchmark_wired,
-    calibrate,
-    cell,
-    doctor,
-    emulate_cell,
-    fleet,
-    hand_eye,
-    monitor,
-    motion,
-    part,
-    plan_motion,
-    plan_poses,
-    profiler,
-    replay,
-    reproduce,
-    robots,
-    runs,
-    scenarios,
-    tablet,
-    tool,
-    verify,
-    view,
-)
+from weldcal.tools import console
+from weldcal.tools.cli.discovery import Entry, find_commands
 
 PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then weld along a seam that is felt by touch."
-COMMANDS = (
-    *(
-        runs.demo,
-        calibrate.calibrate,
-        verify.verify,
-        doctor.doctor,
-        fleet.fleet,
-        monitor.monitor,
-        plan_motion.plan_motion,
-        plan_poses.plan_poses,
-        runs.weld,
-        view.view,
-        replay.replay,
-    ),
-    *(robots.robots, robots.emulate_ur, emulate_cell.emulate_cell, robots.check_robot),
-    *(scenarios.new, scenarios.schema, part.part),
-    *(cell.check_cell, cell.print_board, cell.finger_calibrate, tool.tool_check),
-    *benchmark.COMMANDS,
-    *benchmark_flange.COMMANDS,
-    *benchmark_wired.COMMANDS,
-    *reproduce.COMMANDS,
-    *monitor.COMMANDS,
-    *motion.COMMANDS,
-    *(tablet.serve, tablet.calibrate, runs.tablet_demo),
-    *(hand_eye.ax_xb, hand_eye.ax_yb, hand_eye.axb_ycz, runs.hand_eye_live),
-    *(profiler.edge, profiler.sphere, profiler.compensate, profiler.seam, profiler.clock, runs.profiler_live),
-)
 GROUPS = {
     "benchmark": "Measure speed and accuracy.",
     "reproduce": "Repeat the published studies.",
@@ -69,6 +21,90 @@ GROUPS = {
     "hand-eye": "Calibrate a camera from pairs of poses.",
     "profiler": "Calibrate a laser profiler and map a seam.",
 }
+"""The groups of commands with their help text; a group that is not here needs no text."""
+
+ORDER = (
+    *(
+        "demo",
+        "calibrate",
+        "verify",
+        "doctor",
+        "fleet",
+        "monitor",
+        "plan-motion",
+        "plan-poses",
+        "weld",
+        "view",
+        "replay",
+    ),
+    *("robots", "emulate-ur", "emulate-cell", "check-robot", "new", "schema", "part", "check-cell", "print-board"),
+    *("tablet serve", "tablet calibrate", "tablet demo"),
+    *("profiler edge", "profiler sphere", "profiler compensate", "profiler seam", "profiler clock", "profiler live"),
+)
+"""The commands that the help text lists first; the others follow by name."""
+
+
+class LazyCommands(MutableMapping[str, Any]):
+    """The commands of a group by name: sub-groups as they are, a command imported when it is asked for."""
+
+    def __init__(self, entries: Iterable[Entry], groups: MutableMapping[str, Any]) -> None:
+        self.entries = {entry.title.split(" ")[-1]: entry for entry in entries}
+        self._made: dict[str, Any] = dict.fromkeys(self.entries) | dict(groups)
+
+    def __getitem__(self, name: str) -> Any:
+        if self._made[name] is None:
+            self._made[name] = _typer_command(name, self.entries[name])
+        return self._made[name]
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        self._made[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._made[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._made
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._made)
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+
+def _typer_command(name: str, entry: Entry) -> Any:
+    found = entry.load()
+    alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    alone.command(name, short_help=entry.short_help, hidden=entry.hidden)(found.function)
+    return typer.main.get_command(alone)
+
+
+class CommandGroup(TyperGroup):
+    """A group that lists its commands without importing them."""
+
+    entries: ClassVar[tuple[Entry, ...]] = ()
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = LazyCommands(self.entries, self.commands)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Imports the command that is called; a failed import is one sentence, with --debug its traceback."""
+        if args and args[0] in self.commands:
+            with console.boundary(json_wanted="--json" in args, debug="--debug" in args):
+                self.commands[args[0]]
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Writes the list of commands, each with its whole short help."""
+        entries = self.commands.entries  # type: ignore[attr-defined]
+        rows = [
+            (name, entries[name].short_help if name in entries else self.commands[name].help)
+            for name in self.commands
+            if name not in entries or not entries[name].hidden
+        ]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
 
 def main() -> None:
@@ -103,8 +139,18 @@ def weldcal(
 
 def build_app() -> typer.Typer:
     """The Typer application with all groups and commands."""
+    place = {title: number for number, title in enumerate(ORDER)}
+    entries = sorted(find_commands().values(), key=lambda entry: (place.get(entry.title, len(ORDER)), entry.title))
+    parts: dict[str, list[Entry]] = {"": [], **{name: [] for name in GROUPS}}
+    for entry in entries:
+        parts.setdefault(entry.title.rpartition(" ")[0], []).append(entry)
+
+    def group_class(name: str) -> type[CommandGroup]:
+        return type("CommandGroup", (CommandGroup,), {"entries": tuple(parts[name])})
+
     root = typer.Typer(
         name="weldcal",
+        cls=group_class(""),
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
@@ -112,12 +158,9 @@ def build_app() -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     root.callback(help=PURPOSE)(weldcal)
-    groups = {name: typer.Typer(help=text, no_args_is_help=True) for name, text in GROUPS.items()}
-    for name, group in groups.items():
+    for name in filter(None, parts):
+        group = typer.Typer(cls=group_class(name), help=GROUPS.get(name, ""), no_args_is_help=True)
         root.add_typer(group, name=name)
-    for command in COMMANDS:
-        *parents, name = command.title.split(" ")
-        (groups[parents[0]] if parents else root).command(name, short_help=command.short_help)(command.function)
     return root
 
 

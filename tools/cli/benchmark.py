@@ -4,12 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from weldcal.tools.cli.options import FARM, Call, Outcome, ScenarioOption, command, option, switch
+from weldcal.tools.cli.options import Call, Outcome, command, option
 
 
-@command("benchmark tablet")
+@command("benchmark tablet", short_help="Time the tablet calibrations and the published search.")
 def tablet(call: Call) -> Mapping[str, object]:
     """Time each tablet calibration and compare it with the published search."""
     from weldcal.tools.studies.tablet.speed import run_tablet_benchmark
@@ -17,144 +15,7 @@ def tablet(call: Call) -> Mapping[str, object]:
     return run_tablet_benchmark(call.folder("benchmark", "tablet"), call.seed, call.progress)
 
 
-@command("benchmark seam-planning")
-def seam_planning(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Random poses of each part.", min=1)] = 2,
-    preset: Annotated[
-        list[str] | None, option("--preset", "NAME", "A scanner; repeat for more.", show_default="all")
-    ] = None,
-    full: Annotated[
-        bool, switch("--full-resolution", "Images of the scanner's full width, not 824 pixels at most.")
-    ] = False,
-    troubles: Annotated[
-        bool, switch("--troubles/--no-troubles", "Also test occlusion, clutter and wrong workpieces.")
-    ] = True,
-) -> Outcome:
-    """Measure the error of a seam planned from one scan, with and without a drawing, for each scanner."""
-    from weldcal.models.scanners import get_scanner
-    from weldcal.tools.studies.seam_planning.benchmark import run_seam_planning_benchmark
-
-    folder = call.folder("benchmark", "seam-planning")
-    names = [get_scanner(name).name for name in preset] if preset else None
-    summary, rows = run_seam_planning_benchmark(
-        folder, runs, call.seed, names, call.progress, full=full, troubles=troubles
-    )
-    return Outcome(summary, rows=rows)
-
-
-@command("benchmark part-welds")
-def part_welds(
-    call: Call,
-    part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
-    runs: Annotated[int, option("--runs", "N", "Welds of each part, seeds from --seed on.", min=1)] = 1,
-    located_by: Annotated[
-        str, option("--located-by", "WORD", "Where the part's pose is from: scan or drawing.")
-    ] = "scan",
-    seam_mm: Annotated[
-        float | None, option("--seam-mm", "MM", "Weld only so much of each seam.", show_default="all of it")
-    ] = None,
-    refine: Annotated[
-        str,
-        option("--refine", "KIND", "Calibrate each cell first and refine it: none (not calibrated), joints or links."),
-    ] = "none",
-    arm_mm: Annotated[
-        float, option("--arm-mm", "MM", "How far the true flange is from the reported one (rms).", min=0.0, max=5.0)
-    ] = 0.4,
-) -> Outcome:
-    """Weld twelve parts in four joints in the simulated cell, each from its STEP file, and measure the torch's error."""
-    from weldcal.tools.studies.part_welds.study import Trial, run_part_welds
-
-    trial = Trial.of(located_by, seam_mm, refine, arm_mm)
-    folder = call.folder("benchmark", "part-welds")
-    summary = run_part_welds(folder, part, range(call.seed, call.seed + runs), trial, call.progress)
-    return Outcome(summary)
-
-
-@command("benchmark part-registration")
-def part_registration(
-    call: Call,
-    part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
-    scenes: Annotated[int, option("--scenes", "N", "Scenes with clutter, without a guess.", min=0)] = 40,
-    plans: Annotated[int, option("--plans", "N", "Plans of each part's seam, seeds from --seed on.", min=0)] = 3,
-    refusals: Annotated[int, option("--refusals", "N", "Scenes of each subject that must be refused.", min=0)] = 3,
-) -> Outcome:
-    """Register twelve parts from STEP files in simulated scans, plan their seams, and compare both with the truth."""
-    from weldcal.tools.studies.parts.study import run_registration_study
-
-    folder = call.folder("benchmark", "part-registration")
-    first, second, third = (range(call.seed, call.seed + count) for count in (scenes, plans, refusals))
-    return Outcome(run_registration_study(folder, first, second, third, part, call.progress))
-
-
-@command("benchmark hand-eye")
-def hand_eye(
-    call: Call,
-    data: Annotated[Path | None, option("--data", "FOLDER", "A folder of sets, each a folder with pairs.npz.")] = None,
-    quick: Annotated[bool, switch("--quick", "Few trials of each kind: seconds instead of minutes.")] = False,
-) -> Outcome:
-    """Compare the hand-eye solvers with OpenCV's on public data, and test them in simulation: outliers, invariance,
-    uncertainty, speed."""
-    from weldcal.tools.studies.hand_eye.comparison import run_hand_eye_benchmark, write_table
-
-    folder = call.folder("benchmark", "hand-eye")
-    result = run_hand_eye_benchmark(data, quick=quick, seed=call.seed, progress=call.progress)
-    return Outcome(result.summary(), text=write_table(result, folder))
-
-
-@command("benchmark hand-eye-cells", options=FARM)
-def hand_eye_cells(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Number of cells of each kind.", min=1)] = 40,
-) -> Outcome:
-    """Compare held-out errors with OpenCV's best on simulated cells with a wrong camera matrix, a wrong robot, or both."""
-    from weldcal.tools.studies.hand_eye.cells_against_opencv import run_cells
-
-    summary, table = run_cells(call.farm(call.folder("benchmark", "hand-eye-cells")), runs, call.seed)
-    return Outcome(summary, text=table)
-
-
-@command("benchmark touch", options=FARM)
-def touch(
-    call: Call,
-    runs: Annotated[
-        int, option("--runs", "N", "Number of light worlds of six touches, or of whole cells.", min=1)
-    ] = 500,
-    scenario: Annotated[
-        str | None,
-        option("--scenario", "NAME", "Whole simulated cells of this scenario: calibrate, then touch the part."),
-    ] = None,
-    points: Annotated[
-        int, option("--points", "N", "With --scenario: places to touch in each cell.", min=3, max=60)
-    ] = 8,
-) -> Outcome:
-    """Measure how often points touched by the robot lie in the 95 % region that their calibration states."""
-    from weldcal.tools.studies.touch.coverage import run_touch_cells, run_touch_study
-
-    farm = call.farm(call.folder("benchmark", "touch"))
-    if scenario is not None:
-        return Outcome(run_touch_cells(farm, scenario, runs, points, call.seed))
-    return Outcome(run_touch_study(farm, runs, call.seed))
-
-
-@command("benchmark mountings", options=FARM)
-def mountings(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Number of seeds of each.", min=1)] = 5,
-    names: Annotated[list[str] | None, option("--scenario", "NAME", "Only this scenario; repeat for more.")] = None,
-) -> Outcome:
-    """Calibrate every mounting live over several seeds: errors against the truth, held-out errors, and errors in units of
-    the covariance."""
-    from weldcal.tools.studies.hand_eye.mountings import run_mountings
-
-    folder, seeds = call.folder("benchmark", "mountings"), range(call.seed, call.seed + runs)
-    summary, table = run_mountings(call.farm(folder), seeds, tuple(names or ()))
-    if not call.json:
-        typer.echo(table)
-    return Outcome(summary)
-
-
-@command("benchmark profiler")
+@command("benchmark profiler", short_help="Time the profiler's calibration by an edge.")
 def profiler(
     call: Call,
     data: Annotated[
@@ -168,147 +29,7 @@ def profiler(
     return Outcome(summary, values={}, rows=lines(summary))
 
 
-@command("benchmark cell")
-def cell(call: Call) -> Mapping[str, object]:
-    """Measure the real-time factor of the whole cell while welding, finger camera included."""
-    from weldcal.tools.studies.cell.speed import run_cell_benchmark
-
-    return run_cell_benchmark(call.folder("benchmark", "cell"), call.seed, call.progress)
-
-
-@command("benchmark seeds", options=FARM)
-def seeds(
-    call: Call,
-    scenario: ScenarioOption = "s_groove",
-    runs: Annotated[int, option("--runs", "N", "Number of seeds.", min=1)] = 11,
-) -> Mapping[str, object]:
-    """Run the demo over many seeds: completed runs, and the largest errors of calibration and torch."""
-    from weldcal.tools.studies.cell.seeds import run_seeds
-
-    folder = call.folder("benchmark", f"seeds-{scenario}")
-    return run_seeds(scenario, call.farm(folder), range(call.seed, call.seed + runs))
-
-
-@command("benchmark fleet", options=FARM)
-def fleet(
-    call: Call,
-    cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 25,
-    datasets: Annotated[int, option("--datasets", "N", "Datasets of each.", min=1)] = 8,
-) -> Mapping[str, object]:
-    """Write made cells, some of which move, drift or break, and count what `weldcal fleet` says of them."""
-    from weldcal.tools.studies.fleet.study import run_fleet_study
-
-    return run_fleet_study(call.farm(call.folder("benchmark", "fleet")), cells, datasets, call.seed)
-
-
-@command("benchmark replay", options=FARM)
-def replays(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Number of runs, over all kinds in turn.", min=1)] = 20,
-) -> Outcome:
-    """Record runs of every kind (simulated, on an emulated controller, by wire, with faults), and replay each bit for bit."""
-    from weldcal.tools.studies.replay.study import run_replays
-
-    summary, table = run_replays(call.farm(call.folder("benchmark", "replay")), runs, call.seed)
-    return Outcome(summary, text=table)
-
-
-@command("benchmark recording")
-def recording(
-    call: Call,
-    pairs: Annotated[int, option("--pairs", "N", "Pairs of runs.", min=6)] = 11,
-) -> Outcome:
-    """Run a short demo with and without --record in turn, and compare the computing time."""
-    from weldcal.tools.studies.replay.overhead import run_overhead
-
-    summary, table = run_overhead(call.folder("benchmark", "recording"), pairs, call.seed, call.progress)
-    return Outcome(summary, text=table)
-
-
-@command("benchmark doctor", options=FARM)
-def doctor(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Sets with each cause.", min=1)] = 20,
-    cleans: Annotated[int, option("--clean", "N", "Sets without a cause.", min=0)] = 200,
-) -> Outcome:
-    """Inject each cause into simulated sets of scans, and count which one `weldcal doctor` names first."""
-    from weldcal.tools.studies.doctor.study import run_doctor_study
-
-    summary, table = run_doctor_study(call.farm(call.folder("benchmark", "doctor")), runs, cleans, call.seed)
-    return Outcome(summary, text=table)
-
-
-@command("benchmark arms", options=FARM)
-def arms(
-    call: Call,
-    names: Annotated[list[str] | None, option("--arm", "NAME", "Only this arm; repeat for more.")] = None,
-    seam: Annotated[float, option("--seam", "MM", "How much of the seam is welded.", min=20.0)] = 80.0,
-    robot: Annotated[
-        str | None, option("--robot", "WHERE", "simulated, or emulated: a controller on this computer.")
-    ] = None,
-) -> Outcome:
-    """Run the demo, scaled to the reach, on UR3e, UR5e, UR10e, UR16e, UR20 and UR30; the scenarios are written too."""
-    from weldcal.models.robots import get_robot
-    from weldcal.tools.studies.arms.demo import ARMS, arms_table, run_arms
-
-    chosen = [get_robot(name).name for name in names] if names else list(ARMS)
-    summary, rows = run_arms(call.farm(call.folder("benchmark", "arms")), chosen, call.seed, seam, robot)
-    return Outcome(summary, text=arms_table(rows))
-
-
-@command("benchmark robot-faults", options=("address",))
-def robot_faults(
-    call: Call,
-    sequences: Annotated[int, option("--sequences", "N", "Number of random fault sequences.", min=0)] = 20,
-    seconds: Annotated[float, option("--seconds", "S", "Length of each.", min=1.0)] = 60.0,
-) -> Outcome:
-    """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say why."""
-    from weldcal.tools.studies.robot.faults import run_fault_benchmark
-
-    result = run_fault_benchmark(
-        call.folder("benchmark", "robot-faults"),
-        address=call.given["address"],
-        sequences=sequences,
-        seconds=seconds,
-        seed=call.seed,
-        progress=call.progress,
-    )
-    return Outcome(result.summary(), rows={outcome.name: outcome.line for outcome in result.outcomes})
-
-
-@command("benchmark robot", options=("address",))
-def robot(
-    call: Call, minutes: Annotated[float, option("--minutes", "M", "Length of the stream.", min=0.05)] = 10.0
-) -> Mapping[str, object]:
-    """Stream commands at 125 Hz to an emulated controller: periods, latencies, and deadlines missed by 20 ms or more."""
-    from weldcal.tools.studies.robot.stream import run_robot_benchmark
-
-    folder = call.folder("benchmark", "robot")
-    return run_robot_benchmark(
-        folder, address=call.given["address"], minutes=minutes, seed=call.seed, progress=call.progress
-    ).summary()
-
-
-@command("benchmark robot-jobs")
-def robot_jobs(
-    call: Call,
-    scenario: ScenarioOption = "s_groove",
-    runs: Annotated[int, option("--runs", "N", "Number of jobs.", min=1)] = 10,
-    load: Annotated[int, option("--load", "N", "Busy programs beside the jobs.", min=0)] = 0,
-    seam_mm: Annotated[
-        float | None, option("--seam-mm", "MM", "Length of the seam.", min=10.0, show_default="the scenario's")
-    ] = None,
-) -> Outcome:
-    """Run whole jobs on an emulated controller in real time: how late the velocities are, alone or beside busy programs."""
-    from weldcal.tools.studies.robot.jobs import run_jobs
-
-    folder = call.folder("benchmark", f"robot-jobs-{scenario}")
-    result = run_jobs(scenario, folder, runs, seed=call.seed, load=load, seam_mm=seam_mm, progress=call.progress)
-    rows = {f"seed {job.seed}": job.line for job in result.jobs} | {"this computer": result.host.line}
-    return Outcome(result.summary(), rows=rows)
-
-
-@command("benchmark fuzz-files")
+@command("benchmark fuzz-files", short_help="Give every file reader damaged files.")
 def fuzz_files(
     call: Call,
     cases: Annotated[int, option("--cases", "N", "Damaged files for each reader.", min=1)] = 1000,
@@ -325,7 +46,7 @@ def fuzz_files(
     return Outcome(result.summary(), values={}, rows=rows)
 
 
-@command("benchmark motion-clock")
+@command("benchmark motion-clock", short_help="Measure how well the clock's offset is found in motion.")
 def motion_clock(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Number of calibrations with each clock.", min=2)] = 300,
@@ -337,28 +58,3 @@ def motion_clock(
     folder = call.folder("benchmark", "motion-clock")
     found = run_clock_study(runs, folder, seed=call.seed, duration_s=seconds, progress=call.progress)
     return Outcome({name: kind.summary() for name, kind in found.items()}, text=clock_table(found))
-
-
-COMMANDS = (
-    tablet,
-    seam_planning,
-    part_welds,
-    part_registration,
-    hand_eye,
-    hand_eye_cells,
-    touch,
-    mountings,
-    profiler,
-    cell,
-    seeds,
-    doctor,
-    fleet,
-    replays,
-    recording,
-    arms,
-    fuzz_files,
-    robot_faults,
-    robot,
-    robot_jobs,
-    motion_clock,
-)

@@ -16,13 +16,13 @@ from weldcal.tools.cli.options import (
     option,
     switch,
 )
-from weldcal.tools.cli.runs import run_options
+from weldcal.tools.commands.run import run_options
 
 
 @command(
     "calibrate",
     options=(*MOTION, "record"),
-    short_help="Calibrate a scanner from a folder of scans, or live in a scenario.",
+    short_help="Calibrate a scanner from scans, or live in a scenario.",
 )
 def calibrate(
     call: Call,
@@ -125,7 +125,7 @@ def calibrate(
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
     if poses is not None or refine is not None or kinematics is not None:
         raise typer.BadParameter("--poses, --refine and --kinematics are for a dataset; omit them with --scenario")
-    from weldcal.tools.commands.procedures import calibrate_live
+    from weldcal.tools.commands.demo import calibrate_live
 
     if limit_mm is not None:
         raise typer.BadParameter("--limit-mm is for a dataset; a scenario states calibration.required_error_mm")

@@ -6,7 +6,7 @@ from typing import Annotated
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 
-@command("reproduce motion-data")
+@command("reproduce motion-data", short_help="Write a simulated recording in motion with its truth.")
 def motion_data(
     call: Call,
     frames: Annotated[int, option("--frames", "N", "Frames that the scanner captures.", min=1)] = 900,
@@ -72,7 +72,7 @@ def motion_data(
     return write_motion_data(request, call.progress)
 
 
-@command("reproduce motion")
+@command("reproduce motion", short_help="Repeat the paper on calibration in motion.")
 def motion(
     call: Call,
     quick: Annotated[bool, switch("--quick", "A seventh of the pixels and 90 frames; decides nothing.")] = False,
@@ -92,7 +92,7 @@ def motion(
     return Outcome(study.summary(), {}, {}, text, problem=missed)
 
 
-@command("benchmark motion")
+@command("benchmark motion", short_help="Measure frames per second beside an arm's control.")
 def throughput(
     call: Call, seconds: Annotated[float, option("--seconds", "S", "Length of the stream.", min=2.0)] = 30.0
 ) -> Outcome:
@@ -104,6 +104,3 @@ def throughput(
 
     found = run_throughput(call.folder("benchmark", "motion"), seconds, call.seed, call.progress)
     return Outcome(found.summary(), text=partial(print_targets, "streamed scans", found.targets))
-
-
-COMMANDS = (motion_data, motion, throughput)

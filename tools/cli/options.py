@@ -17,7 +17,7 @@ from weldcal.tools import console
 
 if TYPE_CHECKING:
     from weldcal.tools.farm.run import Farm
-    from weldcal.tools.outcomes.first_screen import FirstScreen
+    from weldcal.tools.report.first_screen import FirstScreen
 
 
 LEAST_BYTES = 1 << 20
@@ -164,11 +164,15 @@ class Call:
 
 @dataclass(frozen=True)
 class Command:
-    """A function as Typer takes it, with its full name ("benchmark cell") and its line in the list of commands."""
+    """A command: its full name ("benchmark cell"), the function as Typer takes it, and its body.
+
+    Attributes:
+        body: the work as it is written, body(call, own parameters ...) -> Outcome, for a command that hands its work on.
+    """
 
     title: str
     function: Callable[..., None]
-    short_help: str | None
+    body: "Body"
 
 
 LARGEST_OPTION = 1e6
@@ -191,15 +195,17 @@ Body = Callable[..., Outcome | Mapping[str, object] | None]
 def command(
     title: str,
     *,
+    short_help: str,
+    hidden: bool = False,
     options: tuple[str, ...] = (),
     common: tuple[str, ...] = RESULT,
-    short_help: str | None = None,
     defaults: Mapping[str, object] | None = None,
 ) -> Callable[[Body], Command]:
     """Makes a command of a function body(call, own parameters ...) that returns an Outcome, a summary or None.
 
     The body gets the common options ``options`` and ``common`` through its Call. It runs inside console.boundary, with a
-    progress bar where it reports progress; its outcome is printed, as JSON if --json is given.
+    progress bar where it reports progress. Its outcome is printed, as JSON if --json is given. The title, ``short_help`` and
+    ``hidden`` are literals: `find_commands` reads them from the module's text. ``short_help`` has at most 56 characters.
     """
     names = (*options, *common)
     preset = {name: (defaults or {}).get(name, COMMON[name][1]) for name in names}
@@ -226,7 +232,7 @@ def command(
         parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + shared
         run.__doc__ = body.__doc__
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        return Command(title, run, short_help)
+        return Command(title, run, body)
 
     return decorate
 

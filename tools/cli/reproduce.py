@@ -24,7 +24,7 @@ class Study(Protocol):
         """The JSON object."""
 
 
-@command("reproduce tablet")
+@command("reproduce tablet", short_help="Repeat the tablet paper: Tables 7 to 12.")
 def tablet(
     call: Call,
     evolution_seeds: Annotated[
@@ -43,7 +43,7 @@ def tablet(
     return _compared(study, rows=rows)
 
 
-@command("reproduce flange")
+@command("reproduce flange", short_help="Repeat the flange paper: tables, figures, Kinect data.")
 def flange(
     call: Call,
     data: Annotated[
@@ -65,7 +65,7 @@ def flange(
     return Outcome(study.summary(), text=partial(print_study, study))
 
 
-@command("reproduce profiler-seeds")
+@command("reproduce profiler-seeds", short_help="Run every target of 'reproduce profiler' on many seeds.")
 def profiler_seeds(
     call: Call,
     seeds: Annotated[int, option("--seeds", "N", "Number of seeds.", min=2)] = 12,
@@ -86,26 +86,7 @@ def profiler_seeds(
     return Outcome(study.summary(), values={}, rows=rows)
 
 
-@command("reproduce weld")
-def weld(
-    call: Call,
-    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each weld.", min=1)] = 10,
-    rows: Annotated[str, option("--rows", "NAMES", "Only these rows, separated by commas.", show_default="all")] = "",
-    quick: Annotated[
-        bool, switch("--quick", "Two seeds of each weld, and two for the comparison of the laws.")
-    ] = False,
-) -> Outcome:
-    """Run the weld law in a small kinematic world: every target, the published law for comparison, figures, a report."""
-    from weldcal.tools.studies.weld.command import run_study
-    from weldcal.tools.studies.weld.report import print_study
-    from weldcal.tools.studies.weld.results import StudyOptions
-
-    folder, number = call.folder("reproduce", "weld"), min(seeds, 2) if quick else seeds
-    study = run_study(StudyOptions(folder, _names(rows), number, call.seed, quick), call.progress)
-    return _compared(study, text=partial(print_study, study))
-
-
-@command("reproduce profiler")
+@command("reproduce profiler", short_help="Repeat both papers on laser profilers.")
 def profiler(
     call: Call,
     data: Annotated[
@@ -126,25 +107,7 @@ def profiler(
     return found if data is not None else replace(found, problem="")
 
 
-@command("reproduce cell")
-def cell(
-    call: Call,
-    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each scenario.", min=1)] = 3,
-    scenarios: Annotated[str, option("--scenarios", "NAMES", "Scenarios, separated by commas.")] = "s_groove,l_groove",
-    seam_mm: Annotated[
-        float | None, option("--seam-mm", "MM", "Weld only this length; default: all.", min=10.0)
-    ] = None,
-    law: Annotated[str, option("--law", "NAME", "Steering law, for comparison.")] = "guarded",
-) -> Outcome:
-    """Weld in the whole simulated cell, with contact and rendered tag: seam points, torch and real-time factor."""
-    from weldcal.tools.studies.cell.study import CellStudyOptions, print_cell_study, run_cell_study
-
-    folder = call.folder("reproduce", "cell")
-    study = run_cell_study(CellStudyOptions(folder, _names(scenarios), seeds, call.seed, seam_mm, law), call.progress)
-    return _compared(study, text=partial(print_cell_study, study))
-
-
-@command("reproduce flange-sphere")
+@command("reproduce flange-sphere", short_help="Repeat Table 2 of the flange paper with a sphere.")
 def flange_sphere(
     call: Call,
     scans: Annotated[int, option("--scans", "N", "Scans of the flange with a sphere on it.", min=20)] = 48,
@@ -156,9 +119,6 @@ def flange_sphere(
 
     summary = run_sphere_study(call.folder("reproduce", "flange-sphere"), scans, draws, call.seed, call.progress)
     return Outcome(summary, rows=sphere_rows(summary))
-
-
-COMMANDS = (tablet, flange, flange_sphere, profiler_seeds, weld, profiler, cell)
 
 
 def _compared(

@@ -21,7 +21,7 @@ from weldcal.calibration.published.icp import (
 )
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-from weldcal.tools.outcomes.calibration import Algorithm1Outcome, error_summary
+from weldcal.tools.report.calibration import Algorithm1Outcome, error_summary
 
 
 def compare_algorithm1(

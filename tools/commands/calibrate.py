@@ -32,10 +32,9 @@ from weldcal.tools.commands.contradictions import estimate_consistent
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
 from weldcal.tools.commands.refine import Refinable, refine_calibration
 from weldcal.tools.console import Progress
-from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
-from weldcal.tools.outcomes.first_screen import check_limit
-from weldcal.tools.report.calibration import calibration_report
+from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
 from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.render import write_atomic
 
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration

@@ -18,11 +18,10 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.console import Progress
-from weldcal.tools.outcomes.calibration import error_summary
-from weldcal.tools.outcomes.first_screen import check_limit
-from weldcal.tools.outcomes.motion import MotionReport
+from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.files import csv_text
-from weldcal.tools.report.motion_calibration import motion_report
+from weldcal.tools.report.first_screen import check_limit
+from weldcal.tools.report.motion_calibration import MotionReport, motion_report
 from weldcal.tools.report.render import write_atomic
 
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration

@@ -11,7 +11,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.tcp import TcpOffset, find_tcp
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
-from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.report.calibration import error_summary
 
 
 def estimate_consistent(

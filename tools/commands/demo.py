@@ -1,95 +1,124 @@
-"""Runs the weld job of a scenario and writes its results; for `demo`, live calibration and `weld`."""
+"""weldcal demo: runs the job of any scenario with the command that is made for it."""
 
-from weldcal.models.result_files import whole_result
-from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
-from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.runner import Progress, Run, no_progress
-from weldcal.systems.scenario.checks import check_scenario
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.scenario.schema import PoseConfig, Scenario
-from weldcal.tools.commands.run import JobRun, run_job
-from weldcal.tools.commands.run_files import SCANS, SUMMARY, weld_record, write_calibration, write_scans, write_weld_log
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import live_calibration_error, weld_outcome
-from weldcal.tools.report.demo import demo_pictures, demo_report
-from weldcal.tools.report.files import write_json
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.cli.options import (
+    Call,
+    Outcome,
+    ScenarioArgument,
+    ScenarioOption,
+    command,
+)
+from weldcal.tools.commands.motion_live import run_motion_live
+from weldcal.tools.commands.mounting_live import run_mounting_live
+from weldcal.tools.commands.profiler.live import run_profiler_live
+from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
+from weldcal.tools.commands.tablet.demo import run_tablet_demo
+from weldcal.tools.commands.touch import run_touches
+from weldcal.tools.commands.weld import run_calibration_live, run_scenario
+from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
+
+DEMO_SCENARIO = "s_groove"
 
 
-def run_demo(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """Run all parts of a scenario's job.
+@command("demo", options=RECORDED, short_help="Run the complete job in simulation and write a report.")
+def demo(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = DEMO_SCENARIO) -> Outcome:
+    """Run the complete job: calibrate, verify, scan the workpiece, plan, weld, retract. A report is written at the end."""
+    options = run_options(call, "demo", named_once(name, scenario, DEMO_SCENARIO))
+    found = run_procedure(options, call.progress)
+    return Outcome(found.summary(), first=getattr(found, "first", None))
+
+
+class RunResult(Protocol):
+    """The result of every run: a folder and a JSON object."""
+
+    @property
+    def folder(self) -> Path:
+        """The result folder."""
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object."""
+
+
+Runner = Callable[[Scenario, RunOptions, Progress], RunResult]
+RUNNERS: dict[str, Runner] = {
+    "": run_scenario,
+    "tablet": run_tablet_demo,
+    "mounting": run_mounting_live,
+    "motion": run_motion_live,
+    "profiler_job": run_profiler_live,
+    "touch": run_touches,
+}
+
+
+def kind_of(scenario: Scenario) -> str:
+    """The key of the scenario's job; empty for the weld job."""
+    return job_of(scenario).key
+
+
+def run_procedure(options: RunOptions, progress: Progress) -> RunResult:
+    """Run a scenario's job; for a job without a command, only its state and a recording are written.
 
     Raises:
-        InputError, UnreachableScanner: the scenario or the options cannot be run; nothing has been written.
+        InputError, UnreachableScanner, RobotRefused: the scenario or the options cannot be run; nothing has been written.
     """
-    return run_scenario(load_scenario(options.scenario), options, progress)
-
-
-def run_calibration_live(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """Run only the calibration of a scenario: calibrate, verify, park."""
     scenario = load_scenario(options.scenario)
-    scenario.job.calibrate, scenario.job.weld = True, False
-    return run_scenario(scenario, options, progress)
+    return RUNNERS.get(kind_of(scenario), run_any)(scenario, options, progress)
 
 
-def run_weld(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """Run only the weld of a scenario, with the scanner at its known pose."""
-    return run_scenario(known_camera(options.scenario), options, progress)
+def calibrate_live(options: RunOptions, progress: Progress) -> tuple[dict[str, object], FirstScreen]:
+    """Run `calibrate --scenario`: the mounting or motion job, or only the calibration of the weld job; JSON object and first screen."""
+    scenario = load_scenario(options.scenario)
+    if kind_of(scenario) == "mounting":
+        mounted = run_mounting_live(scenario, options, progress)
+        return mounted.summary(), mounted.first
+    if kind_of(scenario) == "motion":
+        moved = run_motion_live(scenario, options, progress)
+        return moved.summary(), moved.first
+    found = run_calibration_live(options, progress)
+    return found.calibration_summary(), found.first
 
 
-def known_camera(name: str) -> Scenario:
-    """Load a scenario that only welds: the scanner is exactly at its nominal pose, which the cell uses.
+@dataclass(frozen=True, eq=False)
+class AnyOutcome:
+    """The state of the run, and its timing."""
 
-    Raises:
-        InputError: the scenario cannot be loaded, or has nothing to weld.
-    """
-    scenario = load_scenario(name)
-    scenario.job.calibrate, scenario.job.weld = False, True
-    if isinstance(scenario.scanner, RenderedScanner):
-        scenario.scanner.mounting_translation_mm = scenario.scanner.mounting_rotation_deg = 0.0
-        scenario.job.X_BC = PoseConfig(list(scenario.scanner.xyz_m), list(scenario.scanner.rpy_deg))
-    check_scenario(scenario)
-    return scenario
+    options: RunOptions
+    finished: JobRun
 
+    @property
+    def folder(self) -> Path:
+        """The result folder."""
+        return self.options.out
 
-def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """Build and run the cell, evaluate the run and write its results.
-
-    Raises:
-        InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
-    """
-    finished = run_job(scenario, options, progress, "")
-    progress("measure and write", 0.985)
-    result = measure(finished.run, options, finished.robot)
-    write_result(result, finished)
-    return result
+    def summary(self) -> dict[str, object]:
+        """The JSON object of `demo` for such a job."""
+        run = self.finished.run
+        found: dict[str, object] = {
+            "state": "held" if run.held else "done",
+            "scenario": self.options.scenario,
+            "seed": self.options.seed,
+            "robot": self.finished.robot,
+        }
+        if run.reason:
+            found["reason"] = run.reason
+        return found | run.timing()
 
 
-def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") -> DemoResult:
-    """Compare the run with the ground truth of its simulation."""
-    cell, status = run.cell, run.cell.job.calibration_status(run.root)
-    error = (
-        None
-        if status.estimate is None
-        else live_calibration_error(cell, status.estimate, status.arm_or(cell.station.arm))
-    )
-    return DemoResult(options, run, status, error, weld_outcome(cell, run.root), robot)
-
-
-def write_result(result: DemoResult, finished: JobRun) -> None:
-    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, summary.json, report.html."""
-    folder, run = result.folder, result.run
-    with whole_result(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_calibration(run.cell, result.status, result.options.seed, folder)
-        write_scans(run, result.status, folder / SCANS, result.robot)
-        if result.weld is not None:
-            record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
-            write_weld_log(record, folder)
-        finished.write_recording(folder)
-        pictures = demo_pictures(result)
-        for name, picture in pictures.items():
-            write_atomic(folder / "plots" / f"{name}.svg", picture)
-        write_json(folder / SUMMARY, result.summary())
-        write_atomic(folder / "report.html", demo_report(result, pictures, recording=finished.meshcat is not None))
+def run_any(scenario: Scenario, options: RunOptions, progress: Progress) -> AnyOutcome:
+    """Run the job; write run.json and the recording. Raises as run_job."""
+    outcome = AnyOutcome(options, run_job(scenario, options, progress))
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_atomic(options.out / "run.json", json.dumps(outcome.summary(), indent=1) + "\n")
+    outcome.finished.write_recording(options.out)
+    return outcome

@@ -1,21 +1,58 @@
 """Calibrates and verifies every dataset below a folder, cell by cell, and writes one page about all of them."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+import typer
 
 from weldcal.models.errors import InputError
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.outcomes.fleet import Checked, FleetReport, judge_fleet
 from weldcal.tools.report.files import write_json
-from weldcal.tools.report.fleet import fleet_report
+from weldcal.tools.report.first_screen import CARE
+from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Cell, Checked, FleetReport, fleet_report, held_out_mm
 from weldcal.tools.report.render import write_atomic
 
 HEADER = "dataset.yaml"
 FAILED = "failed"
+
+OUTLIER = 3.0  # times the fleet's median held-out error
+FALSE_ALARM = 1e-3  # of a trend, per cell
+REFUSED = 0.2  # share of a dataset's scans
+
+
+@command("fleet", options=FARM, short_help="Calibrate and verify the datasets of many cells.")
+def fleet(
+    call: Call,
+    folder: Annotated[Path, typer.Argument(help="A folder of cells, each a dataset or a folder of datasets by date.")],
+    limit_mm: Annotated[
+        float | None,
+        option(
+            "--limit-mm",
+            "MM",
+            "Largest median error of a later dataset.",
+            show_default="from what the calibration states",
+        ),
+    ] = None,
+) -> Outcome:
+    """Calibrate every dataset, verify each cell's first calibration on its later datasets, and write one page: which cells
+    drift, and which need a visit."""
+    find_cells(folder)
+    out = call.folder("fleet", folder.resolve().name)
+    report = run_fleet(folder, call.farm(out), limit_mm=limit_mm, seed=call.seed)
+    summary = report.summary()
+    shown = {
+        cell.name: f"{cell.state}: {cell.reason} {cell.next}" for cell in report.cells if cell.state in (VISIT, LOOK)
+    }
+    counts = {name: summary[name] for name in ("cells", "datasets", "fine")} | {
+        name: len(report.named(name)) for name in (VISIT, LOOK)
+    }
+    return Outcome(summary, values=counts, rows={**shown, "report": str(out / "report.html")})
 
 
 def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: int = 0) -> FleetReport:
@@ -118,3 +155,83 @@ def _checked(cell: str, name: str, calibrations: Mapping[str, Any], verification
 
 def _key(cell: str, name: str) -> str:
     return cell if cell == name else f"{cell}/{name}"
+
+
+def judge_fleet(cells: Mapping[str, Sequence[Checked]], out: Path) -> FleetReport:
+    """Judge every cell, and put those that need a visit first, the largest error first within each state."""
+    found = [held_out_mm(datasets[-1]) for datasets in cells.values()]
+    usual = np.median([mm for mm in found if mm is not None]) if any(mm is not None for mm in found) else np.inf
+    judged = [judge_cell(name, tuple(datasets), float(usual)) for name, datasets in cells.items()]
+    order = (VISIT, LOOK, FINE)
+    judged.sort(key=lambda cell: (order.index(cell.state), -(cell.datasets[-1].error_mm or np.inf), cell.name))
+    return FleetReport(tuple(judged), out)
+
+
+def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> Cell:
+    """Judge a cell by its newest dataset, its history, and the fleet's usual held-out error (mm)."""
+    newest = datasets[-1]
+    since = _refuted_since(datasets)
+    trend = _grows([d.error_mm for d in datasets])
+    state, reason, then = FINE, "", ""
+    if newest.calibration["state"] == "failed":
+        state, reason = VISIT, f"'{newest.name}' cannot be calibrated. {newest.calibration['reason']}"
+        then = "Take new scans of the flange."
+    elif since is not None:
+        state, reason = (
+            VISIT,
+            f"Since '{since}' the first calibration does not hold. {(newest.verification or {}).get('reason', '')}",
+        )
+        then = "Find what moved, then use the newest calibration."
+    elif newest.verification is not None and newest.verification["state"] == "failed":
+        state = LOOK
+        reason = (
+            f"The first calibration could not be verified on '{newest.name}'. {newest.verification.get('reason', '')}"
+        )
+        then = "Correct what the reason names, then run the command again with a new --out."
+    elif trend:
+        state, reason = LOOK, f"The error of the first calibration grows: {_mm(datasets[0])} to {_mm(newest)} mm."
+        then = "Check the mounts of scanner and robot, and the scanner's warm-up. Use the newest calibration."
+    else:
+        reason, then = _smaller_signs(newest, usual_mm)
+        state = LOOK if reason else FINE
+    return Cell(name=name, datasets=datasets, state=state, reason=reason, next=then, since=since, trend=trend)
+
+
+def _smaller_signs(newest: Checked, usual_mm: float) -> tuple[str, str]:
+    held_out = held_out_mm(newest)
+    if held_out is not None and held_out > OUTLIER * usual_mm:
+        return (
+            f"Its held-out error, {held_out:.2f} mm, is {held_out / usual_mm:.1f} times the usual one.",
+            f"Compare its scans with those of a good cell: {newest.report}.",
+        )
+    used, refused = newest.calibration["n_used"], len(newest.calibration["refused"])
+    if refused > REFUSED * (used + refused):
+        return f"{refused} of {used + refused} scans were refused.", "Clean the flange and the scanner's window."
+    if newest.verification is not None and newest.verification.get("verdict") == CARE:
+        return str(newest.verification["reason"]), "Take more scans."
+    return "", ""
+
+
+def _refuted_since(datasets: Sequence[Checked]) -> str | None:
+    """The dataset from which on the first calibration must not be used, up to the newest; None where it may be used."""
+    since = None
+    for dataset in reversed(datasets):
+        if not dataset.refuted:
+            break
+        since = dataset.name
+    return since
+
+
+def _grows(errors_mm: Sequence[float | None]) -> bool:
+    """Whether errors grow with time: Kendall's rank correlation at FALSE_ALARM. Seven datasets are the least."""
+    seen = [mm for mm in errors_mm if mm is not None]
+    if len(seen) < 7:
+        return False
+    from scipy.stats import kendalltau  # slow to import
+
+    found = kendalltau(np.arange(len(seen)), seen, alternative="greater")
+    return bool(found.pvalue < FALSE_ALARM)
+
+
+def _mm(dataset: Checked) -> str:
+    return "–" if dataset.error_mm is None else f"{dataset.error_mm:.2f}"

@@ -18,12 +18,11 @@ from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
-from weldcal.tools.outcomes.calibration import error_summary
-from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next
-from weldcal.tools.outcomes.motion import motion_screen
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.calibration import error_summary
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.report.motion_calibration import motion_screen
 from weldcal.tools.report.render import render, write_atomic
-from weldcal.tools.report.robot_timing import robot_timing
+from weldcal.tools.report.run import RunOptions, robot_timing
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,21 +3,39 @@
 import json
 import time
 from hashlib import sha256
+from typing import Annotated
 
 import numpy as np
+import typer
 from pydrake.common.yaml import yaml_dump_typed
 
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.systems.jobs.mounting.calibrator import solve_mounting
 from weldcal.systems.runner import Progress
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.run import JobRun, run_job
-from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, command
+from weldcal.tools.commands.run import JobRun, run_job, run_options
 from weldcal.tools.report.files import csv_text
-from weldcal.tools.report.mounting import mounting_report
-from weldcal.tools.report.mounting_picture import station_picture
+from weldcal.tools.report.mounting import MountingReport, mounting_report, station_picture
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
+
+
+@command(
+    "hand-eye live", short_help="Calibrate a scanner live in any mounting.", options=LIVE, defaults={"browser": False}
+)
+def hand_eye_live(
+    call: Call,
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="A scenario with a mounting section, by name or path.")
+    ] = "eye_in_hand",
+    record: RecordOption = False,
+) -> Outcome:
+    """Calibrate a scanner live in any mounting: it scans the robot's flange, its foot, or a second arm's flange."""
+    options = run_options(call, "hand-eye", scenario, recording=record)
+    result = run_mounting_live(load_scenario(scenario), options, call.progress)
+    return Outcome(result.summary(), text=result.text(), first=result.first)
 
 
 def run_mounting_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MountingReport:

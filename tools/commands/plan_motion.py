@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import read_stream
@@ -21,10 +23,53 @@ from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.report.files import write_json
 
 _EDGES, _LEANS = (0.5, 1.0, 1.25), (5.0, 15.0, 25.0)  # of the scenario's cube; degrees
 _SPEED_M_S = 0.25  # of a part to be scanned: what an error of the clock costs
+
+
+@command("plan-motion", short_help="Find the best motion for a calibration in motion.")
+def plan_motion(
+    call: Call,
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="Arm, scanner's guess and cube: a scenario by name or YAML file.")
+    ] = "motion",
+    stream: Annotated[
+        list[Path] | None,
+        option("--stream", "FILE", "Compare recorded programs, tables as stream.csv, instead of cubes; may repeat."),
+    ] = None,
+    calibration: Annotated[
+        Path | None, option("--calibration", "RESULT", "Where the scanner stands.", show_default="the scenario's guess")
+    ] = None,
+    seconds: Annotated[float, option("--seconds", "S", "How long the scanner streams.", min=2.0)] = 20.0,
+    device_clock: Annotated[
+        bool, switch("--device-clock/--no-device-clock", "Frames with the device's times, or arrivals only.")
+    ] = True,
+) -> Outcome:
+    """Predict what motions tell of the scanner's pose and clock, and write the best one as URScript. Nothing moves.
+
+    The error is that of a point among the flange's places, one sigma, of noise alone.
+    """
+
+    found = plan_motions(
+        scenario,
+        call.folder("plan-motion", scenario),
+        streams=stream or (),
+        calibration=calibration,
+        seconds=seconds,
+        device=device_clock,
+        seed=call.seed,
+        progress=call.progress,
+    )
+    rows = {str(p["name"]): _line(p) for p in found["motions"]}  # type: ignore[attr-defined]
+    return Outcome(found, values={"written to": found["written_to"]}, rows=rows)
+
+
+def _line(p: dict[str, float | None]) -> str:
+    shown = (("error_mm", "mm", 3), ("rotation_deg", "deg", 4), ("clock_offset_ms", "ms", 3))
+    return ", ".join("open" if p[k] is None else f"{p[k]:.{digits}f} {unit}" for k, unit, digits in shown)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +114,12 @@ def plan_motions(
     best = found[0]
     out.mkdir(parents=True, exist_ok=True)
     result: dict[str, object] = {
-        "state": "done", "best": _plain(best), "motions": [_plain(p) for p in found], "device_times": device,
+        "state": "done",
+        "best": _plain(best),
+        "motions": [_plain(p) for p in found],
+        "device_times": device,
         "seconds": None if streams else seconds,
-    }  # fmt: skip
+    }
     write_json(out / "plan.json", result)
     if best.corners_deg:
         speed = (loaded.part(MotionJob) or MotionJob()).speed_m_s

@@ -1,8 +1,10 @@
 """`weldcal plan-poses`: the poses whose scans tell most of camera, scanner and arm together, for `calibrate --refine`."""
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
@@ -12,15 +14,34 @@ from weldcal.calibration.refinement.kinematics_fit import KINDS
 from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.weld.settings import plan_poses
+from weldcal.systems.jobs.weld.settings import plan_poses as plan_scan_poses
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 
 _POOL = (6, 4, 3, 2, 1)
 """Times the scans: how many poses to choose from, as many as the cell allows."""
+
+
+@command("plan-poses", short_help="Find the poses of scans for calibrate --refine.")
+def plan_poses(
+    call: Call,
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="Arm, scanner and its guess: a scenario by name or YAML file.")
+    ] = "calibrate_only",
+    scans: Annotated[int, option("--scans", "N", "Number of scans.", min=12)] = 20,
+    kind: Annotated[str, option("--kind", "KIND", "The refinement that they are for: links or joints.")] = "links",
+) -> Outcome:
+    """Choose flange poses that the arm reaches and the scanner sees, and write them as a table and URScript. Nothing moves."""
+
+    found = plan_refining_poses(
+        scenario, call.folder("plan-poses", scenario), scans=scans, kind=kind, seed=call.seed, progress=call.progress
+    )
+    values = {k: found[k] for k in ("scans", "chosen_from", "written_to")}
+    return Outcome(found, values={k.replace("_", " "): v for k, v in values.items()})
 
 
 def plan_refining_poses(
@@ -49,7 +70,7 @@ def plan_refining_poses(
     try:
         for k, times in enumerate(_POOL):
             try:
-                pool = plan_poses(loaded, station, seed, count=times * scans)
+                pool = plan_scan_poses(loaded, station, seed, count=times * scans)
                 break
             except UnreachableScanner:
                 if times == _POOL[-1]:

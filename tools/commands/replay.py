@@ -1,6 +1,4 @@
-"""Replays a recording: today's algorithms on what the cell saw, compared with what it did, bit for bit."""
-
-from __future__ import annotations
+"""weldcal replay: runs today's algorithms on what a recorded cell measured, and compares what they did bit for bit."""
 
 import json
 import tempfile
@@ -8,8 +6,9 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
@@ -24,11 +23,43 @@ from weldcal.systems.recording.reader import read_recording
 from weldcal.systems.recording.scenario_files import unpacked
 from weldcal.systems.recording.values import array, decode
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command
+from weldcal.tools.commands.run import RECORDING
+from weldcal.tools.report.first_screen import pose_rows
 
 IDENTICAL, DIFFERS = "identical", "differs"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@command("replay", common=LOOK, short_help="Repeat a recorded run and compare bit for bit.")
+def replay(
+    call: Call,
+    recording: Annotated[Path, typer.Argument(help="A recording.mcap from --record, or the folder that holds it.")],
+) -> Outcome:
+    """Run today's algorithms on what a recorded cell saw, and compare all that they did, bit for bit.
+
+    The state is "identical", or "differs" with the first value that is another one; then the exit code is 1. A recording that was
+    cut off is replayed to its end.
+    """
+    found = replay_recording(recording / RECORDING if recording.is_dir() else recording, call.progress)
+    summary = found.summary()
+    values = {
+        "compared": f"{found.compared} messages of {found.seconds:.1f} s",
+        "recorded with": f"weldcal {found.about.get('version')}, seed {found.about.get('seed')}",
+        "ended in": found.phase,
+    }
+    if found.cut_off:
+        values["note"] = "the recording was cut off before its run ended"
+    first, problem = found.first, ""
+    if first is not None:
+        values["first difference"] = f"{first.name} at {first.time_s:.3f} s (message {first.message})"
+        values["recorded, replayed"] = f"{first.was}, {first.now}"
+        values["ports that differ"] = ", ".join(sorted(found.differences))
+        problem = f"The replay differs from the recording since {first.time_s:.3f} s, first in {first.name}."
+    rows = {} if found.X_BC is None else pose_rows(found.X_BC)
+    return Outcome(summary, values=values, rows=rows, problem=problem)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
     """A finished replay: seconds of the recording that were replayed, how many values were compared, and what differs by port.
 
@@ -64,7 +95,7 @@ class Replay:
         return found
 
 
-def replay(
+def replay_recording(
     path: Path, progress: Progress = no_progress, look: Callable[[Cell[Any], Context], None] | None = None
 ) -> Replay:
     """Replay a recording; ``look`` is shown the cell and its Context at the end.

@@ -1,34 +1,81 @@
-"""Runs the job of a scenario for all commands: selects the robot, builds the cell, opens the viewer and advances it."""
+"""Runs the job of a scenario for all commands: selects the robot, builds the cell, opens the viewer, records and advances it."""
 
+import dataclasses as dc
+import json
+import platform
 import time
 import webbrowser
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+import numpy as np
+import typer
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
 from weldcal.systems.cell import Cell, build_cell
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
+from weldcal.systems.drivers.station_build import PreparedRobot
+from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.person import Person, person_at
+from weldcal.systems.recording.port_recorder import ENTERED, LEFT
+from weldcal.systems.recording.scenario_files import packed
+from weldcal.systems.recording.tap import Layout, OpenSink
+from weldcal.systems.recording.values import encode
+from weldcal.systems.recording.writer import RecordingWriter
 from weldcal.systems.runner import Progress, Run, run_cell
+from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station
 from weldcal.systems.viewer.kept import free_unused
 from weldcal.systems.viewer.live import LiveView
 from weldcal.tools import console
-from weldcal.tools.commands.record import RunRecorder
-from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.cli.options import (
+    LIVE,
+    Call,
+)
 from weldcal.tools.dashboard.facts import facts_of
 from weldcal.tools.dashboard.recording import with_overlay
 from weldcal.tools.dashboard.source import DashboardSource
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
+
+SIMULATED, EMULATED = "simulated", "emulated"
+EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this pace they do with other load
+SLOWEST_PACE = 0.05
+GRAVITY = 9.82  # m/s^2, as a controller has it
+RECORDING: Final = "recording.mcap"
+_PACKAGES = ("drake", "numpy", "scipy", "open3d", "opencv-python-headless", "numba")
+
+RECORDED = (*LIVE, "record")
+
+
+def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:
+    """The options of a run; its folder is named after the command and the scenario."""
+    return RunOptions(scenario=scenario, out=call.folder(command, scenario), seed=call.seed, **{**call.live, **more})
+
+
+def named_once(name: str | None, scenario: str, preset: str) -> str:
+    """The scenario, given as an argument or with --scenario.
+
+    Raises:
+        typer.BadParameter: both are given, and differ.
+    """
+    if name is not None and scenario not in (preset, name):
+        raise typer.BadParameter("give the scenario once, as an argument or with --scenario")
+    return name or scenario
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +86,10 @@ class JobRun:
     meshcat: Meshcat | None
     robot: str
     live: LiveView | None = None
+
+    def share(self, done: float) -> float:
+        """The completed share while results are written: ``done`` of a completed run; a held one keeps what it had reached."""
+        return self.run.share if self.run.held else done
 
     @property
     def cell(self) -> Cell[Any]:
@@ -160,3 +211,163 @@ def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTr
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetCameraPose(camera, target)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class ChosenRobot:
+    """The robot of a run. `title` is its name for display; `prepared` is set where the driver need not prepare it."""
+
+    title: str
+    prepared: PreparedRobot | None = None
+
+
+@contextmanager
+def chosen_robot(
+    word: str | None, scenario: Scenario, *, dry_run: bool = False, pace: float | None = None
+) -> Iterator[ChosenRobot]:
+    """Set `scenario.robot` by the option's value for the duration of the block.
+
+    Args:
+        word: `simulated`; `emulated`, on a loopback address of its own, or `emulated@ADDRESS`; the address of a controller;
+            None: the scenario's own.
+        scenario: its `robot` is replaced.
+        dry_run: read the robot's state, then run with a simulated arm that has its kinematics and configuration.
+        pace: controller seconds per second of the wall clock; other than 1 only for an emulated controller.
+
+    Raises:
+        InputError: the options cannot be combined, or the address is none.
+        RobotRefused: the controller does not answer, or does not allow the job; nothing has moved.
+    """
+    if word is None and not isinstance(scenario.robot, UrRtde) and not scenario.robot.SIMULATED:
+        if dry_run or pace is not None:
+            raise InputError("--dry-run and --pace need a controller: give --robot with its address.")
+        yield ChosenRobot(type(scenario.robot).__name__)
+        return
+    if word is None:
+        word = scenario.robot.host if isinstance(scenario.robot, UrRtde) else SIMULATED
+        if isinstance(scenario.robot, UrRtde) and pace is None and scenario.robot.pace != 1.0:
+            pace = scenario.robot.pace
+    if word == SIMULATED:
+        if dry_run or pace is not None:
+            raise InputError(
+                "--dry-run and --pace need a controller: give --robot emulated or the address of a controller."
+            )
+        if isinstance(scenario.robot, UrRtde):
+            scenario.robot = SimulatedUr()
+        yield ChosenRobot("simulated")
+        return
+    kind, _, address = word.partition("@")
+    if kind != EMULATED:
+        host = controller_address(word)
+        if pace is not None and not is_loopback(host):
+            raise InputError(
+                "A real controller runs in real time: --pace is for an emulated one, at a loopback address."
+            )
+        pace = 1.0 if pace is None else pace
+        _check_pace(pace)
+        yield _at(host, f"the controller at {host}", scenario, dry_run=dry_run, pace=pace)
+        return
+    wanted = loopback_address(address) if address else None
+    pace = EMULATED_PACE if pace is None else pace
+    _check_pace(pace)
+    kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
+    q_home = np.deg2rad(scenario.home_deg)
+    with emulator_process(
+        host=wanted, robot=scenario.arm, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
+    ) as emulator:
+        load = (scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(emulator.host, scenario)).load()
+        emulator.do("set_payload", mass=load.mass_kg, cog=list(load.cog_m))
+        emulator.do("set_gravity", gravity=(GRAVITY * nominal_arm(scenario).up).tolist())
+        yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace, lockstep=True)
+
+
+def _check_pace(pace: float) -> None:
+    if not SLOWEST_PACE <= pace <= 1.0:
+        raise InputError(f"--pace must be from {SLOWEST_PACE:g} to 1, and it is {pace:g}.")
+
+
+def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float, lockstep: bool = False) -> ChosenRobot:
+    config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
+    config = dc.replace(config, host=host, pace=pace, lockstep=lockstep or config.lockstep)
+    if not dry_run:
+        scenario.robot = config
+        draw_in_this_thread()
+        return ChosenRobot(name)
+    scenario.robot = SimulatedUr()
+    return ChosenRobot(
+        f"dry run: a simulated arm with the kinematics and configuration of {name}; nothing was sent to it",
+        look_at(config, scenario),
+    )
+
+
+def robot_at(host: str, scenario: Scenario) -> UrRtde:
+    """The robot at an address, with the scenario's tool as its payload."""
+    if scenario.tool == "none":
+        return UrRtde(host=host, payload_kg=0.0, payload_cog_m=[0.0, 0.0, 0.0])
+    if scenario.tool == "pen":
+        return UrRtde(host=host, payload_kg=0.42, payload_cog_m=[0.03, 0.0, 0.02])
+    loaded = scenario.loaded_tool()
+    assert loaded is not None
+    return UrRtde(host=host, payload_kg=loaded.tool.mass_kg, payload_cog_m=list(loaded.tool.centre_of_mass_m))
+
+
+def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
+    """Read the kinematics and configuration of a controller's arm; nothing is written, sent or moved.
+
+    Raises:
+        RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the operator action.
+    """
+    report = preflight(
+        config.host, upper_registers=config.upper_registers, nominal=nominal_arm(scenario), load=config.load(),
+        set_points=config.set_points,
+    )  # fmt: skip
+    require_ready(report)
+    assert report.arm is not None
+    assert report.arm_q is not None
+    return PreparedRobot(report.arm, report.arm_q)
+
+
+class RunRecorder:
+    """Records one run, from the building of its cell to its end."""
+
+    def __init__(self, scenario: Scenario, options: RunOptions, robot: str) -> None:
+        self._scenario, self._options, self._robot = scenario, options, robot
+        self._writer: RecordingWriter | None = None
+
+    @property
+    def open_sink(self) -> OpenSink:
+        """See build_cell."""
+        return self._open
+
+    def _open(self, station: Station, layout: Layout) -> RecordingWriter:
+        sizes = {ENTERED: layout.entered, LEFT: layout.left}
+        about = {
+            "sizes": json.dumps(sizes),
+            "version": version("weldcal"),
+            "packages": json.dumps({name: version(name) for name in _PACKAGES}),
+            "python": platform.python_version(),
+            "machine": f"{platform.system()} {platform.machine()}",
+            "scenario": self._options.scenario,
+            "seed": str(self._options.seed),
+            "robot": self._robot,
+            "drives": json.dumps(layout.drives),
+            "arm": json.dumps(encode(station.arm)),
+            "q_start": json.dumps(encode(station.q_start)),
+        }
+        self._options.out.mkdir(parents=True, exist_ok=True)
+        self._writer = RecordingWriter(self.path, about, packed(self._scenario), station.arm, sizes)
+        return self._writer
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self._options.out / RECORDING
+
+    def close(self, run: Run | None) -> None:  # type: ignore[type-arg]  # of any job
+        """End the file; without a run (it has failed) it stays as one that was cut off.
+
+        Raises:
+            RecordingFailed: see RecordingWriter.close.
+        """
+        if self._writer is not None and run is not None:
+            self._writer.close({"time": run.seconds, "phase": run.command.phase, "interrupted": run.interrupted})

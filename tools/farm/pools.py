@@ -30,6 +30,12 @@ def processes_here() -> int:
     return max(1, min(cores, int(free_gib / MEMORY_GIB)))
 
 
+def in_this_process(tasks: Tasks) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Results one after the other, by key: for tasks that take less time than a new process, or measure this one."""
+    for key, (function, arguments) in tasks.items():
+        yield key, run_task(function, arguments)
+
+
 def on_this_computer(tasks: Tasks, workers: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """Results as they are ready, by key.
 

@@ -8,7 +8,7 @@ from typing import Any
 from weldcal.calibration.data.results import software_version
 from weldcal.tools.console import Progress
 from weldcal.tools.farm.journal import Journal, Result
-from weldcal.tools.farm.pools import on_dask, on_this_computer, processes_here
+from weldcal.tools.farm.pools import in_this_process, on_dask, on_this_computer, processes_here
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Farm:
 
     Attributes:
         folder: of the study's results; a second run with the same folder does only what is missing.
-        workers: processes on this computer; None: as many as its cores and memory allow.
+        workers: processes on this computer; None: as many as its cores and memory allow; 0: in this process.
         scheduler: address of a Dask scheduler, in place of processes of this computer.
         progress: told which task was finished last, and the share done.
     """
@@ -63,6 +63,8 @@ class Farm:
             return iter(())
         if self.scheduler is not None:
             return on_dask(missing, self.scheduler)
+        if self.workers == 0:
+            return in_this_process(missing)
         return on_this_computer(missing, self.workers or processes_here())
 
 

@@ -1,17 +1,278 @@
-"""The report page of `weldcal calibrate`, with its plots and tables."""
+"""The result of `weldcal calibrate` and its page, with its plots and tables."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import export_ros2
-from weldcal.calibration.eye_on_base.solve import point_error_covariance
+from weldcal.calibration.data.results import CalibrationResult, correction_note, export_ros2, matrix4
+from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
+from weldcal.calibration.eye_on_base.nested import bootstrap_interval, mean_interval
+from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
+from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.refinement.budget import USUAL_SCALE, ErrorBudget, error_budget
 from weldcal.models.arrays import Array
-from weldcal.tools.outcomes.calibration import CalibrationReport
-from weldcal.tools.report.calibration_map import knowledge_map
-from weldcal.tools.report.flange_features import HEADER, feature_table, fit_cells
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.models.robots import get_robot
+from weldcal.tools.report.first_screen import (
+    ENOUGH_UNSEEN,
+    SCANNER,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    WorkPoint,
+    refused_note,
+    work_point_error,
+    work_point_expected,
+)
 from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
+
+
+def error_summary(values: Array) -> dict[str, float]:
+    """Median, mean, 95th percentile and maximum of the finite values (n,), in their unit; NaN where there are none."""
+    v = np.asarray(values, dtype=float)
+    v = v[np.isfinite(v)]
+    if len(v) == 0:
+        return dict.fromkeys(("median", "mean", "p95", "max"), float("nan"))
+    return {
+        "median": float(np.median(v)),
+        "mean": float(v.mean()),
+        "p95": float(np.percentile(v, 95)),
+        "max": float(v.max()),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm1Outcome:
+    """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive to.
+
+    ``verification``: id of the pose held out for it. ``figure_mm``: reported by Algorithm 1; ``true_mm``: its errors at the
+    flange at unused poses; ``unseen``: components of a true error of which less than half appears in the figure.
+    """
+
+    verification: str
+    metric: str
+    figure_mm: float
+    true_mm: dict[str, float]
+    at_verification_mm: float
+    unseen: tuple[str, ...]
+    shares: tuple[float, ...]
+    run: Algorithm1Run
+
+    @property
+    def sentence(self) -> str:
+        """One sentence for the terminal."""
+        blind = f" ({self.metric}), insensitive to: {'; '.join(self.unseen)}" if self.unseen else f" ({self.metric})"
+        return (
+            f"Algorithm 1 reports {self.figure_mm:.3f} mm at its verification pose {self.verification}{blind}. "
+            f"Its error at unused poses: {self.true_mm['median']:.3f} mm median."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationReport:
+    """The result of `weldcal calibrate`: the estimate, the records written, and the folder. ``observations`` include the
+    scanner correction where one was accepted; ``notes`` say in which form the dataset was read; ``limit_mm`` is the error that the
+    job allows (None: not stated)."""
+
+    result: CalibrationResult
+    estimate: CalibrationEstimate
+    observations: tuple[Observation, ...]
+    scanner: SelfCalibration | None
+    fits: dict[str, FlangeFit]
+    refused: tuple[tuple[str, str], ...]
+    outliers: tuple[str, ...]
+    algorithm1: Algorithm1Outcome | None
+    convergence: Convergence
+    k_fold_mm: dict[str, float]
+    seconds: float
+    out: Path
+    advice: tuple[str, ...] = ()
+    patterns: dict[str, HolePattern] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    refinement: dict[str, Any] | None = None
+    limit_mm: float | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. The error is the larger of two at 95 %: the calibration's own at the work point, and the held-out one."""
+        r, work = self.result, self.work_point
+        said = self._remarks
+        # what is not observable and matters to X_BC is among the warnings
+        concerns = [text for text in r.warnings if text not in said]
+        expected, figure = work_point_expected(work)
+        tolerance = None
+        if self.limit_mm is not None:
+            tolerance = Tolerance("the error at the work point, 95 %,", figure, self.limit_mm, "--limit-mm")
+        notes = [*filter(None, (correction_note(r),)), *refused_note(self.refused, len(r.poses)), *self._refined]
+        found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
+        return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),))
+
+    @property
+    def _remarks(self) -> list[str]:
+        """Those of the warnings that tell what was done, not what could be wrong."""
+        applied = self.scanner is not None and self.scanner.accepted is not None
+        return [*([self.scanner.sentence] if applied and self.scanner is not None else []), *self._refined]
+
+    @property
+    def _refined(self) -> list[str]:
+        """What --refine found and applied."""
+        return [] if self.refinement is None else [str(self.refinement["sentence"])]
+
+    def _next(self, tolerance: Tolerance | None, concerns: Sequence[str]) -> Next:
+        missed = tolerance is not None and not tolerance.met
+        if self.advice and (missed or self.work_point.unseen_poses < ENOUGH_UNSEEN):
+            return Next(f"{' '.join(self.advice[:2])} Then calibrate again.")
+        if concerns:
+            return Next(
+                "See what disturbs the scans, then verify on scans that the calibration has not seen.",
+                f"weldcal doctor {self.out}",
+            )
+        return Next("Take four or more new scans, and verify with them.", f"weldcal verify {self.out} NEW_SCANS")
+
+    @property
+    def work_point(self) -> WorkPoint:
+        """The expected error at the middle of the flange centres that were used."""
+        used = [o.p_BR for o, keep in zip(self.observations, self.estimate.inliers, strict=True) if keep]
+        return work_point_error(self.estimate, np.mean(used, axis=0))
+
+    @property
+    def budget(self) -> ErrorBudget:
+        """What contributes to the error at the work point."""
+        try:
+            repeatability_m = get_robot(self.result.robot).repeatability_m
+        except InputError:
+            repeatability_m = None  # an arm of the user's own
+        refinement = self.refinement or {}
+        motion = None if self.scanner is None else self.scanner.motion
+        scale = None if motion is None else float(np.hypot(motion.values[0] - 1.0, motion.sigma[0]))
+        return error_budget(
+            self.estimate,
+            self.observations,
+            repeatability_m=repeatability_m,
+            scale_error=scale if scale is not None and scale < USUAL_SCALE else None,
+            flange_m=get_flange(self.result.flange).outer_m,
+            refined=str(refinement["kind"]) if refinement.get("accepted") else "",
+        )
+
+    @property
+    def interval_rows(self) -> dict[str, str]:
+        """Rows for the terminal: the held-out figures, each with its bootstrap interval."""
+        return interval_rows("held-out error", 1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
+
+    @property
+    def held_out_interval_mm(self) -> tuple[float, float] | None:
+        """Interval (mm) that holds the mean error of as many new scans with 95 % probability; None for fewer than four errors."""
+        return mean_interval(1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object of `calibrate`."""
+        interval = self.held_out_interval_mm
+        r = self.result
+        a = self.algorithm1
+        return {
+            "state": "done",
+            "n_used": int(self.estimate.inliers.sum()),
+            "refused": [{"id": i, "reason": t} for i, t in self.refused],
+            "X_BC": matrix4(r.X_BC),
+            "covariance": r.covariance.tolist(),
+            "scanner_correction": r.scanner_correction,
+            "held_out_mm": {k: r.held_out_mm[k] for k in ("median", "mean", "p95")},
+            "held_out_interval_mm": None if interval is None else list(interval),
+            "tilt_deg": r.tilt_deg,
+            "outliers": list(self.outliers),
+            "warnings": list(r.warnings),
+            "unobservable": list(r.unobservable),
+            "seconds": self.seconds,
+            "k_fold_mm": self.k_fold_mm,
+            "axis_turn_deg": None if r.axis_turn_deg is None else list(r.axis_turn_deg),
+            "advice": list(self.advice),
+            "notes": list(self.notes),
+            "work_point": self.work_point.document(),
+            "error_budget": self.budget.document(),
+            "features": feature_residuals(self.fits, self.patterns),
+            **({} if self.refinement is None else {"refinement": self.refinement}),
+            "algorithm1": None
+            if a is None
+            else {
+                "verification": a.verification,
+                "metric": a.metric,
+                "figure_mm": a.figure_mm,
+                "true_mm": a.true_mm,
+                "at_verification_mm": a.at_verification_mm,
+                "unseen": list(a.unseen),
+            },
+        }
+
+
+def scanner_pose(result: CalibrationResult) -> ShownPose:
+    """The result's pose with its frames in words."""
+    return ShownPose(result.symbol, SCANNER[result.symbol], result.X_BC)
+
+
+def interval_rows(what: str, errors_mm: Array) -> dict[str, str]:
+    """Median and 95 % of errors (n,) mm, each beside the interval of as many new ones; {} for fewer than four."""
+    rows = {}
+    for name, share in (("median", 0.5), ("95 %", 0.95)):
+        interval = bootstrap_interval(errors_mm, share)
+        if interval is not None:
+            reported = float(np.nanquantile(errors_mm, share))
+            rows[f"{what}, {name}"] = f"{reported:.3f} mm (bootstrap 95 %: {interval[0]:.3f} to {interval[1]:.3f})"
+    return rows
+
+
+def feature_residuals(
+    fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePattern]
+) -> list[dict[str, float | int | str | None]]:
+    """One row per scan: rms residual (mm) of plane, outer edge, bore (None where not seen) and of the hole centres from
+    their pattern (None where fewer than four show), and one sigma (deg) of the rotation about the flange's axis."""
+    rows: list[dict[str, float | int | str | None]] = []
+    for id, fit in fits.items():
+        holes = patterns.get(id)
+        rows.append(
+            {
+                "id": id,
+                "plane_mm": 1e3 * fit.plane_rms_m,
+                "outer_mm": 1e3 * fit.outer_rms_m,
+                "bore_mm": None if fit.bore_rms_m is None else 1e3 * fit.bore_rms_m,
+                "holes": 0 if holes is None else len(holes.holes_C),
+                "holes_mm": None if holes is None else 1e3 * holes.rms_m,
+                "turn_sigma_deg": None if holes is None else float(np.degrees(holes.turn_sigma)),
+            }
+        )
+    return rows
+
+
+HEADER = ("pose", "plane, mm", "outer edge, mm", "bore, mm", "holes", "holes, mm", "rotation about the axis, ± deg")
+
+
+def feature_table(fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePattern]) -> list[tuple[str, ...]]:
+    """The rows of ``feature_residuals`` as a report shows them, under ``HEADER``."""
+    places = {"plane_mm": 3, "outer_mm": 3, "bore_mm": 3, "holes_mm": 3, "turn_sigma_deg": 2}
+    return [
+        tuple(str(v) if k not in places else fixed(None if v is None else float(v), places[k]) for k, v in row.items())
+        for row in feature_residuals(fits, patterns)
+    ]
+
+
+def fit_cells(fit: FlangeFit | None) -> tuple[str, str]:
+    """One sigma of the centre (3-D, mm) and the share of the edge seen (%); dashes without a fit."""
+    if fit is None:
+        return "–", "–"
+    return fixed(1e3 * float(np.sqrt(np.trace(fit.center_covariance))), 3), fixed(100 * fit.coverage, 0)
 
 
 def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
@@ -132,3 +393,56 @@ def _band(axes: Axes, x: Array, y: Array, color: str, label: str) -> None:
     y = np.where(np.isfinite(y), y, np.nan)[:, good]
     axes.plot(x[good], np.nanmedian(y, axis=0), color=color, marker="o", markersize=3.5, linewidth=1.8, label=label)
     axes.fill_between(x[good], *np.nanpercentile(y, (25, 75), axis=0), color=color, alpha=0.13, linewidth=0)
+
+
+_STEPS = 25
+_MARGIN = 0.35  # of the widest extent of the poses: so far around them the map reaches
+_WIDEST = 3.0  # of the error in the middle: beyond, the map says "more"
+_SHADES = LinearSegmentedColormap.from_list("known", ["#eef4f8", "#9dc0d8", "#1d5f8a", "#10324a"])
+
+
+def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
+    """Standard deviation (3-D) of a scanned point through the middle of poses (n >= 2, 3) m, from above and from the side."""
+    middle, extent = p_B.mean(axis=0), float(np.ptp(p_B, axis=0).max())
+    weak, least = weakest_place(estimate, p_B), 1e3 * sigma_at(estimate, middle)
+    figure = Figure(figsize=(8.2, 4.0), layout="constrained")
+    levels = least * np.linspace(0.95, _WIDEST, 9)
+    drawn = None
+    all_axes = figure.subplots(1, 2)
+    for axes, (i, j), title in zip(all_axes, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
+        reach = 0.5 * extent * (1.0 + 2.0 * _MARGIN)
+        u, v = (np.linspace(-reach, reach, _STEPS) + middle[k] for k in (i, j))
+        sigma = np.empty((_STEPS, _STEPS))
+        for row, b in enumerate(v):
+            for column, a in enumerate(u):
+                p = middle.copy()
+                p[i], p[j] = a, b
+                sigma[row, column] = 1e3 * sigma_at(estimate, p)
+        drawn = axes.contourf(1e3 * u, 1e3 * v, sigma, levels=levels, cmap=_SHADES, extend="both")
+        axes.plot(
+            1e3 * p_B[:, i],
+            1e3 * p_B[:, j],
+            "o",
+            color="white",
+            markeredgecolor="#222",
+            markersize=5,
+            label="poses taken",
+        )
+        axes.plot(
+            1e3 * weak[i],
+            1e3 * weak[j],
+            "*",
+            color="#e0872f",
+            markeredgecolor="#222",
+            markersize=15,
+            label="best next pose",
+        )
+        axes.set_xlabel(f"base {'xyz'[i]}, mm")
+        axes.set_ylabel(f"base {'xyz'[j]}, mm")
+        axes.set_title(title, fontsize=10, loc="left")
+        axes.set_aspect("equal")
+    assert drawn is not None
+    bar = figure.colorbar(drawn, ax=all_axes, shrink=0.85, format="%.3g")
+    bar.set_label("one sigma of a scanned point, mm")
+    all_axes[0].legend(fontsize=8, loc="lower left", framealpha=0.9)
+    return svg(figure, *all_axes)

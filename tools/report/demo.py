@@ -1,16 +1,269 @@
-"""The report of a run, for someone who was not there: did it work, how well, what it looked like, where the numbers are from."""
+"""The result of a weld job, the JSON object of `demo` and `weld`, and its report."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import export_ros2
+from weldcal.models.arrays import Array
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.next_scan import next_scan
+from weldcal.systems.jobs.weld.settings import work_point
+from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.weld import heat_input_kJ_mm
-from weldcal.tools.report import plots_demo, plots_weld
+from weldcal.systems.runner import Run
+from weldcal.tools.report import plots_weld
+from weldcal.tools.report.calibration import error_summary
+from weldcal.tools.report.first_screen import (
+    SCANNER,
+    Expected,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    refused_note,
+    work_point_error,
+    work_point_expected,
+)
+from weldcal.tools.report.monitor import drift_document
+from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, svg
+from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render
-from weldcal.tools.report.robot_timing import robot_timing
+from weldcal.tools.report.run import RunOptions, robot_timing
+from weldcal.tools.report.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
+from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
+
+ARM_NOTE_M = 1e-4  # the torch's mean error that welds are to keep
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DemoResult:
+    """The result of a run; errors against the ground truth exist in simulation only."""
+
+    options: RunOptions
+    run: Run[WeldJob]
+    status: CalibrationStatus
+    calibration: CalibrationError | None
+    weld: WeldOutcome | None
+    robot: str = "simulated"
+
+    @property
+    def folder(self) -> Path:
+        """The result folder."""
+        return self.options.out
+
+    @property
+    def state(self) -> str:
+        """`done`, or `held` with a reason."""
+        return "held" if self.run.held else "done"
+
+    @property
+    def setting(self) -> str:
+        """What was real, for a person."""
+        scenario = self.run.cell.scenario
+        if self.robot == "simulated":
+            return "Simulation"
+        rendered = scenario.scanner.SIMULATED or scenario.finger_camera.SIMULATED
+        return f"{'Rendered sensors; robot' if rendered else 'Robot'}: {self.robot}"
+
+    @property
+    def n_scans(self) -> int:
+        """Number of scans of the feature, verification included."""
+        return self.status.sequence
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the job warned of and did not hold for."""
+        sequencer = self.run.cell.job.sequencer
+        return sequencer.job_state(sequencer.GetMyContextFromRoot(self.run.root)).warnings
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen: of the calibration, by the job's own required error; of a weld alone, whether it was welded."""
+        scenario, status = self.run.cell.scenario, self.status
+        estimate, c = status.estimate, self.run.cell.scenario.calibration
+        against = [self.run.reason or "The job was held."] if self.state == "held" else []
+        more = self._welded()
+        if estimate is None:
+            found = Findings(
+                against=against,
+                no_tolerance="No scenario key states how far the torch may be off: compare the error below with what your joint allows.",
+                concerns=self.warnings,
+                notes=self.arm_note,
+            )
+            more["pose"] = (
+                "none was computed: X_BC is the scenario's" if not scenario.job.calibrate else "none was found"
+            )
+            none = Expected("error at the work point, 95 %", "not known", "there is no calibration")
+            return FirstScreen(
+                found, none if scenario.job.calibrate else self._torch(), self._next(), (), more, self._lead()
+            )
+        work = work_point_error(estimate, work_point(scenario))
+        expected, _ = work_point_expected(work)
+        for v in status.verifications:
+            limit = f"limit {c.verification_limit_mm:g} mm, calibration.verification_limit_mm"
+            backing = f"{expected.backing}; at '{v.label}', held out by the job: {1e3 * v.error_m:.3f} mm ({limit})"
+            expected = Expected(expected.what, expected.figure, backing)
+        tolerance = Tolerance(
+            "the expected error at the work point, one sigma,", 1e3 * status.predicted_error_m, c.required_error_mm,
+            "calibration.required_error_mm",
+        )  # fmt: skip
+        # what is not observable and matters to X_BC is among the warnings
+        concerns = (*self.warnings, *estimate.warnings)
+        notes = [*refused_note(status.refused, self.n_scans), *self.arm_note]
+        if estimate.scanner is not None:
+            # as calibration.yaml says to programs that use X_BC
+            notes.insert(
+                0,
+                f"X_BC applies to corrected scanner points: multiply every point, in metres, by {estimate.scanner.formula}.",
+            )
+        found = Findings(against=against, tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
+        pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
+        return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())
+
+    @property
+    def arm_note(self) -> tuple[str, ...]:
+        """What errors of the arm may do between tip and torch, where a planned seam is bent enough for that to matter."""
+        plan = self.run.cell.job.planned_seam(self.run.root)
+        if self.weld is None or not plan.arm_sigma_m > ARM_NOTE_M:
+            return ()
+        refinement = self.status.refinement
+        refined = refinement is not None and refinement.arm is not None
+        arm = "What the refinement leaves of the arm's errors" if refined else "Errors of an arm as its maker leaves it"
+        advice = "" if refined else " Calibrate with calibration.refine: links."
+        return (
+            f"Along this seam the tool turns by up to {np.degrees(plan.arm_turn_rad):.0f} deg between the tip and the torch at the same "
+            f"place. {arm} then put the torch {1e3 * plan.arm_sigma_m:.2f} mm (rms) off the seam that the tip felt.{advice}",
+        )
+
+    def _lead(self) -> str:
+        if self.weld is None or self.weld.speed is None or self.state != "done":
+            return ""
+        return f"{1e3 * self.weld.speed.welded_m:.0f} mm of seam are welded."
+
+    def _welded(self) -> dict[str, str]:
+        """The torch's error where a simulation knows it, as a row."""
+        if self.weld is None or self.weld.error is None:
+            return {}
+        torch = self._torch()
+        return {"torch": f"{torch.figure} ({torch.backing})"} if self.status.estimate is not None else {}
+
+    def _torch(self) -> Expected:
+        """The torch's distance from the true seam."""
+        if self.weld is None or self.weld.error is None:
+            return Expected("torch off the seam", "not known", "the true seam is known in simulation only")
+        distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
+        backing = (
+            f"95 % of the weld; mean {distance.mean():.3f}, at most {distance.max():.3f} mm; known in simulation only"
+        )
+        return Expected("torch off the seam", f"{np.percentile(distance, 95):.3f} mm", backing)
+
+    def _next(self) -> Next:
+        folder, robot = self.folder, self.robot != "simulated"
+        if self.state == "held":
+            return Next(
+                "Settle the reason; nothing goes on by itself. The doctor looks at scans and weld.",
+                f"weldcal doctor {folder}",
+            )
+        if self.weld is not None and robot:
+            return Next("Look at the weld and at its log, weld.csv.", f"weldcal view {folder}")
+        if self.weld is not None:
+            return Next("See it again; then try your own part.", f"weldcal view {folder}")
+        return Next("Verify with scans that the calibration has not seen.", f"weldcal verify {folder} NEW_SCANS")
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of `demo` and `weld`."""
+        found: dict[str, object] = {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
+        found["robot"] = self.robot
+        if self.run.reason:
+            found["reason"] = self.run.reason
+        if self.warnings:
+            found["warnings"] = list(self.warnings)
+        if (watched := self.run.cell.job.drift(self.run.root)) is not None:
+            found["drift_frames"] = watched.frames
+            found["drift"] = [drift_document(e) for e in watched.events]
+        if self.calibration is not None:
+            found["X_BC_error_mm"] = 1e3 * self.calibration.translation_m
+            found["X_BC_error_deg"] = float(np.degrees(self.calibration.rotation_rad))
+            found["X_BC_error_at_work_mm"] = 1e3 * self.calibration.at_work_m
+        if self.status.estimate is not None:
+            found["X_BC"] = self.status.estimate.X_BC.GetAsMatrix4().tolist()
+            found["work_point"] = work_point_error(self.status.estimate, work_point(self.run.cell.scenario)).document()
+            found["expected_error_mm"] = 1e3 * self.status.predicted_error_m
+            found["held_out_mm"] = live_errors(1e3 * self.status.estimate.held_out.position_m)
+            if self.status.refinement is not None:
+                refinement = self.status.refinement
+                found["refinement"] = refinement.document or {
+                    "kind": refinement.kind,
+                    "accepted": False,
+                    "sentence": refinement.sentence,
+                }
+            found["verification_mm"] = [1e3 * v.error_m for v in self.status.verifications]
+        found["n_scans"] = self.n_scans
+        found["refused"] = [{"id": id, "reason": reason} for id, reason in self.status.refused]
+        if self.weld is not None and self.weld.error is not None:
+            distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
+            found["torch_mean_mm"], found["torch_max_mm"] = float(distance.mean()), float(distance.max())
+            if len(self.weld.seams) > 1:
+                found["seams"] = [seam_document(error) for error in self.weld.seams]
+            found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
+            found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
+        if self.weld is not None and self.weld.speed is not None:
+            found["torch_speed_cv"] = self.weld.speed.cv
+            found["welded_mm"] = 1e3 * self.weld.speed.welded_m
+            heat = heat_input_kJ_mm(self.weld, self.run.cell.scenario.welding.process.process())
+            found["heat_input_kJ_mm"] = None if heat is None else float(heat.mean())
+        if self.weld is not None:
+            if self.weld.plan_error is not None:
+                found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m
+                found["plan_max_mm"] = 1e3 * self.weld.plan_error.max_m
+            plan = self.run.cell.job.planned_seam(self.run.root)
+            if np.isfinite(plan.sigma_m):
+                found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
+            found["plan_words"] = plan.summary
+            if np.isfinite(plan.arm_sigma_m):
+                found["plan_arm_sigma_mm"] = 1e3 * plan.arm_sigma_m
+                found["plan_arm_turn_deg"] = float(np.degrees(plan.arm_turn_rad))
+            found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
+        found |= self.run.timing()
+        return found
+
+    def calibration_summary(self) -> dict[str, object]:
+        """The JSON object of a live `calibrate`: the keys of the offline command and those of the run."""
+        found, estimate = self.summary(), self.status.estimate
+        found["seconds"] = self.run.wall_seconds
+        if estimate is not None:
+            ids = [o.id for o in self.status.observations]
+            found |= {
+                "n_used": int(estimate.inliers.sum()),
+                "covariance": estimate.covariance.tolist(),
+                "scanner_correction": None,
+                "tilt_deg": live_errors(np.degrees(estimate.held_out.tilt_rad)),
+                "outliers": [id for id, used in zip(ids, estimate.inliers, strict=True) if not used],
+                "warnings": [*self.warnings, *estimate.warnings],
+                "unobservable": list(estimate.unobservable),
+            }
+        advice = next_scan(self.status, self.run.cell.job.poses, work_point(self.run.cell.scenario))
+        found["next_pose"] = None if advice is None else advice.sentence()
+        return found
+
+
+def seam_document(error: PathError) -> dict[str, float]:
+    """The torch's error on one seam, mm."""
+    distance = 1e3 * np.hypot(error.lateral, error.height)
+    return {"torch_mean_mm": float(distance.mean()), "torch_max_mm": float(distance.max())}
+
+
+def live_errors(values: np.ndarray) -> dict[str, float]:
+    """Median, mean and 95th percentile of the finite values, in their unit; empty where there are none."""
+    found = error_summary(values)
+    return {name: found[name] for name in ("median", "mean", "p95") if np.isfinite(found[name])}
 
 
 def demo_pictures(result: DemoResult) -> dict[str, bytes]:
@@ -19,9 +272,9 @@ def demo_pictures(result: DemoResult) -> dict[str, bytes]:
     pictures = {}
     if status.history:
         required = cell.scenario.calibration.required_error_mm * 1e-3
-        pictures["convergence"] = plots_demo.convergence(status, required)
+        pictures["convergence"] = convergence(status, required)
     if weld is not None:
-        trace = plots_demo.weld_trace(weld, cell.job.servo_config)
+        trace = weld_trace(weld, cell.job.servo_config)
         if len(trace.s) > 1:
             pictures["seam"] = plots_weld.paths(trace)
             pictures["along"] = plots_weld.along_the_weld(trace)
@@ -49,7 +302,7 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         scenario_name=Path(result.options.scenario).stem,
         status=status,
         weld=weld,
-        tip_error_mm=None if weld is None else 1e3 * plots_demo.tip_error(weld),
+        tip_error_mm=None if weld is None else 1e3 * tip_error(weld),
         pictures=pictures,
         planned=_planned(result),
         heat=_process(result),
@@ -118,7 +371,8 @@ def _process(result: DemoResult) -> list[tuple[str, str]]:
 def _timing(result: DemoResult) -> list[tuple[str, ...]]:
     """Simulated and wall seconds per phase, phases of one name added up."""
     phases = result.run.phases
-    ends = [*phases[1:], ("", float(result.run.root.get_time()), result.run.wall_seconds)]
+    # a run that is ended before its first phase has none
+    ends = [*phases, ("", float(result.run.root.get_time()), result.run.wall_seconds)][1:]
     total: dict[str, list[float]] = {}
     for (name, t0, w0), (_, t1, w1) in zip(phases, ends, strict=True):
         spent = total.setdefault(phase_words(name), [0.0, 0.0])
@@ -126,3 +380,71 @@ def _timing(result: DemoResult) -> list[tuple[str, ...]]:
         spent[1] += w1 - w0
     rows = [(name, fixed(s, 1), fixed(w, 1)) for name, (s, w) in total.items() if s > 0.0 or w > 0.05]
     return [*rows, ("all", fixed(float(result.run.root.get_time()), 1), fixed(result.run.wall_seconds, 1))]
+
+
+def convergence(status: CalibrationStatus, required_m: float) -> bytes:
+    """Expected and held-out error of the estimate in use and Algorithm 1's own figure, against the scans taken (Fig. 11)."""
+    n, expected, held_out, figure = (np.array(c, dtype=float) for c in zip(*status.history, strict=True))
+    picture = Figure(figsize=(7.2, 3.4), layout="constrained")
+    axes = picture.subplots()
+    axes.semilogy(n, 1e3 * expected, "o-", color=OURS, label="expected at the work point (one sigma, 3-D)")
+    axes.semilogy(n, 1e3 * held_out, "s--", color=ROBOT, label="held out, at the ring (median)")
+    if np.isfinite(figure).any():
+        axes.semilogy(n, 1e3 * figure, "^:", color=THEIRS, label="Algorithm 1: its own ICP figure")
+    axes.axhline(1e3 * required_m, color=TRUTH, lw=1.0, label="required")
+    millimetres(axes)
+    axes.set_xticks(n)
+    plain(axes, "scans used", "error, mm")
+    picture.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
+    return svg(picture)
+
+
+def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
+    """The weld for the pictures, over the planned seam; y of the base is drawn to the right, as the cell stands."""
+    log, named = weld.log, weld.log.telemetry
+    keep = named["phase"] != list(Phase).index(Phase.TOUCH)  # the search has no place along the seam
+    speed = speed_along(log.time, log.p_BTorch)
+    work = travel = None
+    if weld.planned is not None:
+        up = weld.planned.up(named["s_torch"])
+        work, travel = (angle[keep] for angle in torch_angles(log.R_BT, up, config.torch.work_angle_rad))
+    errors = [None if e is None else (e.s, e.lateral, e.height) for e in (weld.plan_error, weld.error)]
+    return WeldTrace(
+        s=named["s_torch"][keep],
+        torch_on=log.torch_on[keep],
+        felt=named["phase"][keep] == list(Phase).index(Phase.TRACK),
+        tip=log.p_BTip[keep],
+        torch=log.p_BTorch[keep],
+        robot=log.p_BRobot[keep],
+        planned=_line(weld.planned),
+        true=_line(weld.true_seam),
+        plan_error=errors[0],
+        torch_error=errors[1],
+        delta_n=named["delta_n"][keep],
+        delta_axial=named["delta_axial"][keep],
+        speed=speed[keep],
+        omega=named["omega"][keep],
+        n_d_dot_n_t=named["n_d_dot_n_t"][keep],
+        weld_speed=config.weld_speed_m_s,
+        delta_d=config.deflection.delta_d_m,
+        axial_d=config.deflection.axial_d_m,
+        omega_max=config.limits.omega_max_rad_s,
+        e_t=named["e_t"][keep],
+        work=work,
+        travel=travel,
+        windows=(config.windows.work_rad, config.windows.travel_rad),
+        axes=(1, 0),
+        names=("y, mm", "x, mm"),
+    )
+
+
+def _line(seam: SeamCurve | None) -> Array | None:
+    return None if seam is None else np.asarray(seam.position(np.linspace(0.0, seam.length, 400)))
+
+
+def tip_error(weld: WeldOutcome) -> float:
+    """Mean distance (m) sideways between the felt tip line and the true seam while the servo tracked."""
+    felt = weld.log.telemetry["phase"] == list(Phase).index(Phase.TRACK)
+    if weld.true_seam is None or not felt.any():
+        return float("nan")
+    return path_error(weld.log.p_BTip[felt], weld.true_seam).mean_m

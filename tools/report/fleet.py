@@ -1,12 +1,128 @@
-"""The report page of `weldcal fleet`: every cell in one table, those that need a visit first."""
+"""The state of each cell of a fleet, judged from the calibrations and verifications of its datasets."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from weldcal.tools.outcomes.fleet import FINE, LOOK, VISIT, Cell, FleetReport
+from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.render import fixed, render
+
+VISIT, LOOK, FINE = "visit", "look", "fine"
+
+
+@dataclass(frozen=True)
+class Checked:
+    """One dataset of a cell: its calibration, and the verification of the cell's first calibration on it.
+
+    Attributes:
+        name: of the dataset within its cell.
+        calibration: JSON object of `calibrate`, or {"state": "failed", "reason"}.
+        verification: JSON object of `verify`, or failed; None for the dataset that was calibrated first.
+        report, verified: the report's paths relative to the fleet's page; None: there is none.
+    """
+
+    name: str
+    calibration: Mapping[str, Any]
+    verification: Mapping[str, Any] | None
+    report: str | None
+    verified: str | None
+
+    @property
+    def error_mm(self) -> float | None:
+        """Median error of the cell's first calibration on this dataset, mm: held-out for its own dataset, else verified."""
+        if self.verification is None:
+            return None if self.calibration["state"] == "failed" else self.calibration["held_out_mm"]["median"]
+        return None if self.verification["state"] == "failed" else self.verification["position_error_mm"]["median"]
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the cell's first calibration must not be used on this dataset."""
+        return self.verification is not None and self.verification.get("verdict") == DO_NOT
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """A cell with its datasets in order, oldest first, and what follows from them: VISIT, LOOK or FINE, why, and what to do."""
+
+    name: str
+    datasets: tuple[Checked, ...]
+    state: str
+    reason: str
+    next: str
+    since: str | None
+    trend: bool
+
+    @property
+    def held_out_mm(self) -> float | None:
+        """Median held-out error of the newest calibration, mm."""
+        return held_out_mm(self.datasets[-1])
+
+    @property
+    def error_95_mm(self) -> float | None:
+        """Expected error of a scanned point at the work point by the newest calibration, 95 %, mm."""
+        newest = self.datasets[-1].calibration
+        return None if newest["state"] == "failed" else newest["work_point"]["error_95_mm"]
+
+    @property
+    def shift_mm(self) -> float | None:
+        """Distance between the newest and the first calibration at the work point, mm; None where there is only one."""
+        made = [d.calibration for d in self.datasets if d.calibration["state"] != "failed"]
+        if len(made) < 2:
+            return None
+        p_B = 1e-3 * np.array(made[0]["work_point"]["p_B_mm"])
+        first, newest = (np.array(c["X_BC"]) for c in (made[0], made[-1]))
+        moved = newest @ np.linalg.inv(first) @ np.append(p_B, 1.0)
+        return float(1e3 * np.linalg.norm(moved[:3] - p_B))
+
+    def document(self) -> dict[str, object]:
+        """The JSON object of the cell."""
+        return {
+            "cell": self.name,
+            "state": self.state,
+            "reason": self.reason,
+            "next": self.next,
+            "datasets": len(self.datasets),
+            "since": self.since,
+            "drifts": self.trend,
+            "held_out_mm": self.held_out_mm,
+            "error_95_mm": self.error_95_mm,
+            "shift_mm": self.shift_mm,
+            "errors_mm": [d.error_mm for d in self.datasets],
+        }
+
+
+@dataclass(frozen=True)
+class FleetReport:
+    """All cells, those that need a visit first, and where the page is."""
+
+    cells: tuple[Cell, ...]
+    out: Path
+
+    def named(self, state: str) -> list[str]:
+        """Names of the cells in a state."""
+        return [cell.name for cell in self.cells if cell.state == state]
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of `fleet`."""
+        return {
+            "state": "done",
+            "cells": len(self.cells),
+            "datasets": sum(len(cell.datasets) for cell in self.cells),
+            "visit": self.named(VISIT),
+            "look": self.named(LOOK),
+            "fine": len(self.named(FINE)),
+            "drifting": [cell.name for cell in self.cells if cell.trend or cell.since is not None],
+            "per_cell": [cell.document() for cell in self.cells],
+        }
+
+
+def held_out_mm(dataset: Checked) -> float | None:
+    return None if dataset.calibration["state"] == "failed" else dataset.calibration["held_out_mm"]["median"]
+
 
 WIDTH, HEIGHT, EDGE = 120.0, 28.0, 3.0
 

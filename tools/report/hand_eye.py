@@ -1,17 +1,159 @@
-"""The report page of `weldcal hand-eye`: the poses, how sure each component is, the errors of every sample, the comparison of methods."""
+"""The result of `weldcal hand-eye` and its page: poses and how sure they are, errors of every sample, comparison of methods."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
-from weldcal.calibration.hand_eye.solve import HandEyeResult
-from weldcal.tools.outcomes.hand_eye import HandEyeReport
+from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
+from weldcal.calibration.motion.pose_streams import Synchronised
+from weldcal.calibration.planning.next_pose import NextPose
+from weldcal.models.arrays import Array
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 
 Table = tuple[str, list[tuple[str, str, str]]]
+
+
+@dataclass(frozen=True)
+class MethodRow:
+    """One line of the comparison: a method and its held-out errors; NaN where it gave no answer on some fold."""
+
+    method: str
+    deg: float
+    mm: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandEyeReport:
+    """A finished calibration: the result, the comparison, the next pose (``advice``: as a sentence) and the files;
+    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were given."""
+
+    result: HandEyeResult
+    mounting: Mounting
+    comparison: tuple[MethodRow, ...]
+    next_pose: NextPose | None
+    files: tuple[Path, ...]
+    seconds: float
+    corners: str = ""
+    advice: str = ""
+    streams: Synchronised | None = None
+    limit_mm: float | None = None
+    folder: Path | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. Pose pairs have no work point: the held-out error at the target stands in its place."""
+        r = self.result
+        expected, p95, n = held_out_error(r)
+        tolerance = None
+        if self.limit_mm is not None:
+            tolerance = Tolerance(f"the {expected.what},", p95, self.limit_mm, "--limit-mm")
+        outliers = int((~r.inliers).sum())
+        notes = (
+            [f"{outliers} of {len(r.inliers)} poses disagree with the others and were not used."] if outliers else []
+        )
+        concerns = [*(f"Not observable: {text}" for text in r.unobservable), *r.warnings]
+        found = Findings(tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
+        after = Next(f"To know it better, add a pose. {self.advice}") if self.advice else Next(
+            "Compare with poses that were not in the file: the target must stay where the result puts it."
+        )  # fmt: skip
+        return FirstScreen(found, expected, after, shown_poses(r, self.mounting))
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of the command."""
+        r = self.result
+        out: dict[str, object] = {"state": "done", "configuration": self.mounting.name}
+        for k, X in r.poses.items():
+            out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": r.covariance[k]}
+        if self.streams is not None:
+            out |= {
+                "clock_offset_ms": 1e3 * self.streams.offset_s,
+                "clock_offset_sigma_ms": 1e3 * self.streams.sigma_s,
+            }
+        return out | {
+            "held_out_deg": r.held_out.rms_deg,
+            "held_out_mm": 1e3 * r.held_out.rms_translation,
+            "residual_deg": np.degrees(r.rotation_rad),
+            "residual_mm": 1e3 * r.translation,
+            "inliers": r.inliers,
+            "unobservable": list(r.unobservable),
+            "warnings": list(r.warnings),
+            "condition": r.condition,
+            "method": r.method,
+            "comparison": [{"method": c.method, "held_out_deg": c.deg, "held_out_mm": c.mm} for c in self.comparison],
+            "next_pose": self.advice or None,
+            "corners": self.corners or None,
+            "seconds": self.seconds,
+        }
+
+    def text(self) -> str:
+        """What is printed between the poses' diversity and the first screen: directions, sketch, uncertainty, comparison.
+
+        The first screen has the poses themselves, the warnings and the next pose.
+        """
+        r, m = self.result, self.mounting
+        lines = [f"{m.name}: {m.words}   {m.equation}   ({m.source})", "", *m.sketch.splitlines(), ""]
+        for k in r.poses:
+            sigma = np.sqrt(np.diag(r.covariance[k]))
+            mm, deg = _sigmas(1e3 * sigma[3:], 1e3 * r.extent), _sigmas(np.degrees(sigma[:3]), 57.3)
+            lines.append(f"one sigma    {m.unknowns[k].symbol}  {mm} mm   {deg} deg")
+        lines += [f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
+        if not r.inliers.all():
+            kept = HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
+            lines += [f"             {_held_out(kept, 'without outliers, ')}"]
+        lines += [f"weighting    {r.method}"]
+        if self.corners:
+            lines += ["", self.corners]
+        if self.comparison:
+            most = most_compared(len(r.inliers))
+            few = 0.8 * len(r.inliers) > most
+            note = f"   (OpenCV's methods: fitted to {most} of the poses)" if few else ""
+            lines += ["", f"method        held-out deg   held-out mm{note}"]
+            for c in self.comparison:
+                failed = not (np.isfinite(c.deg) and np.isfinite(c.mm))
+                lines += [
+                    f"{c.method:<12}  {'no answer':>12}" if failed else f"{c.method:<12}  {c.deg:12.4f}  {c.mm:12.3f}"
+                ]
+        return "\n".join(lines)
+
+
+def _held_out(held_out: HandEyeHeldOut, of: str) -> str:
+    if not np.isfinite(held_out.rms_translation):
+        return "none: too few poses for cross-validation"
+    return f"{held_out.rms_deg:.4f} deg   {1e3 * held_out.rms_translation:.3f} mm ({of}rms, 5 folds)"
+
+
+def _sigmas(values: Array, certain: float) -> str:
+    return "  ".join("open" if v > certain else f"{v:.3f}" for v in values)
+
+
+def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
+    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and their number."""
+    held = 1e3 * r.held_out.translation[r.inliers]
+    held = held[np.isfinite(held)]
+    what = "held-out error at the target, 95 %"
+    if not len(held):
+        return (
+            Expected(what, "not known", "too few poses to leave any out; it stands in place of a work point"),
+            float("nan"),
+            0,
+        )
+    p95 = float(np.percentile(held, 95))
+    backing = f"of {len(held)} poses, each unseen by its calibration; rms {r.held_out.rms_deg:.3f} degrees; in place of a work point"
+    return Expected(what, f"{p95:.3f} mm", backing), p95, len(held)
+
+
+def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:
+    """The poses that were solved for, with their frames in words."""
+    return tuple(
+        ShownPose(u.symbol, f"pose of the {u.child_words} in the {u.parent_words} frame", X)
+        for u, X in ((mounting.unknowns[k], X) for k, X in r.poses.items())
+    )
 
 
 def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:

@@ -1,13 +1,160 @@
-"""The report page of a calibration in motion, with residuals against time and the cost against the clock's offset."""
+"""The result of `weldcal calibrate` on a recording in motion and its page: residuals against time, cost against the offset."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import export_ros2
+from weldcal.calibration.data.results import CalibrationResult, export_ros2, matrix4, target_document
 from weldcal.calibration.data.scanner_clock import DEVICE
-from weldcal.tools.outcomes.motion import MotionReport
+from weldcal.calibration.motion.estimate import MotionEstimate
+from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.models.arrays import Array
+from weldcal.tools.report.calibration import scanner_pose
+from weldcal.tools.report.first_screen import (
+    NO_TOLERANCE,
+    Findings,
+    FirstScreen,
+    Next,
+    Tolerance,
+    expected_error,
+    point_covariance,
+    radius_95,
+    refused_note,
+)
 from weldcal.tools.report.pictures import GREY, OURS, TRUTH, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionReport:
+    """The estimate, the records written, and the folder. ``dropped``: frames of the recording that no estimate used."""
+
+    result: CalibrationResult
+    estimate: MotionEstimate
+    frames: ObservedFrames
+    refused: tuple[tuple[str, str], ...]
+    outliers: tuple[str, ...]
+    seconds: float
+    out: Path
+    limit_mm: float | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. The error is the larger of two at 95 %: the pose's own in the middle of the frames, and the held-out one."""
+        return motion_screen(self.result, self.estimate, self.frames.p_C, self.refused, self.out, self.limit_mm)
+
+    @property
+    def rms_mm(self) -> float:
+        """Rms distance of the used frames' centres at their capture times, mm."""
+        e = self.estimate
+        return 1e3 * float(np.sqrt(np.mean(e.residual_m[e.inliers] ** 2)))
+
+    @property
+    def along_rms_mm(self) -> tuple[float, float]:
+        """Rms residual along the motion, mm: arrivals taken for captures, and by the clock that was found."""
+        e = self.estimate
+        used = e.inliers & np.isfinite(e.before_m) & np.isfinite(e.along_m)
+        if not used.any():
+            return float("nan"), float("nan")
+        before, after = (1e3 * float(np.sqrt(np.mean(x[used] ** 2))) for x in (e.before_m, e.along_m))
+        return before, after
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object of `calibrate` in motion: the keys of the calibration at rest, and those of the clock."""
+        e, r = self.estimate, self.result
+        clock = e.clock
+        before, after = (None if not np.isfinite(v) else v for v in self.along_rms_mm)
+        return {
+            "state": "done",
+            "mode": "motion",
+            "n_used": int(e.inliers.sum()),
+            "refused": [{"id": i, "reason": t} for i, t in self.refused],
+            "configuration": r.configuration,
+            r.symbol: matrix4(r.X_BC),
+            **({} if r.target is None else {"target": target_document(r.target)}),
+            "covariance": r.covariance.tolist(),
+            "clock_offset_ms": _ms(clock.offset_s),
+            "clock_offset_sigma_ms": _ms(clock.sigma_s),
+            "clock": clock.kind,
+            "clock_reason": clock.reason,
+            "clock_jitter_ms": _ms(clock.jitter_s),
+            "clock_drift_ppm": None if clock.drift is None else 1e6 * clock.drift,
+            "clock_drift_sigma_ppm": None if clock.drift_sigma is None else 1e6 * clock.drift_sigma,
+            "clock_reference_s": clock.reference_s,
+            "rolling_ms": _ms(clock.rolling_s),
+            "late": list(clock.late),
+            "scanner_correction": None,
+            "held_out_mm": {k: _number(r.held_out_mm[k]) for k in ("median", "mean", "p95")},
+            "held_out_interval_mm": None,
+            "tilt_deg": r.tilt_deg,
+            "rms_mm": self.rms_mm,
+            "along_motion_rms_mm": {"before": before, "after": after},
+            "outliers": list(self.outliers),
+            "warnings": list(r.warnings),
+            "unobservable": list(r.unobservable),
+            "seconds": self.seconds,
+            "k_fold_mm": {k: _number(v) for k, v in r.held_out_mm.items()},
+            "axis_turn_deg": None,
+            "advice": [],
+            "features": [],
+            "algorithm1": None,
+        }
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else 1e3 * seconds
+
+
+def _number(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def motion_screen(
+    r: CalibrationResult,
+    e: MotionEstimate,
+    p_C: Array,
+    refused: Sequence[tuple[str, str]],
+    out: Path,
+    limit_mm: float | None,
+    against: Sequence[str] = (),
+    no_tolerance: str = NO_TOLERANCE,
+) -> FirstScreen:
+    """The first screen of a calibration in motion; ``p_C`` (n, 3) m are the centres of all its frames."""
+    used, held = e.inliers, 1e3 * e.held_out_m[e.inliers]
+    held = held[np.isfinite(held)]
+    middle = np.asarray(p_C[used].mean(axis=0))
+    own = 1e3 * radius_95(point_covariance(r.X_BC, r.covariance, np.asarray(r.X_BC @ middle)))
+    p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
+    place = "in the middle of the frames" if r.symbol == "X_BC" else "at the target"
+    what = f"error {place}, 95 %"
+    expected, larger = expected_error(what, own, p95, len(held), "frames")
+    tolerance = None
+    if limit_mm is not None:
+        tolerance = Tolerance(f"the {what},", larger, limit_mm, "--limit-mm")
+    notes = refused_note(refused, len(p_C) + len(refused), "frames")
+    concerns = (*r.warnings, *r.unobservable)
+    found = Findings(
+        against=against,
+        tolerance=tolerance,
+        no_tolerance=no_tolerance,
+        unseen=len(held),
+        concerns=concerns,
+        notes=notes,
+    )
+    if tolerance is not None and not tolerance.met:
+        after = Next("Record a longer motion, with more turns, or scans at rest: plan it first.", "weldcal plan-motion")
+    elif r.symbol == "X_BC":
+        after = Next(
+            "Verify with scans at rest that the calibration has not seen, or watch it while the arm works.",
+            f"weldcal monitor RECORDING --calibration {out}",
+        )
+    else:
+        after = Next("Record a second motion and calibrate again: the two poses should agree within their errors.")
+    return FirstScreen(found, expected, after, (scanner_pose(r),))
 
 
 def motion_report(report: MotionReport, *, dataset: str) -> str:
@@ -18,8 +165,8 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
     before, after = report.along_rms_mm
     facts = [
         ("clock used", f"{clock.kind}. {clock.reason}"),
-        ("offset, ms", f"{_ms(clock.offset_s)} ± {_ms(clock.sigma_s)} (one sigma)"),
-        ("jitter of single frames, ms", _ms(clock.jitter_s)),
+        ("offset, ms", f"{_ms_text(clock.offset_s)} ± {_ms_text(clock.sigma_s)} (one sigma)"),
+        ("jitter of single frames, ms", _ms_text(clock.jitter_s)),
     ]
     if clock.kind == DEVICE and clock.drift is not None and clock.drift_sigma is not None:
         facts += [
@@ -27,7 +174,9 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
             ("device time of the offset, s", fixed(clock.reference_s, 3)),
         ]
     if clock.rolling_s is not None:
-        facts.append(("rolling time per unit of y/z, ms", f"{_ms(clock.rolling_s)} ± {_ms(clock.rolling_sigma_s)}"))
+        facts.append(
+            ("rolling time per unit of y/z, ms", f"{_ms_text(clock.rolling_s)} ± {_ms_text(clock.rolling_sigma_s)}")
+        )
     return render(
         "motion_calibration.html.j2",
         dataset=dataset,
@@ -56,7 +205,7 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
     )
 
 
-def _ms(seconds: float | None) -> str:
+def _ms_text(seconds: float | None) -> str:
     return fixed(None if seconds is None else 1e3 * seconds, 3)
 
 

@@ -1,13 +1,234 @@
-"""The report of a live calibration in any mounting: the station, what was found in which direction, and how sure it is."""
+"""The result of a live calibration in any mounting and its page: the station, what was found in which direction, how sure."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    LightParameter,
+    MakeRenderEngineVtk,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.sensors import CameraInfo
 
-from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.report.hand_eye import unknown_tables
+from weldcal.calibration.hand_eye.mountings import Mounting
+from weldcal.calibration.hand_eye.solve import HandEyeResult, pose_difference
+from weldcal.calibration.planning.mounting_poses import work_point
+from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
+from weldcal.models.arrays import Array
+from weldcal.systems.jobs.mounting.job import FOOT, AddedMounting
+from weldcal.systems.jobs.mounting.messages import MountingStatus
+from weldcal.systems.runner import Run
+from weldcal.tools.report.first_screen import (
+    Expected,
+    Findings,
+    FirstScreen,
+    Next,
+    Tolerance,
+    expected_error,
+    point_covariance,
+    radius_95,
+    refused_note,
+)
+from weldcal.tools.report.hand_eye import HandEyeReport, held_out_error, shown_poses, unknown_tables
 from weldcal.tools.report.pictures import OURS, error_bars, millimetres, svg
 from weldcal.tools.report.render import fixed, render
-from weldcal.tools.report.robot_timing import robot_timing
+from weldcal.tools.report.run import robot_timing
+
+
+@dataclass(frozen=True)
+class TruthError:
+    """Error of an estimated pose against the ground truth: mm, deg, squared error in units of its covariance, and the bound
+    that it does not exceed with a probability of 99.7 %."""
+
+    mm: float
+    deg: float
+    nees: float
+    bound: float
+
+
+@dataclass(frozen=True, eq=False)
+class MountingReport:
+    """The result of a live calibration, and its folder."""
+
+    run: Run[AddedMounting]
+    result: HandEyeResult | None
+    folder: Path
+    seconds: float
+    robot: str = "simulated"
+
+    @property
+    def job(self) -> AddedMounting:
+        """The job that ran."""
+        return self.run.cell.job
+
+    @property
+    def status(self) -> MountingStatus:
+        """The calibration's last status in the run."""
+        return self.job.status(self.run.root)
+
+    @property
+    def mounting(self) -> Mounting:
+        """The configuration."""
+        return self.job.scene.mounting
+
+    @property
+    def state(self) -> str:
+        """`done`, or `held` with a reason."""
+        return "done" if not self.run.held and self.result is not None else "held"
+
+    @property
+    def reason(self) -> str:
+        """The reason why the job was held; empty where it is done."""
+        if self.state == "done":
+            return ""
+        return self.run.reason or self.status.message
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen: the job's own tolerance on its expected error, at the scanner's best distance."""
+        status, result, scenario = self.status, self.result, self.run.cell.scenario
+        against = [self.reason] if self.state != "done" else []
+        aside = [1e3 * k.error_m for k in status.held_out]
+        what = f"error {1e3 * self.job.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
+        if result is None:
+            found = Findings(against=against or ["There is no result."], unseen=0)
+            after = Next("Settle the reason, then run the job again.")
+            return FirstScreen(
+                found, Expected(what, "not known", "there is no calibration"), after, more={"pose": "none was found"}
+            )
+        X = result.X
+        p = np.asarray(X @ work_point(self.job.scene))
+        own = 1e3 * radius_95(point_covariance(X, result.covariance["X"], p))
+        _, p95, n = held_out_error(result)
+        expected, _ = expected_error(what, own, p95, n, "poses")
+        if aside:
+            more = f"{expected.backing}; {len(aside)} held out by the job: at most {max(aside):.3f} mm"
+            expected = Expected(what, expected.figure, more)
+        tolerance = Tolerance(
+            "the expected error, one sigma,", 1e3 * status.sigma_work_m, scenario.calibration.required_error_mm,
+            "calibration.required_error_mm",
+        )  # fmt: skip
+        concerns = [*(f"Not observable: {text}" for text in result.unobservable), *result.warnings]
+        notes = refused_note(status.refused, status.sequence)
+        found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
+        if status.next_best is not None:
+            after = Next(f"To know it better, add the pose {status.next_best.sentence()}")
+        else:
+            after = Next("Use the pose; calibrate again after any knock.")
+        return FirstScreen(
+            found,
+            expected,
+            after,
+            shown_poses(result, self.mounting),
+        )
+
+    def truth_errors(self) -> dict[str, TruthError]:
+        """Symbol (X_FC ...) -> error against the truth."""
+        out = {}
+        for letter, X in self.job.truth.items():
+            if self.result is None or letter not in self.result.poses:
+                continue
+            e = pose_difference(self.result.poses[letter], X)
+            out[self.mounting.unknowns[letter].symbol] = TruthError(
+                1e3 * float(np.linalg.norm(e[3:])),
+                float(np.degrees(np.linalg.norm(e[:3]))),
+                self.result.normalised_error(letter, X),
+                self.result.region(0.997),
+            )
+        return out
+
+    def work_error_mm(self) -> float | None:
+        """True error of a point at the scanner's best distance, mm."""
+        truth = self.job.truth.get("X")
+        if self.result is None or truth is None:
+            return None
+        p = work_point(self.job.scene)
+        return 1e3 * float(np.linalg.norm(self.result.X @ p - truth @ p))
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object: the keys of hand-eye and those of the run."""
+        status, result = self.status, self.result
+        out: dict[str, object] = {"state": self.state, "configuration": self.mounting.name, "robot": self.robot}
+        if self.reason:
+            out["reason"] = self.reason
+        out |= {
+            "n_scans": status.sequence,
+            "n_used": len(status.seen),
+            "refused": [{"id": id, "reason": why} for id, why in status.refused],
+        }
+        if result is not None:
+            for k, X in result.poses.items():
+                out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": result.covariance[k]}
+            out |= {
+                "held_out_deg": result.held_out.rms_deg,
+                "held_out_mm": 1e3 * result.held_out.rms_translation,
+                "kept_aside_mm": [1e3 * k.error_m for k in status.held_out],
+                "kept_aside_deg": [float(np.degrees(k.tilt_rad)) for k in status.held_out],
+                "expected_error_mm": 1e3 * status.sigma_work_m,
+                "work_error_mm": self.work_error_mm(),
+                "truth": {s: vars(e) for s, e in self.truth_errors().items()},
+                "inliers": result.inliers,
+                "unobservable": list(result.unobservable),
+                "warnings": list(result.warnings),
+                "method": result.method,
+                "next_pose": None if status.next_best is None else status.next_best.sentence(),
+            }
+        return out | self.run.timing() | {"seconds": self.seconds}
+
+    def given(self) -> tuple[str, ...]:
+        """The given data: the pose of the circle, and the link that carries the scanner."""
+        scene, scenario = self.job.scene, self.run.cell.scenario
+        out = []
+        for letter in scene.known:
+            u = self.mounting.unknowns[letter]
+            circle = (
+                "the circle of the base mounting" if scenario.calibration.configuration in FOOT else "the flange itself"
+            )
+            out.append(f"{u.symbol} is known: the target M is {circle}, at the pose of the robot's drawing.")
+        if "arm" in scene.configuration and (scanner := scenario.scanner_config()) is not None:
+            out.append(f"The arm link L is the {scanner.mounted_on.replace('_', ' ')}.")
+        return tuple(out)
+
+    def text(self) -> str:
+        """The printed result: directions, sketch, numbers, and the errors at held-out poses."""
+        status = self.status
+        if self.result is None:
+            return f"{self.mounting.name}: {self.state}. {self.reason}"
+        lines = [
+            HandEyeReport(
+                result=self.result,
+                mounting=self.mounting,
+                comparison=(),
+                next_pose=None,
+                files=(),
+                seconds=self.seconds,
+            ).text(),
+            "",
+        ]
+        lines.append(f"poses        {self.result.diversity.sentence()}")
+        lines += [f"given        {sentence}" for sentence in self.given()]
+        aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.held_out)
+        if aside:
+            lines.append(f"verified     {aside} mm at held-out poses, which the calibration did not use")
+        lines.append(
+            f"expected     {1e3 * status.sigma_work_m:.3f} mm (1 sigma) of a point at the scanner's best distance"
+        )
+        for symbol, e in self.truth_errors().items():
+            lines.append(
+                f"truth        {symbol} is off by {e.mm:.3f} mm, {e.deg:.4f} deg (simulation; squared error in units of its "
+                f"covariance {e.nees:.1f}, 99.7 % of the time below {e.bound:.1f})"
+            )
+        lines += [f"refused      {id}: {why}" for id, why in status.refused]
+        return "\n".join(lines)
 
 
 def mounting_report(report: MountingReport, picture: bytes | None) -> str:
@@ -77,3 +298,112 @@ def _growth(report: MountingReport) -> bytes:
     axes.set_xlabel("scans")
     axes.set_ylabel("expected error, mm")
     return svg(figure, axes)
+
+
+WIDTH, HEIGHT, FOCAL = 1000, 640, 900.0
+AXES_M = 0.10
+COLOURS = ("#d33d2f", "#2c9a45", "#2b5fc4")
+_PLATE = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.5}
+
+
+def station_picture(report: MountingReport) -> bytes | None:
+    """PNG of the station at the last calibration pose: arms, scanner, circle, and the frames by their letters.
+
+    Seen from the side on which the frames lie farthest apart. It shows what truly is: None where nothing is simulated.
+    """
+    run, cell = report.run, report.run.cell
+    world = cell.station.world
+    if world is None:
+        return None
+    pose = report.status.seen[-1].pose if report.status.seen else report.job.plan[0]
+    frames = true_frames(report, pose.q, pose.q_2)
+    root = run.root.Clone()
+    plant_context = world.plant.GetMyMutableContextFromRoot(root)
+    world.plant.SetPositions(plant_context, world.arm, pose.q)
+    if world.second is not None and pose.q_2 is not None:
+        world.plant.SetPositions(plant_context, world.second, pose.q_2)
+    light = LightParameter(type="directional", direction=(0.3, -0.2, 1.0), frame="camera", intensity=1.1)
+    params = RenderEngineVtkParams(default_clear_color=np.array([0.94, 0.95, 0.97]), lights=[light])
+    scene_graph, name = world.scene_graph, "picture"
+    scene_graph.AddRenderer(scene_graph.GetMyMutableContextFromRoot(root), name, MakeRenderEngineVtk(params))
+    X_WV = _best_view(frames)
+    core = RenderCameraCore(
+        name,
+        CameraInfo(WIDTH, HEIGHT, FOCAL, FOCAL, 0.5 * WIDTH, 0.5 * HEIGHT),
+        ClippingRange(0.05, 20.0),
+        RigidTransform(),
+    )
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(root))
+    image = query.RenderColorImage(ColorRenderCamera(core, False), scene_graph.world_frame_id(), X_WV)
+    return _annotated(np.array(image.data[:, :, :3]), frames, X_WV)
+
+
+def true_frames(report: MountingReport, q: Array, q_2: Array | None) -> dict[str, RigidTransform]:
+    """Letter -> pose in the base B of every frame in the mounting's sketch, as it truly is."""
+    scene = report.job.scene.believing(report.job.truth)
+    links = scene.frames(q)
+    found = {"B": RigidTransform(), "F": links[FLANGE], "C": links[scene.link] @ scene.X_LC}
+    if scene.link not in (BASE, FLANGE):
+        found["L"] = links[scene.link]
+    if scene.two and scene.X_BD is not None and q_2 is not None:
+        found |= {"D": scene.X_BD, "E": scene.frames_2(q_2)[FLANGE]}
+    found["M"] = scene.circle(links, q_2)
+    return found
+
+
+def _best_view(frames: dict[str, RigidTransform]) -> RigidTransform:
+    """From a little above, far enough for all frames, where the nearest two of them are farthest apart in the picture."""
+    points = np.array([X.translation() for X in frames.values()])
+    distinct = points[[all(np.linalg.norm(p - o) > 0.03 for o in points[:i]) for i, p in enumerate(points)]]
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0)) + np.array([0.0, 0.0, 0.05])
+    distance = 0.9 + 1.9 * float(np.linalg.norm(points - middle, axis=1).max())
+    best, widest = RigidTransform(), -1.0
+    for azimuth in np.radians(np.arange(0.0, 360.0, 15.0)):
+        away = np.array([np.cos(azimuth) * 0.88, np.sin(azimuth) * 0.88, 0.47])
+        z = -away / np.linalg.norm(away)
+        x = np.cross(z, [0.0, 0.0, 1.0])
+        x /= np.linalg.norm(x)
+        X_WV = RigidTransform(RotationMatrix(np.column_stack([x, np.cross(z, x), z])), middle - distance * z)
+        seen = _project(points, X_WV)
+        # centre the picture on the frames, and leave room for an arm's elbow above them
+        shift = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) - [0.5 * WIDTH, 0.5 * HEIGHT + 0.06 * HEIGHT]
+        X_WV = X_WV @ RigidTransform([*(shift * distance / FOCAL), 0.0])
+        uv = _project(distinct, X_WV)
+        gaps = np.linalg.norm(uv[:, None] - uv[None], axis=2) + 1e9 * np.eye(len(uv))
+        if float(gaps.min()) > widest:
+            best, widest = X_WV, float(gaps.min())
+    return best
+
+
+def _project(points: Array, X_WV: RigidTransform) -> Array:
+    p = np.asarray(X_WV.inverse() @ np.atleast_2d(points).T).reshape(3, -1).T
+    return np.asarray(FOCAL * p[:, :2] / p[:, 2:] + [0.5 * WIDTH, 0.5 * HEIGHT])
+
+
+def _annotated(image: NDArray[np.uint8], frames: dict[str, RigidTransform], X_WV: RigidTransform) -> bytes:
+    figure = Figure(figsize=(WIDTH / 100.0, HEIGHT / 100.0), dpi=120)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.imshow(image)
+    axes.set_axis_off()
+    sight = _project(np.array([frames["C"].translation(), frames["M"].translation()]), X_WV)
+    axes.plot(*sight.T, linestyle="--", color="#333", linewidth=1.2)
+    placed: list[Array] = []
+    for letter, X in frames.items():
+        _draw_frame(axes, letter, X, X_WV, placed)
+    axes.set_xlim(0, WIDTH)
+    axes.set_ylim(HEIGHT, 0)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue()
+
+
+def _draw_frame(axes: Axes, letter: str, X: RigidTransform, X_WV: RigidTransform, placed: list[Array]) -> None:
+    tips = X.translation() + AXES_M * X.rotation().matrix().T
+    uv = _project(np.vstack([X.translation(), tips]), X_WV)
+    for tip, colour in zip(uv[1:], COLOURS, strict=True):
+        axes.plot(*np.array([uv[0], tip]).T, color=colour, linewidth=2.2, solid_capstyle="round")
+    at = uv[0] + np.array([14.0, -16.0])
+    while any(np.linalg.norm(at - other) < 24.0 for other in placed):
+        at = at + np.array([26.0, 0.0])
+    placed.append(at)
+    axes.annotate(letter, at, fontsize=12, fontweight="bold", ha="center", va="center", bbox=_PLATE)

@@ -17,7 +17,7 @@ _ALONG = 0.99  # a chord that lies along the seam has no place worth a mark
 _DOTTED = (0, (1.2, 0.7))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class WeldTrace:
     """A weld as it is plotted, SI units; N rows from the first contact on.
 

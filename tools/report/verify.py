@@ -1,11 +1,143 @@
-"""The report page of `weldcal verify`: errors per scan against the stated ones, and over the field of view."""
+"""The result of `weldcal verify` and its page: errors per scan against the stated ones, and over the field of view."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from weldcal.tools.outcomes.calibration import VerifyReport
-from weldcal.tools.report.flange_features import fit_cells
+from weldcal.calibration.data.results import CalibrationResult, correction_note
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.observation import Observation
+from weldcal.tools.report.calibration import error_summary, fit_cells, interval_rows, scanner_pose
+from weldcal.tools.report.first_screen import (
+    CARE,
+    DO_NOT,
+    ENOUGH_UNSEEN,
+    USE,
+    Expected,
+    Findings,
+    FirstScreen,
+    Next,
+    Tolerance,
+)
 from weldcal.tools.report.pictures import error_bars, error_field
 from weldcal.tools.report.render import fixed, render
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face normals
+    (None where none was seen), and whether the calibration used this scan."""
+
+    id: str
+    error_mm: float
+    tilt_deg: float | None
+    used_before: bool
+
+
+NONE = "not a verification"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict of a verification (one of the four above), its limit for the median of the new scans in mm (None: the calibration
+    states none) and the reason, a sentence."""
+
+    verdict: str
+    limit_mm: float | None
+    reason: str
+
+    @property
+    def tone(self) -> str:
+        """The report's colour."""
+        return {USE: "good", DO_NOT: "bad"}.get(self.verdict, "warn")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifyReport:
+    """The result of a verification. ``observations`` include the scanner correction where the result has one."""
+
+    result: CalibrationResult
+    correction: ScannerCorrection | None
+    observations: tuple[Observation, ...]
+    fits: dict[str, FlangeFit]
+    poses: tuple[PoseError, ...]
+    refused: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    hashes: dict[str, str]
+    out: Path
+    verdict: Verdict
+    source: str = ""
+    dataset: str = "NEW_SCANS"
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen; its verdict is this command's own, on the new scans. What is no verification says so."""
+        v, r = self.verdict, self.result
+        new = np.array([p.error_mm for p in self.poses if not p.used_before])
+        reason = f"This is no verification. {v.reason}" if v.verdict == NONE else v.reason
+        settled = (CARE if v.verdict == NONE else v.verdict, reason)
+        tolerance = None
+        if v.limit_mm is not None and len(new):
+            tolerance = Tolerance("the median error of the new scans", float(np.median(new)), v.limit_mm, self.source)
+        found = Findings(
+            tolerance=tolerance,
+            unseen=len(new),
+            concerns=self.warnings,
+            notes=tuple(filter(None, (correction_note(r),))),
+            settled=settled,
+        )
+        if len(new):
+            what = f"{len(new)} new scan{'' if len(new) == 1 else 's'}, which the calibration did not use"
+            expected = Expected(
+                "error at the flange, 95 %",
+                f"{np.percentile(new, 95):.3f} mm",
+                f"of {what}; median {np.median(new):.3f} mm",
+            )
+        else:
+            expected = Expected("error at the flange, 95 %", "not known", "every scan here was used in the calibration")
+        return FirstScreen(found, expected, self._next(), (scanner_pose(r),))
+
+    def _next(self) -> Next:
+        v = self.verdict
+        if v.verdict == USE:
+            return Next("Use X_BC. Verify again after any knock, and after work at the robot or the scanner.")
+        if v.verdict == DO_NOT:
+            return Next("See what has changed, then calibrate again.", f"weldcal doctor {self.dataset}")
+        if v.verdict == NONE or sum(not p.used_before for p in self.poses) < ENOUGH_UNSEEN:
+            return Next("Take four or more new scans across the work space, and verify with them.")
+        return Next("Settle what could be wrong, then verify again.", f"weldcal doctor {self.dataset}")
+
+    @property
+    def position_error_mm(self) -> dict[str, float]:
+        """Median, mean, 95th percentile and largest position error, mm."""
+        return error_summary(np.array([p.error_mm for p in self.poses]))
+
+    @property
+    def interval_rows(self) -> dict[str, str]:
+        """Rows for the terminal: median and 95 % of the errors, each with its bootstrap interval."""
+        return interval_rows("error", np.array([p.error_mm for p in self.poses]))
+
+    @property
+    def tilt_deg(self) -> dict[str, float | None]:
+        """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
+        found = error_summary(np.array([p.tilt_deg for p in self.poses], dtype=float))
+        return {key: found[key] if np.isfinite(found[key]) else None for key in ("median", "p95")}
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object of `verify`. A refused scan is named in the warnings."""
+        return {
+            "state": "done",
+            "verdict": self.verdict.verdict,
+            "limit_mm": self.verdict.limit_mm,
+            "reason": self.verdict.reason,
+            "position_error_mm": self.position_error_mm,
+            "tilt_deg": self.tilt_deg,
+            "per_pose": [{"id": p.id, "error_mm": p.error_mm, "tilt_deg": p.tilt_deg} for p in self.poses],
+            "warnings": list(self.warnings),
+        }
 
 
 def verify_report(report: VerifyReport, *, dataset: str) -> str:

@@ -18,7 +18,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def print_table(
     title: str, header: Sequence[str], rows: Iterable[Sequence[str]], *, text: Sequence[int] = (0,)
 ) -> None:
-    """Write a table on stdout; columns in `text` are text, the others are numbers and stand at the right."""
+    """Write a table on stdout; columns in `text` are text, the others are numbers, aligned right."""
     table = Table(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0))
     for k, name in enumerate(header):
         table.add_column(name, justify="left" if k in text else "right")

@@ -11,9 +11,8 @@ import pytest
 from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.calibration.doctor.record import case_text, read_case
 from weldcal.models.errors import InputError
-from weldcal.tools.outcomes.doctor import CHECKED, worded
-from weldcal.tools.studies.doctor.unknown import UNKNOWN
-from weldcal.tools.studies.doctor.world import CAUSES, clean
+from weldcal.tools.commands.doctor import CHECKED, worded
+from weldcal.tools.worlds.doctor import CAUSES, UNKNOWN, clean
 
 SEED = 31
 

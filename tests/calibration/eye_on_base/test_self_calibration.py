@@ -22,7 +22,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.tools.studies.flange.warped import calibrate_warped, new_errors
+from weldcal.tools.worlds.warped_scanner import calibrate_warped, new_errors
 
 X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
 WRONG = ScannerCorrection(1.003, (0.015, -0.01))

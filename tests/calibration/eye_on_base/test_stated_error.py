@@ -25,7 +25,7 @@ from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.verify import verify_dataset
-from weldcal.tools.outcomes.poses import pose_rows
+from weldcal.tools.report.first_screen import pose_rows
 
 SIGMA = 2e-4
 

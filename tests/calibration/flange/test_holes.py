@@ -9,10 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
-from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, face_points, get_flange
-from weldcal.models.scanners import get_scanner
-from weldcal.tools.studies.flange.hole_turn import study_hole_turn
 
 Array = NDArray[np.float64]
 STANDARD = get_flange("iso9409-1-50-4-m6")
@@ -132,20 +129,6 @@ def test_a_second_hole_at_a_rival_place_of_the_dowel_leaves_the_rotation_open() 
     pattern = find_holes(points, fit_flange(points, STANDARD), STANDARD)
     assert pattern is not None
     assert np.degrees(np.abs(pattern.other_turns_rad)) == pytest.approx([90.0])
-
-
-def test_no_filled_holes_lead_to_a_wrong_rotation() -> None:
-    rows = study_hole_turn(get_scanner("phoxi_m", 1032), STANDARD, 2, seed=4)
-    assert [r.filled for r in rows] == ["nothing", *(f"thread {k}" for k in (1, 2, 3, 4)), "dowel hole", "two"]
-    assert sum(r.wrong for r in rows) == 0
-    assert rows[0].right > 0
-    assert rows[5].right == 0
-    assert rows[5].left_open > 0
-
-
-def test_a_flange_without_holes_has_none_to_fill() -> None:
-    with pytest.raises(InputError, match="has no holes to fill"):
-        study_hole_turn(get_scanner("phoxi_m", 1032), get_flange("tool-ring-63"), 1)
 
 
 def test_a_ring_has_no_pattern() -> None:

@@ -20,7 +20,7 @@ from weldcal.calibration.geometry.plane import plane_steps, weighted_moments
 from weldcal.calibration.geometry.robust import middle, solved
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.studies.flange.frames import facing, flange_frame
+from weldcal.tools.worlds.flange_frames import facing, flange_frame
 
 
 @settings(deadline=None)  # the first call compiles

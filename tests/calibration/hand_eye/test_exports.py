@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from tests.calibration.hand_eye.poses import co_manipulation, eye_in_hand
 from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.tools.commands.hand_eye import run_hand_eye
-from weldcal.tools.outcomes.hand_eye import HandEyeReport
+from weldcal.tools.report.hand_eye import HandEyeReport
 
 LAST_DIGIT = 2e-9  # of the nine decimals written, rad and m
 

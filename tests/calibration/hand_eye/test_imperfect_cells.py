@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from tests.calibration.hand_eye.poses import eye_in_hand
 from weldcal.calibration.geometry.se3 import difference
 from weldcal.calibration.hand_eye.choice import CANDIDATES, solve
 from weldcal.calibration.hand_eye.problem import full_problem, residuals
 from weldcal.calibration.hand_eye.solve import IDENTITY
-from weldcal.tools.cli.app import app
-from weldcal.tools.studies.hand_eye import cells_against_opencv
-from weldcal.tools.studies.hand_eye.cells_against_opencv import ratios
-from weldcal.tools.studies.hand_eye.imperfect_cells import imperfect_cell
+from weldcal.tools.worlds.imperfect_cells import imperfect_cell, ratios
 
 KNOWN = (IDENTITY, IDENTITY, IDENTITY)
 
@@ -56,13 +49,3 @@ def test_the_truth_of_a_cell_fits_its_poses_up_to_their_errors(kind: str) -> Non
     w, d = residuals(full_problem(cell.F, cell.G), (cell.X, cell.Y, IDENTITY))
     assert np.degrees(np.linalg.norm(w, axis=1)).max() < 6.0
     assert 1e-5 < np.linalg.norm(d, axis=1).max() < 0.04
-
-
-def test_the_command_tells_how_often_opencv_is_ahead(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cells_against_opencv, "KINDS", ("robot",))
-    call = ["benchmark", "hand-eye-cells", "--runs", "1", "--json", "--out", str(tmp_path)]
-    found = CliRunner().invoke(app, call)
-    assert found.exit_code == 0, found.output
-    cells = json.loads(found.output.splitlines()[-1])["cells"]
-    assert cells["all, weldcal"] == cells["robot, weldcal"]
-    assert set(cells["all, weldcal"]) == {"opencv_ahead_percent", "p95_deg", "p95_mm"}

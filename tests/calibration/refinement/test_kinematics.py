@@ -19,7 +19,7 @@ from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.flange.wrong_arm import Station, run_wrong_arm, station
+from weldcal.tools.worlds.wrong_arm import Station, judged, station, study_station
 
 ARM = load_chain("ur10e")
 
@@ -30,12 +30,11 @@ def _choice(world: Station, kind: str) -> KinematicsChoice:
 
 
 def test_planned_scans_find_factory_size_errors_and_state_what_remains() -> None:
-    found = run_wrong_arm(4, seed=40)
-    assert isinstance(found["ratio"], float)
+    found = judged([study_station(station(40 + k)) for k in range(4)])
     assert found["ratio"] < 0.45
     # 100 scans of four worlds that share their errors
-    assert 88.0 < float(str(found["inside_95_percent"])) <= 100.0
-    assert float(str(found["offsets_within_3_sigma_percent"])) >= 95.0
+    assert 88.0 < found["inside_95_percent"] <= 100.0
+    assert found["offsets_within_3_sigma_percent"] >= 95.0
 
 
 def test_offsets_alone_state_what_unfitted_links_do_to_them() -> None:

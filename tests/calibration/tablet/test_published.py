@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from weldcal.calibration.tablet.published.two_stage import (
 )
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.cell.study import CellStudy, CellStudyOptions
 from weldcal.tools.studies.tablet.paper import STAGE_1, STAGE_2, published_touches
 from weldcal.tools.studies.tablet.study import compare_signs, dh_by_eq_20
 from weldcal.tools.studies.targets import Target, all_met
@@ -89,9 +87,6 @@ def test_a_slow_moment_of_the_computer_is_shown_and_decides_nothing() -> None:
     assert not slow.met
     assert all_met([slow])
     assert not all_met([slow._replace(decides=True)])
-    cell = CellStudy(CellStudyOptions(Path("out")), (), 1.0, (("real_time_factor", 0.1, 1.0, False),))
-    assert cell.met
-    assert not replace(cell, reached=(("torch_max_mm", 0.4, 0.3, False),)).met
 
 
 def test_the_parameters_are_the_printed_ones(reproduction: Reproduction) -> None:

@@ -28,7 +28,7 @@ from weldcal.calibration.touch.table import (
 from weldcal.calibration.touch.touches import POINT, Touch
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.touch.world import World, touch_world
+from weldcal.tools.worlds.touch import World, touch_world
 
 
 @lru_cache(maxsize=8)

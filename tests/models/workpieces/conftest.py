@@ -9,7 +9,7 @@ import pytest
 
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.shape import PartShape
-from weldcal.tools.studies.part_welds.step_parts import PARTS, MadePart
+from weldcal.tools.worlds.parts.step_parts import PARTS, MadePart
 
 
 class Shelf:

@@ -13,7 +13,7 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, bowed
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.step import CHORD_MM
-from weldcal.tools.studies.part_welds.step_parts import PARTS
+from weldcal.tools.worlds.parts.step_parts import PARTS
 
 if TYPE_CHECKING:
     from tests.models.workpieces.conftest import Shelf

@@ -14,7 +14,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, chained, read_polyline, seam_of
-from weldcal.tools.studies.part_welds.step_parts import PARTS, write_step
+from weldcal.tools.worlds.parts.step_parts import PARTS, write_step
 
 if TYPE_CHECKING:
     from tests.models.workpieces.conftest import Shelf
@@ -135,7 +135,7 @@ def test_files_that_are_no_part_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_sheet_without_a_volume_is_no_solid(tmp_path: Path) -> None:
-    from weldcal.tools.studies.part_welds.step_parts import _face
+    from weldcal.tools.worlds.parts.step_parts import _face
 
     path = tmp_path / "face.step"
     write_step(_face([(0, 0, 0), (100, 0, 0), (100, 100, 0)]), path)

@@ -35,7 +35,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.commands.motion_live import MotionOutcome, follower_delay, run_motion_live
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 
 
 def scenario(frames: int = 45) -> Scenario:

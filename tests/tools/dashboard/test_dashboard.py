@@ -30,7 +30,7 @@ from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.dashboard.facts import Facts
 from weldcal.tools.dashboard.server import Dashboard
 from weldcal.tools.dashboard.source import DashboardSource
-from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.run import RunOptions
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
 

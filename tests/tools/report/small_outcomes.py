@@ -25,35 +25,19 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.systems.messages import CalibrationStatus, VerificationResult
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.outcomes.calibration import (
-    CARE,
-    CalibrationReport,
-    PoseError,
-    Verdict,
-    VerifyReport,
-    error_summary,
-)
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.first_screen import NO_TOLERANCE, FirstScreen
-from weldcal.tools.outcomes.hand_eye import HandEyeReport, MethodRow
-from weldcal.tools.outcomes.monitor import MonitorReport
-from weldcal.tools.outcomes.motion import MotionReport
-from weldcal.tools.outcomes.mounting import MountingReport
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome, ProfilerLive
-from weldcal.tools.outcomes.profiler_file import ProfilerFile, ProfilerSeam
-from weldcal.tools.outcomes.tablet import tablet_screen
-from weldcal.tools.report.calibration import calibration_report
-from weldcal.tools.report.demo import demo_pictures, demo_report
-from weldcal.tools.report.hand_eye import hand_eye_report
-from weldcal.tools.report.monitor import monitor_page
-from weldcal.tools.report.motion_calibration import motion_report
-from weldcal.tools.report.mounting import mounting_report
-from weldcal.tools.report.profiler_file import profiler_report, seam_report
-from weldcal.tools.report.profiler_live import live_report
-from weldcal.tools.report.tablet import Shown
+from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
+from weldcal.tools.report.first_screen import CARE, NO_TOLERANCE, FirstScreen
+from weldcal.tools.report.hand_eye import HandEyeReport, MethodRow, hand_eye_report
+from weldcal.tools.report.monitor import MonitorReport, monitor_page
+from weldcal.tools.report.motion_calibration import MotionReport, motion_report
+from weldcal.tools.report.mounting import MountingReport, mounting_report
+from weldcal.tools.report.profiler_file import ProfilerFile, ProfilerSeam, profiler_report, seam_report
+from weldcal.tools.report.profiler_live import LiveOutcome, PoseOutcome, ProfilerLive, live_report
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
-from weldcal.tools.report.verify import verify_report
+from weldcal.tools.report.verify import PoseError, Verdict, VerifyReport, verify_report
 
 Made = tuple[FirstScreen, str]
 OUT = Path("result")
@@ -132,11 +116,17 @@ def motion() -> Made:
     p_C = np.array([o.p_CR for o in make_observations(n, 1)])
     estimate = SimpleNamespace(
         X_BC=RESULT.X_BC,
-        clock=ScannerClock(kind="arrival", offset_s=0.03, sigma_s=1e-4, jitter_s=1e-3, reference_s=0.0, reason="There is no other."),
+        clock=ScannerClock(
+            kind="arrival", offset_s=0.03, sigma_s=1e-4, jitter_s=1e-3, reference_s=0.0, reason="There is no other."
+        ),
         start=SimpleNamespace(delays=np.linspace(0.0, 0.1, 20), rms_m=1e-3 * np.ones(20), delay_s=0.03),
-        inliers=np.ones(n, bool), capture=np.linspace(0.0, 3.0, n), residual_m=values[0], along_m=values[1], before_m=values[2],
+        inliers=np.ones(n, bool),
+        capture=np.linspace(0.0, 3.0, n),
+        residual_m=values[0],
+        along_m=values[1],
+        before_m=values[2],
         held_out_m=values[3],
-    )  # fmt: skip
+    )
     frames = ObservedFrames(
         ids=tuple(map(str, range(n))),
         arrival=np.linspace(0.0, 3.0, n),
@@ -180,12 +170,25 @@ def monitor() -> Made:
         clock=SimpleNamespace(kind="arrival"), delay_s=0.1, sigma_s=1e-3, jitter_s=1e-3, source="recording"
     )
     watched = SimpleNamespace(
-        ids=tuple(map(str, range(n))), rows=SimpleNamespace(times=np.linspace(0.0, 4.0, n)),
-        residuals=1e-4 * rng.standard_normal((n, 3)), tilts=1e-4 * rng.standard_normal((n, 2)),
-        before=1e-3 * rng.standard_normal((n, 3)), offsets=1e-3 * rng.standard_normal(n), gross=np.zeros(n, bool),
-        statistic=np.linspace(1.0, 80.0, n), threshold=30.0, events=(event,), X_BC=X, covariance=COVARIANCE, since_s=2.0,
-        clock=clock, noise=SimpleNamespace(jitter_s=1e-3), dropped=(("q", "No flange: 3"),), rms_m=2e-4, rms_after_m=1e-4,
-    )  # fmt: skip
+        ids=tuple(map(str, range(n))),
+        rows=SimpleNamespace(times=np.linspace(0.0, 4.0, n)),
+        residuals=1e-4 * rng.standard_normal((n, 3)),
+        tilts=1e-4 * rng.standard_normal((n, 2)),
+        before=1e-3 * rng.standard_normal((n, 3)),
+        offsets=1e-3 * rng.standard_normal(n),
+        gross=np.zeros(n, bool),
+        statistic=np.linspace(1.0, 80.0, n),
+        threshold=30.0,
+        events=(event,),
+        X_BC=X,
+        covariance=COVARIANCE,
+        since_s=2.0,
+        clock=clock,
+        noise=SimpleNamespace(jitter_s=1e-3),
+        dropped=(("q", "No flange: 3"),),
+        rms_m=2e-4,
+        rms_after_m=1e-4,
+    )
     report = MonitorReport(
         watched=cast(Any, watched),
         calibration=RESULT,
@@ -234,9 +237,16 @@ def _run(name: str, **job: Any) -> Any:
     context = SimpleNamespace(get_time=lambda: 10.0)
     cell = SimpleNamespace(scenario=scenario, job=SimpleNamespace(**job))
     return SimpleNamespace(
-        cell=cell, root=context, held=False, reason=None, clock=None, seconds=10.0, wall_seconds=5.0,
-        phases=[("start", 0.0, 0.0), ("scan_pose", 1.0, 0.5), ("done", 9.0, 4.5)], timing=lambda: timing,
-    )  # fmt: skip
+        cell=cell,
+        root=context,
+        held=False,
+        reason=None,
+        clock=None,
+        seconds=10.0,
+        wall_seconds=5.0,
+        phases=[("start", 0.0, 0.0), ("scan_pose", 1.0, 0.5), ("done", 9.0, 4.5)],
+        timing=lambda: timing,
+    )
 
 
 class LiveMounting(MountingReport):
@@ -256,15 +266,21 @@ def mounting() -> Made:
         mounting=get_mounting("eye_in_hand"), scanner=scanner, known=(), configuration="eye_in_hand", two=False
     )
     status = SimpleNamespace(
-        sequence=9, seen=(), refused=(("pose3", "No circle."),), sigma_work_m=2e-5, history=((4, 4e-5), (9, 2e-5)),
-        held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),), next_best=None, message="",
-    )  # fmt: skip
+        sequence=9,
+        seen=(),
+        refused=(("pose3", "No circle."),),
+        sigma_work_m=2e-5,
+        history=((4, 4e-5), (9, 2e-5)),
+        held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),),
+        next_best=None,
+        message="",
+    )
     run = _run("eye_in_hand", scene=scene, truth={}, status=lambda root: status)
     report = LiveMounting(run, _hand_eye(), OUT, 5.0)
     return report.first, mounting_report(report, None)
 
 
-def _demo(estimate: Any, *, held: bool) -> Made:
+def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
     sequencer = SimpleNamespace(
         GetMyContextFromRoot=lambda root: root, job_state=lambda context: SimpleNamespace(warnings=("A remark.",))
     )
@@ -276,6 +292,8 @@ def _demo(estimate: Any, *, held: bool) -> Made:
     )
     if held:
         run.held, run.reason = True, "The tag was lost."
+    if not begun:
+        run.phases = []
     status = CalibrationStatus(
         sequence=11,
         calibration_scans=10,
@@ -286,7 +304,9 @@ def _demo(estimate: Any, *, held: bool) -> Made:
         history=((4, 3e-4, 2e-4, 1e-4), (10, 9e-5, 1e-4, 5e-5)),
         verifications=(VerificationResult("pose11", 1e-4, 1e-3),),
     )
-    result = DemoResult(RunOptions(scenario="calibrate_only", out=OUT), run, status, None, None)
+    result = DemoResult(
+        options=RunOptions(scenario="calibrate_only", out=OUT), run=run, status=status, calibration=None, weld=None
+    )
     return result.first, demo_report(result, demo_pictures(result), recording=True)
 
 
@@ -298,6 +318,11 @@ def demo() -> Made:
 def held() -> Made:
     """`demo` that was held before it had a pose."""
     return _demo(None, held=True)
+
+
+def unbegun() -> Made:
+    """`demo` that the operator ended before its first phase."""
+    return _demo(None, held=True, begun=False)
 
 
 RECORD = ProfilerRecord(
@@ -386,7 +411,7 @@ def tablet() -> Made:
 
 def finger() -> Made:
     """`finger calibrate` with touches."""
-    from weldcal.tools.commands.finger_calibrate import FingerReport, finger_page
+    from weldcal.tools.commands.cell.finger import FingerReport, finger_page
     from weldcal.welding.finger.calibration import Intrinsics, TipCalibration
 
     camera = Intrinsics(
@@ -424,6 +449,19 @@ def finger() -> Made:
 PAGES: dict[str, Callable[[], Made]] = {
     made.__name__: made
     for made in (
-        calibrate, verify, motion, monitor, hand_eye, mounting, demo, held, profiler, seam, profiler_live, tablet, finger,
+        calibrate,
+        verify,
+        motion,
+        monitor,
+        hand_eye,
+        mounting,
+        demo,
+        held,
+        unbegun,
+        profiler,
+        seam,
+        profiler_live,
+        tablet,
+        finger,
     )
-}  # fmt: skip
+}

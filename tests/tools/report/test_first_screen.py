@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.models.errors import InputError
 from weldcal.tools import console
-from weldcal.tools.outcomes.first_screen import (
+from weldcal.tools.report.first_screen import (
     CARE,
     DO_NOT,
     USE,
@@ -26,8 +26,8 @@ from weldcal.tools.outcomes.first_screen import (
     check_limit,
     decide,
     point_covariance,
+    radius_95,
 )
-from weldcal.tools.outcomes.poses import radius_95
 
 WITHIN = Tolerance("the error", 0.2, 0.3, "--limit-mm")
 ABOVE = Tolerance("the error", 0.4, 0.3, "--limit-mm")

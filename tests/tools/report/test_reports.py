@@ -11,12 +11,12 @@ import pytest
 
 from tests.browser import Browser
 from tests.tools.report.small_outcomes import PAGES, Made
-from weldcal.tools.outcomes.first_screen import CARE, DO_NOT, USE
-from weldcal.tools.report.inline_svg import inline_svg
+from weldcal.tools.report.first_screen import CARE, DO_NOT, USE
+from weldcal.tools.report.render import inline_svg
 
 VERDICTS = {"calibrate": CARE, "verify": CARE, "monitor": DO_NOT, "hand_eye": CARE, "demo": CARE, "held": DO_NOT}
 VERDICTS |= {"profiler": DO_NOT, "seam": CARE, "tablet": USE, "finger": CARE, "mounting": USE, "profiler_live": CARE}
-VERDICTS |= {"motion": CARE}
+VERDICTS |= {"motion": CARE, "unbegun": DO_NOT}
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
 

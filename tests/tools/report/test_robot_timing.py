@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from weldcal.systems.runner import Run
 from weldcal.systems.wall_clock import LIMITS_MS, WallClock
-from weldcal.tools.report.robot_timing import robot_timing
+from weldcal.tools.report.run import robot_timing
 
 
 def run_with(clock: WallClock | None) -> Run[Any]:

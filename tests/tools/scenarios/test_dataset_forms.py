@@ -12,8 +12,8 @@ from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.errors import InputError
-from weldcal.tools.commands.new import FILES, write_example
-from weldcal.tools.scenarios.dataset_forms import FORMS, rewrite, write_bag
+from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite, write_bag
+from weldcal.tools.commands.cell.new import FILES, write_example
 
 RNG = np.random.default_rng(4)
 POSES = {

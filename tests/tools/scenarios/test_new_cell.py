@@ -11,16 +11,16 @@ from pydrake.common.yaml import yaml_load
 
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario, scenario_names
-from weldcal.tools.scenarios.new_cell import SCHEMA, write_cell
+from weldcal.tools.commands.cell.new import SCHEMA, write_cell
 
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_a_new_cell_means_what_its_scenario_means(tmp_path: Path, name: str) -> None:
-    assert load_scenario(str(write_cell(tmp_path / "mine", name))) == load_scenario(name)
+    assert load_scenario(str(write_cell(tmp_path / "mine", name)[0])) == load_scenario(name)
 
 
 def test_every_key_that_is_commented_out_can_be_written(tmp_path: Path) -> None:
-    path = write_cell(tmp_path, "s_groove")
+    path, _ = write_cell(tmp_path, "s_groove")
     scenario = load_scenario("s_groove")
     parts = [scenario, *(value for value in vars(scenario).values() if dc.is_dataclass(value))]
     keys = "|".join({field.name for part in parts for field in dc.fields(part)} - {"extends"})
@@ -31,12 +31,12 @@ def test_every_key_that_is_commented_out_can_be_written(tmp_path: Path) -> None:
 
 
 def test_no_line_is_longer_than_an_editor_is_wide(tmp_path: Path) -> None:
-    text = write_cell(tmp_path, "s_groove").read_text()
+    text = write_cell(tmp_path, "s_groove")[0].read_text()
     assert max(len(line) for line in text.splitlines() if not line.startswith("description")) <= 132
 
 
 def test_a_cell_is_never_overwritten(tmp_path: Path) -> None:
-    first = write_cell(tmp_path, "s_groove").read_text()
+    first = write_cell(tmp_path, "s_groove")[0].read_text()
     with pytest.raises(InputError, match=r"There is a cell in .* already"):
         write_cell(tmp_path, "l_groove")
     assert (tmp_path / "cell.yaml").read_text() == first
@@ -61,7 +61,7 @@ def test_the_schema_beside_it_knows_every_part_and_the_drivers(tmp_path: Path) -
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_shipped_scenarios_fit_the_schema(tmp_path: Path, name: str) -> None:
-    text = re.sub(r"!\w+", "", write_cell(tmp_path, name).read_text())
+    text = re.sub(r"!\w+", "", write_cell(tmp_path, name)[0].read_text())
     Draft202012Validator(json.loads((tmp_path / SCHEMA).read_text())).validate(yaml_load(data=text))
 
 

@@ -1,10 +1,12 @@
 """A cell begins with a user's own part and tool: the files lie beside it, and the seam is an edge of the part."""
 
+import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
@@ -18,8 +20,8 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario, ToolFile
 from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
-from weldcal.tools.cli.scenarios import edge_numbers
-from weldcal.tools.scenarios.new_cell import OwnPart, write_cell
+from weldcal.tools.cli.app import app
+from weldcal.tools.commands.cell.new import OwnPart, edge_numbers, write_cell
 
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])  # an L, mm
 
@@ -32,7 +34,7 @@ def angle(tmp_path: Path) -> Path:
 
 
 def test_the_longest_concave_edge_of_a_part_becomes_the_seam(angle: Path, tmp_path: Path) -> None:
-    cell = write_cell(tmp_path / "cell", "s_groove", OwnPart(angle), WELDING)
+    cell, _ = write_cell(tmp_path / "cell", "s_groove", OwnPart(angle), WELDING)
     scenario = load_scenario(str(cell))
     assert scenario.workpiece is not None
     assert scenario.workpiece.joint == "fillet"
@@ -44,13 +46,13 @@ def test_the_longest_concave_edge_of_a_part_becomes_the_seam(angle: Path, tmp_pa
 
 
 def test_the_part_stands_on_the_table_under_the_scanner(angle: Path, tmp_path: Path) -> None:
-    guess = load_scenario(str(write_cell(tmp_path / "cell", "s_groove", OwnPart(angle)))).workpiece
+    guess = load_scenario(str(write_cell(tmp_path / "cell", "s_groove", OwnPart(angle))[0])).workpiece
     assert guess is not None
     assert guess.pose_guess.pose().multiply([0.04, 0.03, 0.0]) == pytest.approx([0.65, 0.0, 0.0], abs=1e-4)
 
 
 def test_the_part_lies_elsewhere_than_guessed_so_the_scan_has_to_find_it(angle: Path, tmp_path: Path) -> None:
-    part = load_scenario(str(write_cell(tmp_path / "cell", "s_groove", OwnPart(angle)))).workpiece
+    part = load_scenario(str(write_cell(tmp_path / "cell", "s_groove", OwnPart(angle))[0])).workpiece
     assert part is not None
     assert part.located_by == "scan"
     assert part.placement_error.translation_mm > 3.0
@@ -63,13 +65,13 @@ def test_of_two_joints_the_seam_is_the_one_above(tmp_path: Path) -> None:
     upright = extrude(lap, -70.0, 70.0)
     path = tmp_path / "lap.obj"
     path.write_text(TriMesh(upright.vertices[:, [2, 0, 1]], upright.triangles).to_obj())
-    scenario = load_scenario(str(write_cell(tmp_path / "above", "s_groove", OwnPart(path))))
+    scenario = load_scenario(str(write_cell(tmp_path / "above", "s_groove", OwnPart(path))[0]))
     assert scenario.workpiece is not None
     assert part_of(scenario.workpiece).seam.up_P[:, 2].min() > 0.5
     assert planned(scenario).reason is None
     chosen = scenario.workpiece.seams[0].edges
     below = next(edge.id for edge in read_shape(path).edges if edge.kind == "concave" and [edge.id] != chosen)
-    scenario = load_scenario(str(write_cell(tmp_path / "below", "s_groove", OwnPart(path, (below,)))))
+    scenario = load_scenario(str(write_cell(tmp_path / "below", "s_groove", OwnPart(path, (below,)))[0]))
     assert re.search("would touch the part on its way to the seam, even 100 mm above", str(planned(scenario).reason))
 
 
@@ -82,7 +84,7 @@ def planned(scenario: Scenario) -> PlannedSeam:
 
 
 def test_edges_and_joint_can_be_chosen(angle: Path, tmp_path: Path) -> None:
-    chosen = load_scenario(str(write_cell(tmp_path / "cell", "s_groove", OwnPart(angle, (1,), "lap")))).workpiece
+    chosen = load_scenario(str(write_cell(tmp_path / "cell", "s_groove", OwnPart(angle, (1,), "lap"))[0])).workpiece
     assert chosen is not None
     assert (chosen.seams[0].edges, chosen.joint) == ([1], "lap")
 
@@ -97,3 +99,21 @@ def test_a_part_that_cannot_begin_a_cell_is_refused_in_a_sentence(angle: Path, t
     with pytest.raises(InputError, match="--edges must be numbers with commas between them"):
         edge_numbers("12;13")
     assert edge_numbers(" 12, 13 ") == [12, 13]
+
+
+def test_a_part_that_no_place_lets_the_arm_weld_is_no_cell(tmp_path: Path) -> None:
+    channel = np.array([[0, 0], [60, 0], [60, 60], [50, 60], [50, 10], [10, 10], [10, 60], [0, 60]], dtype=float)
+    path = tmp_path / "tube.obj"
+    path.write_text(extrude(channel, 0.0, 150.0).to_obj())
+    folder = tmp_path / "cell"
+    words = ["new", str(folder), "--part", str(path), "--json"]
+    finished = CliRunner().invoke(app, words)
+    found = json.loads(finished.stdout.splitlines()[-1])
+    assert finished.exit_code == 1
+    assert found["state"] == "unfinished"
+    assert found["reason"].startswith("The arm cannot weld tube.obj in any of the poses that were tried: ")
+    assert not (folder / "cell.yaml").exists()
+    text = (folder / "unfinished.yaml").read_text()
+    assert "It runs as it is" not in text
+    assert "the arm cannot weld the seam of its part yet" in text
+    assert load_scenario(str(folder / "unfinished.yaml")).workpiece is not None

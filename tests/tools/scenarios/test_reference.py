@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from weldcal.systems.scenario.schema import WeldingConfig
-from weldcal.tools.scenarios.fields import keys_of
-from weldcal.tools.scenarios.reference import reference
+from weldcal.tools.commands.cell.schema import keys_of, reference
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "scenario.md"
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.places import SHARED_DATA, needs
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.tools.studies.flange.held_out import study_halves
+from weldcal.tools.studies.flange.recorded import study_halves
 
 FLANGE = SHARED_DATA / "flange"
 pytestmark = needs(FLANGE)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from weldcal.tools.studies.parts import study
-from weldcal.tools.studies.parts.scenes import scan_scene, subject
-from weldcal.tools.studies.parts.study import NEES_BOUND, run_registration_study
+from weldcal.tools.studies.parts import registration
+from weldcal.tools.studies.parts.registration import NEES_BOUND, run_registration_study
+from weldcal.tools.worlds.parts.scenes import scan_scene, subject
 from weldcal.welding.locate.part.result import PartRegistration
 
 pytest.importorskip("OCP")
@@ -32,7 +32,7 @@ def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(tmp_path: Path, monkeypa
 
     def confident(cloud: object, mesh: object, seam: object, *_: object, **__: object) -> object:
         part = subject("lap")
-        true = scan_scene(part.mesh, study.get_scanner("phoxi_m", 824), 6000, objects=4, fingers=1).X_BP
+        true = scan_scene(part.mesh, registration.get_scanner("phoxi_m", 824), 6000, objects=4, fingers=1).X_BP
         off = true @ RigidTransform([0.001, 0.0, 0.0])
         said = PartRegistration(
             X_BP=off,
@@ -47,14 +47,14 @@ def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(tmp_path: Path, monkeypa
         )
         return said, type("Joint", (), {"seam": part.seam, "share": 1.0})
 
-    monkeypatch.setattr(study, "locate_part", confident)
+    monkeypatch.setattr(registration, "locate_part", confident)
     found = run_registration_study(tmp_path, range(0), range(1), range(0), ["lap"])
     assert (found["state"], found["plan"]["wrong"]) == ("held", 1)  # type: ignore[index]
 
 
 def test_subjects_must_be_refused_for_the_right_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert study.run_refusal("wrong unit", 0)["verdict"] == "refused: PartNotFound"
-    case = study.REFUSALS["wrong unit"]()
+    assert registration.run_refusal("wrong unit", 0)["verdict"] == "refused: PartNotFound"
+    case = registration.REFUSALS["wrong unit"]()
     other = type(case)(case.there, case.looked_for, case.error, "looks the same")
-    monkeypatch.setitem(study.REFUSALS, "wrong unit", lambda: other)
-    assert study.run_refusal("wrong unit", 0)["verdict"] == "wrong reason"
+    monkeypatch.setitem(registration.REFUSALS, "wrong unit", lambda: other)
+    assert registration.run_refusal("wrong unit", 0)["verdict"] == "wrong reason"

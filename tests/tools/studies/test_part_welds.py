@@ -15,9 +15,10 @@ from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam, Refinement
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.studies.part_welds.step_parts import PARTS
-from weldcal.tools.studies.part_welds.study import Trial, run_part_welds, write_cell
+from weldcal.tools.report.demo import DemoResult
+from weldcal.tools.studies.parts.welds import run_part_welds
+from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.step_parts import PARTS
 
 
 def test_a_refined_cell_calibrates_scanner_and_arm_before_it_welds(tmp_path: Path) -> None:
@@ -50,7 +51,7 @@ def of_plan(sigma_m: float, refinement: Refinement | None = None) -> DemoResult:
     plan = PlannedSeam(arm_sigma_m=sigma_m, arm_turn_rad=math.radians(44.0))
     run: Any = SimpleNamespace(cell=SimpleNamespace(job=SimpleNamespace(planned_seam=lambda root: plan)), root=None)
     status = CalibrationStatus(refinement=refinement)
-    return DemoResult(cast(Any, None), run, status, None, cast(Any, object()))
+    return DemoResult(options=cast(Any, None), run=run, status=status, calibration=None, weld=cast(Any, object()))
 
 
 def test_a_bent_seam_is_noted_where_the_arm_matters() -> None:

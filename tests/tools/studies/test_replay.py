@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -12,41 +12,26 @@ import numpy as np
 import pytest
 
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.commands.record import RECORDING
-from weldcal.tools.farm.journal import Result
+from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.studies.replay import overhead, study
-from weldcal.tools.studies.replay.study import KINDS, Kind, run_replays
+from weldcal.tools.studies.cell import replays
+from weldcal.tools.studies.cell.replays import KINDS, REPLAYS, Kind, replay_cases
 
 HELD = "job: {maximum_time_s: 1.0}\nscanner: {width: 412, height: 308}"
-
-
-class Here(Farm):
-    """Runs the tasks in this process."""
-
-    def run(
-        self,
-        function: Callable[..., Mapping[str, object]],
-        tasks: Mapping[str, Mapping[str, Any]],
-        each: Callable[[dict[str, Result]], None] | None = None,
-    ) -> dict[str, Result]:
-        found = {name: dict(function(**given)) for name, given in tasks.items()}
-        if each is not None:
-            each(found)
-        return found
 
 
 def test_a_run_is_recorded_and_replayed_and_only_a_recording_that_differs_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(study, "KINDS", {"held soon": Kind("calibrate_only", HELD)})
-    summary, table = run_replays(Here(tmp_path), 1, 4)
+    monkeypatch.setattr(replays, "KINDS", {"held soon": Kind("calibrate_only", HELD)})
+    found = REPLAYS.run(Farm(tmp_path, workers=0), replay_cases(tmp_path, 1, 4))
+    summary, table = found.figures, found.markdown()
     assert (summary["state"], summary["runs"], summary["identical"]) == ("done", 1, 1)
-    row = summary["per_run"]["held soon, seed 4"]  # type: ignore[index]
+    row = summary["per_run"]["held soon, seed 4"]
     assert (row["run"], row["replayed"], row["first"]) == ("held", "identical", "")
     assert row["compared"] > 100
     assert "| held soon, seed 4 | held | identical | 1." in table
-    assert (tmp_path / "replays.csv").read_text().count("\n") == 2
+    assert (tmp_path / "runs.csv").read_text().count("\n") == 2
     assert not list(tmp_path.rglob(RECORDING))
 
 
@@ -62,7 +47,7 @@ def test_the_overhead_is_that_of_the_pairs_and_its_interval_holds_it() -> None:
     plain = rng.uniform(20.0, 40.0, 9)
     recorded = 1.03 * plain * np.exp(rng.normal(0.0, 0.01, 9))
     recorded[4] *= 1.3  # a host that was busy with something else
-    found = overhead.overhead(np.column_stack([plain, recorded]))
+    found = replays.overhead(np.column_stack([plain, recorded]))
     assert found["low"] < 3.0 < found["high"]
     assert found["percent"] == pytest.approx(3.0, abs=1.5)
     assert found["high"] - found["low"] < 5.0
@@ -73,7 +58,7 @@ def test_the_interval_holds_the_true_overhead_in_nineteen_of_twenty_studies() ->
     held = 0
     for _ in range(400):
         plain = np.exp(rng.normal(3.2, 0.05, 11))
-        found = overhead.overhead(np.column_stack([plain, 1.04 * np.exp(rng.normal(3.2, 0.05, 11))]))
+        found = replays.overhead(np.column_stack([plain, 1.04 * np.exp(rng.normal(3.2, 0.05, 11))]))
         held += found["low"] <= 4.0 <= found["high"]
     assert held >= 370  # 380 expected, less three standard deviations
 
@@ -93,11 +78,11 @@ def test_the_runs_of_a_pair_work_in_turns_and_the_first_pair_does_not_count(
         used = 99.0 if pair == 0 else 10.2 if record else 10.0
         return used, 117.0 if record else 0.0, 5.0
 
-    monkeypatch.setattr(overhead, "seconds", seconds)
-    monkeypatch.setattr(overhead, "get_context", lambda _: ThreadsInTurns)
-    monkeypatch.setattr(overhead, "ProcessPoolExecutor", ThreadsInTurns.pool)
-    monkeypatch.setattr(overhead, "_TURNS", [])
-    summary, table = overhead.run_overhead(tmp_path, 6, 4, no_progress)
+    monkeypatch.setattr(replays, "seconds", seconds)
+    monkeypatch.setattr(replays, "get_context", lambda _: ThreadsInTurns)
+    monkeypatch.setattr(replays, "ProcessPoolExecutor", ThreadsInTurns.pool)
+    monkeypatch.setattr(replays, "_TURNS", [])
+    summary, table = replays.run_overhead(tmp_path, 6, 4, no_progress)
     of_a_pair = [side for pair, side in worked if pair == 3]
     assert of_a_pair == 20 * [0, 1] + 10 * [0]
     assert summary["overhead"] == pytest.approx({"percent": 2.0, "low": 2.0, "high": 2.0})

@@ -14,16 +14,14 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, planned_seam, roughness
-from weldcal.tools.studies.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, Tip
-from weldcal.tools.studies.weld.metrics import RunMetrics
-from weldcal.tools.studies.weld.plant import StudyRun, simulate
-from weldcal.tools.studies.weld.rows import ROWS, Case, Target, UnknownRow, get_rows
-from weldcal.tools.studies.weld.seams import NAMES, UnknownSeam, get_seam
-from weldcal.tools.studies.weld.stamps import Stamps
-from weldcal.tools.studies.weld.study import CaseResult, hold_against, run_case, study_config
-from weldcal.tools.studies.weld.turns import run_turn
-from weldcal.tools.studies.weld.unknowns import World, draw_world
+from weldcal.tools.studies.weld.rows import ROWS, CaseResult, Target, UnknownRow, get_rows, hold_against, run_turn
+from weldcal.tools.worlds.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, planned_seam, roughness
+from weldcal.tools.worlds.weld.case import Case, run_case, study_config
+from weldcal.tools.worlds.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, Tip
+from weldcal.tools.worlds.weld.metrics import RunMetrics
+from weldcal.tools.worlds.weld.plant import Stamps, StudyRun, simulate
+from weldcal.tools.worlds.weld.seams import NAMES, UnknownSeam, get_seam
+from weldcal.tools.worlds.weld.unknowns import World, draw_world
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import DeflectionSample

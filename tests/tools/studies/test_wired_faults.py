@@ -15,8 +15,8 @@ import pytest
 
 from weldcal.tools.emulators.cell.bridges import Bridge, PictureBridge, ScannerBridge
 from weldcal.tools.emulators.cell.input_wire import DELAY_S, InputWire
-from weldcal.tools.studies.wired.fault_run import DEVICES, FAULTS, PHASES, Happening
-from weldcal.tools.studies.wired.soak import FLAT_MB_H, grows, growth
+from weldcal.tools.studies.robot.wired import FLAT_MB_H, grows, growth
+from weldcal.tools.worlds.robot.wired_job import DEVICES, FAULTS, PHASES, Happening
 
 HOST = "127.0.0.1"
 

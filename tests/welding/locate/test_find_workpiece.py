@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.tools.studies.seam_planning.scenes import Scene, box, cast, looking_at, scan_part, table
+from weldcal.tools.worlds.parts.plates import Scene, box, cast, looking_at, scan_part, table
 from weldcal.welding.locate.find_workpiece import AmbiguousWorkpiece, FoundWorkpiece, find_workpiece
 from weldcal.welding.locate.registration import WorkpieceNotFound
 

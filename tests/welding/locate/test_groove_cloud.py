@@ -5,10 +5,8 @@ Accuracy on poses that no figure was set on is what `weldcal benchmark seam-plan
 
 from __future__ import annotations
 
-import csv
 import math
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +17,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.tools.studies.seam_planning import benchmark as seam_planning
-from weldcal.tools.studies.seam_planning.scenes import Scene, box, cast, looking_at, scan_part, table
-from weldcal.tools.studies.seam_planning.trials import sideways
+from weldcal.tools.worlds.parts.plates import Scene, box, cast, looking_at, scan_part, sideways, table
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.groove.seam import (
     GrooveNotFound,
@@ -191,18 +187,3 @@ def test_a_cloud_of_the_wrong_shape_or_size_is_bad_input() -> None:
         extract_groove(np.zeros((5, 4)))
     with pytest.raises(GrooveNotFound, match="only 0 points"):
         extract_groove(np.full((20, 20, 3), np.nan))
-
-
-def test_the_table_of_the_benchmark_counts_refusals_and_states_errors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(seam_planning, "SHAPES", ("s",))
-    summary, rows = seam_planning.run_seam_planning_benchmark(tmp_path, 1, 50, ["azure_kinect"], troubles=False)
-    assert summary["trials"] == 2
-    assert set(rows) == {"azure_kinect cad", "azure_kinect cloud"}
-    with (tmp_path / "trials.csv").open() as table_file:
-        trials = list(csv.DictReader(table_file))
-    assert len(trials) == 2
-    for trial in trials:
-        # Noise of 1 mm and points 1.8 mm apart: refused in a sentence, or a line with a sigma that covers its error.
-        assert trial["refused"] or float(trial["rms_mm"]) < 3.0 * float(trial["sigma_mm"]) < 2.0

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.studies.parts.scenes import PartScene, block, scan_scene
-from weldcal.tools.studies.seam_planning.scenes import box, cast, looking_at, table
+from weldcal.tools.worlds.parts.plates import box, cast, looking_at, table
+from weldcal.tools.worlds.parts.scenes import PartScene, block, scan_scene
 from weldcal.welding.locate.part.fit import fine_fit
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_part

@@ -12,7 +12,7 @@ import pytest
 
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
-from weldcal.tools.outcomes.weld import WeldLog, new_ticks, welds
+from weldcal.tools.report.weld import WeldLog, new_ticks, welds
 from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.record.weld_log import (
     COLUMNS,
@@ -158,15 +158,6 @@ def test_the_rows_of_several_welds_are_told_apart_by_their_touch() -> None:
     phases = [Phase.TOUCH, Phase.TOUCH, Phase.TRACK, Phase.COAST, Phase.TRACK, Phase.FINISH, Phase.TOUCH, Phase.TRACK]
     n, none = len(phases), np.zeros(0)
     codes = np.array([PHASE_CODES[phase] for phase in phases])
-    log = WeldLog(
-        time=np.arange(n),
-        telemetry={"phase": codes},
-        torch_on=np.ones(n, bool),
-        p_BTip=none,
-        p_BRobot=none,
-        R_BT=none,
-        p_BTorch=none,
-        deflection_T=none,
-        sigma_min=none,
-    )
+    rest = ("p_BTip", "p_BRobot", "R_BT", "p_BTorch", "deflection_T", "sigma_min")
+    log = WeldLog(time=np.arange(n), telemetry={"phase": codes}, torch_on=np.ones(n, bool), **dict.fromkeys(rest, none))
     assert [part.nonzero()[0].tolist() for part in welds(log)] == [[0, 1, 2, 3, 4, 5], [6, 7]]

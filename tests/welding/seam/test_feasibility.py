@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.welding.weld_kinematics import l_curve, straight
-from weldcal.tools.studies.weld.seams import arcs, s_curve
+from weldcal.tools.worlds.weld.seams import arcs, s_curve
 from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics, torch_events
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve

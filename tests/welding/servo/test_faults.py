@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.studies.weld.budgets import NOMINAL
-from weldcal.tools.studies.weld.metrics import judge
-from weldcal.tools.studies.weld.plant import simulate
-from weldcal.tools.studies.weld.rows import Case
-from weldcal.tools.studies.weld.seams import TrueSeam, arcs
-from weldcal.tools.studies.weld.study import study_config
+from weldcal.tools.worlds.weld.budgets import NOMINAL
+from weldcal.tools.worlds.weld.case import Case, study_config
+from weldcal.tools.worlds.weld.metrics import judge
+from weldcal.tools.worlds.weld.plant import simulate
+from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.seam.curve import SeamCurve, SeamError
 from weldcal.welding.servo.settings import ServoConfig, TorchControl, TouchConfig
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState

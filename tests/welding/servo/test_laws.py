@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.tools.studies.weld.budgets import KINEMATIC, NOMINAL, Budget
-from weldcal.tools.studies.weld.metrics import RunMetrics, judge
-from weldcal.tools.studies.weld.plant import simulate
-from weldcal.tools.studies.weld.rows import Case
-from weldcal.tools.studies.weld.seams import TrueSeam, arcs, corner
-from weldcal.tools.studies.weld.study import study_config
+from weldcal.tools.worlds.weld.budgets import KINEMATIC, NOMINAL, Budget
+from weldcal.tools.worlds.weld.case import Case, study_config
+from weldcal.tools.worlds.weld.metrics import RunMetrics, judge
+from weldcal.tools.worlds.weld.plant import simulate
+from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.refinement import RefinedSeam
 from weldcal.welding.servo.laws import LAWS, UnknownLaw, get_law, literal_tangent

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from weldcal.tools.studies.weld.budgets import NOMINAL
-from weldcal.tools.studies.weld.plant import simulate
-from weldcal.tools.studies.weld.seams import TrueSeam, arcs
+from weldcal.tools.worlds.weld.budgets import NOMINAL
+from weldcal.tools.worlds.weld.plant import simulate
+from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.record.process import path_error
 from weldcal.welding.servo.settings import (
     ServoConfig,

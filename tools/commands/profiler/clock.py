@@ -1,9 +1,10 @@
-"""`weldcal profiler clock`: the offset of a profiler's clock from profiles of one straight edge, taken while the arm moves."""
+"""weldcal profiler clock: the offset of a profiler's clock from profiles of one straight edge, taken while the arm moves."""
 
 from pathlib import Path
-from typing import Literal, cast
+from typing import Annotated, Literal, cast
 
 import numpy as np
+import typer
 
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.data.tables import read_rows
@@ -14,11 +15,31 @@ from weldcal.calibration.profiler.edge.features import Kind, extract_edge
 from weldcal.calibration.profiler.record import load_record
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.files import write_json
 
 _COLUMNS = ("time", "x", "z")
 _KINDS, _SIDES = ("bar", "step", "apex"), ("left", "right")
 _UNITS = {"m": 1.0, "mm": 1e-3}
+
+
+@command("profiler clock", short_help="Find a profiler's clock from a straight edge.")
+def clock(
+    call: Call,
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="stream.csv of the robot and profiles.csv (time,x,z).")
+    ],
+    calibration: Annotated[Path, option("--calibration", "RESULT", "Result folder of edge, sphere or compensate.")],
+    robot: Annotated[str, option("--arm", "NAME", "The arm of a stream of joint angles.")] = "",
+    unit: Annotated[str, option("--unit", "U", "m or mm, of the profiles and of the stream's positions.")] = "m",
+    feature: Annotated[
+        str, option("--feature", "KIND", "Where a time has many rows, the edge in them: bar, step or apex.")
+    ] = "bar",
+    side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
+) -> Outcome:
+    """Find the offset of a profiler's clock while the arm weaves across one straight edge: capture = stamp - offset."""
+    out = call.folder("profiler", folder.resolve().name)
+    return Outcome(find_clock(folder, calibration, out, robot=robot, unit=unit, feature=feature, side=side))
 
 
 def find_clock(

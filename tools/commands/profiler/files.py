@@ -32,7 +32,7 @@ LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 
 
 @dataclass(frozen=True, eq=False)
-class ProfilerFile:
+class Measurements:
     """The contents of a file, in m and rad; `digest` is its SHA-256; `warnings` about it are sentences."""
 
     arrays: dict[str, Floats]
@@ -72,7 +72,7 @@ class ProfilerFile:
 
 def read_profiler_file(
     path: Path, *, unit: str | None = None, dataset: str = "", trial: int | None = None
-) -> ProfilerFile:
+) -> Measurements:
     """Read an NPZ or a CSV.
 
     Args:
@@ -94,7 +94,7 @@ def read_profiler_file(
     else:
         raise InputError(f"'{path.name}' is neither .npz nor .csv. Give one of these.")
     _check_numbers(path, arrays, profiles)
-    file = ProfilerFile(arrays, profiles, digest, () if told is None else (told,))
+    file = Measurements(arrays, profiles, digest, () if told is None else (told,))
     X = file.poses()
     if X is None:
         raise InputError("The file has no flange poses. Give 'T', or 'rotation' and 'translation'.")

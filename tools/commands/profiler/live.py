@@ -1,10 +1,10 @@
-"""Runs `weldcal profiler live`: the profiler job, its measurement files, calibrations and report; for several seeds, a table."""
+"""weldcal profiler live: the profiler job, its measurement files, calibrations and report; for several seeds, a table."""
 
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -13,13 +13,56 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.runner import Progress
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.run import JobRun, run_job
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.profiler import WITHIN_MM, LiveOutcome, ProfilerLive, live_outcome
+from weldcal.tools.cli.options import (
+    LIVE,
+    Call,
+    Outcome,
+    RecordOption,
+    ScenarioArgument,
+    command,
+    option,
+)
+from weldcal.tools.commands.run import JobRun, named_once, run_job, run_options
 from weldcal.tools.report.files import mappings_csv
-from weldcal.tools.report.profiler_live import live_report, seeds_report
+from weldcal.tools.report.profiler_live import (
+    WITHIN_MM,
+    LiveOutcome,
+    ProfilerLive,
+    live_outcome,
+    live_report,
+    seeds_report,
+)
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
+
+PROFILER_SCENARIO = "profiler_seam"
+
+
+@command(
+    "profiler live",
+    short_help="Calibrate a profiler on the arm and follow a seam.",
+    options=LIVE,
+    defaults={"browser": False},
+)
+def profiler_live(
+    call: Call,
+    name: ScenarioArgument = None,
+    scenario: Annotated[
+        str, option("--scenario", "NAME", "profiler_edge, profiler_sphere, profiler_seam or a YAML file.")
+    ] = PROFILER_SCENARIO,
+    runs: Annotated[int, option("--runs", "N", "Number of seeds, from --seed on.", min=1)] = 1,
+    record: RecordOption = False,
+) -> Outcome:
+    """Calibrate a profiler on the arm by an edge and a touched sphere, then scan and follow a seam."""
+    chosen = named_once(name, scenario, PROFILER_SCENARIO)
+    options = run_options(call, "profiler-live", chosen, recording=record)
+    loaded = load_scenario(chosen)
+    if runs > 1:
+        return Outcome(run_profiler_seeds(loaded, options, runs, call.progress))
+    found = run_profiler_live(loaded, options, call.progress)
+    return Outcome(found.summary(), first=found.first)
 
 
 def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progress) -> ProfilerLive:
@@ -29,7 +72,7 @@ def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progres
         InputError, RobotRefused: see run_job; nothing has been written or moved. A held run also returns a result.
     """
     finished = run_job(scenario, options, progress, "profiler_job")
-    progress("measure and write", 0.97)
+    progress("measure and write", finished.share(0.97))
     live = ProfilerLive(options, finished.run, live_outcome(finished.run), finished.robot)
     write_live(live, finished)
     return live

@@ -1,7 +1,7 @@
-"""`weldcal profiler seam`: maps a V-groove into the base with a calibrated profiler, and writes it with its report."""
+"""weldcal profiler seam: a V-groove mapped into the base with a calibrated profiler, with its report."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 
@@ -10,15 +10,40 @@ from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.record import load_record
 from weldcal.models.errors import InputError
-from weldcal.tools.commands.profiler.calibrate import check_number
-from weldcal.tools.commands.profiler.files import ProfilerFile
-from weldcal.tools.outcomes.profiler_file import ProfilerSeam, middle_error_mm
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
+from weldcal.tools.commands.profiler.files import Measurements, read_profiler_file
+from weldcal.tools.commands.profiler.result import (
+    FileArgument,
+    TrialOption,
+    UnitOption,
+    check_number,
+    outcome_of,
+    with_warnings,
+)
 from weldcal.tools.report.files import csv_text
-from weldcal.tools.report.profiler_file import seam_report
+from weldcal.tools.report.first_screen import check_limit
+from weldcal.tools.report.profiler_file import ProfilerSeam, middle_error_mm, seam_report
 from weldcal.tools.report.render import write_atomic
 
 
-def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, Any]:
+@command("profiler seam", short_help="Map a V-groove in the base frame.")
+def seam(
+    call: Call,
+    file: FileArgument,
+    calibration: Annotated[Path, option("--calibration", "FOLDER", "Result folder of edge, sphere or compensate.")],
+    unit: UnitOption = None,
+    trial: TrialOption = None,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Map both edges and the root of a V-groove from raw profiles into the base frame, as seam.csv."""
+    check_limit(limit_mm)
+    folder = call.folder("profiler", file.stem)
+    data = read_profiler_file(file, unit=unit, trial=trial)
+    found = with_warnings(data, map_seam(data, calibration, folder))
+    return outcome_of(call, found, finish_seam(found, calibration, file.name, folder, limit_mm))
+
+
+def map_seam(file: Measurements, calibration: Path, folder: Path) -> dict[str, Any]:
     """Writes a V-groove's three features of every profile in the base frame as seam.csv; returns the summary."""
     record = load_record(calibration)
     if file.profiles is None:

@@ -1,10 +1,12 @@
-"""`weldcal tablet calibrate`: calibrates camera and pen from the touches of one visit or of many."""
+"""weldcal tablet calibrate: camera and pen from the touches of one visit or of many."""
 
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 
 from weldcal.calibration.tablet.detection import Look
 from weldcal.calibration.tablet.planar.files import hand_step_m, load_planar
@@ -17,12 +19,61 @@ from weldcal.calibration.tablet.wrist.diagnostics import check_wrist, wrist_diag
 from weldcal.calibration.tablet.wrist.files import file_hash, load_visit
 from weldcal.calibration.tablet.wrist.fit import WristFit, fit_wrist
 from weldcal.models.errors import InputError
-from weldcal.tools.commands.tablet.planar import NAMES, best_model, fit_visit
-from weldcal.tools.commands.tablet.visits import ManyVisits, error_figures, fit_many
-from weldcal.tools.outcomes.first_screen import NO_TOLERANCE, FirstScreen, check_limit
-from weldcal.tools.outcomes.tablet import tablet_screen
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
+from weldcal.tools.commands.tablet.planar import NAMES, ManyVisits, best_model, error_figures, fit_many, fit_visit
+from weldcal.tools.report.first_screen import NO_TOLERANCE, FirstScreen, check_limit
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.tablet import Shown, calibration_report, marked_picture
+from weldcal.tools.report.tablet import Shown, calibration_report, marked_picture, tablet_screen
+
+
+@command("tablet calibrate", short_help="Calibrate a camera by touches of the tablet.")
+def calibrate(
+    call: Call,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The page's touches (CSV), or planar touches (npz).")],
+    poses: Annotated[Path | None, option("--poses", "CSV", "Flange poses at each touch, and one row 'camera'.")] = None,
+    camera: Annotated[Path | None, option("--camera", "YAML", "fx, fy, cx, cy and distortion of the camera.")] = None,
+    image: Annotated[
+        Path | None, option("--image", "PICTURE", "The camera's image; landmarks are detected in it.")
+    ] = None,
+    seen: Annotated[Path | None, option("--seen", "CSV", "Instead of --image: landmark,u,v in the image.")] = None,
+    look: Annotated[str, option("--look", "LOOK", "Landmarks in the image: rings or dots.")] = "rings",
+    pen_length_mm: Annotated[
+        float | None, option("--pen-length-mm", "MM", "Distance of the pen tip from the flange, along its z axis.")
+    ] = None,
+    pen_radius_mm: Annotated[float, option("--pen-radius-mm", "MM", "Radius of the pen's round tip.", min=0.0)] = 0.0,
+    hand_step_mm: Annotated[
+        float | None,
+        option(
+            "--hand-step-mm",
+            "MM",
+            "npz: hand positions are rounded to this step; 0: not rounded.",
+            min=0.0,
+            show_default="detected",
+        ),
+    ] = None,
+    printed_sign: Annotated[
+        bool, switch("--printed-sign", "npz: use the sign of the touching error as printed in the paper.")
+    ] = False,
+    two_stages: Annotated[bool, switch("--two-stages", "npz: also run the paper's two stages.")] = False,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Calibrate camera and pen on the wrist from one image of the tablet and a touch of each landmark."""
+    inputs = TabletInputs(
+        file=file,
+        poses=poses,
+        camera=camera,
+        image=image,
+        seen=seen,
+        look=look,
+        pen_length_m=None if pen_length_mm is None else 1e-3 * pen_length_mm,
+        pen_radius_m=1e-3 * pen_radius_mm,
+        hand_step_m=None if hand_step_mm is None else 1e-3 * hand_step_mm,
+        printed_sign=printed_sign,
+        two_stages=two_stages,
+        limit_mm=limit_mm,
+    )
+    made = calibrate_tablet(inputs, call.folder("tablet", file.stem))
+    return Outcome(made.summary(), first=made.first)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +94,7 @@ class TabletInputs:
     limit_mm: float | None = None
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TabletCalibration:
     """The result, the data of its report, the fit with full poses where it is one; else the rounding step of the hand and the
     errors at the file's queries; and the duration."""

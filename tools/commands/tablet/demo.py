@@ -1,10 +1,12 @@
-"""Runs the tablet job of a scenario: files for `weldcal tablet calibrate`, the calibration, and its errors against the truth."""
+"""weldcal tablet demo: runs the tablet job, writes its files, calibrates from them and compares with the truth."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
-from pydrake.math import RollPitchYaw
+from pydrake.common.yaml import yaml_dump
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.tablet.detection import find_landmarks
 from weldcal.calibration.tablet.plane_depth import plane_depth
@@ -13,18 +15,36 @@ from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.runner import Progress, Run
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.run import run_job
+from weldcal.tools.cli.options import (
+    LIVE,
+    Call,
+    Outcome,
+    RecordOption,
+    ScenarioOption,
+    command,
+)
+from weldcal.tools.commands.run import run_job, run_options
 from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
-from weldcal.tools.commands.tablet.files import write_visit
-from weldcal.tools.outcomes.first_screen import FirstScreen
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.tablet import NO_KEY, run_screen
+from weldcal.tools.report.files import mappings_csv
+from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.tablet import visit_report
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.tablet import NO_KEY, run_screen, visit_report
 
 MOST_LEAN_RAD = 0.15  # tilt of the pen at the unseen points
 UNSEEN = 50  # points of the tablet that are neither landmarks nor touched
+
+
+@command(
+    "tablet demo", short_help="Run the tablet calibration in a scenario.", options=LIVE, defaults={"browser": False}
+)
+def tablet_demo(call: Call, scenario: ScenarioOption = "tablet", record: RecordOption = False) -> Outcome:
+    """Run the tablet calibration: look, touch each landmark, calibrate, compare with the truth."""
+    options = run_options(call, "tablet", scenario, recording=record)
+    found = run_tablet_demo(load_scenario(scenario), options, call.progress)
+    return Outcome(found.summary(), first=found.first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +91,7 @@ def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress)
     """
     finished = run_job(scenario, options, progress, "tablet")
     run = finished.run
-    progress("calibrate and write", 0.96)
+    progress("calibrate and write", finished.share(0.96))
     options.out.mkdir(parents=True, exist_ok=True)
     demo = TabletDemo(options, run, finished.robot)
     if not run.held:
@@ -151,4 +171,40 @@ def depth_error(run: Run[AddedVisit], uv: Array) -> dict[str, object]:
     return {
         "depth_by_plane_mm": 1e3 * float(np.sqrt(((by_plane - true) ** 2).mean())),
         "depth_by_pixel_mm": 1e3 * float(np.sqrt(((by_pixel - true) ** 2).mean())),
+    }
+
+
+def write_visit(run: Run[AddedVisit], folder: Path) -> None:
+    """Write the four files, each atomically."""
+    job, arm = run.cell.job, run.cell.station.arm
+    tablet, state = job.tablet, job.state(run.root)
+    shown = 1e3 * tablet.px_per_mm * tablet.landmarks_m()
+    touches = [
+        {
+            "landmark": t.landmark,
+            "landmark_x_px": f"{shown[t.landmark, 0]:.4f}",
+            "landmark_y_px": f"{shown[t.landmark, 1]:.4f}",
+            "touch_x_px": f"{t.position_px[0]:.1f}",
+            "touch_y_px": f"{t.position_px[1]:.1f}",
+            "mm_per_px": f"{1.0 / tablet.px_per_mm:.9f}",
+            "size_checked": 1,
+            "pointer": "pen",
+        }
+        for t in state.touches
+    ]
+    poses = [_pose_row(str(t.landmark), forward_kinematics(arm, t.q)) for t in state.touches]
+    poses.append(_pose_row("camera", forward_kinematics(arm, state.q_look)))
+    K = job.camera.camera_matrix()
+    intrinsics = {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+    write_atomic(folder / "touches.csv", mappings_csv(touches))
+    write_atomic(folder / "poses.csv", mappings_csv(poses))
+    write_atomic(folder / "camera.yaml", yaml_dump(intrinsics))
+    write_atomic(folder / "picture.png", cv2.imencode(".png", job.picture(run.root).grey)[1].tobytes())
+
+
+def _pose_row(name: str, X: RigidTransform) -> dict[str, object]:
+    values = (*X.translation(), *X.rotation().ToQuaternion().wxyz())
+    return {
+        "landmark": name,
+        **{c: f"{v:.9f}" for c, v in zip(("x", "y", "z", "qw", "qx", "qy", "qz"), values, strict=True)},
     }

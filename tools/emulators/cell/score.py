@@ -3,7 +3,7 @@
 import numpy as np
 
 from weldcal.tools.emulators.cell.physics import Physics
-from weldcal.tools.outcomes.weld import true_seam
+from weldcal.tools.report.weld import true_seam
 from weldcal.welding.record.process import path_error
 
 FEWEST = 30  # points with a burning arc

@@ -2,24 +2,26 @@
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
-from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.loading import scenario_names
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import known_camera, measure
-from weldcal.tools.outcomes.demo import DemoResult
-from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import FeltSeam, felt_seam
+from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.commands.weld import known_camera, measure
 from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.studies.harness import MISSED
 from weldcal.tools.studies.output import print_note, print_table
 from weldcal.tools.studies.targets import Target, print_targets
+from weldcal.tools.worlds.weld.cell_run import CellRun, figures
 from weldcal.welding.servo.laws import get_law
 
 # (figure, worst or mean over the runs, limit, unit); a real-time factor is a lower bound
@@ -42,31 +44,6 @@ class CellStudyOptions:
     first_seed: int = 0
     seam_mm: float | None = None
     law: str = "guarded"
-
-
-@dataclass(frozen=True, kw_only=True)
-class CellRun:
-    """One weld. Lengths in mm: seam points sideways and in height against where the tool's numbers say a seated tip is
-    felt (sd about a smooth line through themselves, and mean); torch against the true line, sideways and in space; its speed's
-    coefficient of variation in %. `cpu_per_second`: processor seconds (all threads) per simulated second of the weld."""
-
-    scenario: str
-    law: str
-    seed: int
-    completed: bool
-    reason: str
-    point_sd_mm: float = np.nan
-    point_spread_mm: float = np.nan
-    point_offset_mm: float = np.nan
-    height_sd_mm: float = np.nan
-    height_offset_mm: float = np.nan
-    torch_mean_mm: float = np.nan
-    torch_max_mm: float = np.nan
-    space_max_mm: float = np.nan
-    cv_percent: float = np.nan
-    welded_mm: float = np.nan
-    real_time_factor: float = np.nan
-    cpu_per_second: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -153,45 +130,6 @@ def weld_once(name: str, seed: int, options: CellStudyOptions, progress: Progres
     return figures(result, name, options.law, seed, cpu)
 
 
-def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: float) -> CellRun:
-    """The figures of a finished run, in mm."""
-    run, weld = result.run, result.weld
-    felt: FeltSeam | None = felt_seam(run.cell, run.root)
-    if weld is None or weld.error is None or weld.speed is None or felt is None:
-        return CellRun(scenario=name, law=law, seed=seed, completed=False, reason=run.reason or "nothing was welded")
-    return CellRun(
-        scenario=name,
-        law=law,
-        seed=seed,
-        completed=not run.held,
-        reason=run.reason or "",
-        point_sd_mm=1e3 * scatter(felt.lateral),
-        point_spread_mm=1e3 * float(felt.lateral.std()),
-        point_offset_mm=1e3 * float(felt.lateral.mean()),
-        height_sd_mm=1e3 * scatter(felt.height),
-        height_offset_mm=1e3 * float(felt.height.mean()),
-        torch_mean_mm=1e3 * weld.error.mean_m,
-        torch_max_mm=1e3 * weld.error.max_m,
-        space_max_mm=1e3 * float(np.hypot(weld.error.lateral, weld.error.height).max()),
-        cv_percent=1e2 * weld.speed.cv,
-        welded_mm=1e3 * weld.speed.welded_m,
-        real_time_factor=run.real_time_factor("weld"),
-        cpu_per_second=cpu_per_second,
-    )
-
-
-def scatter(values: Array, window: int = 31) -> float:
-    """Standard deviation of a series about a smooth line through itself: quadratics over `window` neighbours."""
-    from scipy.signal import savgol_coeffs, savgol_filter
-
-    if len(values) <= window:
-        return float(np.std(values))
-    gap = values - savgol_filter(values, window, 2)
-    # A point pulls its own line towards itself by its weight in it.
-    own = savgol_coeffs(window, 2)[window // 2]
-    return float(np.sqrt(np.mean(gap**2) / (1.0 - own)))
-
-
 def hold_against(runs: list[CellRun]) -> tuple[tuple[str, float, float, bool], ...]:
     """(figure, value, limit, whether met) of every target, over the runs that have it."""
     reached = []
@@ -245,3 +183,20 @@ def print_cell_study(study: CellStudy) -> None:
     ]
     print_targets(f"Law: {study.options.law}", targets)
     print_note(f"written to {study.options.folder}")
+
+
+@command("reproduce cell", short_help="Weld in the whole simulated cell.")
+def cell(
+    call: Call,
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each scenario.", min=1)] = 3,
+    scenarios: Annotated[str, option("--scenarios", "NAMES", "Scenarios, separated by commas.")] = "s_groove,l_groove",
+    seam_mm: Annotated[
+        float | None, option("--seam-mm", "MM", "Weld only this length; default: all.", min=10.0)
+    ] = None,
+    law: Annotated[str, option("--law", "NAME", "Steering law, for comparison.")] = "guarded",
+) -> Outcome:
+    """Weld in the whole simulated cell, with contact and rendered tag: seam points, torch and real-time factor."""
+    folder = call.folder("reproduce", "cell")
+    names = tuple(name.strip() for name in scenarios.split(",") if name.strip())
+    study = run_cell_study(CellStudyOptions(folder, names, seeds, call.seed, seam_mm, law), call.progress)
+    return Outcome(study.summary(), {}, text=partial(print_cell_study, study), problem="" if study.met else MISSED)

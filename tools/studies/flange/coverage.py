@@ -1,7 +1,8 @@
 """Coverage of the stated 95 % regions: shares of simulated calibrations whose regions hold the truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,8 +20,12 @@ from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.calibration.planning.observability import check_diversity
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import svg
-from weldcal.tools.studies.flange.frames import facing
+from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.studies.harness import Figures, Row, Study
+from weldcal.tools.worlds import warped_scanner
+from weldcal.tools.worlds.flange_frames import facing
 
 LEVEL = 0.95
 SIGMA_M, SIGMA_RAD, SIGMA_RATIO = 1e-4, 1e-3, 1e-3  # of a centre and a normal per axis, and of a hole circle's ratio
@@ -201,3 +206,55 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
     axes[0].set_ylabel("inside the stated 95 % region, %")
     axes[0].legend(frameon=False, fontsize=9, loc="lower right")
     return svg(figure, *axes)
+
+
+def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Coverage:
+    """Calibrate ``runs`` devices, each with a warp of its own, from ``poses`` scans each."""
+    X_BC = warped_scanner.X_BC
+    inside, stated, true = np.zeros(2), [], []
+    for device in range(runs):
+        progress(f"calibrations of {poses} scans by a warped scanner", device / runs)
+        _, estimate, scanner = warped_scanner.calibrate_warped(device, poses)
+        seen = warped_scanner.warped_point(warped_scanner.WORK_C, device)
+        found = estimate.X_BC @ (seen if scanner.accepted is None else scanner.accepted.points(seen))
+        p_BQ = X_BC @ warped_scanner.WORK_C
+        turn = rotation_vector(X_BC.rotation() @ estimate.X_BC.rotation().inverse())
+        e, d = np.concatenate([turn, X_BC.translation() - estimate.X_BC.translation()]), p_BQ - found
+        inside[0] += float(e @ np.linalg.solve(estimate.covariance, e)) < chi2.ppf(LEVEL, 6)
+        inside[1] += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < chi2.ppf(LEVEL, 3)
+        stated.append(float(np.mean(estimate.held_out.position_m)))
+        true.append(float(np.mean(warped_scanner.new_errors(device, estimate, scanner))))
+    pose, point = inside / max(runs, 1)
+    return Coverage(
+        poses, runs, float(pose), float(point), float(np.mean(stated) / np.mean(true)), corrected=True, warped=True
+    )
+
+
+def _coverage_rows(f: Figures) -> Iterable[Row]:
+    for s in f["studies"]:
+        kind = "of another model" if s["warped"] else "corrected" if s["corrected"] else "exact"
+        shares = (f"{100 * s[key]:.1f} %" for key in ("pose", "point"))
+        yield str(s["poses"]), kind, *shares, fixed(s["held_out_over_true"])
+
+
+HONESTY = Study(
+    name="flange-honesty",
+    what="How often stated 95 % regions hold the truth, and the ratio of held-out to true errors.",
+    figures=lambda results: results["all"],
+    header=("scans", "scanner", "X_BC inside", "work point inside", "held-out over true error"),
+    rows=_coverage_rows,
+    numbers=3,
+)
+
+
+@command("benchmark flange-honesty", short_help="Measure how often stated 95 % regions hold the truth.", hidden=True)
+def honesty(
+    call: Call, runs: Annotated[int, option("--runs", "N", "Number of calibrations of each size.", min=10)] = 500
+) -> Outcome:
+    """Measure how often the stated 95 % regions contain the truth, and the ratio of held-out to true errors."""
+    folder = HONESTY.folder(call)
+    studies = [study_coverage(n, runs, call.seed, call.progress) for n in (5, 6, 8, 12, 20)]
+    studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
+    studies.append(study_warped(12, max(10, runs // 5), call.progress))
+    write_atomic(folder / "coverage.svg", coverage_picture(studies))
+    return HONESTY.measured({"all": {"studies": [vars(s) for s in studies]}}, folder).outcome()

@@ -23,7 +23,7 @@ from weldcal.systems.jobs.weld.settings import feature_on_flange, plan_poses, wo
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.outcomes.arm_frame import true_work_point
+from weldcal.tools.report.weld import true_work_point
 
 LEVEL = 0.95
 _CENTRE_M, _NORMAL_RAD = 2e-5, 1e-4  # noise of a fit, an axis, as fits of rendered PhoXi M scans state it

@@ -1,10 +1,12 @@
 """Calibrations of recorded scans: the worth of each ingredient, and the errors with few scans."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from pydrake.math import RigidTransform
 from scipy.stats import chi
 
@@ -13,6 +15,7 @@ from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
+from weldcal.calibration.eye_on_base.nested import calibrate_by_choice, mean_interval, nested_errors
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes, from_motion
 from weldcal.calibration.eye_on_base.self_calibration import held_out_errors
@@ -20,10 +23,15 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.refinement.local_field import choose_local
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
+from weldcal.tools.report.render import fixed
+from weldcal.tools.studies.flange.halves import study_parts
+from weldcal.tools.studies.harness import Figures, Row, Study, statistics
 
 LEAST = 12
 SIZES = (1, 2, 3, 4, 6, 8, 12)
@@ -182,3 +190,190 @@ def _calibrated(
     scanner, _, estimate = apply_self_calibration(used, rigid, patterns, seed=seed, nested=False)
     accepted = None if scanner is None else scanner.accepted
     return estimate.X_BC, ScannerCorrection() if accepted is None else accepted
+
+
+LEAST_HALVES = 16
+"""Scans of a recording from which on its halves are calibrated; eight are the least with a choice of the scanner's correction."""
+
+
+@dataclass(frozen=True)
+class Halves:
+    """Of ``draws`` random halves: means of the stated held-out error and of the error on the other half (mm), and how many of
+    the latter lie in the interval (95 %) that the first half states. ``skipped`` halves fixed no calibration."""
+
+    draws: int
+    scans: int
+    stated_mm: float
+    new_mm: float
+    inside: int
+    skipped: int
+
+
+def study_halves(
+    folder: Path, draws: int = 20, seed: int = 0, progress: Progress = no_progress, *, local: bool = False
+) -> Halves:
+    """Calibrate from ``draws`` random halves of a dataset, choices included, and measure on the others. Deterministic for ``seed``.
+
+    ``local``: from two thirds, with the choice of a local field (--refine local).
+
+    Raises InputError for a folder that is none, TooFewPoses for fewer than sixteen usable scans.
+    """
+    good, patterns, _ = usable_scans(
+        folder, LEAST_HALVES, f"Halves need {LEAST_HALVES} usable scans and more", seed, progress, 0.1
+    )
+    half, rows, skipped = 2 * len(good) // 3 if local else len(good) // 2, [], 0
+    for k in range(draws):
+        progress("halves", 0.1 + 0.9 * k / draws)
+        order = np.random.default_rng([seed, k]).permutation(len(good))
+        ours, others = ([good[i] for i in part] for part in (order[:half], order[half:]))
+        try:
+            X_BC, correction = calibrate_by_choice(ours, patterns, seed=seed)
+            new_scans = [corrected_observation(correction, o) for o in others]
+            if local:
+                choice = choose_local(ours, patterns, X_BC, correction, seed=seed)
+                errors = choice.local_m if choice.accepted else choice.plain_m
+                new_scans = choice.field.applied(X_BC, new_scans) if choice.accepted else new_scans
+            else:
+                errors, _ = nested_errors(ours, patterns, seed=seed)
+        except InputError:
+            skipped += 1
+            continue
+        interval = mean_interval(errors)
+        new = float(np.mean(position_errors(X_BC, new_scans)))
+        inside = interval is not None and interval[0] < new < interval[1]
+        rows.append((float(np.nanmean(errors)), new, float(inside)))
+    table = np.array(rows).reshape(-1, 3)
+    stated, new = (float(1e3 * table[:, k].mean()) if len(table) else float("nan") for k in (0, 1))
+    return Halves(draws, half, stated, new, int(table[:, 2].sum()), skipped)
+
+
+def _ingredient(r: Ingredient) -> dict[str, object]:
+    tilt = np.degrees(r.tilt_rad)
+    return {
+        "name": r.name,
+        "position_mm": statistics(1e3 * r.position_m, "median", "mean", "p95"),
+        "median_sigma_mm": 1e3 * r.median_sigma_m(),
+        "tilt_deg": statistics(tilt, "median", "p95"),
+        "floor_mm": 1e3 * r.floor_m,
+    }
+
+
+def _ingredient_rows(f: Figures) -> Iterable[Row]:
+    for r in f["rows"]:
+        p, t = r["position_mm"], r["tilt_deg"]
+        yield (
+            r["name"],
+            f"{p['median']:.3f} ± {r['median_sigma_mm']:.3f}",
+            *(f"{v:.3f}" for v in (p["mean"], p["p95"], t["median"], t["p95"], r["floor_mm"])),
+        )
+
+
+INGREDIENTS = Study(
+    name="flange-ingredients",
+    what="What normals, hole circle, gradient and bends each contribute on recorded scans, every scan held out in turn.",
+    figures=lambda results: results["all"],
+    header=("calibration", "median mm", "mean mm", "95 % mm", "tilt deg", "95 % deg", "spread alone mm"),
+    rows=_ingredient_rows,
+    numbers=6,
+)
+DatasetArgument = Annotated[Path, typer.Argument(metavar="DATASET", help="A dataset folder with scans.")]
+
+
+@command("benchmark flange-ingredients", short_help="Measure what each part of the method contributes.", hidden=True)
+def ingredients(call: Call, dataset: DatasetArgument) -> Outcome:
+    """Measure what normals, hole circle, gradient and bends each contribute on at least twelve recorded scans."""
+    folder, found = INGREDIENTS.folder(call), study_ingredients(dataset, call.seed, call.progress)
+    return INGREDIENTS.measured({"all": {"rows": [_ingredient(r) for r in found]}}, folder).outcome()
+
+
+def _few(found: Sequence[Draws], draws: int) -> dict[str, object]:
+    rows = []
+    for r in (r for r in found if len(r.position_m) > 1):
+        of = statistics(1e3 * r.position_m, "median", "p95")
+        tilt = float(np.degrees(np.median(r.tilt_rad)))
+        row = {"scans": r.scans, "median_mm": of["median"], "median_sigma_mm": 1e3 * r.median_sigma_m()}
+        rows.append(row | {"p95_mm": of["p95"], "tilt_deg": tilt, "corrected": r.corrected, "refused": r.refused})
+    return {"draws": draws, "rows": rows}
+
+
+def _few_rows(f: Figures) -> Iterable[Row]:
+    for r in f["rows"]:
+        error = f"{r['median_mm']:.3f} ± {r['median_sigma_mm']:.3f}"
+        share = f"{100 * r['corrected']:.0f} %"
+        yield str(r["scans"]), error, f"{r['p95_mm']:.3f}", fixed(r["tilt_deg"], 3), share, str(r["refused"])
+
+
+FEW = Study(
+    name="flange-few",
+    what="Calibrations from few of the recorded scans, judged on the scans that were not used.",
+    figures=lambda results: results["all"],
+    header=("scans", "median mm", "95 % mm", "tilt deg", "scanner corrected", "draws refused"),
+    rows=_few_rows,
+    numbers=5,
+)
+
+
+@command("benchmark flange-few", short_help="Calibrate from 1 to 12 of the scans.", hidden=True)
+def few(
+    call: Call,
+    dataset: DatasetArgument,
+    draws: Annotated[int, option("--draws", "N", "Number of random draws of each size.", min=2)] = 60,
+) -> Outcome:
+    """Calibrate from 1, 2, 3, 4, 6, 8 or 12 of the scans and measure the error on the scans that were not used."""
+    folder, found = FEW.folder(call), study_few_scans(dataset, draws, call.seed, progress=call.progress)
+    return FEW.measured({"all": _few(found, draws)}, folder).outcome()
+
+
+def _halves_rows(f: Figures) -> Iterable[Row]:
+    yield "held-out error stated", f"{f['stated_mm']:.3f} mm mean, from {f['scans']} scans each"
+    yield "error on the other half", f"{f['new_mm']:.3f} mm mean"
+    yield "in the stated 95 % interval", f"{f['inside']} of {f['draws'] - f['skipped']}"
+
+
+HALVES = Study(
+    name="flange-halves",
+    what="The held-out error that random halves of recorded scans state, against the error on the other halves.",
+    figures=lambda results: results["all"],
+    header=("", "found"),
+    rows=_halves_rows,
+)
+
+
+@command("benchmark flange-halves", short_help="Calibrate from random halves of the scans.", hidden=True)
+def halves(
+    call: Call,
+    dataset: DatasetArgument,
+    draws: Annotated[int, option("--draws", "N", "Number of random halves.", min=1)] = 20,
+    local: Annotated[
+        bool, switch("--local", "Calibrate from two thirds with --refine local, and judge it on the others.")
+    ] = False,
+) -> Outcome:
+    """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the other half."""
+    folder, found = HALVES.folder(call), study_halves(dataset, draws, call.seed, call.progress, local=local)
+    return HALVES.measured({"all": vars(found)}, folder).outcome()
+
+
+def _part_rows(f: Figures) -> Iterable[Row]:
+    for r in f["rows"]:
+        yield str(r["points"]), *(f"{r[key]:.3f}" for key in ("apart_mm", "bound_mm", "stated_mm"))
+
+
+PARTS = Study(
+    name="flange-parts",
+    what="The distance between the flange centres from two parts of one recorded cloud, and its lower bound.",
+    figures=lambda results: results["all"],
+    header=("points each", "apart, rms mm", "least possible mm", "stated mm"),
+    rows=_part_rows,
+    numbers=3,
+)
+
+
+@command("benchmark flange-parts", short_help="Compare flange centres found in two parts of a cloud.", hidden=True)
+def parts(call: Call, dataset: DatasetArgument) -> Outcome:
+    """Compare the flange centres found in two parts of one cloud: their distance, and its lower bound."""
+    data = load_dataset(dataset)
+    if not data.clouds:
+        raise InputError(f"'{dataset}' holds no clouds to divide. Give a dataset with scans.")
+    folder, clouds = PARTS.folder(call), [data.cloud(id) for id in data.clouds]
+    rows = study_parts(clouds, get_flange(data.header.flange), seed=call.seed, progress=call.progress)
+    return PARTS.measured({"all": {"rows": [vars(r) for r in rows]}}, folder).outcome()

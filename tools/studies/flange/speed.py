@@ -1,8 +1,9 @@
 """Times the detection of the flange: weldcal, the paper's loop, an Open3D chain and a PCL-style random search."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import open3d as o3d
@@ -12,7 +13,16 @@ from weldcal.models.arrays import Array
 from weldcal.models.flanges import PAPER_RADIUS_M, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.studies.flange.frames import Frame, facing, flange_frame
+from weldcal.tools.cli.options import Call, Outcome, command, switch
+from weldcal.tools.cli.subject import one_of
+from weldcal.tools.report.render import fixed
+from weldcal.tools.studies.flange.cells import arm, imperfect
+from weldcal.tools.studies.flange.coverage import honesty
+from weldcal.tools.studies.flange.live import live
+from weldcal.tools.studies.flange.recorded import few, halves, ingredients, parts
+from weldcal.tools.studies.flange.scans import frames, hidden, holes
+from weldcal.tools.studies.harness import Figures, Row, Study
+from weldcal.tools.worlds.flange_frames import Frame, facing, flange_frame
 
 FLANGE = "iso9409-1-50-4-m6"
 _E_D, _E_R, _K_MAX = 0.0003, 0.001, 10_000  # paper, section 3.2.2
@@ -163,3 +173,54 @@ def _open3d_chain(frame: Array, depth_m: float) -> Array | None:
                 return _ransac(part, 0)
         cloud = cloud.select_by_index(inside, invert=True)
     return None
+
+
+def _speed_rows(f: Figures) -> Iterable[Row]:
+    rows = f["rows"]
+    for r in rows:
+        against = f"{r['median_ms'] / rows[0]['median_ms']:.0f} x ours"
+        wanted = against if r["target_ms"] is None else f"target {r['target_ms']:g}"
+        yield r["name"], f"{r['median_ms']:.2f}", f"{r['least_ms']:.2f}", wanted, fixed(r["error_mm"], 3)
+
+
+SPEED = Study(
+    name="flange",
+    what="Processor time to find the flange in a scan, beside the paper's loop, an Open3D chain and a PCL-style search.",
+    figures=lambda results: results["all"],
+    header=("method and scan", "median ms", "least ms", "", "centre off, mm"),
+    rows=_speed_rows,
+    numbers=4,
+)
+
+
+@command("benchmark flange-speed", short_help="Time the detection of the flange beside other chains.", hidden=True)
+def speed(
+    call: Call,
+    loop: Annotated[
+        bool, switch("--loop/--no-loop", "Also run the paper's search as a Python loop; takes seconds.")
+    ] = True,
+) -> Outcome:
+    """Time the detection of the flange in a scan and compare with the paper's loop, an Open3D chain and a PCL-style search."""
+    folder, rows = SPEED.folder(call), run_flange_benchmark(call.seed, loop=loop, progress=call.progress)
+    return SPEED.measured({"all": {"rows": [vars(r) for r in rows]}}, folder).outcome()
+
+
+@command("benchmark flange", short_help="Measure how the flange is found, and what is stated.")
+@one_of(
+    "speed",
+    speed=speed,
+    frames=frames,
+    hidden=hidden,
+    parts=parts,
+    honesty=honesty,
+    live=live,
+    ingredients=ingredients,
+    few=few,
+    holes=holes,
+    imperfect=imperfect,
+    halves=halves,
+    arm=arm,
+)
+def flange(call: Call) -> None:
+    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden, holes), uncertainty (parts, honesty,
+    imperfect, halves) and accuracy (live, ingredients, few, arm)."""

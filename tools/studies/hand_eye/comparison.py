@@ -1,10 +1,11 @@
-"""Benchmark of the hand-eye solvers: public data against OpenCV, outliers, invariance, uncertainty, AXB = YCZ, speed."""
+"""Hand-eye solvers on public data beside OpenCV, and in simulation: outliers, invariance, uncertainty, AXB = YCZ, speed."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,9 +26,12 @@ from weldcal.calibration.hand_eye.solve import (
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.hand_eye.fuzz import fuzz
-from weldcal.tools.studies.output import markdown_table
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
+from weldcal.tools.cli.subject import one_of
+from weldcal.tools.report.render import fixed
+from weldcal.tools.studies.hand_eye.cells import hand_eye_cells, mountings
+from weldcal.tools.studies.harness import Figures, Row, Study, Table
+from weldcal.tools.worlds.hand_eye_mistakes import fuzz
 
 _PLAIN = HandEyeConfig(folds=0)
 _TOLERANCE = (0.02, 0.01, 0.05)  # share, degrees, millimetres: how much of a tie still counts as one
@@ -72,10 +76,9 @@ class HandEyeBenchmark:
     rows: list[DatasetRow] = field(default_factory=list)
     checks: dict[str, tuple[bool, str]] = field(default_factory=dict)
 
-    def summary(self) -> dict[str, object]:
+    def summary(self) -> dict[str, Any]:
         """For the last line of --json."""
         return {
-            "state": "done",
             "datasets": {
                 r.name: {
                     "held_out_deg": r.deg,
@@ -337,37 +340,61 @@ def run_hand_eye_benchmark(
     return report
 
 
-def _short(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"
+def _set_rows(figures: Figures) -> Iterable[Row]:
+    for name, r in figures["datasets"].items():
+        known = r["best_opencv_deg"] is not None and np.isfinite(r["best_opencv_deg"])
+        yield (
+            name,
+            f"{r['held_out_deg']:.4f}",
+            fixed(r["best_opencv_deg"], 4),
+            f"{r['held_out_mm']:.3f}",
+            fixed(r["best_opencv_mm"], 3),
+            ", ".join(map(str, r["flagged"])) or "-",
+            "; ".join(r["unobservable"]) or "-",
+            ("yes" if r["holds"] else "NO") if known else "-",
+            f"{fixed(r['truth_nees'], 1)}, {fixed(r['truth_nees_corners'], 1)}",
+        )
 
 
-def write_table(report: HandEyeBenchmark, folder: Path) -> str:
-    """Write hand_eye.md in ``folder`` and return its text."""
-    header = ("set", "n", "held-out deg", "best OpenCV", "held-out mm", "best OpenCV", "flagged", "open", "holds")
-    rows = [
-        (r.name, f"{r.n}", f"{r.deg:.4f}", f"{r.best_deg:.4f} {r.best_deg_by}", f"{r.mm:.3f}",
-         f"{r.best_mm:.3f} {r.best_mm_by}", ", ".join(map(str, r.flagged)) or "-", "; ".join(r.unobservable) or "-",
-         "yes" if r.holds else "NO" if np.isfinite(r.best_deg) else "-")
-        for r in report.rows
-    ]  # fmt: skip
-    tables = [markdown_table(header, rows)]
-    truths = [
-        (
-            r.name,
-            f"{r.truth_deg:.4f}",
-            f"{r.truth_mm:.3f}",
-            f"{r.truth_nees:.1f}",
-            _short(r.truth_nees_corners),
-            r.corners,
-        )
-        for r in report.rows
-        if r.truth_nees is not None
-    ]
-    if truths:
-        tables.append(
-            markdown_table(("set", "truth deg", "truth mm", "normalised error squared", "with corners", ""), truths)
-        )
-    checks = [(name, "yes" if ok else "NO", seen) for name, (ok, seen) in report.checks.items()]
-    text = "\n".join([*tables, markdown_table(("check", "holds", "seen"), checks)])
-    write_atomic(folder / "hand_eye.md", text)
-    return text
+def _checks(figures: Figures) -> Iterable[Table]:
+    rows = [(name, "yes" if c["holds"] else "NO", c["seen"]) for name, c in figures["checks"].items()]
+    yield "In simulation", ("check", "holds", "found"), rows
+
+
+SETS = Study(
+    name="hand-eye",
+    what="The hand-eye solvers beside OpenCV's seven methods on public sets, and checks in simulation.",
+    figures=lambda results: results["all"],
+    header=(
+        "set",
+        "held-out deg",
+        "best OpenCV",
+        "held-out mm",
+        "best OpenCV",
+        "flagged",
+        "open",
+        "holds",
+        "squared error against the truth, with corners",
+    ),
+    rows=_set_rows,
+    others=_checks,
+)
+
+
+@command("benchmark hand-eye-sets", short_help="Compare the hand-eye solvers with OpenCV's on sets.", hidden=True)
+def hand_eye_sets(
+    call: Call,
+    data: Annotated[Path | None, option("--data", "FOLDER", "A folder of sets, each a folder with pairs.npz.")] = None,
+    quick: Annotated[bool, switch("--quick", "Few trials of each kind: seconds instead of minutes.")] = False,
+) -> Outcome:
+    """Compare the hand-eye solvers with OpenCV's on public data, and test them in simulation."""
+    folder = SETS.folder(call)
+    found = run_hand_eye_benchmark(data, quick=quick, seed=call.seed, progress=call.progress)
+    return SETS.measured({"all": found.summary()}, folder).outcome()
+
+
+@command("benchmark hand-eye", short_help="Compare the hand-eye solvers with OpenCV's.", options=FARM)
+@one_of("sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings)
+def hand_eye(call: Call) -> None:
+    """Compare the hand-eye solvers with OpenCV's on public data (sets) and on imperfect cells (cells), test them in simulation, and
+    calibrate every mounting live (mountings)."""

@@ -1,27 +1,106 @@
-"""Whole jobs on an emulated controller in real time: how late their velocities are, alone and beside other programs."""
+"""Whole jobs on an emulated controller in real time: how late their velocities and this computer's wake-ups are."""
 
+import contextlib
+import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
+from weldcal.systems.host_timing import TICK_S
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
-from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import emulator_process
-from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.robot.host_probe import HostLateness, watched_host
+from weldcal.tools.report.run import RunOptions
 
+ABOVE_ALL = 50  # of SCHED_FIFO; cell, worker and emulated controller have SCHED_RR 1 to 3
+ANSWERS_WITHIN_S = 10.0
 BUSY = "while True: pass"
 UNDER_8_MS = 8.0
+
+
+@dataclass
+class HostLateness:
+    """Wake-ups asked for every TICK_S on each core; `lateness` holds their delays once the watch is over."""
+
+    lateness: Lateness = field(default_factory=Lateness)
+    precedence: bool = True  # whether the system gave it
+
+    @property
+    def line(self) -> str:
+        """One row of a table."""
+        late = self.lateness
+        return (
+            f"{late.on_time_percent:.3f} % of {sum(late.counts)} wake-ups of a program above all others under 4 ms, "
+            f"{late.over(8.0)} over 8 ms, latest {late.worst_ms:.1f} ms"
+        )
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object."""
+        late = self.lateness
+        found = {"wake_ups": sum(late.counts), "under_4_ms_percent": late.on_time_percent, "over_8_ms": late.over(8.0)}
+        return {**found, "worst_ms": late.worst_ms, "histogram": list(late.counts), "precedence": self.precedence}
+
+
+@contextlib.contextmanager
+def watched_host() -> Iterator[HostLateness]:
+    """Watch every core of this process for the duration of the block; the result is complete at its end."""
+    found, context = HostLateness(), get_context("spawn")
+    probes = []
+    for core in sorted(os.sched_getaffinity(0)):
+        ours, its = context.Pipe()
+        process = context.Process(target=probe, args=(core, its), daemon=True)
+        process.start()
+        its.close()
+        probes.append((process, ours))
+    try:
+        for _, pipe in probes:
+            if pipe.poll(ANSWERS_WITHIN_S):
+                found.precedence = pipe.recv() and found.precedence
+        yield found
+    finally:
+        for process, pipe in probes:
+            with contextlib.suppress(OSError, EOFError):
+                pipe.send("end")
+                if pipe.poll(ANSWERS_WITHIN_S):
+                    counts, worst_ms = pipe.recv()
+                    late = found.lateness
+                    late.counts = [a + b for a, b in zip(late.counts, counts, strict=True)]
+                    late.worst_ms = max(late.worst_ms, worst_ms)
+            process.terminate()
+            process.join()
+
+
+def probe(core: int, pipe: Connection) -> None:
+    """Wake up every TICK_S on one core until something comes through the pipe. Says first whether it has precedence, and at the end
+    (counts, worst ms).
+    """
+    os.sched_setaffinity(0, {core})
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(ABOVE_ALL))
+        precedence = True
+    except OSError:
+        precedence = False
+    pipe.send(precedence)
+    late = Lateness()
+    while not pipe.poll(0.0):
+        due = time.monotonic() + TICK_S
+        time.sleep(TICK_S)
+        late.add(1e3 * max(time.monotonic() - due, 0.0))
+    pipe.send((late.counts, late.worst_ms))
 
 
 @contextmanager
@@ -154,3 +233,22 @@ def _job(described: Any, out: Path, name: str, seed: int) -> JobTiming:
         slowed_s=clock.slowed_s,
         figures=summary,
     )
+
+
+@command("benchmark robot-jobs", short_help="Measure how late velocities are in whole jobs.", hidden=True)
+def jobs(
+    call: Call,
+    scenario: Annotated[
+        str, option("--scenario", "NAME", "Name of a scenario, or path of a scenario YAML file.")
+    ] = "s_groove",
+    runs: Annotated[int, option("--runs", "N", "Number of jobs.", min=1)] = 10,
+    load: Annotated[int, option("--load", "N", "Busy programs beside the jobs.", min=0)] = 0,
+    seam_mm: Annotated[
+        float | None, option("--seam-mm", "MM", "Length of the seam.", min=10.0, show_default="the scenario's")
+    ] = None,
+) -> Outcome:
+    """Run whole jobs on an emulated controller in real time: how late the velocities are, alone or beside busy programs."""
+    folder = call.folder("benchmark", f"robot-jobs-{scenario}")
+    result = run_jobs(scenario, folder, runs, seed=call.seed, load=load, seam_mm=seam_mm, progress=call.progress)
+    rows = {f"seed {job.seed}": job.line for job in result.jobs} | {"this computer": result.host.line}
+    return Outcome(result.summary(), rows=rows)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import cast
+from typing import Annotated, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +23,11 @@ from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.wall_clock import WallClock
+from weldcal.tools.cli.options import Call, command, option
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.robot.faults import LOADED
+from weldcal.tools.worlds.robot.fault_run import LOADED
 
 RATE_HZ = 125.0
 READ_S = 0.002
@@ -249,3 +251,18 @@ def _spread(values_s: NDArray[np.float64]) -> dict[str, float]:
         return {}
     found = {f"p{p}": 1e3 * float(np.percentile(values_s, p)) for p in PERCENTILES}
     return found | {"max": 1e3 * float(values_s.max())}
+
+
+@command(
+    "benchmark robot-stream",
+    short_help="Measure the periods of commands streamed at 125 Hz.",
+    hidden=True,
+    options=("address",),
+)
+def stream(
+    call: Call, minutes: Annotated[float, option("--minutes", "M", "Length of the stream.", min=0.05)] = 10.0
+) -> Mapping[str, object]:
+    """Stream commands at 125 Hz to an emulated controller: periods, latencies, and deadlines missed by 20 ms or more."""
+    folder, address = call.folder("benchmark", "robot"), call.given["address"]
+    found = run_robot_benchmark(folder, address=address, minutes=minutes, seed=call.seed, progress=call.progress)
+    return found.summary()

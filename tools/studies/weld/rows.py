@@ -1,38 +1,24 @@
-"""Rows of the target table: welds, figures and limits."""
+"""Rows of the target table: welds, figures and limits; how runs are held against them; and turns beside them."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.weld.budgets import BUDGETS, Budget
+from weldcal.tools.console import Progress
+from weldcal.tools.worlds.weld.budgets import NOMINAL
+from weldcal.tools.worlds.weld.case import Case, run_case, study_config
+from weldcal.tools.worlds.weld.metrics import RunMetrics, judge
+from weldcal.tools.worlds.weld.plant import StudyRun, simulate
+from weldcal.tools.worlds.weld.seams import TrueSeam, get_seam
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.feasibility import assess_seam, split_seam
 
 
 class UnknownRow(InputError):
     """No row of the study has this name."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One weld to be repeated over the seeds: seam, budget, chord m, torch speed m/s, gaps (from, to) m, law."""
-
-    seam: str
-    budget: str = "nominal"
-    chord_m: float = 0.060
-    speed_m_s: float = 0.008
-    gaps: tuple[tuple[float, float], ...] = ()
-    law: str = "guarded"
-
-    @property
-    def errors(self) -> Budget:
-        """The error budget by its name."""
-        return BUDGETS[self.budget]
-
-    @property
-    def name(self) -> str:
-        """Short and unique: also the name of its CSV files."""
-        parts = [self.seam, f"d{1e3 * self.chord_m:.0f}"]
-        parts += [f"{1e3 * self.speed_m_s:.0f}mms"] if self.speed_m_s != 0.008 else []
-        parts += [f"gap{1e3 * (b - a):.0f}" for a, b in self.gaps]
-        return "-".join([*parts, self.budget, *([self.law] if self.law != "guarded" else [])])
 
 
 @dataclass(frozen=True)
@@ -172,3 +158,191 @@ def get_rows(names: tuple[str, ...]) -> tuple[Row, ...]:
         if name not in (*known, "turns", "laws"):
             raise UnknownRow(f"Unknown row '{name}'; use some of {', '.join((*known, 'turns', 'laws'))}.")
     return tuple(known[name] for name in names if name in known) if names else ROWS
+
+
+@dataclass(frozen=True)
+class Reached:
+    """One figure held against its target: the mean and the worst over all runs of the row, and which run was worst."""
+
+    target: Target
+    mean: float
+    worst: float
+    worst_run: str
+
+    @property
+    def value(self) -> float:
+        """The number that the target speaks of."""
+        return self.worst if self.target.over == "worst" else self.mean
+
+    @property
+    def met(self) -> bool:
+        """Whether it is within the limit; what could not be measured is not."""
+        return self.value <= self.target.limit
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """All runs of one case: seeds and figures, in order."""
+
+    case: Case
+    seeds: tuple[int, ...]
+    metrics: tuple[RunMetrics, ...]
+
+    @property
+    def completed(self) -> int:
+        """How many welds were completed."""
+        return sum(m.completed for m in self.metrics)
+
+    def figures(self, name: str) -> np.ndarray:
+        """One figure (n,) over the runs."""
+        return np.array([float(getattr(m, name)) for m in self.metrics])
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """A row of the table, measured."""
+
+    row: Row
+    cases: tuple[CaseResult, ...]
+    reached: tuple[Reached, ...]
+
+    @property
+    def runs(self) -> int:
+        """How many welds there were."""
+        return sum(len(c.metrics) for c in self.cases)
+
+    @property
+    def completed(self) -> int:
+        """How many of them were completed."""
+        return sum(c.completed for c in self.cases)
+
+    @property
+    def met(self) -> bool:
+        """Whether every weld was completed and every target met."""
+        return self.completed == self.runs and all(r.met for r in self.reached)
+
+
+def hold_against(target: Target, cases: Iterable[CaseResult]) -> Reached:
+    """A target's figure over all runs; a run that lacks it (it broke off before) counts as infinitely bad."""
+    values = {
+        f"{c.case.name} seed {seed}": v if math.isfinite(v) else math.inf
+        for c in cases
+        for seed, v in zip(c.seeds, c.figures(target.figure).tolist(), strict=True)
+    }
+    worst = max(values, key=lambda name: values[name])
+    return Reached(target, float(np.mean(list(values.values()))), values[worst], worst)
+
+
+def measure_row(row: Row, results: dict[Case, CaseResult]) -> RowResult:
+    """The row's table line from the results of its cases."""
+    cases = tuple(results[case] for case in row.cases)
+    return RowResult(row, cases, tuple(hold_against(t, cases) for t in row.targets))
+
+
+def run_cases(
+    cases: Iterable[Case],
+    seeds: tuple[int, ...],
+    keep: Callable[[Case, int, StudyRun, RunMetrics], None],
+    progress: Progress,
+    known: dict[Case, CaseResult] | None = None,
+) -> dict[Case, CaseResult]:
+    """Every case over every seed, each case once however many rows ask for it; `keep` sees each run as it ends.
+
+    What is `known` of the same seeds already is not run again.
+    """
+    wanted = list(dict.fromkeys(cases))
+    results = {}
+    for k, case in enumerate(wanted):
+        if known and case in known and known[case].seeds[: len(seeds)] == seeds:
+            results[case] = CaseResult(case, seeds, known[case].metrics[: len(seeds)])
+            continue
+        metrics = []
+        for i, seed in enumerate(seeds):
+            progress(case.name, (k + i / len(seeds)) / len(wanted))
+            run, figures = run_case(case, seed)
+            keep(case, seed, run, figures)
+            metrics.append(figures)
+        results[case] = CaseResult(case, seeds, tuple(metrics))
+    return results
+
+
+TURNS = ("turn_120_r20", "turn_120_r5", "turn_150_r10", "u_r20", "u_r30", "u_r100", "cusp_r20")
+CHORDS = (0.040, 0.060, 0.080)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TurnResult:
+    """One seam and chord: the true seam's chord map, and how the weld of its nominal plan ended.
+
+    Attributes:
+        turn_deg, back_up_mm: by the true seam's chord map; possible: nothing stands against it there.
+        refused: before anything moved; phase, reason: how it ended; max_mm: error of what was welded in one go.
+        splits_mm: where the seam was split instead; pieces_done: how many of its pieces were welded; pieces_max_mm: their
+            largest error.
+    """
+
+    seam: str
+    chord_mm: float
+    turn_deg: float
+    back_up_mm: float
+    possible: bool
+    refused: bool
+    phase: str
+    reason: str
+    max_mm: float
+    splits_mm: tuple[float, ...] = ()
+    pieces_done: int = 0
+    pieces_max_mm: float = float("nan")
+
+    @property
+    def named(self) -> bool:
+        """Whether what is impossible was named before arc-on; of what is possible nothing is asked here."""
+        return self.possible or self.refused
+
+    @property
+    def stalled(self) -> bool:
+        """Whether the weld neither finished nor said why not, or had to be stopped with the arc on."""
+        return not self.refused and self.phase != "DONE"
+
+    @property
+    def outcome(self) -> str:
+        """In words."""
+        if self.refused:
+            places = " and ".join(f"{s:.0f}" for s in self.splits_mm)
+            pieces = len(self.splits_mm) + 1
+            welded = f"{self.pieces_done} of {pieces} pieces welded, largest error {self.pieces_max_mm:.2f} mm"
+            return f"refused before arc-on; split at {places} mm: {welded}" if places else "refused before arc-on"
+        return f"welded, largest error {self.max_mm:.2f} mm" if self.phase == "DONE" else f"{self.phase}: {self.reason}"
+
+
+def run_turn(seam: str, chord_m: float, seed: int) -> TurnResult:
+    """Predict and then weld one seam with one chord, with the nominal budget's plan; what is refused is welded in pieces."""
+    case = Case(seam, chord_m=chord_m)
+    config = study_config(case)
+    true = get_seam(seam)
+    line = SeamCurve.from_points(true.points, true.up)
+    report = assess_seam(line, chord_m, case.speed_m_s)
+    run = simulate(true, NOMINAL, config, seed)
+    figures = judge(run, case.speed_m_s, chord_m)
+    refused = figures.phase == "FAULT" and not run.column("torch_on").any() and "infeasible" in figures.reason
+    result = TurnResult(
+        seam=seam,
+        chord_mm=1e3 * chord_m,
+        turn_deg=float(np.degrees(report.chart.max_turn)),
+        back_up_mm=1e3 * report.chart.back_up_m,
+        possible=report.feasible,
+        refused=refused,
+        phase=figures.phase,
+        reason=figures.reason,
+        max_mm=figures.max_mm,
+    )
+    if not refused or not report.splits:
+        return result
+    done, worst = 0, 0.0
+    for k, part in enumerate(split_seam(line, chord_m, case.speed_m_s)):
+        s = np.linspace(0.0, part.length, max(8, round(part.length / 0.5e-3)))
+        welded = simulate(TrueSeam(f"{seam}-{k}", part.position(s), part.up(s)), NOMINAL, config, seed)
+        found = judge(welded, case.speed_m_s, chord_m)
+        done += found.completed
+        worst = max(worst, found.max_mm)
+    return replace(result, splits_mm=tuple(1e3 * s for s in report.splits), pieces_done=done, pieces_max_mm=worst)

@@ -1,149 +1,363 @@
-"""Runs every case of the weld study over its seeds and compares the figures with the targets."""
+"""Runs the weld study and writes its tables, CSV files, pictures and report page."""
 
 import math
+import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, astuple, dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
-from weldcal.tools.studies.weld.metrics import RunMetrics, judge
-from weldcal.tools.studies.weld.plant import StudyRun, simulate
-from weldcal.tools.studies.weld.rows import Case, Row, Target
-from weldcal.tools.studies.weld.seams import get_seam
-from weldcal.welding.seam.feasibility import SeamWindows
-from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.tools.report.files import csv_text, write_json
+from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, paths
+from weldcal.tools.report.render import fixed, render, write_atomic
+from weldcal.tools.studies.harness import MISSED
+from weldcal.tools.studies.output import print_note, print_table
+from weldcal.tools.studies.targets import verdict
+from weldcal.tools.studies.weld.rows import (
+    CHORDS,
+    COMPARED,
+    TURNS,
+    CaseResult,
+    RowResult,
+    TurnResult,
+    get_rows,
+    measure_row,
+    run_cases,
+    run_turn,
+)
+from weldcal.tools.worlds.weld.case import Case, study_config
+from weldcal.tools.worlds.weld.metrics import RunMetrics
+from weldcal.tools.worlds.weld.plant import COLUMNS, PHASES, StudyRun
+from weldcal.welding.record.process import path_error, speed_along
+from weldcal.welding.seam.chord_map import chord_map
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
 
 
 @dataclass(frozen=True)
-class Reached:
-    """One figure held against its target: the mean and the worst over all runs of the row, and which run was worst."""
+class StudyOptions:
+    """Output folder, rows (all when none), how many seeds, the first of them, and whether in short form."""
 
-    target: Target
-    mean: float
-    worst: float
-    worst_run: str
+    folder: Path
+    rows: tuple[str, ...] = ()
+    seeds: int = 10
+    first_seed: int = 0
+    quick: bool = False
 
-    @property
-    def value(self) -> float:
-        """The number that the target speaks of."""
-        return self.worst if self.target.over == "worst" else self.mean
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """All runs of a study, by row, by turn and by law, and one pictured run of each seam."""
+
+    options: StudyOptions
+    rows: tuple[RowResult, ...]
+    turns: tuple[TurnResult, ...]
+    compared: tuple[CaseResult, ...]
+    pictured: tuple[tuple[Case, StudyRun, RunMetrics], ...]
+    wall_seconds: float
 
     @property
     def met(self) -> bool:
-        """Whether it is within the limit; what could not be measured is not."""
-        return self.value <= self.target.limit
+        """Whether every weld was completed, every target met, and every impossible turn refused."""
+        return all(r.met for r in self.rows) and all(t.named and not t.stalled for t in self.turns)
+
+    def summary(self) -> dict[str, object]:
+        """The result for JSON; what could not be measured is null."""
+        return {
+            "state": "done",
+            "met": self.met,
+            "seeds": self.options.seeds,
+            "first_seed": self.options.first_seed,
+            "rows": {r.row.key: _row_summary(r) for r in self.rows},
+            "turns": [asdict(t) | {"named": t.named, "stalled": t.stalled} for t in self.turns],
+            "laws": [
+                {"case": c.case.name, "law": c.case.law, "completed": c.completed, "runs": c.metrics}
+                for c in self.compared
+            ],
+            "wall_seconds": self.wall_seconds,
+            "written_to": self.options.folder,
+        }
 
 
-@dataclass(frozen=True)
-class CaseResult:
-    """All runs of one case: seeds and figures, in order."""
-
-    case: Case
-    seeds: tuple[int, ...]
-    metrics: tuple[RunMetrics, ...]
-
-    @property
-    def completed(self) -> int:
-        """How many welds were completed."""
-        return sum(m.completed for m in self.metrics)
-
-    def figures(self, name: str) -> np.ndarray:
-        """One figure (n,) over the runs."""
-        return np.array([float(getattr(m, name)) for m in self.metrics])
+def _row_summary(row: RowResult) -> dict[str, object]:
+    return {
+        "label": row.row.label,
+        "met": row.met,
+        "runs": row.runs,
+        "completed": row.completed,
+        "figures": {
+            r.target.figure: {
+                "target": r.target.limit, "over": r.target.over, "unit": r.target.unit, "mean": r.mean, "worst": r.worst,
+                "met": r.met, "worst_run": r.worst_run,
+            }
+            for r in row.reached
+        },
+    }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class RowResult:
-    """A row of the table, measured."""
-
-    row: Row
-    cases: tuple[CaseResult, ...]
-    reached: tuple[Reached, ...]
-
-    @property
-    def runs(self) -> int:
-        """How many welds there were."""
-        return sum(len(c.metrics) for c in self.cases)
-
-    @property
-    def completed(self) -> int:
-        """How many of them were completed."""
-        return sum(c.completed for c in self.cases)
-
-    @property
-    def met(self) -> bool:
-        """Whether every weld was completed and every target met."""
-        return self.completed == self.runs and all(r.met for r in self.reached)
+FIGURE_NAMES = {
+    "mean_mm": "torch, mean", "max_mm": "torch, largest", "space_mm": "torch in space, largest",
+    "height_mm": "torch height, largest", "end_mm": "last chord, largest",
+    "gap_mm": "gap and 60 mm after, largest", "cv_percent": "torch speed CV", "time_ratio": "time over L/V",
+    "omega_rad_s": "turning rate", "tip_speed_mm_s": "tip speed", "end_step_mm_s": "robot's velocity step",
+    "work_deg": "work angle", "travel_error_deg": "travel angle against prediction",
+}  # fmt: skip
 
 
-def study_config(case: Case) -> ServoConfig:
-    """The servo's settings for a case: everything at its default but chord, speed, law and the touch-on calibration.
+TURN_HEADER = ("seam", "chord mm", "turn deg", "back-up mm", "for a trailing torch", "what was done")
+LAW_HEADER = (
+    "weld", "law", "mean mm", "largest mm", "omega rad/s", "speed CV %", "torch mm/s", "outside ±25 % mm", "completed",
+)  # fmt: skip
 
-    The paper's laws watch neither the torch's place nor its angles, so these are set wide open: they are to show what they do.
-    """
-    config = ServoConfig(
-        tool=ToolGeometry(torch_offset_m=case.chord_m),
-        touch=TouchConfig(calibrate_gain=True, zero_frames=30, feel_start=True),
-        weld_speed_m_s=case.speed_m_s,
-        law=case.law,
+
+def table_lines(rows: Iterable[RowResult]) -> list[tuple[str, str, str, str, str, str, str]]:
+    """The target table as text: what, figure, target, mean, worst, whether met, and the worst run."""
+    lines = []
+    for row in rows:
+        done = f"{row.completed} of {row.runs}"
+        lines.append(
+            (row.row.label, "completed", "all", done, "", verdict(row.completed == row.runs), _first_stop(row))
+        )
+        for r in row.reached:
+            unit = {"L/V": "", "%": " %"}.get(r.target.unit, f" {r.target.unit}")
+            target = f"{r.target.over} ≤ {r.target.limit:g}{unit}"
+            name = FIGURE_NAMES.get(r.target.figure, r.target.figure)
+            lines.append(("", name, target, fixed(r.mean, 3), fixed(r.worst, 3), verdict(r.met), r.worst_run))
+    return lines
+
+
+def _first_stop(row: RowResult) -> str:
+    for c in row.cases:
+        for seed, m in zip(c.seeds, c.metrics, strict=True):
+            if not m.completed:
+                return f"{c.case.name} seed {seed}: {m.reason or m.phase}"
+    return ""
+
+
+def compared_lines(results: Iterable[CaseResult]) -> list[tuple[str, ...]]:
+    """The laws in comparison: seam, law, mean, largest, peak turning rate, speed range, weld outside the band, completed."""
+
+    def over_runs(c: CaseResult, name: str, digits: int, statistic: Callable[[np.ndarray], object] = np.max) -> str:
+        good = c.figures(name)[np.isfinite(c.figures(name))]
+        return fixed(float(statistic(good)) if len(good) else None, digits)  # type: ignore[arg-type]
+
+    return [
+        (c.case.name.removesuffix(f"-{c.case.law}"), c.case.law, over_runs(c, "mean_mm", 3, np.mean),
+         over_runs(c, "max_mm", 2), over_runs(c, "omega_rad_s", 2), over_runs(c, "cv_percent", 1),
+         f"{over_runs(c, 'slowest_mm_s', 1, np.min)} to {over_runs(c, 'fastest_mm_s', 1)}",
+         over_runs(c, "outside_mm", 1), f"{c.completed} of {len(c.metrics)}")
+        for c in results
+    ]  # fmt: skip
+
+
+def turn_lines(turns: Iterable[TurnResult]) -> list[tuple[str, ...]]:
+    """One line per turn and chord."""
+    return [
+        (t.seam, fixed(t.chord_mm, 0), fixed(t.turn_deg, 0), fixed(t.back_up_mm, 1),
+         "possible" if t.possible else "impossible", t.outcome)
+        for t in turns
+    ]  # fmt: skip
+
+
+def print_study(study: Study) -> None:
+    """Write the tables on stdout."""
+    lines = table_lines(study.rows)
+    if lines:
+        header = ("what", "figure", "target", "mean", "worst", "")
+        print_table("Reached against targets", header, [line[:6] for line in lines], text=(0, 1, 2, 5))
+        for line in lines:
+            if line[5] == "MISSED":
+                print_note(f"missed: {line[1]}, target {line[2]}: {line[6]}")
+    if study.turns:
+        print_table("Turns, U-turns and cusps", TURN_HEADER, turn_lines(study.turns), text=(0, 4, 5))
+    if study.compared:
+        print_table("Comparison of the laws", LAW_HEADER, compared_lines(study.compared), text=(0, 1, 6))
+    print_note(f"written to {study.options.folder}")
+
+
+TITLES = {
+    "straight": "Straight", "s_r60": "S of radius 60 mm", "l_r20_convex": "Corner of 20 mm, convex",
+    "l_r20_concave": "Corner of 20 mm, concave", "l_r5_convex": "Corner of 5 mm, convex", "l_r5_concave": "Corner of 5 mm, concave",
+    "l_r1_convex": "Corner of 1 mm, convex", "l_r1_concave": "Corner of 1 mm, concave", "arc_r60_end": "Ending on an arc of 60 mm",
+}  # fmt: skip
+_CARDS = (
+    ("imperfect", "mean_mm"),
+    ("imperfect", "max_mm"),
+    ("imperfect", "height_mm"),
+    ("imperfect_corners", "max_mm"),
+)
+
+
+def study_report(study: Study) -> str:
+    """The whole report as one self-contained HTML text."""
+    lines = table_lines(study.rows)
+    missed = sum(line[5] != "met" for line in lines) + sum(not t.named or t.stalled for t in study.turns)
+    total = len(lines) + len(study.turns)
+    seams = [
+        {
+            "title": TITLES.get(case.seam, case.seam.replace("_", " ")),
+            "sentence": f"{case.name}, seed {study.options.first_seed}: mean {fixed(m.mean_mm, 3)} mm, largest "
+            f"{fixed(m.max_mm, 3)} mm, torch speed CV {fixed(m.cv_percent, 1)} %, turning rate up to {fixed(m.omega_rad_s, 2)} rad/s.",
+            "paths": paths(trace),
+            "along": along_the_weld(trace),
+            "bent": trace.work is not None,
+        }
+        for case, trace, m in ((case, weld_trace(run, study_config(case)), m) for case, run, m in study.pictured)
+    ]
+    usual = any(row.row.key == key for row in study.rows for key, _ in _CARDS)
+    cards = [
+        (row.row.label, FIGURE_NAMES[r.target.figure], r)
+        for row in study.rows
+        for r in row.reached
+        if ((row.row.key, r.target.figure) in _CARDS if usual else r == row.reached[0])
+    ]
+    return render(
+        "weld_study.html.j2",
+        cards=cards,
+        study=study,
+        lines=lines,
+        missed=missed,
+        total=total,
+        seams=seams,
+        turns=turn_lines(study.turns),
+        compared=compared_lines(study.compared),
     )
-    if case.law == "guarded":
-        return config
-    open_wide = SeamWindows(travel_rad=math.pi, work_rad=math.pi)
-    return replace(
-        config,
-        torch=replace(config.torch, ignition_error_m=1.0),
-        faults=replace(config.faults, torch_error_m=1.0),
-        windows=open_wide,
+
+
+_EVERY = 4  # ticks per plotted point: 0.26 mm at 8 mm/s
+_BENT_RAD = math.radians(1.0)  # a surface whose normal turns by less is flat
+
+
+def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
+    """The run for the pictures, over the true seam; angles only where the surface bends."""
+    phase = run.column("phase").astype(int)
+    moving = np.flatnonzero((phase != PHASES.index(Phase.TOUCH)) & np.isfinite(run.column("n_d_dot_n_t")))
+    keep = moving[::_EVERY]
+    torch, line = run.points("torch"), run.torch_line
+    off = path_error(torch[keep], line)
+    on = (off.s >= 0.0) & (off.s <= line.length)
+    plan = run.planned.position(np.linspace(0.0, run.planned.length, 400))
+    plan_off = path_error(plan, line)
+    work = travel = predicted = None
+    up = line.up(np.clip(off.s, 0.0, line.length))
+    if float(np.min(up @ up[0], initial=1.0)) < math.cos(_BENT_RAD):
+        seen = on & (off.s <= line.length - config.tool.torch_offset_m)
+        lean, pitch = run.angles(keep, up)
+        chart = chord_map(
+            line, config.tool.torch_offset_m, config.weld_speed_m_s, spacing=1e-3, tip_left=config.deflection.delta_d_m
+        )
+        work, travel = (np.where(seen, angle, np.nan) for angle in (lean, pitch))
+        predicted = np.where(seen, chart.travel_at(off.s), np.nan)
+    speed = speed_along(run.column("time_s")[moving], torch[moving])[::_EVERY]
+    return WeldTrace(
+        s=off.s,
+        torch_on=run.column("torch_on")[keep] > 0.5,
+        felt=phase[keep] == PHASES.index(Phase.TRACK),
+        tip=run.points("tip")[keep],
+        torch=torch[keep],
+        robot=run.points("robot")[keep],
+        planned=np.asarray(plan),
+        true=np.asarray(line.position(np.linspace(0.0, line.length, 400))),
+        plan_error=(plan_off.s, plan_off.lateral, plan_off.height),
+        torch_error=(off.s[on], off.lateral[on], off.height[on]),
+        delta_n=run.column("delta_n_m")[keep],
+        delta_axial=run.column("delta_axial_m")[keep],
+        speed=speed,
+        omega=run.column("omega_rad_s")[keep],
+        n_d_dot_n_t=run.column("n_d_dot_n_t")[keep],
+        weld_speed=config.weld_speed_m_s,
+        delta_d=config.deflection.delta_d_m,
+        axial_d=config.deflection.axial_d_m,
+        omega_max=config.limits.omega_max_rad_s,
+        work=work,
+        travel=travel,
+        predicted=predicted,
+        windows=(config.windows.work_rad, config.windows.travel_rad),
     )
 
 
-def run_case(case: Case, seed: int) -> tuple[StudyRun, RunMetrics]:
-    """One weld and its figures."""
-    run = simulate(get_seam(case.seam), case.errors, study_config(case), seed, case.gaps)
-    return run, judge(run, case.speed_m_s, case.chord_m, case.gaps)
+COMPARED_SEEDS = 3
 
 
-def hold_against(target: Target, cases: Iterable[CaseResult]) -> Reached:
-    """A target's figure over all runs; a run that lacks it (it broke off before) counts as infinitely bad."""
-    values = {
-        f"{c.case.name} seed {seed}": v if math.isfinite(v) else math.inf
-        for c in cases
-        for seed, v in zip(c.seeds, c.figures(target.figure).tolist(), strict=True)
-    }
-    worst = max(values, key=lambda name: values[name])
-    return Reached(target, float(np.mean(list(values.values()))), values[worst], worst)
+def run_study(options: StudyOptions, progress: Progress) -> Study:
+    """Run what is asked for and write table.json, runs.csv, one CSV per pictured run, and report.html."""
+    start = time.monotonic()
+    everything = not options.rows
+    rows = get_rows(options.rows)
+    wanted = [case for row in rows for case in row.cases]
+    seeds = tuple(range(options.first_seed, options.first_seed + options.seeds))
+    pictured: dict[str, tuple[Case, StudyRun, RunMetrics]] = {}
+
+    def keep(case: Case, seed: int, run: StudyRun, figures: RunMetrics) -> None:
+        # One run of each seam is drawn: the first seed, ours, nominal, as far as there is one.
+        if seed == options.first_seed and case.law == "guarded" and case.seam not in pictured:
+            pictured[case.seam] = (case, run, figures)
+
+    results = run_cases(wanted, seeds, keep, lambda name, share: progress(name, 0.7 * share))
+    turns: list[TurnResult] = []
+    if everything or "turns" in options.rows:
+        chords = CHORDS[1:2] if options.quick else CHORDS
+        pairs = [(name, chord) for name in TURNS for chord in chords]
+        for k, (name, chord) in enumerate(pairs):
+            progress(name, 0.7 + 0.05 * k / len(pairs))
+            turns.append(run_turn(name, chord, options.first_seed))
+    compared: dict[Case, CaseResult] = {}
+    if everything or "laws" in options.rows:
+        few = seeds[: 1 if options.quick else COMPARED_SEEDS]
+        compared = run_cases(COMPARED, few, keep, lambda name, share: progress(name, 0.75 + 0.25 * share), results)
+    study = Study(
+        options,
+        tuple(measure_row(row, results) for row in rows) if results else (),
+        tuple(turns),
+        tuple(compared.values()),
+        tuple(pictured.values()),
+        time.monotonic() - start,
+    )
+    folder = options.folder
+    write_json(folder / "table.json", study.summary())
+    write_atomic(folder / "runs.csv", runs_csv([*results.values(), *compared.values()]))
+    for case, run, _ in study.pictured:
+        write_atomic(folder / "runs" / f"{case.name}.csv", run_csv(run))
+    write_atomic(folder / "report.html", study_report(study))
+    return study
 
 
-def measure_row(row: Row, results: dict[Case, CaseResult]) -> RowResult:
-    """The row's table line from the results of its cases."""
-    cases = tuple(results[case] for case in row.cases)
-    return RowResult(row, cases, tuple(hold_against(t, cases) for t in row.targets))
+def runs_csv(results: Iterable[CaseResult]) -> str:
+    """One line per run: case, seed and every figure."""
+    header = ["case", "seam", "budget", "chord_mm", "speed_mm_s", "law", "seed", *(f.name for f in fields(RunMetrics))]
+    lines: list[tuple[object, ...]] = []
+    for result in results:
+        c = result.case
+        head = (c.name, c.seam, c.budget, 1e3 * c.chord_m, 1e3 * c.speed_m_s, c.law)
+        lines += [(*head, seed, *astuple(m)) for seed, m in zip(result.seeds, result.metrics, strict=True)]
+    return csv_text(header, lines)
 
 
-def run_cases(
-    cases: Iterable[Case],
-    seeds: tuple[int, ...],
-    keep: Callable[[Case, int, StudyRun, RunMetrics], None],
-    progress: Progress,
-    known: dict[Case, CaseResult] | None = None,
-) -> dict[Case, CaseResult]:
-    """Every case over every seed, each case once however many rows ask for it; `keep` sees each run as it ends.
+def run_csv(run: StudyRun) -> str:
+    """One run, a line per servo tick; units in the header's names, positions in m."""
+    k = COLUMNS.index("phase")
+    lines = [[f"{v:.7g}" for v in row] for row in run.table.tolist()]
+    for line, phase in zip(lines, run.column("phase"), strict=True):
+        line[k] = PHASES[int(phase)].value
+    return csv_text(COLUMNS, lines)
 
-    What is `known` of the same seeds already is not run again.
-    """
-    wanted = list(dict.fromkeys(cases))
-    results = {}
-    for k, case in enumerate(wanted):
-        if known and case in known and known[case].seeds[: len(seeds)] == seeds:
-            results[case] = CaseResult(case, seeds, known[case].metrics[: len(seeds)])
-            continue
-        metrics = []
-        for i, seed in enumerate(seeds):
-            progress(case.name, (k + i / len(seeds)) / len(wanted))
-            run, figures = run_case(case, seed)
-            keep(case, seed, run, figures)
-            metrics.append(figures)
-        results[case] = CaseResult(case, seeds, tuple(metrics))
-    return results
+
+@command("reproduce weld", short_help="Run the weld law in a small kinematic world.")
+def weld(
+    call: Call,
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each weld.", min=1)] = 10,
+    rows: Annotated[str, option("--rows", "NAMES", "Only these rows, separated by commas.", show_default="all")] = "",
+    quick: Annotated[
+        bool, switch("--quick", "Two seeds of each weld, and two for the comparison of the laws.")
+    ] = False,
+) -> Outcome:
+    """Run the weld law in a small kinematic world: every target, the published law for comparison, figures, a report."""
+    folder, number = call.folder("reproduce", "weld"), min(seeds, 2) if quick else seeds
+    names = tuple(name.strip() for name in rows.split(",") if name.strip())
+    study = run_study(StudyOptions(folder, names, number, call.seed, quick), call.progress)
+    return Outcome(study.summary(), {}, text=partial(print_study, study), problem="" if study.met else MISSED)

@@ -26,7 +26,7 @@ from weldcal.models.scanners import get_scanner
 from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.flange.frames import facing, sphere_frame
+from weldcal.tools.worlds.flange_frames import facing, sphere_frame
 
 SPHERE_RADIUS_M = 0.025
 P_FS = np.array([0.085, 0.0, 0.02])

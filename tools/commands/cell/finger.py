@@ -1,0 +1,302 @@
+"""weldcal finger calibrate: the finger camera, its tag and the soft tip, from pictures."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+import yaml
+from numpy.typing import NDArray
+
+from weldcal.calibration.data.tables import read_rows
+from weldcal.models.array_files import read_grey_image
+from weldcal.models.arrays import Array
+from weldcal.models.documents import read_document
+from weldcal.models.errors import InputError
+from weldcal.models.tool import WeldingTool
+from weldcal.models.tools.finger_file import SCHEMA
+from weldcal.models.tools.loading import WELDING, load_tool
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
+from weldcal.tools.commands.cell.board import Board
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, Tolerance, check_limit
+from weldcal.tools.report.render import render, write_atomic
+from weldcal.welding.finger.calibration import (
+    Intrinsics,
+    TipCalibration,
+    calibrate_intrinsics,
+    calibrate_tip,
+    find_board,
+)
+from weldcal.welding.finger.deformation import TagModel, TagObservation, deflection_from_tag, detect_tag
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+COLUMNS = ("x_mm", "y_mm", "z_mm")
+FORCES = ("fx_n", "fy_n", "fz_n")
+_NO_TOUCHES = "Only the camera is calibrated: without touches nothing says how exactly the tip is measured."
+
+
+@command("finger calibrate", short_help="Calibrate the finger camera, its tag and the soft tip.")
+def finger_calibrate(
+    call: Call,
+    folder: Annotated[Path, typer.Argument(metavar="PICTURES", help="Folder of pictures of the board, png or jpg.")],
+    board: Annotated[Path, option("--board", "FILE", "board.yaml of the printed board, from print-board.")],
+    touches: Annotated[
+        Path | None, option("--touches", "FILE", "Table of touches on a plate: picture, x_mm, y_mm, z_mm, forces.")
+    ] = None,
+    tool: Annotated[
+        Path | None,
+        option("--tool", "FILE", "Tool file of the tool that carries the tag.", show_default="the welding tool"),
+    ] = None,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Calibrate the finger: intrinsics from pictures of the board; tag, seat and stiffness from touches on a known plate."""
+    report = calibrate_finger(folder, board, touches, call.folder("finger-calibrate", folder.name), tool, limit_mm)
+    found = report.document()
+    camera = found["camera"]
+    values = {
+        "focal length": f"{camera['fx']:.2f}, {camera['fy']:.2f} px, +- {camera['focal_sigma_px']:.2f}",
+        "principal point": f"{camera['cx']:.2f}, {camera['cy']:.2f} px",
+        "reprojection": f"{camera['rms_px']:.3f} px, on held-out pictures {camera['held_out_px']:.3f} px",
+        "pictures": f"{camera['pictures']} used, {camera['held_out_pictures']} held out, {len(report.without_board)} without the board",
+    }
+    if report.tip is not None:
+        tag, tip = found["tag"], found["tip"]
+        values |= {
+            "tag": f"{tag['size_mm']:.3f} mm, +- {tag['sigma_mm']:.3f}",
+            "seat": ", ".join("-" if v is None else f"{v:.3f}" for v in tip["seat_mm"]) + " mm",
+            "touches": f"held-out error {tip['held_out_mm']:.3f} mm",
+            "open": " ".join(tip["unknown"]) or "nothing",
+        }
+    summary = {"state": "done", "out": str(call.written), "without_board": list(report.without_board), **found}
+    return Outcome(summary, values=values, first=report.first)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FingerReport:
+    """The camera, the tip (None without touches), pictures in which the board was not found, and the tag's pose at rest."""
+
+    camera: Intrinsics
+    tip: TipCalibration | None
+    without_board: tuple[str, ...]
+    tag_size_mm: float | None = None
+    tag_at_rest_mm: tuple[float, ...] | None = None  # p_KM
+    touches: int = 0
+    limit_mm: float | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen. There is no work point: the error of a touch that the fit did not use stands in its place; without touches
+        the reprojection of pictures that were left out."""
+        c, tip = self.camera, self.tip
+        concerns = [] if tip is None else [f"Open: {text}" for text in tip.unknown]
+        lost = f"The board was not found in {len(self.without_board)} pictures ({', '.join(self.without_board[:4])})."
+        notes = [lost] if self.without_board else []
+        pictures = (
+            f"{c.held_out} of {c.held_out + c.used} pictures were left out of the fit: {c.held_out_px:.3f} px rms"
+        )
+        more = {
+            "camera": f"focal length {c.K[0, 0]:.2f}, {c.K[1, 1]:.2f} px, +- {c.focal_sigma_px:.2f}; centre {c.K[0, 2]:.2f}, {c.K[1, 2]:.2f} px",
+            "pose": "none is computed; the tool file states that of the camera",
+        }
+        if self.tag_at_rest_mm is not None:
+            more["tag at rest"] = "({:.3f}, {:.3f}, {:.3f}) mm in the camera".format(*self.tag_at_rest_mm)
+        if tip is None:
+            found = Findings(unseen=c.held_out, concerns=concerns, notes=notes, no_tolerance=_NO_TOUCHES)
+            after = Next(
+                "Touch a plate at known displacements, a picture each, and calibrate again with --touches FILE."
+            )
+            return FirstScreen(
+                found,
+                Expected("reprojection of pictures left out", f"{c.held_out_px:.3f} px", pictures),
+                after,
+                (),
+                more,
+            )
+        error, what = 1e3 * tip.held_out_m, "error of a touch, median"
+        tolerance = None if self.limit_mm is None else Tolerance(f"the {what},", error, self.limit_mm, "--limit-mm")
+        found = Findings(tolerance=tolerance, unseen=self.touches, concerns=concerns, notes=notes)
+        expected = Expected(
+            what,
+            f"{error:.3f} mm",
+            f"of {self.touches} touches, each left out of the fit; too few for a 95 % figure. {pictures}",
+        )
+        after = Next(
+            "Name the finger.yaml in the tool file, and see the tag in pictures of the cell.",
+            "weldcal check-cell SCENARIO",
+        )
+        return FirstScreen(found, expected, after, (), more)
+
+    def document(self) -> dict[str, Any]:
+        """The contents of finger.yaml, and the JSON object of the command."""
+        K, c = self.camera.K, self.camera
+        found: dict[str, Any] = {
+            "schema": SCHEMA,
+            "camera": {
+                "width": c.width,
+                "height": c.height,
+                "fx": float(K[0, 0]),
+                "fy": float(K[1, 1]),
+                "cx": float(K[0, 2]),
+                "cy": float(K[1, 2]),
+                "distortion": [float(v) for v in c.distortion],
+                "rms_px": c.rms_px,
+                "held_out_px": c.held_out_px,
+                "pictures": c.used,
+                "held_out_pictures": c.held_out,
+                "focal_sigma_px": c.focal_sigma_px,
+            },
+        }
+        if self.tip is not None and self.tag_size_mm is not None:
+            t = self.tip
+            found["tag"] = {"size_mm": self.tag_size_mm, "sigma_mm": self.tag_size_mm * t.scale_sigma / t.scale}
+            if self.tag_at_rest_mm is not None:
+                found["tag"]["rest_mm"] = list(self.tag_at_rest_mm)
+            found["tip"] = {
+                "seat_mm": [None if np.isnan(v) else 1e3 * float(v) for v in t.seat_m],
+                "rotation_deg": t.rotation_deg,
+                "stiffness_N_per_mm": {axis: 1e-3 * v for axis, v in t.stiffness_N_per_m.items()},
+                "held_out_mm": 1e3 * t.held_out_m,
+                "unknown": list(t.unknown),
+            }
+        return found
+
+
+def calibrate_finger(
+    folder: Path,
+    board: Path,
+    touches: Path | None,
+    out: Path,
+    tool: Path | None = None,
+    limit_mm: float | None = None,
+) -> FingerReport:
+    """Calibrate from a folder of pictures of the board, and a table of touches with a picture each; writes finger.yaml and report.html
+    to `out`. `limit_mm` is the error of a touch that the job allows.
+    `tool` is the file of the tool that carries the tag; None: the welding tool.
+
+    Raises:
+        InputError: what was given cannot be used; nothing is written.
+    """
+    check_limit(limit_mm)
+    if limit_mm is not None and touches is None:
+        raise InputError("--limit-mm is measured by touches: give them with --touches, or omit it.")
+    opencv = read_board(board).opencv()
+    carrier = load_tool(WELDING if tool is None else tool).tool
+    names = sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES) if folder.is_dir() else []
+    if not names:
+        raise InputError(f"'{folder}' holds no pictures: give the folder of the pictures of the board, png or jpg.")
+    seen, without, size = [], [], None
+    for name in names:
+        picture = read_grey_image(name)
+        size = _same_size(size, picture, name)
+        found = find_board(picture, opencv)
+        if found is None:
+            without.append(name.name)
+        else:
+            seen.append(found)
+    assert size is not None
+    camera = calibrate_intrinsics(seen, size)
+    report = FingerReport(camera=camera, tip=None, without_board=tuple(without))
+    if touches is not None:
+        report = _with_touches(report, touches, size, carrier)
+    report = replace(report, limit_mm=limit_mm)
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomic(out / "report.html", finger_page(report, folder))
+    write_atomic(out / "finger.yaml", yaml.safe_dump(report.document(), sort_keys=False))
+    return report
+
+
+def finger_page(report: FingerReport, folder: Path) -> str:
+    """The report as one self-contained HTML text."""
+    c, t = report.camera, report.tip
+    rows = [
+        ("reprojection, rms, of the pictures used", f"{c.rms_px:.3f} px"),
+        ("of the pictures left out", f"{c.held_out_px:.3f} px"),
+        ("distortion", ", ".join(f"{v:.5f}" for v in c.distortion)),
+    ]
+    if t is not None and report.tag_size_mm is not None:
+        seat = ", ".join("open" if np.isnan(v) else f"{1e3 * v:.3f}" for v in t.seat_m)
+        turn = "open" if t.rotation_deg is None else f"{t.rotation_deg:.2f} deg"
+        rows += [
+            ("tag", f"{report.tag_size_mm:.3f} mm, +- {report.tag_size_mm * t.scale_sigma / t.scale:.3f}"),
+            ("seat in the tool's axes", f"{seat} mm"),
+            ("turn of the camera's displacements", turn),
+            *((f"stiffness along {axis}", f"{1e-3 * v:.2f} N/mm") for axis, v in t.stiffness_N_per_m.items()),
+        ]
+    return render(
+        "finger.html.j2", first=report.first, folder=folder.name, rows=rows, unknown=[] if t is None else t.unknown,
+        without_board=report.without_board,
+    )  # fmt: skip
+
+
+def read_board(path: Path) -> Board:
+    """The board that `weldcal print-board` described. Raises InputError where the file is no such description."""
+    try:
+        keys = dict(read_document(path)["board"])
+        board = Board(**keys)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"'{path}' describes no board: give the board.yaml that weldcal print-board wrote.") from error
+    return board
+
+
+def _same_size(size: tuple[int, int] | None, picture: NDArray[np.uint8], name: Path) -> tuple[int, int]:
+    found = (picture.shape[1], picture.shape[0])
+    if size is not None and found != size:
+        raise InputError(
+            f"'{name.name}' is {found[0]} x {found[1]}, and the others are {size[0]} x {size[1]}: use one camera mode."
+        )
+    return found
+
+
+def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool: WeldingTool) -> FingerReport:
+    """The report with what the touches show."""
+    header, rows = read_rows(table)
+    if not {"picture", *COLUMNS} <= set(header):
+        raise InputError(
+            f"'{table.name}' needs the columns picture, {', '.join(COLUMNS)}; forces are fx_N, fy_N, fz_N."
+        )
+    camera = report.camera
+    tag = TagModel(tool.tag_dictionary, tool.tag_id, tool.tag_size_m)
+    R_TK = tool.X_FT.rotation().inverse() @ tool.X_FK.rotation()
+    rest: TagObservation | None = None
+    pressed, shown, forces = [], [], []
+    for line, row in enumerate(rows, 2):
+        name = table.parent / row["picture"]
+        picture = read_grey_image(name)
+        _same_size(size, picture, name)
+        found = detect_tag(picture, camera.K, tag, distortion=camera.distortion)
+        if not found.valid or found.X_KM is None:
+            raise InputError(f"'{table.name}', line {line}: the tag is not seen in {row['picture']}: {found.reason}")
+        if not any(row[key] for key in COLUMNS):
+            rest = found
+            continue
+        if rest is None or rest.X_KM is None:
+            raise InputError(
+                f"'{table.name}' must begin with a picture of the free tip, with x_mm, y_mm and z_mm left empty."
+            )
+        pressed.append([1e-3 * _number(table, line, row, key) for key in COLUMNS])
+        shown.append(deflection_from_tag(found.X_KM, rest.X_KM, R_TK))
+        forces.append([_number(table, line, row, key) if row.get(key) else np.nan for key in FORCES])
+    measured: Array | None = np.array(forces) if np.isfinite(forces).any() else None
+    tip = calibrate_tip(np.array(pressed).reshape(-1, 3), np.array(shown).reshape(-1, 3), measured)
+    assert rest is not None
+    assert rest.X_KM is not None
+    at_rest = tuple(float(1e3 * v / tip.scale) for v in rest.X_KM.translation())
+    return FingerReport(
+        camera=camera,
+        tip=tip,
+        without_board=report.without_board,
+        tag_size_mm=1e3 * tag.size_m / tip.scale,
+        tag_at_rest_mm=at_rest,
+        touches=len(pressed),
+    )
+
+
+def _number(table: Path, line: int, row: dict[str, str], key: str) -> float:
+    try:
+        found = float(row[key] or "0")
+    except ValueError:
+        found = np.nan
+    if not np.isfinite(found):
+        raise InputError(f"'{table.name}', line {line}: {key} is '{row[key]}', not a number.")
+    return float(found)

@@ -1,0 +1,363 @@
+"""weldcal new: a commented cell of one's own with every key, or an example of a calibration dataset."""
+
+import dataclasses as dc
+import json
+import shutil
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from pydrake.math import RotationMatrix
+
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.mesh import TriMesh
+from weldcal.models.result_files import write_atomic
+from weldcal.models.tools.loading import WELDING
+from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
+from weldcal.models.workpieces.reading import read_shape
+from weldcal.models.workpieces.seam_input import SeamSource, seam_of
+from weldcal.models.workpieces.shape import PartEdge, PartShape
+from weldcal.systems.drivers.config import DEVICES, NoDevice
+from weldcal.systems.jobs.weld.job import seam_planning
+from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
+from weldcal.systems.jobs.weld.settings import servo_config
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, SeamConfig, ToolFile, WorkpieceConfig
+from weldcal.systems.station import Station, make_station
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
+from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
+from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
+from weldcal.tools.commands.run import run_job
+from weldcal.tools.commands.weld import write_scans
+from weldcal.tools.report.run import RunOptions
+
+EXAMPLE = "calibrate_only"
+SMALL = "scanner: {width: 412, height: 308}"  # pixels of the example's scans: a few hundred kB each
+README = """# An example of a calibration dataset
+
+Scans of a robot's bare flange, taken in simulation. Calibrate with: weldcal calibrate {folder}
+
+    dataset.yaml   the robot, its flange, the scanner, the units, and where the scanner stands roughly
+    poses.csv      id, x, y, z (m), qw, qx, qy, qz, time (s): the flange in the robot's base, TCP zero, at each scan
+    clouds/ID.npz  the scan of that pose in the camera's frame; ply and pcd are read too
+
+Put your own scans and poses in their place. Eight to twelve poses, tilted and turned, spread over the working volume, are a good number.
+"""
+OTHER = """# An example of a calibration dataset: {form}
+
+Scans of a robot's bare flange, taken in simulation. Calibrate with: weldcal calibrate {folder}
+
+    dataset.yaml   the robot, its flange, the scanner, and where the scanner stands roughly
+    {files}
+
+docs/datasets.md lists the forms that are read. Put your own scans and poses in the place of these.
+"""
+FILES = {
+    "ur": "poses.txt      p[x, y, z, rx, ry, rz] (m, rad) of the flange, TCP zero, one line a scan, in the order of clouds/",
+    "matrices": "poses/ID.txt   X_BF, the flange in the robot's base, 4 x 4, row by row (m); clouds/ID.npz is its scan",
+    "opencv": "robot_poses.yml OpenCV FileStorage with a node for each scan: X_BF, 4 x 4 (m); clouds/ID.npz is its scan",
+    "zivid": "pos01.yaml     X_BF as PoseState, 4 x 4 (mm); img01.pcd is its scan (mm), in place of Zivid's closed .zdf",
+    "ros": "tool_pose.csv  X_BF of each scan as 'rostopic echo -p' prints it, in the order of clouds/",
+    "mcap": "recording/     a ROS 2 recording: PointCloud2 and PoseStamped",
+}
+CELL, UNFINISHED, SCHEMA = "cell.yaml", "unfinished.yaml", "cell.schema.json"
+WIDTH = 120
+LEFT_OUT = ("extends", "visualization")
+HEAD = """# yaml-language-server: $schema={schema}
+{state}
+# A key behind a `#` has its default: remove the `#` to change it. Positions are in the robot's base, in metres; `rpy_deg` are roll,
+# pitch and yaw about fixed axes. All keys: docs/scenario.md. With real devices: docs/your_cell.md, and
+#   weldcal check-cell {path}
+"""
+TOOL = "tool.yaml"
+NARROW_RAD = np.deg2rad(75.0)  # a V is narrower than this, a fillet wider
+OPEN_ABOVE = 0.3  # z of the joint's bisector
+TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
+OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
+PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
+
+
+RUNS = """# A cell of your own. It runs as it is, in simulation:
+#   weldcal demo --scenario {path}"""
+CANNOT_WELD = """# A cell of your own, unfinished: the arm cannot weld the seam of its part yet.
+# {reason}
+# Change seams or pose_guess of the workpiece, then run it in simulation:
+#   weldcal demo --scenario {path}"""
+
+
+@command("new", common=("seed", "json", "debug"), short_help="Write a cell or a dataset of your own to start from.")
+def new(
+    call: Call,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to write it.")],
+    base: Annotated[str, option("--from", "NAME", "Scenario that the cell begins as, by name or path.")] = "s_groove",
+    part: Annotated[
+        Path | None, option("--part", "FILE", "A part of your own: STEP, STL, OBJ or PLY. It is copied there.")
+    ] = None,
+    edges: Annotated[
+        str, option("--edges", "N,N...", "Edges of the seam, from weldcal part; default: the longest.")
+    ] = "",
+    joint: Annotated[
+        str | None, option("--joint", "NAME", "v_groove, butt, fillet or lap; default: by the angle.")
+    ] = None,
+    tool: Annotated[bool, switch("--tool", "Also write tool.yaml, a copy of the welding tool to change.")] = False,
+    dataset: Annotated[
+        bool, switch("--dataset", "Write an example of a calibration dataset, scanned in simulation, instead.")
+    ] = False,
+    form: Annotated[
+        str,
+        option("--format", "NAME", "With --dataset: ur, matrices, opencv, zivid, ros or mcap; default: weldcal's own."),
+    ] = "",
+) -> Outcome:
+    """Write a commented scenario that runs, cell.yaml, with a schema for editors; or an example of a calibration dataset."""
+    if form and not dataset:
+        raise typer.BadParameter("--format is for --dataset")
+    if dataset:
+        written = write_example(folder, call.seed, call.progress, form)
+        following = f"weldcal calibrate {written}"
+    else:
+        numbers = tuple(edge_numbers(edges))
+        own = None if part is None else OwnPart(part, numbers, joint)
+        written, reason = write_cell(folder, base, own, WELDING if tool else None)
+        following = f"weldcal demo --scenario {written}"
+        if reason:
+            assert part is not None
+            problem = (
+                f"The arm cannot weld {part.name} in any of the poses that were tried: {reason} "
+                f"Choose other edges from weldcal part {part} and give --edges, or change {written}."
+            )
+            summary = {"state": "unfinished", "reason": problem, "written": str(written)}
+            return Outcome(summary, values={"written": str(written)}, problem=problem)
+    summary = {"state": "done", "written": str(written), "next": following}
+    return Outcome(summary, values={"written": str(written), "next": following})
+
+
+def edge_numbers(text: str) -> list[int]:
+    """The numbers of a list such as 12,13. Raises InputError."""
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    if not all(word.isdecimal() for word in words):
+        raise InputError(f"--edges must be numbers with commas between them, such as 12,13, not '{text}'.")
+    return [int(word) for word in words]
+
+
+def write_example(folder: Path, seed: int, progress: Progress = no_progress, form: str = "") -> Path:
+    """Scan a flange in simulation and write the scans as a dataset, in weldcal's own form or another (ur, matrices, opencv ...).
+
+    Raises:
+        InputError: there is something in the folder already, or no such form.
+    """
+    if form and form not in FORMS:
+        raise InputError(f"There is no form '{form}': use {', '.join(FORMS)}.")
+    if folder.exists() and any(folder.iterdir()):
+        raise InputError(f"'{folder}' is not empty: choose another folder.")
+    scenario = load_scenario(EXAMPLE, SMALL)
+    finished = run_job(scenario, RunOptions(scenario=EXAMPLE, out=folder, seed=seed, recording=False), progress, "")
+    progress("write", 0.99)
+    status = finished.cell.job.calibration_status(finished.run.root)
+    written = write_scans(finished.run, status, folder)
+    if written is None:
+        raise InputError("No scan of the flange was taken: give another --seed.")
+    text = OTHER.format(folder=folder, form=form, files=FILES[form]) if form else README.format(folder=folder)
+    if form:
+        rewrite(folder, form)
+    write_atomic(folder / "README.md", text)
+    return written
+
+
+@dataclass(frozen=True)
+class OwnPart:
+    """A part's file, the numbers of the seam's edges (none: the longest concave one), and the joint (None: by its angle)."""
+
+    file: Path
+    edges: tuple[int, ...] = ()
+    joint: str | None = None
+
+
+def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path | None = None) -> tuple[Path, str]:
+    """Write cell.yaml and its JSON schema into a folder, with a part and a tool of one's own.
+
+    Returns:
+        The path of cell.yaml, and "". Where the arm can weld the part's seam in no pose that was tried: the path of
+        unfinished.yaml, and the reason in the pose that came nearest.
+
+    Raises:
+        InputError: there is one already, `base` is no scenario, or the part cannot be used.
+    """
+    scenario = load_scenario(base)
+    path = folder / CELL
+    if path.exists():
+        raise InputError(f"There is a cell in '{folder}' already: choose another folder, or delete {CELL}.")
+    folder.mkdir(parents=True, exist_ok=True)
+    if part is not None:
+        scenario.description = f"A cell that welds {part.file.name}."
+        add_part(scenario, folder, part.file, list(part.edges), part.joint)
+    if tool is not None:
+        add_tool(scenario, folder, tool)
+    write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
+    unfinished = folder / UNFINISHED
+    if part is not None:
+        assert scenario.workpiece is not None
+        _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
+        scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)))
+        if reason:
+            words = "\n# ".join(textwrap.wrap(reason, WIDTH - 2))
+            _write(unfinished, scenario, CANNOT_WELD.format(reason=words, path=unfinished))
+            return unfinished, reason
+    _write(path, scenario, RUNS.format(path=path))
+    unfinished.unlink(missing_ok=True)
+    return path, ""
+
+
+def _write(path: Path, scenario: Scenario, state: str) -> None:
+    head = HEAD.format(schema=SCHEMA, path=path, state=state)
+    write_atomic(path, head + "".join(_parts(scenario)))
+
+
+def _parts(scenario: Scenario) -> Iterator[str]:
+    meanings = {key.name: key.meaning for key in keys_of(Scenario)}
+    for key in keys_of(type(scenario)):
+        value = getattr(scenario, key.name)
+        absent = isinstance(value, NoDevice) and isinstance(key.default, NoDevice)
+        if key.name in LEFT_OUT or (value is None and key.parts) or absent:
+            continue
+        meaning = meanings.get(key.name) or key.meaning
+        if not dc.is_dataclass(value):
+            yield _line(dc.replace(key, meaning=meaning), value, "")
+            continue
+        tag = f" !{type(value).__name__}" if key.name in DEVICES else ""
+        comment = f"# {meaning}\n" if meaning else ""
+        below = "".join(_below(value, "  "))
+        yield f"\n{comment}{key.name}:{tag}" + (f"\n{below}" if below else " {}\n")
+
+
+def _below(config: Any, indent: str) -> Iterator[str]:
+    keys = keys_of(type(config))
+    changed = any(getattr(config, key.name) != key.default for key in keys)
+    for k, key in enumerate(keys):
+        # a mapping needs one key
+        yield _line(key, getattr(config, key.name), indent, written=k == 0 and not changed)
+
+
+def _line(key: Key, value: Any, indent: str, written: bool = False) -> str:
+    """The key with its value, behind a comment sign where that is the default, and what it means."""
+    meaning = key.meaning
+    mark = "# " if value == key.default and not written and key.name != "description" else ""
+    text = f"{indent}{mark}{key.name}: {yaml_of(value)}"
+    if not meaning:
+        return text + "\n"
+    if len(text) + 4 + len(meaning) <= WIDTH:
+        return f"{text}  # {meaning}\n"
+    above = textwrap.wrap(meaning, WIDTH - len(indent) - 2)
+    return "".join(f"{indent}# {words}\n" for words in above) + text + "\n"
+
+
+def add_part(scenario: Scenario, folder: Path, part: Path, edges: list[int], joint: str | None) -> None:
+    """Copy a part's file into the cell's folder, and make it the scenario's workpiece, standing on the table.
+
+    Without `edges` the longest concave one that opens upwards is the seam; without `joint` its angle says which joint it is.
+
+    Raises:
+        InputError: the part cannot be read, has no such edge, or no concave one.
+    """
+    shape = read_shape(part)
+    chosen = _chosen(shape, part, edges)
+    name = joint or _joint(chosen[0])
+    scenario.workpiece = WorkpieceConfig(
+        file=part.name,
+        seams=[SeamConfig(edges=[edge.id for edge in chosen])],
+        joint=name,
+        pose_guess=_standing(shape.mesh, TURNS_DEG[0], 0.5 * shape.mesh.bounds.sum(axis=0), scenario),
+        located_by="scan",
+        placement_error=ErrorConfig(OFF_MM, OFF_DEG),
+    )
+    shutil.copyfile(part, folder / part.name)
+
+
+def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
+    """The first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
+
+    Where there is none: the scenario's own pose, and the reason of the try in which the most seams could be welded.
+    """
+    assert scenario.workpiece is not None
+    own = scenario.workpiece.pose_guess
+    try:
+        station = make_station(scenario, 0)
+    except WeldcalError as error:
+        return own, str(error)
+    nearest = (-1, "")
+    try:
+        part = station.cad
+        if not isinstance(part, Part) or station.tool is None:
+            return (
+                own,
+                "Only a part from a file and a welding tool can be planned. Choose another scenario with --from.",
+            )
+        seams = [numbered(part, k) for k in range(seam_count(part))]
+        line = np.concatenate([seam.seam_P for seam in seams])
+        for middle in (0.5 * part.mesh.bounds.sum(axis=0), 0.5 * (line.min(axis=0) + line.max(axis=0))):
+            for turn in TURNS_DEG:
+                guess = _standing(part.mesh, turn, middle, scenario)
+                welded, reason = _first_refusal(scenario, station, seams, guess)
+                if not reason:
+                    return guess, ""
+                if welded > nearest[0]:
+                    nearest = welded, reason
+    finally:
+        station.close()
+    return own, nearest[1]
+
+
+def _first_refusal(scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig) -> tuple[int, str]:
+    """The number of seams before the first that the arm cannot weld with the part in a pose, and why; all, and "" for none."""
+    for number, part in enumerate(seams):
+        config = servo_config(scenario, station, number)
+        planning = dc.replace(seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose())
+        reason = plan_drawn_seam(planning, 0).reason
+        if reason is not None:
+            return number, reason
+    return len(seams), ""
+
+
+def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:
+    """The pose of a part that stands on the table as it is drawn, turned about z, with a point of it at PLACE_M."""
+    R = RotationMatrix.MakeZRotation(np.deg2rad(turn_deg)).matrix()
+    x, y = np.array(PLACE_M) - (R @ middle_P)[:2]
+    z = scenario.calibration.table_z_m - float(mesh.bounds[0, 2])
+    return PoseConfig([round(float(v), 4) for v in (x, y, z)], [0.0, 0.0, turn_deg])
+
+
+def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
+    """Copy a tool's file into the cell's folder as tool.yaml, and make it the scenario's tool."""
+    shutil.copyfile(tool, folder / TOOL)
+    scenario.tool = ToolFile(TOOL)
+
+
+def _chosen(shape: PartShape, part: Path, edges: list[int]) -> list[PartEdge]:
+    by_id = {edge.id: edge for edge in shape.edges}
+    if unknown := [str(number) for number in edges if number not in by_id]:
+        raise InputError(f"{part.name} has no edge {', '.join(unknown)}: see weldcal part {part}.")
+    if edges:
+        return [by_id[number] for number in edges]
+    concave = [edge for edge in shape.edges if edge.kind == "concave"]
+    if not concave:
+        raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
+    concave.sort(key=lambda edge: -edge.length_m)
+    return [next((edge for edge in concave if _open_above(shape, edge)), concave[0])]
+
+
+def _open_above(shape: PartShape, edge: PartEdge) -> bool:
+    """Whether the joint at an edge opens upwards, as the part is drawn."""
+    try:
+        seam = seam_of(shape, SeamSource(edges=(edge.id,)), _joint(edge))
+    except WeldcalError:
+        return False
+    return float(seam.up_P[:, 2].mean()) > OPEN_ABOVE
+
+
+def _joint(edge: PartEdge) -> str:
+    return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"

@@ -1,0 +1,288 @@
+"""weldcal profiler sphere: the pose on the flange from raw profiles of a sphere, with or without touches of it."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import numpy as np
+
+from weldcal.calibration.errors import ArcNotFound
+from weldcal.calibration.profiler.arm_errors import DhArm
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.plan import (
+    Field,
+    plan_sphere_poses,
+    sample_sphere_poses,
+)
+from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
+from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, choose_model, leave_one_out_m, sphere_joint
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.radius import SCALE_SIGMAS, check_radius
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
+from weldcal.tools.commands.profiler.files import Measurements, read_profiler_file
+from weldcal.tools.commands.profiler.result import (
+    CANDIDATES,
+    ROBOT_SIGMA,
+    Z_SIGMA,
+    FileArgument,
+    PlanOption,
+    RadiusOption,
+    SetOption,
+    Sigmas,
+    TipOption,
+    TouchesOption,
+    TrialOption,
+    UnitOption,
+    check_number,
+    figures_of,
+    finish,
+    next_poses,
+    outcome_of,
+    widened,
+    with_warnings,
+)
+from weldcal.tools.report.first_screen import check_limit
+from weldcal.tools.report.profiler_file import ProfilerFile
+
+POORLY = 1.5  # reduced chi-square from which another convention of the poses is tried
+RADIUS_OFF_M = 0.1e-3
+_LONGEST_TORCH_M = 10.0
+ALL_ARC_M = 0.5e-3  # a profile off one circle by less holds the sphere only
+MODELS = ("auto", "rigid", "affine", "affine+joints")
+
+
+@command("profiler sphere", short_help="Calibrate by a sphere, with or without touches of it.")
+def sphere(
+    call: Call,
+    file: FileArgument,
+    unit: UnitOption = None,
+    dataset: SetOption = "",
+    trial: TrialOption = None,
+    radius: RadiusOption = None,
+    model: Annotated[str, option("--model", "M", "auto, rigid, affine or affine+joints.")] = "auto",
+    arm: Annotated[str, option("--arm", "NAME", "Arm whose kinematic table is used, for example ur10e.")] = "",
+    touches: TouchesOption = None,
+    tip: TipOption = "",
+    sigma_robot: Annotated[float, option("--sigma-robot", "MM", ROBOT_SIGMA)] = 0.03,
+    sigma_z: Annotated[float, option("--sigma-z", "MM", Z_SIGMA)] = 0.05,
+    plan: PlanOption = 0,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Calibrate the profiler's pose on the flange by raw profiles of a sphere. Needs no initial guess, no scan sides and no
+    pure translations."""
+    check_limit(limit_mm)
+    sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
+    lost: list[int] = []
+    data, measured = read_sphere(call, file, unit, dataset, trial, radius, touches, tip, arm, lost)
+    record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=call.seed)
+    made, summary = finish_sphere(
+        measured, SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m), record,
+        with_warnings(data, found) | {"without_sphere": lost}, file.name, call.folder("profiler", file.stem), limit_mm,
+    )  # fmt: skip
+    return outcome_of(call, summary, made)
+
+
+def read_sphere(
+    call: Call,
+    file: Path,
+    unit: str | None,
+    dataset: str,
+    trial: int | None,
+    radius: float | None,
+    touches: Path | None,
+    tip: str,
+    arm: str = "",
+    lost: list[int] | None = None,
+) -> tuple[Measurements, SphereData]:
+
+    tip_m = parse_tip(tip)
+    data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
+    felt = None if touches is None else read_profiler_file(touches, unit=unit)
+    radius_m = None if radius is None else 1e-3 * radius
+    return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=call.seed)
+
+
+def sphere_data(
+    file: Measurements,
+    *,
+    radius_m: float | None,
+    arm: str = "",
+    tip_m: Floats | None = None,
+    touches: Measurements | None = None,
+    lost: list[int] | None = None,
+    seed: int = 0,
+) -> SphereData:
+    """A file's measurements of a sphere: the detected arcs, with touches and joints where there are any.
+
+    Scans without an arc are not used and their numbers added to `lost`; without that list they are refused.
+    """
+    if file.profiles is None:
+        raise InputError("The file has no 'profiles' of the sphere. Give (n, m, 2), or 'xz' with the lengths 'n'.")
+    radius = radius_m if radius_m is not None else float(file.needed("radius", "the sphere's (or give --radius in mm)"))
+    if not 1e-3 <= radius <= 1.0:
+        raise InputError(f"A sphere of {1e3 * radius:.3g} mm radius cannot be used. Give --radius in mm.")
+    felt = touches.poses() if touches is not None else file.poses("touch_")
+    tip = tip_m if tip_m is not None else file.arrays.get("tip")
+    if felt is not None and tip is None:
+        raise InputError("There are touches but no tip. Give its position in the flange frame as --tip x,y,z in mm.")
+    table = DhArm.of(load_arm(arm)) if arm else file.arm()
+    poses = cast(FlangePoses, file.poses())
+    check_number(poses, (len(file.profiles),), "profiles")
+    profiles, kept = [], []
+    for k, p in enumerate(file.profiles):
+        try:
+            profiles.append(_arc(p, radius, seed))
+            kept.append(k)
+        except ArcNotFound as e:
+            if lost is None:
+                raise ArcNotFound(f"Scan {k} shows no arc of the sphere. Remove it from the file.") from e
+            lost.append(k)
+    if not kept:
+        raise ArcNotFound("No scan shows an arc of the sphere. Check the radius, the unit and which column is z.")
+    q = file.arrays.get("q")
+    if q is not None:
+        check_number(poses, (len(q),), "joint vectors q")
+    return SphereData(
+        poses=poses[np.array(kept)], profiles=profiles, radius_m=radius, touches=felt, tip=tip if felt is not None else None, arm=table,
+        q=None if q is None else q[kept], touch_q=file.arrays.get("touch_q"),
+    )  # fmt: skip
+
+
+def parse_tip(text: str) -> Floats | None:
+    """The tip (3,) m of the option --tip, "x,y,z" in mm; None where it is empty.
+
+    Raises:
+        InputError: not three numbers.
+    """
+    if not text:
+        return None
+    try:
+        x, y, z = (1e-3 * float(v) for v in text.split(","))
+    except ValueError as e:
+        raise InputError(f"The tip is three numbers in mm with commas between, as --tip 0,0,150, not '{text}'.") from e
+    tip = np.array([x, y, z])
+    if not (np.abs(tip) <= _LONGEST_TORCH_M).all():
+        raise InputError(f"The tip lies within {1e3 * _LONGEST_TORCH_M:.0f} mm of the flange; '{text}' does not.")
+    return tip
+
+
+def _arc(profile: Floats, radius_m: float, seed: int) -> Floats:
+    """The sphere's points of a profile: all of them where they form one arc, else those detected."""
+    p = profile[np.isfinite(profile).all(axis=1)]
+    if len(p) >= 5:
+        circle, rms = fit_circle(p)
+        if rms < ALL_ARC_M and circle[2] < 1.05 * radius_m and len(np.unique(p[:, 1] < circle[1])) == 1:
+            return p
+    return np.asarray(profile[find_arc(profile, radius_m, seed=seed)[0]])
+
+
+def calibrate_sphere(
+    data: SphereData, digest: str, sigmas: Sigmas, *, model: str = "auto", plan: int = 0, seed: int = 0
+) -> tuple[ProfilerRecord, dict[str, Any]]:
+    """X_FS from a sphere in any poses, by the model with the smallest held-out error (or the one named)."""
+    if model not in MODELS:
+        raise InputError(f"The model is one of {', '.join(MODELS)}, not '{model}'.")
+    s = SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m)
+    found: dict[str, Any] = {"scans": len(data.poses), "touches": 0 if data.touches is None else len(data.touches)}
+    scans = SphereData(poses=data.poses, profiles=data.profiles, radius_m=data.radius_m)
+    rigid = _rigid(scans, s)
+    check_radius(scans, s, rigid)
+    _refuse_inverse_poses(scans, rigid, s)
+    chosen = cast(Model, model)
+    if model == "auto":
+        full = data.arm is not None and data.q is not None and (data.touches is None or data.touch_q is not None)
+        choice = choose_model(data if full else _without_arm(data), s)
+        chosen = choice.model
+        found["left_out_rms_mm"] = {name: 1e3 * v for name, v in choice.left_out_m.items()}
+        found["model_reason"] = choice.reason
+    e = widened(sphere_joint(data, chosen, s))
+    found |= {"model": chosen} | figures_of(e)
+    found["wrong_scans"] = list(e.wrong_poses)
+    # to first order, and so only where it is near the stated one
+    known = abs(e.radius_change_m) <= SCALE_SIGMAS * s.affine * data.radius_m
+    found["radius_of_profiles_mm"] = 1e3 * (data.radius_m + e.radius_change_m) if known else None
+    found["warnings"] = _warnings(e, data, s)
+    if plan:
+        if np.median([fit_circle(p)[0][1] - np.median(p[:, 1]) for p in data.profiles]) < 0.0:
+            raise InputError(
+                "Planning needs z pointing away from the sensor. Change the sign of z, and of x to keep the frame right-handed, in the file."
+            )
+        seen = np.vstack(data.profiles)
+        near, far = (float(v) for v in np.percentile(seen[:, 1], [1.0, 99.0]))
+        field = Field(float(np.percentile(np.abs(seen[:, 0]), 99.0)), near, max(far, near + 5e-3))
+        candidates = sample_sphere_poses(e.rotation, e.translation, e.center, data.radius_m, CANDIDATES, seed, field)
+        best = plan_sphere_poses(
+            e.rotation, e.translation, e.center, data.radius_m, data.poses, candidates, plan, sigmas=s, field=field
+        )
+        found["next_poses"] = next_poses(candidates, best.chosen, best.rms_m)
+    arm = data.arm if chosen == "affine+joints" else None
+    return ProfilerRecord.of(f"sphere, {chosen}", e, found, digest, arm), found
+
+
+def _refuse_inverse_poses(scans: SphereData, rigid: SphereEstimate | None, s: SphereSigmas) -> None:
+    """Refuses poses of the base in the flange instead of the flange in the base.
+
+    Raises:
+        InputError: the inverse poses fit the profiles far better.
+    """
+    chi2 = float("inf") if rigid is None else rigid.reduced_chi2
+    if chi2 < POORLY:
+        return
+    R, p = scans.poses.rotation, scans.poses.translation
+    inverse = FlangePoses(np.swapaxes(R, 1, 2), -np.einsum("nji,nj->ni", R, p))
+    other = _rigid(replace(scans, poses=inverse), s)
+    if other is not None and other.reduced_chi2 < 0.4 * chi2:
+        raise InputError(
+            "The inverses of the poses fit the profiles. Give the flange in the base, not the base in the flange."
+        )
+
+
+def _rigid(scans: SphereData, s: SphereSigmas) -> SphereEstimate | None:
+    """The rigid model's estimate; None where it refuses."""
+    try:
+        return sphere_joint(scans, "rigid", s)
+    except WeldcalError:
+        return None
+
+
+def _warnings(e: SphereEstimate, data: SphereData, s: SphereSigmas) -> list[str]:
+    said = []
+    known = abs(e.radius_change_m) <= SCALE_SIGMAS * s.affine * data.radius_m
+    if known and abs(e.radius_change_m) > max(4.0 * e.radius_sigma_m, RADIUS_OFF_M):
+        said.append(
+            f"The profiles show a sphere of {1e3 * (data.radius_m + e.radius_change_m):.2f} mm instead of "
+            f"{1e3 * data.radius_m:.2f}. Check the radius and the profiler's scale."
+        )
+    if e.tip is not None and data.tip is not None and np.linalg.norm(e.tip - data.tip) > 3.0 * s.tip_m:
+        said.append(
+            f"The touches put the tip {1e3 * float(np.linalg.norm(e.tip - data.tip)):.0f} mm from its given position. Check --tip."
+        )
+    return said
+
+
+def _without_arm(data: SphereData) -> SphereData:
+    return SphereData(
+        poses=data.poses, profiles=data.profiles, radius_m=data.radius_m, touches=data.touches, tip=data.tip
+    )
+
+
+def finish_sphere(
+    data: SphereData, sigmas: SphereSigmas, record: ProfilerRecord, found: dict[str, Any], source: str, out: Path,
+    limit_mm: float | None,
+) -> tuple[ProfilerFile, dict[str, Any]]:  # fmt: skip
+    """Write a sphere's calibration and its report; the result, and its JSON object without the folder."""
+    held = np.zeros(0)
+    if "model" in found:  # the published method cannot leave a scan out
+        model = cast(Model, found["model"])
+        whole = data if model == "affine+joints" else replace(data, arm=None, q=None, touch_q=None)
+        try:
+            held = 1e3 * leave_one_out_m(whole, model, sigmas)
+        except WeldcalError:  # too few scans to leave any out
+            held = np.zeros(0)
+        used = np.ones(len(held), bool)
+        used[[k for k in found.get("wrong_scans", ()) if k < len(held)]] = False
+        held = held[used]
+    return finish(record, found, np.vstack(data.profiles), held, source, out, limit_mm)

@@ -1,0 +1,115 @@
+"""weldcal check-robot: the pre-flight checks of a controller, as a table or as JSON."""
+
+import shutil
+import textwrap
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
+from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
+from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.host_timing import measure_host
+from weldcal.systems.scenario.arm import nominal_arm
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option
+from weldcal.tools.commands.run import robot_at
+
+WIDEST = 100
+MARKS = {"ok": typer.colors.GREEN, "to change": typer.colors.RED, "not checked": typer.colors.YELLOW}
+
+
+@command("check-robot", common=LOOK, short_help="Check whether a robot is ready. Nothing moves.")
+def check_robot(
+    call: Call,
+    host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")],
+    scenario: Annotated[
+        str | None,
+        option("--scenario", "NAME", "Compare arm and payload with this scenario's; without it, the welding tool's."),
+    ] = None,
+    arm: Annotated[str, option("--arm", "NAME", "The arm, where no scenario is given: ur3e, ur5e, ur20 ...")] = "ur10e",
+) -> Outcome:
+    """Check whether a robot and this computer are ready: what is right and what to change. Nothing moves or is written."""
+    nominal = nominal_arm(load_scenario(scenario)) if scenario is not None else load_arm(arm)
+    report = with_host(preflight(host, nominal=nominal, load=expected_load(host, scenario)))
+    problem = "" if report.first_problem is None else report.first_problem.operator_action
+    return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
+
+
+def expected_load(host: str, name: str | None) -> ExpectedLoad:
+    """The payload of a scenario; that of the welding tool, which most scenarios have, where none is named.
+
+    Raises:
+        InputError: there is no such scenario.
+    """
+    if name is None:
+        return UrRtde(host=host).load("the welding tool")
+    scenario = load_scenario(name)
+    config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
+    return config.load(f"the scenario {Path(name).stem}")
+
+
+def with_host(report: Preflight) -> Preflight:
+    """The report of a controller that answered, with a further check: this computer's timing."""
+    if report.version is None:
+        return report
+    timing = measure_host()
+    check = Check("computer", timing.ok, timing.words, "" if timing.ok else timing.advice)
+    return replace(report, checks=(*report.checks, check))
+
+
+def state_of(check: Check) -> str:
+    """ok, to change, or not checked."""
+    if not check.checked:
+        return "not checked"
+    return "ok" if check.ok else "to change"
+
+
+def as_json(report: Preflight) -> Mapping[str, object]:
+    """The JSON object of the command; what was not read is null."""
+    problem = report.first_problem
+    return {
+        "state": "ready" if report.ok else "refused",
+        "reason": problem.operator_action if problem else "",
+        "checks": [
+            {"name": check.name, "state": state_of(check), "found": check.found, "remedy": check.operator_action}
+            for check in report.checks
+        ],
+        "version": ".".join(str(number) for number in report.version) if report.version else None,
+        "joints_deg": np.rad2deg(report.arm_q) if report.arm_q is not None else None,
+        "kinematics": report.kinematics and ("calibrated" if report.kinematics.calibrated else "nominal"),
+        "pose_error_mm": report.pose_error_m and 1e3 * report.pose_error_m,
+        "pose_error_deg": report.pose_error_rad and float(np.rad2deg(report.pose_error_rad)),
+    }
+
+
+def emit_table(report: Preflight) -> None:
+    """Writes one row per check on stdout, and below each failed check the operator's action."""
+    width = min(shutil.get_terminal_size((80, 24)).columns, WIDEST)
+    marks = max(map(len, MARKS))
+    names = max(len(check.name) for check in report.checks)
+    indent = " " * (2 + marks + 2)
+    problems = sum(check.checked and not check.ok for check in report.checks)
+    verdict = "ready" if report.ok else f"not ready, {problems} to change"
+    typer.secho(f"{report.host}: {verdict}", bold=True)
+    shown = [check for check in report.checks if check.checked]
+    if len(shown) > 1:
+        shown = list(report.checks)
+    for check in shown:
+        state = state_of(check)
+        found = _wrapped(check.found, width, f"  {state:<{marks}}  {check.name:<{names}}  ")
+        typer.echo("  " + typer.style(f"{state:<{marks}}", fg=MARKS[state]) + found[2 + marks :])
+        if check.operator_action:
+            typer.echo(_wrapped(check.operator_action, width, indent))
+    if waiting := len(report.checks) - len(shown):
+        typer.secho(f"  not checked  {waiting} more that need an answer", fg=MARKS["not checked"])
+
+
+def _wrapped(text: str, width: int, first: str) -> str:
+    return textwrap.fill(text, width, initial_indent=first, subsequent_indent=" " * len(first), break_on_hyphens=False)

@@ -1,1 +1,0 @@
-"""The page that turns a tablet into the calibration target, and the small server that hands it out."""

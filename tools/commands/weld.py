@@ -1,0 +1,308 @@
+"""weldcal weld: runs the weld job of a scenario and writes its results; for `demo` and live calibration too."""
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from weldcal.calibration.data.dataset import save_dataset
+from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.record import case_of
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
+from weldcal.calibration.eye_on_base.stated_error import orientations_of
+from weldcal.calibration.refinement.refined import KINEMATICS_FILE
+from weldcal.calibration.touch.arm_prior import observed_document
+from weldcal.models.result_files import whole_result
+from weldcal.systems.cell import Cell
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.settings import feature_standard
+from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
+from weldcal.systems.messages import CalibrationStatus
+from weldcal.systems.runner import Progress, Run, no_progress
+from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import PoseConfig, Scenario
+from weldcal.tools.cli.options import (
+    Call,
+    Outcome,
+    ScenarioOption,
+    command,
+)
+from weldcal.tools.commands.run import RECORDED, JobRun, run_job, run_options
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
+from weldcal.tools.report.files import write_json
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.run import RunOptions
+from weldcal.tools.report.weld import WeldOutcome, columns, live_calibration_error, weld_outcome
+from weldcal.welding.record.process import speed_along, torch_angles
+from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
+from weldcal.welding.servo.state import Phase
+
+SCANS: Final = "scans"
+SUMMARY: Final = "summary.json"
+PHASE_NAMES = [str(phase) for phase in Phase]
+
+
+@command("weld", options=RECORDED, short_help="Weld a seam in a scenario, without calibrating.")
+def weld(call: Call, scenario: ScenarioOption = "straight_groove") -> Outcome:
+    """Weld a seam in a scenario, with the scanner's pose taken from the scenario."""
+    found = run_weld(run_options(call, "weld", scenario), call.progress)
+    return Outcome(found.summary(), first=found.first)
+
+
+def run_demo(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
+    """Run all parts of a scenario's job.
+
+    Raises:
+        InputError, UnreachableScanner: the scenario or the options cannot be run; nothing has been written.
+    """
+    return run_scenario(load_scenario(options.scenario), options, progress)
+
+
+def run_calibration_live(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
+    """Run only the calibration of a scenario: calibrate, verify, park."""
+    scenario = load_scenario(options.scenario)
+    scenario.job.calibrate, scenario.job.weld = True, False
+    return run_scenario(scenario, options, progress)
+
+
+def run_weld(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
+    """Run only the weld of a scenario, with the scanner at its known pose."""
+    return run_scenario(known_camera(options.scenario), options, progress)
+
+
+def known_camera(name: str) -> Scenario:
+    """Load a scenario that only welds: the scanner is exactly at its nominal pose, which the cell uses.
+
+    Raises:
+        InputError: the scenario cannot be loaded, or has nothing to weld.
+    """
+    scenario = load_scenario(name)
+    scenario.job.calibrate, scenario.job.weld = False, True
+    if isinstance(scenario.scanner, RenderedScanner):
+        scenario.scanner.mounting_translation_mm = scenario.scanner.mounting_rotation_deg = 0.0
+        scenario.job.X_BC = PoseConfig(list(scenario.scanner.xyz_m), list(scenario.scanner.rpy_deg))
+    check_scenario(scenario)
+    return scenario
+
+
+def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = no_progress) -> DemoResult:
+    """Build and run the cell, evaluate the run and write its results.
+
+    Raises:
+        InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
+    """
+    finished = run_job(scenario, options, progress, "")
+    progress("measure and write", finished.share(0.985))
+    result = measure(finished.run, options, finished.robot)
+    write_result(result, finished)
+    return result
+
+
+def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") -> DemoResult:
+    """Compare the run with the ground truth of its simulation."""
+    cell, status = run.cell, run.cell.job.calibration_status(run.root)
+    error = (
+        None
+        if status.estimate is None
+        else live_calibration_error(cell, status.estimate, status.arm_or(cell.station.arm))
+    )
+    return DemoResult(
+        options=options, run=run, status=status, calibration=error, weld=weld_outcome(cell, run.root), robot=robot
+    )
+
+
+def write_result(result: DemoResult, finished: JobRun) -> None:
+    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, summary.json, report.html."""
+    folder, run = result.folder, result.run
+    with whole_result(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_calibration(run.cell, result.status, result.options.seed, folder)
+        write_scans(run, result.status, folder / SCANS, result.robot)
+        if result.weld is not None:
+            record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
+            write_weld_log(record, folder)
+        finished.write_recording(folder)
+        pictures = demo_pictures(result)
+        for name, picture in pictures.items():
+            write_atomic(folder / "plots" / f"{name}.svg", picture)
+        write_json(folder / SUMMARY, result.summary())
+        write_atomic(folder / "report.html", demo_report(result, pictures, recording=finished.meshcat is not None))
+
+
+def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> CalibrationResult | None:
+    """The live calibration in the form that `weldcal calibrate` writes; None without an estimate."""
+    estimate, refinement = status.estimate, status.refinement
+    if estimate is None:
+        return None
+    inliers = [o for o, keep in zip(status.observations, estimate.inliers, strict=True) if keep]
+    scanner = cell.scenario.scanner_config()
+    records = [_record(observation.id, estimate, k) for k, observation in enumerate(status.observations)]
+    records += [PoseRecord(id=label, used=False, reason=reason) for label, reason in status.refused]
+    return CalibrationResult(
+        X_BC=estimate.X_BC,
+        covariance=estimate.covariance,
+        held_out_mm=live_errors(1e3 * estimate.held_out.position_m),
+        tilt_deg={"median": live_errors(np.degrees(estimate.held_out.tilt_rad)).get("median")},
+        poses=tuple(records),
+        unobservable=estimate.unobservable,
+        warnings=estimate.warnings if refinement is None else (*estimate.warnings, refinement.sentence),
+        robot=cell.scenario.arm,
+        flange=cell.scenario.calibration.feature,
+        scanner="" if scanner is None else scanner.scanner().name,
+        sigma_position_mm=1e3 * estimate.sigma_position_m,
+        sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
+        seed=seed,
+        scanner_correction=None if estimate.scanner is None else estimate.scanner.document(),
+        joint_covariance=estimate.joint,
+        orientations=orientations_of(inliers, cell.job.X_FR),
+        observed=observed_document(
+            inliers, cell.job.X_FR, [q for q, keep in zip(status.joints, estimate.inliers, strict=False) if keep]
+        ),
+        local_field=None if refinement is None or refinement.local_field is None else refinement.local_field.document(),
+        arm_errors=None if refinement is None else refinement.arm_errors,
+        kinematics_file=KINEMATICS_FILE if refinement is not None and refinement.kinematics else "",
+    )
+
+
+def _record(id: str, estimate: CalibrationEstimate, k: int) -> PoseRecord:
+    used = bool(estimate.inliers[k])
+    return PoseRecord(
+        id=id,
+        used=used,
+        reason="" if used else "it disagrees with the other poses",
+        residual_mm=float(1e3 * estimate.position_residuals_m[k]),
+        held_out_mm=float(1e3 * estimate.held_out.position_m[k]),
+        tilt_deg=float(np.degrees(estimate.tilt_residuals_rad[k])),
+        held_out_tilt_deg=float(np.degrees(estimate.held_out.tilt_rad[k])),
+    )
+
+
+def write_calibration(cell: Cell[WeldJob], status: CalibrationStatus, seed: int, folder: Path) -> Path | None:
+    """Write calibration.yaml and its exports for other tools, where there is a calibration."""
+    result = live_result(cell, status, seed)
+    if result is None:
+        return None
+    export_all(result, folder)
+    if status.refinement is not None and status.refinement.kinematics:
+        write_atomic(folder / KINEMATICS_FILE, status.refinement.kinematics)
+    return save_result(result, folder)
+
+
+def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robot: str = "simulated") -> Path | None:
+    """Write the calibration scans as a dataset folder for `weldcal calibrate`; returns None where there are none.
+
+    `robot` is the name of the robot, for the dataset's note.
+    """
+    cell, scanner = run.cell, run.cell.scenario.scanner_config()
+    observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
+    if not observed or scanner is None:
+        return None
+    preset = scanner.scanner()
+    c, X_RF = cell.scenario.calibration, cell.job.X_FR.inverse()
+    guess = c.mounting_guess.pose()
+    header = DatasetHeader(
+        robot=cell.scenario.arm,
+        flange=feature_standard(cell.scenario).designation,
+        scanner=preset.name,
+        configuration="eye_on_base",
+        note=f"rendered scans of a run; robot: {robot}",
+        feature_in_flange=Feature(
+            _numbers(cell.job.X_FR.translation()), _numbers(cell.job.X_FR.rotation().ToQuaternion().wxyz())
+        ),
+        scanner_guess=ScannerGuess(
+            _numbers(guess.translation()), _numbers(guess.rotation().ToQuaternion().wxyz()), 1e-3 * c.guess_radius_mm
+        ),
+    )
+    save_dataset(
+        folder,
+        header,
+        {id: X_BR @ X_RF for id, X_BR in observed.items()},
+        {id: run.scans[id][0].points_C.astype(float) for id in observed},
+        times={id: run.scans[id][0].capture_time for id in observed},
+        intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
+    )
+    return folder
+
+
+def live_case(cell: Cell[Any], root: Context) -> Case | None:
+    """What a live calibration has seen of its feature, as the doctor examines it; None where the job does not calibrate by it."""
+    status = getattr(cell.job, "calibration_status", None)
+    seen = None if status is None else status(root)
+    if seen is None or not seen.observations:
+        return None
+    c, scanner = cell.scenario.calibration, cell.scenario.scanner_config()
+    preset = None if scanner is None else scanner.scanner()
+    return case_of(
+        seen.observations,
+        {},
+        cell.job.X_FR.GetAsMatrix4(),
+        robot=cell.scenario.arm,
+        flange=feature_standard(cell.scenario).designation,
+        refused=seen.refused,
+        guess=c.mounting_guess.pose().GetAsMatrix4(),
+        guess_radius=1e-3 * c.guess_radius_mm,
+        near_far=None if preset is None else (preset.near_m, preset.far_m),
+    )
+
+
+def _numbers(values: np.ndarray) -> list[float]:
+    return [float(v) for v in values]
+
+
+def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
+    """The weld record from the log; it contains no ground truth of the simulation."""
+    log, cell, config = weld.log, run.cell, run.cell.job.servo_config
+    process = cell.scenario.welding.process.process()
+    p_BW = log.p_BRobot + log.R_BT @ config.p_TW
+    speed = speed_along(log.time, p_BW)
+    up = np.full((len(log.time), 3), np.nan)
+    if weld.planned is not None:
+        up = np.asarray(weld.planned.up(log.telemetry["s_torch"]))
+    moving = log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH]
+    work, travel = torch_angles(log.R_BT, up, config.torch.work_angle_rad)
+    named = log.telemetry
+    table = {"time_s": log.time, "torch_on": log.torch_on.astype(float), "sigma_min": log.sigma_min}
+    table |= {f"{name}_m": named[name] for name in ("s_tip", "s_torch", "delta_n", "delta_axial", "e_t", "e_height")}
+    table |= {name: named[name] for name in ("n_d_dot_n_t", "conditioning", "gain", "n_points")}
+    table |= {f"q_B{frame}_{axis}": named[f"q_BT_{axis}"] for frame in "TW" for axis in "wxyz"}
+    tip, target = columns(named, "tip"), columns(named, "target")
+    vectors = {"p_BW": p_BW, "p_BT": log.p_BRobot, "deflection": log.deflection_T, "p_BTip": tip, "p_BSeam": target}
+    table |= {f"{name}_{axis}_m": v[:, k] for name, v in vectors.items() for k, axis in enumerate("xyz")}
+    table |= {
+        "torch_speed_m_s": speed,
+        "torch_speed_commanded_m_s": named["torch_speed"],
+        "tip_speed_m_s": named["tip_speed"],
+        "omega_rad_s": named["omega"],
+        "work_angle_rad": np.where(moving, work, np.nan),
+        "travel_angle_rad": np.where(moving, travel, np.nan),
+        "heat_input_J_m": process.heat_input(np.where(log.torch_on, speed, np.nan)),
+    }
+    settings = {
+        "software": software_version(),
+        "scenario": scenario,
+        "seed": seed,
+        "robot": robot,
+        "servo_period_s": config.period_s,
+        "weld_speed_m_s": config.weld_speed_m_s,
+        "delta_d_m": config.deflection.delta_d_m,
+        "axial_d_m": config.deflection.axial_d_m,
+        "omega_max_rad_s": config.limits.omega_max_rad_s,
+        "chord_m": config.tool.torch_offset_m,
+        "law": config.law,
+        "ended": run.reason or "done",
+    }
+    phase = np.array([PHASE_NAMES[int(k)] for k in named["phase"]], dtype=np.str_)
+    return WeldRecord(table, phase, process, settings)
+
+
+def write_weld_log(record: WeldRecord, folder: Path) -> Path:
+    """Write weld.csv and weld.json (docs/weld_log.md); the header last, so that it never describes a missing table."""
+    table, header = weld_log_texts(record)
+    write_atomic(folder / CSV_NAME, table)
+    write_atomic(folder / HEADER_NAME, header)
+    return folder / CSV_NAME

@@ -1,1 +1,0 @@
-"""Results of runs, as commands return them and reports show them, with errors against the ground truth of a simulation."""

@@ -1,0 +1,371 @@
+"""The first screen of every report and of the terminal: verdict, expected error, what could be wrong, next step and poses.
+
+It holds the rule of the verdict, every printed form of a pose, and the error of a scanned point at the work point.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.data.results import export_ur_pose
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
+from weldcal.calibration.geometry.robust import chi2_quantile
+from weldcal.calibration.geometry.se3 import rotation_vector
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+
+SCANNER = {
+    "X_BC": "pose of the scanner C in the robot's base B",
+    "X_FC": "pose of the scanner C in the robot's flange F",
+}
+"""The scanner's pose in words, by its symbol."""
+
+
+def pose_rows(pose: object, symbol: str = "X_BC", words: str = "") -> dict[str, str]:
+    """Rows for the terminal, by name: a RigidTransform, or its matrix (4, 4) as nested lists; ``words``: its frames."""
+    if isinstance(pose, RigidTransform):
+        X = pose
+    else:
+        M = np.asarray(pose, dtype=float)
+        X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(M[:3, :3]), M[:3, 3])
+    q = X.rotation().ToQuaternion()
+    rows = [" ".join(f"{v:+.6f}" for v in row) for row in X.GetAsMatrix4()]
+    return {
+        symbol: words or SCANNER.get(symbol, "pose of the scanner in the robot's flange"),
+        "position": "  ".join(f"{1e3 * v:+.3f}" for v in X.translation()) + "  mm",
+        "rotation vector": "  ".join(f"{v:+.6f}" for v in rotation_vector(X.rotation())) + "  rad",
+        "roll pitch yaw": "  ".join(f"{v:+.4f}" for v in np.degrees(X.rotation().ToRollPitchYaw().vector())) + "  deg",
+        "quaternion wxyz": "  ".join(f"{v:+.7f}" for v in (q.w(), q.x(), q.y(), q.z())),
+        "UR pose": export_ur_pose(X).strip(),
+        "4 x 4, m": "\n".join(rows),
+    }
+
+
+@dataclass(frozen=True)
+class WorkPoint:
+    """The expected error of a scanned point at ``p_B_mm`` in the base: with 95 % probability at most ``error_95_mm``, if the errors are as
+    stated; ``unseen_poses`` with a held-out error back it, 95 % of which were within ``held_out_95_mm`` (None: too few)."""
+
+    p_B_mm: tuple[float, float, float]
+    error_95_mm: float
+    unseen_poses: int
+    held_out_95_mm: float | None
+
+    def document(self) -> dict[str, object]:
+        """The JSON object."""
+        return {
+            "p_B_mm": list(self.p_B_mm),
+            "error_95_mm": self.error_95_mm,
+            "unseen_poses": self.unseen_poses,
+            "held_out_95_mm": self.held_out_95_mm,
+        }
+
+
+def radius_95(S: Array) -> float:
+    """Distance that an error of covariance ``S`` (3, 3) does not exceed with 95 %, in the square root of its unit.
+
+    It is that of a scaled chi-square with the mean and variance of the squared error (Satterthwaite 1946).
+    """
+    mean, square = float(np.trace(S)), float(np.trace(S @ S))
+    freedom = mean**2 / square if square > 0.0 else 3.0
+    return float(np.sqrt(chi2_quantile(0.95, freedom) * mean / freedom))
+
+
+def work_point_error(estimate: CalibrationEstimate, p_BQ: Array) -> WorkPoint:
+    """The error at the point (3,) m in the base, from the estimate's covariance and its held-out errors."""
+    radius = radius_95(point_error_covariance(estimate, p_BQ))
+    held = estimate.held_out.position_m[estimate.inliers]
+    held = 1e3 * held[np.isfinite(held)]
+    x, y, z = (float(1e3 * v) for v in p_BQ)
+    return WorkPoint((x, y, z), 1e3 * radius, len(held), float(np.percentile(held, 95)) if len(held) else None)
+
+
+USE, CARE, DO_NOT = "use it", "use with care", "do not use"
+ENOUGH_UNSEEN = 4
+"""Unseen poses (scans, frames, landmarks) from which on they back a verdict; `verify` asks for as many new scans."""
+MOST_CONCERNS = 3
+NO_TOLERANCE = (
+    "No tolerance is stated, so nothing says whether this is good enough for your job: state it with --limit-mm."
+)
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What the verdict is measured against: `figure` may be `limit` at most, in `unit`.
+
+    `what` names the figure, `source` the option or scenario key that states the limit.
+    """
+
+    what: str
+    figure: float
+    limit: float
+    source: str
+    unit: str = "mm"
+
+    @property
+    def met(self) -> bool:
+        """Whether the figure is within the limit; a figure that is not known is not."""
+        return bool(self.figure <= self.limit)
+
+    @property
+    def sentence(self) -> str:
+        """The comparison as one sentence."""
+        if not np.isfinite(self.figure):
+            return f"{self.what} is not known, so it cannot be held against {self._text(self.limit)} ({self.source})."
+        where = "within" if self.met else "above"
+        return f"{self.what} is {self._text(self.figure)}, {where} the tolerance of {self._text(self.limit)} ({self.source})."
+
+    def _text(self, value: float) -> str:
+        return f"{value:.3f} {self.unit}".strip()
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The error to expect: `what` is measured, the figure with its unit, and what backs it, in words."""
+
+    what: str
+    figure: str
+    backing: str
+
+
+@dataclass(frozen=True)
+class Next:
+    """The next step: a sentence, and the command or motion that does it (empty: none)."""
+
+    text: str
+    command: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ShownPose:
+    """A pose that a command computed: its symbol (X_BC), frames in words, and the transform with its translation in m."""
+
+    symbol: str
+    words: str
+    X: RigidTransform
+
+    @property
+    def forms(self) -> tuple[tuple[str, str, str], ...]:
+        """Forms to copy: a name, a word for the button, and the text."""
+        q = self.X.rotation().ToQuaternion()
+        matrix = ",\n".join(
+            ("[[" if k == 0 else " [") + ", ".join(f"{v: .9f}" for v in row + 0.0) + ("]]" if k == 3 else "]")
+            for k, row in enumerate(self.X.GetAsMatrix4())
+        )
+        quaternion = ", ".join(f"{v:.9f}" for v in (*self.X.translation(), q.w(), q.x(), q.y(), q.z()))
+        return (
+            ("4 x 4 matrix, m", "matrix", matrix),
+            ("UR pose: x, y, z in m, rotation vector in rad", "UR pose", export_ur_pose(self.X).strip()),
+            ("x, y, z in m, quaternion w, x, y, z", "quaternion", quaternion),
+        )
+
+    @property
+    def read(self) -> tuple[tuple[str, str], ...]:
+        """Forms to read: position and angles."""
+        rows = self.rows()
+        return (("position", rows["position"]), ("roll pitch yaw", rows["roll pitch yaw"]))
+
+    def rows(self) -> dict[str, str]:
+        """The rows for the terminal."""
+        return pose_rows(self.X, self.symbol, self.words)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What a command found, as the verdict's rule reads it.
+
+    Attributes:
+        against: what the command itself decided against its result: a held job, a moved scanner; any of them ends in "do not use".
+        tolerance: None where nobody stated one.
+        no_tolerance: the sentence that takes its place.
+        unseen: number of poses that were unseen when their error was predicted; None for a result that has no such poses.
+        concerns: what could be wrong; any of them leaves the verdict at "use with care".
+        notes: what a reader should know; they do not change the verdict.
+        settled: verdict and reason of a command that has a rule of its own (`verify`).
+    """
+
+    against: Sequence[str] = ()
+    tolerance: Tolerance | None = None
+    no_tolerance: str = NO_TOLERANCE
+    unseen: int | None = None
+    concerns: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    settled: tuple[str, str] | None = None
+
+
+def decide(found: Findings) -> tuple[str, str]:
+    """The verdict, one of three, and the reason; the first rule that applies decides.
+
+    1. A verdict that the command settled by a rule of its own stays as it is.
+    2. "do not use": the command decided against the result (the job was held, no pose, the scanner has moved).
+    3. "do not use": a tolerance is stated, and the figure is above it or not known.
+    4. "use with care": no tolerance is stated; or fewer than ENOUGH_UNSEEN unseen poses back the figure; or something could be wrong.
+    5. "use it".
+    """
+    if found.settled is not None:
+        return found.settled
+    if found.against:
+        return DO_NOT, found.against[0]
+    said = found.no_tolerance if found.tolerance is None else _upper(found.tolerance.sentence)
+    if found.tolerance is not None and not found.tolerance.met:
+        return DO_NOT, said
+    if found.unseen is not None and found.unseen < ENOUGH_UNSEEN:
+        number = {0: "no unseen pose backs", 1: "only 1 unseen pose backs"}
+        return CARE, f"{said} But {number.get(found.unseen, f'only {found.unseen} unseen poses back')} it."
+    if found.concerns:
+        n = len(found.concerns)
+        return CARE, f"{said} But {'one thing' if n == 1 else f'{n} things'} could be wrong, below."
+    return (CARE, said) if found.tolerance is None else (USE, said)
+
+
+@dataclass(frozen=True, eq=False)
+class FirstScreen:
+    """The first screen. `lead` is said before the verdict's reason; `more` are rows by name: other results, and what takes the place of a
+    pose or a figure that the command does not have."""
+
+    found: Findings
+    expected: Expected
+    next: Next
+    poses: tuple[ShownPose, ...] = ()
+    more: Mapping[str, str] = field(default_factory=dict)
+    lead: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """One of three."""
+        return decide(self.found)[0]
+
+    @property
+    def reason(self) -> str:
+        """Why, in a sentence or two."""
+        return f"{self.lead} {decide(self.found)[1]}".strip()
+
+    @property
+    def tone(self) -> str:
+        """The report's colour."""
+        return {USE: "good", CARE: "warn", DO_NOT: "bad"}[self.verdict]
+
+    @property
+    def concerns(self) -> tuple[str, ...]:
+        """At most three things that could be wrong, the gravest first; the third says how many more there are."""
+        return _first_few([*self.found.against[1:], *self.found.concerns])
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """At most three things that a reader should know and that do not speak against the result; the third says how many more there are."""
+        return _first_few(text for text in self.found.notes if text not in self.concerns)
+
+    @property
+    def nothing(self) -> str:
+        """What is said where there is no concern besides the verdict's reason."""
+        return "Nothing was found." if self.verdict == USE or not self.found.against else "Nothing else was found."
+
+    def rows(self) -> dict[str, str]:
+        """The rows for the terminal, by name; several things stand on lines of their own."""
+        rows = {
+            "verdict": f"{self.verdict}. {self.reason}",
+            self.expected.what: f"{self.expected.figure} ({self.expected.backing})",
+            "could be wrong": "\n".join(f"- {text}" for text in self.concerns) or self.nothing,
+            **({"good to know": "\n".join(f"- {text}" for text in self.notes)} if self.notes else {}),
+            "next": self.next.text + (f"\n{self.next.command}" if self.next.command else ""),
+            **self.more,
+        }
+        for k, pose in enumerate(self.poses):
+            rows |= {name + " " * k: text for name, text in pose.rows().items()}
+        return rows
+
+    def document(self) -> dict[str, object]:
+        """The JSON object."""
+        tolerance = self.found.tolerance
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "error": f"{self.expected.what}: {self.expected.figure}",
+            "backing": self.expected.backing,
+            "tolerance": None if tolerance is None else vars(tolerance),
+            "unseen": self.found.unseen,
+            "could_be_wrong": list(self.concerns),
+            "good_to_know": list(self.notes),
+            "next": self.next.text,
+            "command": self.next.command or None,
+        }
+
+
+def point_covariance(X: RigidTransform, covariance: Array, p: Array) -> Array:
+    """Covariance (3, 3) m^2 of a point at ``p`` (3,) m of the parent's axes, mapped by ``X`` with covariance (6, 6) [rotation; translation].
+
+    The rotation is on the parent's side about the child's origin, as in every result of weldcal.
+    """
+    d = np.asarray(p, dtype=float) - X.translation()
+    skewed = np.array([[0.0, -d[2], d[1]], [d[2], 0.0, -d[0]], [-d[1], d[0], 0.0]])
+    J = np.hstack([-skewed, np.eye(3)])
+    return np.asarray(J @ covariance @ J.T)
+
+
+def expected_error(
+    what: str, own_mm: float | None, held_95_mm: float | None, n: int, of: str, place: str = ""
+) -> tuple[Expected, float]:
+    """The error at 95 % in words, and in mm (NaN: not known): the larger of the result's own and that of what it had not seen.
+
+    ``own_mm``: from the covariance (None: none is stated), ``place``: where; ``held_95_mm``: 95 % of ``n`` held-out errors of ``of``
+    (poses, scans; None: there are none).
+    """
+    own = None if own_mm is None or not np.isfinite(own_mm) else own_mm
+    held = None if held_95_mm is None or not np.isfinite(held_95_mm) else held_95_mm
+    itself = f"of the calibration itself{f', at {place}' if place else ''}"
+    seen = (
+        f"of 1 {of.removesuffix('s')}, unseen by its calibration"
+        if n == 1
+        else f"within which 95 % of {n} {of} were, each unseen by its calibration"
+    )
+    if own is None and held is None:
+        return Expected(
+            what, "not known", f"the method states no uncertainty, and none of the {of} was left out"
+        ), float("nan")
+    if held is None:
+        return Expected(what, f"{own:.3f} mm", f"{itself}; no unseen {of.removesuffix('s')} backs it"), float(
+            own or 0.0
+        )
+    if own is None:
+        return Expected(what, f"{held:.3f} mm", f"{seen}; the method states no uncertainty of its own"), held
+    larger = max(own, held)
+    return Expected(
+        what, f"{larger:.3f} mm", f"the larger of two: {own:.3f} mm {itself}, and {held:.3f} mm {seen}"
+    ), larger
+
+
+def work_point_expected(work: WorkPoint) -> tuple[Expected, float]:
+    """The error at the work point in words, and in mm."""
+    x, y, z = work.p_B_mm
+    place = f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the base"
+    what = "error at the work point, 95 %"
+    return expected_error(what, work.error_95_mm, work.held_out_95_mm, work.unseen_poses, "poses", place)
+
+
+def check_limit(limit_mm: float | None) -> None:
+    """Check a stated tolerance. Raises InputError where it is no positive number."""
+    if limit_mm is not None and not (np.isfinite(limit_mm) and limit_mm > 0.0):
+        raise InputError(f"The limit must be a positive number of millimetres, not {limit_mm:g}.")
+
+
+def refused_note(refused: Sequence[tuple[str, str]], n: int, what: str = "scans") -> tuple[str, ...]:
+    """A sentence on what was not used, of ``n`` in all; none where all were used."""
+    if not refused:
+        return ()
+    names = ", ".join(name for name, _ in refused[:4]) + (" ..." if len(refused) > 4 else "")
+    was = "was not used ({}); the reason is" if len(refused) == 1 else "were not used ({}); the reasons are"
+    return (f"{len(refused)} of {n} {what} {was.format(names)} listed in the report.",)
+
+
+def _first_few(texts: Iterable[str]) -> tuple[str, ...]:
+    every = list(dict.fromkeys(texts))
+    if len(every) <= MOST_CONCERNS:
+        return tuple(every)
+    kept = every[: MOST_CONCERNS - 1]
+    return (*kept, f"{len(every) - len(kept)} more are listed in the report.")
+
+
+def _upper(text: str) -> str:
+    return text[:1].upper() + text[1:]

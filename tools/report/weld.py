@@ -1,0 +1,270 @@
+"""Errors of the weld and of the calibration of a run against the ground truth of the simulation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context
+
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.calibration.geometry.rigid import fit_rigid
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arrays import Array
+from weldcal.models.workpieces.part import numbered
+from weldcal.systems.cell import Cell
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, seated_tip, work_point
+from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
+from weldcal.systems.station import Truth
+from weldcal.welding.record.process import (
+    PathError,
+    SpeedStatistics,
+    WeldProcess,
+    path_error,
+    speed_along,
+    speed_statistics,
+)
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.state import Phase
+
+
+def true_work_point(
+    arm: ArmModel,
+    true_arm: ArmModel,
+    X_FT: RigidTransform | None,
+    p_BWork: Array,
+    q_home: Array,
+    poses: Sequence[Array],
+) -> Array:
+    """The place (3,) m in the true base that the arm reports as the work point (3,) m.
+
+    With a tool: where its tip is when it is reported there, upright as at ``q_home`` (6,) rad. Without one no posture
+    belongs to the work point: it is mapped by the rigid transform that fits the true to the reported flange positions of
+    the calibration ``poses`` (n, 6) rad best.
+    """
+    if X_FT is not None:
+        p_FT = np.asarray(X_FT.translation())
+        R = forward_kinematics(arm, q_home).rotation()
+        q = nearest_solution(arm, RigidTransform(R, p_BWork - R.multiply(p_FT)), q_home)
+        if q is not None:
+            shift = forward_kinematics(true_arm, q).multiply(p_FT) - forward_kinematics(arm, q).multiply(p_FT)
+            return np.asarray(p_BWork + shift)
+    reported, true = (np.array([forward_kinematics(a, q).translation() for q in poses]) for a in (arm, true_arm))
+    return np.asarray(fit_rigid(true, reported).multiply(p_BWork))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WeldLog:
+    """The weld's time series, one row per servo tick; (N,) and (N, 3) arrays in B, SI units."""
+
+    time: Array
+    telemetry: dict[str, Array]
+    torch_on: NDArray[np.bool_]
+    p_BTip: Array  # tip position measured by the servo from the arm's pose and the tag
+    p_BRobot: Array  # origin of T: the "robot end effector" of the paper
+    R_BT: Array  # (N, 3, 3)
+    p_BTorch: Array
+    deflection_T: Array
+    sigma_min: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WeldOutcome:
+    """Errors of the weld against the true seam (simulation only)."""
+
+    log: WeldLog
+    true_seam: SeamCurve | None
+    planned: SeamCurve | None
+    error: PathError | None  # torch while the arc burned
+    speed: SpeedStatistics | None
+    plan_error: PathError | None  # of the newest plan, that of the last seam
+    seams: tuple[PathError, ...] = ()  # the torch's error on each seam, where there are several
+
+
+@dataclass(frozen=True, eq=False)
+class FeltSeam:
+    """The points of the refined seam, (N,) m: arc length on the true seam, and distance to the left of and above the nominal
+    line of a seated tip's measured centre."""
+
+    s: Array
+    lateral: Array
+    height: Array
+
+
+@dataclass(frozen=True)
+class CalibrationError:
+    """Error of X_BC against the ground truth: at the camera's origin, and for a point at the work point."""
+
+    translation_m: float
+    rotation_rad: float
+    at_work_m: float
+
+
+def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: Array) -> CalibrationError:
+    """Difference of two camera poses; `at_work_m` is the position error of a point whose true position is p_BWork."""
+    turn = RotationMatrix(X_BC_true.rotation().inverse() @ X_BC.rotation()).ToAngleAxis().angle()
+    landed = X_BC @ (X_BC_true.inverse() @ p_BWork)
+    return CalibrationError(
+        translation_m=float(np.linalg.norm(X_BC.translation() - X_BC_true.translation())),
+        rotation_rad=float(abs(turn)),
+        at_work_m=float(np.linalg.norm(landed - p_BWork)),
+    )
+
+
+def live_calibration_error(
+    cell: Cell[WeldJob], estimate: CalibrationEstimate, arm: ArmModel | None = None
+) -> CalibrationError | None:
+    """Error of a live calibration in a simulated world whose scanner and arm have errors of their own; None without truth.
+
+    `at_work_m` is the distance between where scanner and calibration put the work point and where the arm reports it: by ``arm``, the refined one, where given.
+    """
+    station, scenario = cell.station, cell.scenario
+    truth, work = station.truth, work_point(scenario)
+    if truth.X_BC is None or truth.arm is None:
+        return None
+    X_FT = None if station.tool is None else station.tool.X_FT
+    poses = [p.q for p in cell.job.poses]
+    p_true = true_work_point(arm or station.arm, truth.arm, X_FT, work, np.deg2rad(scenario.home_deg), poses)
+    p_C = truth.X_BC.inverse().multiply(p_true)
+    seen = p_C if truth.scanner is None else truth.scanner.device.measured(p_C)
+    corrected = seen if estimate.scanner is None else estimate.scanner.points(seen)
+    off = calibration_error(estimate.X_BC, truth.X_BC, work)
+    return replace(off, at_work_m=float(np.linalg.norm(estimate.X_BC.multiply(corrected) - work)))
+
+
+def true_seam(truth: Truth, seam: int = 0) -> SeamCurve | None:
+    """The reference path of the torch on a seam by its number: above the true groove's root, in B."""
+    if truth.workpiece is None or truth.X_BP is None:
+        return None
+    part = numbered(truth.workpiece, seam)
+    ups = part.up_P
+    line = part.seam_P + TORCH_ABOVE_ROOT_M * ups
+    R = truth.X_BP.rotation().matrix()
+    return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=np.broadcast_to(ups, line.shape) @ R.T)
+
+
+def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
+    """The seam points that the servo measured with the tip, against the ground truth; None where there are none."""
+    number = cell.job.command(root).seam
+    state, seam = cell.job.servo_report(root).state, true_seam(cell.station.truth, number)
+    if state is None or seam is None or len(state.refined) < 10:
+        return None
+    seat = seated_tip(cell.station, number)
+    line = seam.raised(seat.above_m - TORCH_ABOVE_ROOT_M, seat.aside_m)
+    found = path_error(state.refined.points, line)
+    return FeltSeam(found.s, found.lateral, found.height)
+
+
+def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
+    """The log rows in which the servo was active; None where there are none."""
+    if not cell.logs:
+        return None
+    series = {name: sink.FindLog(root).data() for name, sink in cell.logs.items()}
+    # a run that is interrupted within a tick leaves some logs a row shorter
+    rows = min(data.shape[1] for data in series.values())
+    series = {name: data[:, :rows] for name, data in series.items()}
+    telemetry = series["telemetry"]
+    ticks = telemetry[TELEMETRY.index("tick_time")]
+    keep = (telemetry[0] >= 0.0) & (telemetry[0] != PHASE_CODES[Phase.DONE])
+    keep &= new_ticks(ticks)
+    if keep.sum() < 3:
+        return None
+    tool = cell.station.tool
+    assert tool is not None
+    named = {name: np.array(telemetry[k, keep]) for k, name in enumerate(TELEMETRY)}
+    p_BRobot = columns(named, "p_BT")
+    q = columns(named, "q_BT", "wxyz")
+    R_BT = np.array([RotationMatrix(Quaternion(w / np.linalg.norm(w))).matrix() for w in q])
+    deflection = series["deflection"][:3, keep].T
+    return WeldLog(
+        time=named["tick_time"],
+        telemetry=named,
+        torch_on=np.array(series["torch_on"][0, keep] > 0.5),
+        p_BTip=p_BRobot + np.einsum("nij,nj->ni", R_BT, deflection),
+        p_BRobot=p_BRobot,
+        R_BT=R_BT,
+        p_BTorch=np.array(series["torch"][:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW,
+        deflection_T=np.array(deflection),
+        sigma_min=np.array(series["margin"][0, keep]),
+    )
+
+
+def new_ticks(ticks: Array) -> NDArray[np.bool_]:
+    """Mask of the ticks' times (N,) s, NaN outside a weld, that are later than all previous ones.
+
+    After a fault the last report repeats, and a robot's clock may stall or restart.
+    """
+    newest = np.fmax.accumulate(np.nan_to_num(ticks, nan=-np.inf))
+    return np.asarray(ticks > np.concatenate([[-np.inf], newest[:-1]]))
+
+
+def columns(table: dict[str, Array], name: str, axes: str = "xyz") -> Array:
+    """The columns name_x, name_y ... side by side, (N, len(axes))."""
+    return np.column_stack([table[f"{name}_{axis}"] for axis in axes])
+
+
+def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
+    """Measure the weld, with its errors where the ground truth is known; None where nothing was welded."""
+    number = cell.job.command(root).seam
+    log, seam = weld_log(cell, root), true_seam(cell.station.truth, number)
+    if log is None:
+        return None
+    plan = cell.job.planned_seam(root).seam
+    plan_error = None
+    if plan is not None and seam is not None:
+        lowered = plan.raised(TORCH_ABOVE_ROOT_M - seated_tip(cell.station, number).above_m)
+        line = lowered.position(np.linspace(0.0, lowered.length, 200))
+        plan_error = path_error(line, seam)
+    if log.torch_on.sum() < 30:
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
+    wanted = cell.job.servo_config.weld_speed_m_s
+    parts = [part for part in welds(log) if (part & log.torch_on).sum() >= 30]
+    if not parts:
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=None, plan_error=plan_error)
+    speed = _together([speed_statistics(log.time[p], log.p_BTorch[p], log.torch_on[p], wanted) for p in parts])
+    if seam is None:
+        return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=speed, plan_error=plan_error)
+    errors = tuple(
+        path_error(log.p_BTorch[part & log.torch_on], true)
+        for k, part in enumerate(welds(log))
+        if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, k)) is not None
+    )
+    error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
+    return WeldOutcome(
+        log=log, true_seam=seam, planned=plan, error=error, speed=speed, plan_error=plan_error, seams=errors
+    )
+
+
+def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
+    """The statistics of several welds, each weighted by its length."""
+    length = np.array([w.welded_m for w in welds])
+    means = np.array([w.mean for w in welds])
+    mean = float(means @ length / length.sum())
+    spread = np.array([w.cv * w.mean for w in welds]) ** 2 + (means - mean) ** 2
+    return SpeedStatistics(
+        mean=mean,
+        least=min(w.least for w in welds),
+        most=max(w.most for w in welds),
+        cv=float(np.sqrt(spread @ length / length.sum())) / mean,
+        outside_m=sum(w.outside_m for w in welds),
+        welded_m=float(length.sum()),
+        seconds=sum(w.seconds for w in welds),
+    )
+
+
+def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
+    """Masks (N,) of the log's rows, one for each seam: a weld begins where the tip is brought into touch again."""
+    touching = log.telemetry["phase"] == PHASE_CODES[Phase.TOUCH]
+    number = np.cumsum(touching & ~np.concatenate([[True], touching[:-1]]))
+    return [number == k for k in range(int(number[-1]) + 1)]
+
+
+def heat_input_kJ_mm(weld: WeldOutcome, process: WeldProcess) -> Array | None:
+    """Heat input of each row with a burning arc, kJ/mm; None where it is not known."""
+    if process.missing is not None or not weld.log.torch_on.any():
+        return None
+    return 1e-6 * process.heat_input(speed_along(weld.log.time, weld.log.p_BTorch)[weld.log.torch_on])

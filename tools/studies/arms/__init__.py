@@ -1,1 +1,0 @@
-"""The demo on every arm of Universal Robots, its cell scaled to the arm's reach."""

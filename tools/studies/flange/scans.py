@@ -1,0 +1,261 @@
+"""Studies on ray-cast frames: flanges found and imagined, half-hidden flanges, and the rotation of filled hole patterns."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Annotated, Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.flange.fit import fit_flange
+from weldcal.calibration.flange.holes import HolePattern, find_holes
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.scanners import get_scanner
+from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.report.render import fixed
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, statistics
+from weldcal.tools.worlds.flange_frames import WAYS, empty_frame, fit_frame, flange_frame, hidden_frame
+
+WidthOption = Annotated[int, option("--width", "PX", "Width of the PhoXi M images; 2064 is the full width.", min=200)]
+FlangeName = Annotated[str, option("--flange", "NAME", "Flange standard.")]
+FLANGE = "iso9409-1-50-4-m6"
+SAME_PLACE_M = 0.001  # a flange reported farther from where it is, is another thing taken for it
+_WRONG_RAD = float(np.radians(10.0))  # half of the least symmetry that a pattern has is more
+
+
+def fit_one(width: int, flange: str, rng: Sequence[int], kind: str, share: float = 0.5) -> dict[str, Any]:
+    """Fit the flange of one frame: "whole", "empty", or hidden in one of WAYS. Its error (m), or why there is none."""
+    scanner, standard, draw = get_scanner("phoxi_m", width), get_flange(flange), np.random.default_rng(list(rng))
+    try:
+        if kind == "empty":
+            fit_flange(empty_frame(scanner, standard, draw).points_C, standard)
+            return {"kind": kind, "imagined": True}
+        frame = (
+            flange_frame(scanner, standard, draw)
+            if kind == "whole"
+            else hidden_frame(kind, scanner, standard, draw, share=share)
+        )
+        found = fit_frame(frame, standard)
+    except FlangeNotFound as problem:
+        return {"kind": kind, "reason": problem.reason}
+    mistaken = found.error_m > SAME_PLACE_M
+    reason = f"found {1e3 * found.error_m:.1f} mm off" if mistaken else None
+    return {"kind": kind, "mistaken": mistaken, "reason": reason, **found._asdict()}
+
+
+def frame_cases(frames: int, empty: int, seed: int, width: int, flange: str = FLANGE) -> Cases:
+    """``frames`` frames that show the flange and ``empty`` that do not."""
+    of = {"width": width, "flange": flange}
+    whole = {f"frame {k}": {**of, "rng": [seed, k], "kind": "whole"} for k in range(frames)}
+    return whole | {f"empty frame {k}": {**of, "rng": [seed, 1, k], "kind": "empty"} for k in range(empty)}
+
+
+def _frame_figures(results: Results) -> Figures:
+    whole = [r for r in results.values() if r["kind"] == "whole"]
+    good = [r["error_m"] for r in whole if r["reason"] is None]
+    missed = [(k, r["reason"]) for k, r in enumerate(whole) if "mistaken" not in r]
+    centre = statistics((1e3 * e for e in good), "rms", "max")
+    return {
+        "frames": len(whole),
+        "found": len(good),
+        "mistaken": sum(r.get("mistaken", False) for r in whole),
+        "imagined": sum(r.get("imagined", False) for r in results.values()),
+        "centre_rms_mm": centre["rms"],
+        "centre_max_mm": centre["max"] if good else 0.0,
+        "missed": [{"frame": k, "reason": why} for k, why in missed],
+    }
+
+
+def _frame_rows(f: Figures) -> Iterable[Row]:
+    yield "found", f"{f['found']} of {f['frames']} (wrong object detected: {f['mistaken']})"
+    yield "false detections", f"{f['imagined']} of {f['frames']} frames without a flange"
+    yield "centre", f"{f['centre_rms_mm']:.3f} mm rms, {f['centre_max_mm']:.3f} at most"
+
+
+FRAMES = Study(
+    name="flange-frames",
+    what="The flange in ray-cast frames with and without one: detections, false detections and centre error.",
+    case=fit_one,
+    figures=_frame_figures,
+    header=("", "found"),
+    rows=_frame_rows,
+)
+
+
+@command("benchmark flange-frames", short_help="Count detections in frames with and without a flange.", hidden=True)
+def frames(
+    call: Call,
+    count: Annotated[int, option("--frames", "N", "Number of frames with a flange, and without.", min=1)] = 500,
+    width: WidthOption = 824,
+    flange: FlangeName = FLANGE,
+) -> Outcome:
+    """Detect the flange in ray-cast frames with and without one: detections, false detections and centre error."""
+    get_flange(flange)
+    return FRAMES.outcome(call, frame_cases(count, count, call.seed, width, flange))
+
+
+def hidden_cases(
+    count: int, share: float, seed: int, width: int, flange: str = FLANGE, ways: Sequence[str] = WAYS
+) -> Cases:
+    """``count`` frames of each way to hide ``share`` of the flange's width."""
+    of = {"width": width, "flange": flange, "share": share}
+    return {f"{way} {k}": {**of, "rng": [seed, k], "kind": way} for way in ways for k in range(count)}
+
+
+def _hidden_figures(results: Results) -> Figures:
+    rows = []
+    for way in dict.fromkeys(r["kind"] for r in results.values()):
+        all_ = [r for r in results.values() if r["kind"] == way]
+        good = [r for r in all_ if r["reason"] is None]
+        rows.append(
+            {
+                "way": way,
+                "frames": len(all_),
+                "found": len(good),
+                "centre_rms_mm": statistics((1e3 * r["error_m"] for r in good), "rms")["rms"],
+                "normalised": statistics((r["normalised"] for r in good), "mean")["mean"],
+                "coverage": statistics((r["coverage"] for r in good), "mean")["mean"] if good else 0.0,
+                "missed": [r["reason"] for r in all_ if r["reason"] is not None],
+            }
+        )
+    return {"rows": rows}
+
+
+def _hidden_rows(f: Figures) -> Iterable[Row]:
+    for r in f["rows"]:
+        found = (fixed(r["centre_rms_mm"], 3), fixed(r["normalised"]), f"{100 * r['coverage']:.0f} %")
+        yield r["way"], f"{r['found']} of {r['frames']}", *found
+
+
+HIDDEN = Study(
+    name="flange-hidden",
+    what="Flanges of which a part is hidden: detections, and errors in units of the stated uncertainty.",
+    case=fit_one,
+    figures=_hidden_figures,
+    header=("hidden by", "found", "centre rms, mm", "squared error over stated variance", "of the edge seen"),
+    rows=_hidden_rows,
+)
+
+
+@command("benchmark flange-hidden", short_help="Detect a flange that is partly hidden.", hidden=True)
+def hidden(
+    call: Call,
+    count: Annotated[int, option("--frames", "N", "Number of frames for each kind of occlusion.", min=1)] = 30,
+    share: Annotated[float, option("--share", "S", "Hidden share of the flange's width.", min=0.0, max=0.9)] = 0.5,
+    width: WidthOption = 824,
+    flange: FlangeName = FLANGE,
+) -> Outcome:
+    """Detect a flange partly hidden by a plate, the image border or missing readings: detections, and errors in units of the
+    stated uncertainty."""
+    get_flange(flange)
+    return HIDDEN.outcome(call, hidden_cases(count, share, call.seed, width, flange))
+
+
+def turn_of(width: int, flange: str, filled: Sequence[int], rng: Sequence[int], name: str) -> Mapping[str, object]:
+    """The rotation of the hole pattern in one scan with these openings filled: "none", "open", "right" or "wrong" (over 10 degrees)."""
+    scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
+    frame = flange_frame(scanner, _with_filled(standard, filled), np.random.default_rng(list(rng)))
+    assert frame.X_CR is not None
+    try:
+        pattern = find_holes(frame.points_C, fit_flange(frame.points_C, standard), standard)
+    except FlangeNotFound:
+        pattern = None
+    if pattern is None or not pattern.turn_known:
+        return {"name": name, "turn": "none" if pattern is None else "open"}
+    error = _turn_error(pattern, frame.X_CR)
+    return {
+        "name": name,
+        "turn": "right" if abs(error) < _WRONG_RAD else "wrong",
+        "normalised": float(np.square(error / pattern.turn_sigma)),
+    }
+
+
+def _with_filled(standard: FlangeStandard, filled: Sequence[int]) -> FlangeStandard:
+    """The flange without these of its openings (threads in order, then the dowel hole)."""
+    threads = tuple(a for k, a in enumerate(standard.hole_angles_rad) if k not in filled)
+    pin = 0.0 if standard.n_holes in filled else standard.pin_m
+    return replace(standard, n_holes=len(threads), hole_angles_rad=threads, pin_m=pin)
+
+
+def _turn_error(pattern: HolePattern, X_CR: RigidTransform) -> float:
+    """Error (rad) of the pattern's rotation about the flange axis."""
+    R = (X_CR.rotation().inverse() @ pattern.X_CR.rotation()).matrix()
+    return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
+
+
+def _fillings(standard: FlangeStandard) -> Iterator[tuple[str, list[tuple[int, ...]]]]:
+    """Names and the openings that each fills, by turns."""
+    n = standard.n_holes
+    names = [*(f"thread {k + 1}" for k in range(n)), *(["dowel hole"] if standard.pin_m > 0.0 else [])]
+    yield "nothing", [()]
+    for k, name in enumerate(names):
+        yield name, [(k,)]
+    yield "two", list(combinations(range(len(names)), 2))
+
+
+def hole_cases(scans: int, seed: int, width: int, flange: str = FLANGE) -> Cases:
+    """``scans`` scans of the open pattern, of each opening filled alone and of all pairs of them.
+
+    Raises:
+        InputError: a flange without holes.
+    """
+    standard = get_flange(flange)
+    if standard.n_holes == 0:
+        raise InputError(f"The flange '{standard.designation}' has no holes to fill: give one of ISO 9409-1.")
+    of = {"width": width, "flange": flange}
+    return {
+        f"{name} filled, scan {k}": {**of, "filled": choices[k % len(choices)], "rng": [seed, c, k], "name": name}
+        for c, (name, choices) in enumerate(_fillings(standard))
+        for k in range(scans)
+    }
+
+
+def _hole_figures(results: Results) -> Figures:
+    rows: list[dict[str, Any]] = []
+    for name in dict.fromkeys(r["name"] for r in results.values()):
+        found = [r for r in results.values() if r["name"] == name]
+        count = Counter(r["turn"] for r in found)
+        square = [r["normalised"] for r in found if r["turn"] == "right"]
+        rows.append(
+            {
+                "filled": name,
+                "scans": len(found),
+                "no_pattern": count["none"],
+                "left_open": count["open"],
+                "right": count["right"],
+                "wrong": count["wrong"],
+                "mean_normalised": statistics(square, "mean")["mean"],
+            }
+        )
+    return {"rows": rows}
+
+
+def _hole_rows(f: Figures) -> Iterable[Row]:
+    for r in f["rows"]:
+        yield r["filled"], *(str(r[key]) for key in ("scans", "right", "wrong", "left_open", "no_pattern"))
+
+
+HOLES = Study(
+    name="flange-holes",
+    what="The rotation about the flange axis from hole patterns with filled holes.",
+    case=turn_of,
+    figures=_hole_figures,
+    header=("filled", "scans", "right", "wrong", "left open", "without a pattern"),
+    rows=_hole_rows,
+    numbers=5,
+)
+
+
+@command("benchmark flange-holes", short_help="Fill holes of the flange and count wrong rotations.", hidden=True)
+def holes(
+    call: Call,
+    scans: Annotated[int, option("--scans", "N", "Number of scans for each set of filled holes.", min=1)] = 200,
+    width: WidthOption = 1032,
+    flange: FlangeName = FLANGE,
+) -> Outcome:
+    """Fill holes of the flange and count the rotations about its axis that are stated, left open and wrong."""
+    return HOLES.outcome(call, hole_cases(scans, call.seed, width, flange))

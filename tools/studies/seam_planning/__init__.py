@@ -1,1 +1,0 @@
-"""Seam planning from one scan, over parts, scanners and disturbances."""

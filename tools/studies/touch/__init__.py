@@ -1,1 +1,0 @@
-"""Studies of touches as the judge of a calibration."""

@@ -1,0 +1,1 @@
+"""Simulated parts, rigs, scans and recordings with a known truth, for tests and studies."""

@@ -1,0 +1,363 @@
+"""Simulated sets of flange scans, clean or with one cause; the arm and the scanner err in ways that the doctor's models do not hold.
+
+The arm has joint zeros, link lengths, sag and repeatability of its own; the scanner a polynomial warp to the third power, noise that
+grows with distance, and normals that bend at the rim.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
+from weldcal.models.arms.chain import Chain, chain_poses, load_chain
+from weldcal.models.arms.inverse import inverse_kinematics
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arrays import Array
+
+ARMS = ("ur10e", "ur5e")
+FLANGE = "iso9409-1-50-4-m6"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class World:
+    """A cell in which scans are taken: the arm as its controller believes it, as it is, the camera and its errors."""
+
+    rng: np.random.Generator
+    name: str
+    believed: Chain
+    true: Chain
+    zeros: Array
+    X_BC: Array
+    guess: Array
+    warp: Array
+    q: Array
+
+    @property
+    def n(self) -> int:
+        """How many scans."""
+        return len(self.q)
+
+
+def make_world(seed: int, *, alike: bool = False) -> World:
+    """A cell of its own for each seed: arm, scanner place, and 10 to 20 poses in front of the scanner."""
+    rng = np.random.default_rng([seed, 18])
+    name = ARMS[int(rng.integers(len(ARMS)))]
+    reach = 1.0 if name == "ur10e" else 0.72
+    believed = load_chain(name)
+    true = _off(believed, rng, 2e-4)
+    zeros = np.radians(rng.normal(0.0, 0.02, believed.n))
+    at = reach * np.array([0.62, 0.0, 0.95]) + rng.normal(0.0, 0.05, 3)
+    look = Rotation.from_euler(
+        "xyz", [180.0 + rng.normal(0, 6), rng.normal(0, 6), rng.uniform(-180, 180)], degrees=True
+    )
+    X_BC = pose(look.as_matrix(), at)
+    guess = X_BC @ pose(exp_rotation(rng.normal(0.0, 0.01, 3)), rng.normal(0.0, 0.008, 3))
+    warp = np.concatenate(
+        [[rng.normal(0.0, 1.5e-3)], rng.normal(0.0, 6e-3, 2), rng.normal(0.0, 8e-3, 3), rng.normal(0.0, 0.02, 2)]
+    )
+    wanted = int(rng.integers(10, 21))
+    arm = load_arm(name)
+    found: list[Array] = []
+    near: Array | None = None
+    middle: Array | None = None
+    for _ in range(4000):
+        if len(found) == wanted:
+            break
+        spread = np.array([0.13, 0.10, 0.13])
+        tilt, spin = np.radians(25.0), np.pi / 3
+        if alike and middle is not None:
+            spread, tilt, spin = np.full(3, 0.008), np.radians(0.6), np.radians(0.6)
+        p = (np.array([0.0, 0.0, 0.62]) if middle is None or not alike else middle) + rng.uniform(-spread, spread)
+        angle = tilt * np.sqrt(rng.uniform())
+        turn = Rotation.from_rotvec(angle * np.array([np.cos(a := rng.uniform(0, 2 * np.pi)), np.sin(a), 0.0]))
+        R_CF = turn.as_matrix() @ Rotation.from_euler("zx", [rng.uniform(-spin, spin), np.pi]).as_matrix()
+        X = X_BC @ pose(R_CF, p)
+        answers = inverse_kinematics(arm, RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]))
+        if len(answers) == 0:
+            continue
+        if near is None:
+            near, middle = answers[int(rng.integers(len(answers)))], p
+        q = answers[np.argmin(np.abs(np.angle(np.exp(1j * (answers - near)))).sum(axis=1))]
+        if np.abs(np.angle(np.exp(1j * (q - near)))).max() < 2.2:
+            found.append(q)
+    return World(
+        rng=rng,
+        name=name,
+        believed=believed,
+        true=true,
+        zeros=zeros,
+        X_BC=X_BC,
+        guess=guess,
+        warp=warp,
+        q=np.array(found),
+    )
+
+
+def _off(chain: Chain, rng: np.random.Generator, length: float) -> Chain:
+    stack = chain.stack.copy()
+    stack[:, :3, 3] += rng.normal(0.0, length, (chain.n, 3))
+    stack[:, :3, :3] = stack[:, :3, :3] @ exp_rotation(rng.normal(0.0, 4e-5, (chain.n, 3)))
+    return replace(chain, stack=stack)
+
+
+def observe(
+    world: World, X_BF: Array, X_BC: Array | None = None, believed: Array | None = None, *, soft: float = 0.0
+) -> Case:
+    """What the scanner sees of the true flange poses (n, 4, 4); ``believed`` is what the controller states, ``soft`` the distance (m) from
+    which on the image is out of focus (0: nowhere)."""
+    rng, n = world.rng, len(X_BF)
+    X_CF = inverse(np.broadcast_to(world.X_BC if X_BC is None else X_BC, (n, 4, 4))) @ X_BF
+    c, m = X_CF[:, :3, 3], X_CF[:, :3, 2]
+    u = c - np.array([0.0, 0.0, 0.62])
+    w = world.warp
+    factor = (
+        1.0
+        + w[0]
+        + u[:, :2] @ w[1:3]
+        + w[3] * u[:, 0] ** 2
+        + w[4] * u[:, 0] * u[:, 1]
+        + w[5] * u[:, 1] ** 2
+        + (u[:, :2] ** 3) @ w[6:8]
+    )
+    far = (c[:, 2] / 0.62) ** 2
+    blur = 1.0 if soft == 0.0 else 1.0 + 6.0 * np.clip((c[:, 2] - soft) / 0.08, 0.0, 3.0)
+    seen = c * factor[:, None] + rng.normal(0.0, 4e-5, (n, 3)) * (far * blur)[:, None]
+    bent = 4e-4 * u[:, [1, 0]] / 0.1
+    turn = (
+        np.column_stack([bent, np.zeros(n)]) + rng.normal(0.0, 6e-4, (n, 3)) * np.atleast_1d(blur * np.ones(n))[:, None]
+    )
+    normals = np.einsum("kij,kj->ki", exp_rotation(turn), m)
+    noise = 6e-5 * far * blur * np.exp(rng.normal(0.0, 0.12, n))
+    return Case(
+        ids=tuple(f"scan{k + 1:02d}" for k in range(n)),
+        X_BF=chain_poses(world.believed, world.q) if believed is None else believed,
+        c=seen,
+        m=normals / np.linalg.norm(normals, axis=1)[:, None],
+        time=np.cumsum(rng.uniform(8.0, 15.0, n)),
+        noise=noise,
+        coverage=np.clip(rng.normal(0.97, 0.02, n), 0.0, 1.0),
+        robot=world.name,
+        guess=world.guess,
+        guess_radius=0.06,
+        flange=FLANGE,
+    )
+
+
+def true_poses(world: World) -> Array:
+    """Flange poses X_BF (n, 4, 4) as they are: the arm's own lengths, zeros, sag and repeatability."""
+    sag = np.zeros_like(world.q)
+    sag[:, 1] = 4e-5 * np.cos(world.q[:, 1])
+    q = world.q + world.zeros + sag + world.rng.normal(0.0, 1.2e-5, world.q.shape)
+    return chain_poses(world.true, q)
+
+
+def clean(seed: int) -> Case:
+    """A set without a cause."""
+    world = make_world(seed)
+    return observe(world, true_poses(world))
+
+
+def _moved(seed: int) -> Case:
+    world = make_world(seed)
+    rng, n = world.rng, world.n
+    k = int(rng.integers(max(3, n // 3), n - max(3, n // 3) + 1))
+    X = true_poses(world)
+    turn = exp_rotation(_direction(rng) * np.radians(rng.uniform(0.05, 0.5)))
+    shifted = world.X_BC.copy()
+    shifted[:3, :3] = turn @ shifted[:3, :3]
+    shifted[:3, 3] += _direction(rng) * rng.uniform(1.5e-3, 6e-3)
+    X_BC = np.where((np.arange(n) < k)[:, None, None], world.X_BC, shifted)
+    return observe(world, X, X_BC)
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    v = rng.normal(size=3)
+    return np.asarray(v / np.linalg.norm(v))
+
+
+def _tcp(seed: int) -> Case:
+    world = make_world(seed)
+    rng = world.rng
+    t = np.array([rng.normal(0.0, 0.02), rng.normal(0.0, 0.02), rng.uniform(0.03, 0.25)])
+    turn = exp_rotation(_direction(rng) * (np.radians(rng.uniform(10.0, 60.0)) if rng.uniform() < 0.4 else 0.0))
+    return observe(world, true_poses(world), believed=chain_poses(world.believed, world.q) @ pose(turn, t))
+
+
+def _quaternion(seed: int) -> Case:
+    world = make_world(seed)
+    X = chain_poses(world.believed, world.q)
+    first = bool(world.rng.uniform() < 0.5)
+    stored = Rotation.from_matrix(X[:, :3, :3]).as_quat(scalar_first=first)
+    wrong = Rotation.from_quat(stored, scalar_first=not first).as_matrix()
+    return observe(world, true_poses(world), believed=pose(wrong, X[:, :3, 3]))
+
+
+def _installation(seed: int) -> Case:
+    world = make_world(seed)
+    rng = world.rng
+    kind = int(rng.integers(3))
+    turn = np.radians(float(rng.choice([45.0, 90.0, -90.0, 180.0]))) if kind == 0 else 0.0
+    tilt = np.radians(float(rng.choice([45.0, 90.0, 180.0]))) if kind == 1 else 0.0
+    shift = _direction(rng) * rng.uniform(0.15, 0.5) if kind == 2 else np.zeros(3)
+    X = pose(Rotation.from_euler("xz", [tilt, turn]).as_matrix(), shift)
+    return observe(world, true_poses(world), believed=X @ chain_poses(world.believed, world.q))
+
+
+def _flange(seed: int) -> Case:
+    names = ("iso9409-1-40-4-m6", "iso9409-1-63-4-m6", "iso9409-1-31.5-4-m5")
+    return replace(clean(seed), fits_flange=names[seed % 3])
+
+
+def _units(seed: int) -> Case:
+    case = clean(seed)
+    rng = np.random.default_rng([seed, 5])
+    X = case.X_BF.copy()
+    which = rng.uniform(size=case.n) < 0.3
+    which[int(rng.integers(case.n))] = True
+    if rng.uniform() < 0.3:
+        which[:] = True
+    X[which, :3, 3] *= float(rng.choice([1e3, 25.4])) if which.all() else 1e3
+    return case.with_poses(X)
+
+
+def _alike(seed: int) -> Case:
+    world = make_world(seed, alike=True)
+    return observe(world, true_poses(world))
+
+
+def _focus(seed: int) -> Case:
+    world = make_world(seed)
+    return observe(world, true_poses(world), soft=float(world.rng.uniform(0.57, 0.64)))
+
+
+def _drift(seed: int) -> Case:
+    world = make_world(seed)
+    rng, n = world.rng, world.n
+    t = np.linspace(0.0, 1.0, n)
+    tau = float(rng.uniform(0.2, 0.8))
+    f = (1.0 - np.exp(-t / tau)) / (1.0 - np.exp(-1.0 / tau))
+    X_BC = np.broadcast_to(world.X_BC, (n, 4, 4)).copy()
+    X_BC[:, :3, 3] += f[:, None] * (_direction(rng) * rng.uniform(0.8e-3, 3e-3))
+    X_BC[:, :3, :3] = exp_rotation(f[:, None] * _direction(rng) * np.radians(rng.uniform(0.0, 0.1))) @ X_BC[:, :3, :3]
+    return observe(world, true_poses(world), X_BC)
+
+
+def _slack(seed: int) -> Case:
+    world = make_world(seed)
+    rng, n = world.rng, world.n
+    X = true_poses(world)
+    jump = _direction(rng) * rng.uniform(0.8e-3, 3e-3)
+    if rng.uniform() < 0.5:  # as gravity pulls
+        state = X[:, :3, 0] @ np.array([0.0, 0.0, 1.0])
+        state = state > np.median(state)
+    else:
+        state = rng.permutation(n) < n // 2
+    if rng.uniform() < 0.7:
+        return observe(world, X @ pose(np.eye(3), state[:, None] * jump))
+    X_BC = np.broadcast_to(world.X_BC, (n, 4, 4)).copy()
+    X_BC[:, :3, 3] += state[:, None] * jump
+    return observe(world, X, X_BC)
+
+
+def _kinematics(seed: int) -> Case:
+    world = make_world(seed)
+    rng = world.rng
+    if rng.uniform() < 0.3:
+        other = {"ur10e": "ur10", "ur5e": "ur5"}[world.name]
+        believed = chain_poses(load_chain(other), world.q)
+        return replace(observe(world, true_poses(world), believed=believed), robot=other)
+    stack = world.believed.stack.copy()
+    stack[1:, :3, 3] += rng.normal(0.0, 1.5e-3, (world.believed.n - 1, 3)) * (np.abs(stack[1:, :3, 3]) > 1e-3)
+    wrong = replace(world.believed, stack=stack)
+    q = world.q + np.radians(rng.normal(0.0, 0.25, world.q.shape[1]))
+    return observe(world, true_poses(world), believed=chain_poses(wrong, q))
+
+
+def _outliers(seed: int) -> Case:
+    case = clean(seed)
+    rng = np.random.default_rng([seed, 7])
+    bad = rng.permutation(case.n)[: int(rng.integers(1, max(2, case.n // 5) + 1))]
+    c, coverage = case.c.copy(), np.array(case.coverage)
+    for k in bad:
+        c[k] += _direction(rng) * rng.uniform(2.5e-3, 2e-2)
+        coverage[k] = rng.uniform(0.3, 0.5)
+    return replace(case, c=c, coverage=coverage)
+
+
+CAUSES: dict[str, Callable[[int], Case]] = {
+    "scanner moved": _moved,
+    "TCP set at the controller": _tcp,
+    "wrong quaternion order": _quaternion,
+    "robot in another installation": _installation,
+    "wrong flange size": _flange,
+    "unit mix": _units,
+    "poses too alike": _alike,
+    "scanner out of focus or range": _focus,
+    "warm-up drift": _drift,
+    "slack flange or loose mount": _slack,
+    "wrong kinematics file": _kinematics,
+    "outlier scans or partial views": _outliers,
+}
+"""What each cause does to a set, by seed."""
+
+
+def _inverted(seed: int) -> Case:
+    case = clean(seed)
+    return case.with_poses(inverse(case.X_BF))
+
+
+def _euler(seed: int) -> Case:
+    case = clean(seed)
+    angles = Rotation.from_matrix(case.X_BF[:, :3, :3]).as_euler("ZYX")
+    return case.with_poses(pose(Rotation.from_euler("xyz", angles).as_matrix(), case.X_BF[:, :3, 3]))
+
+
+def _shifted(seed: int) -> Case:
+    case = clean(seed)
+    return case.pick(np.arange(1, case.n)).with_poses(case.X_BF[:-1])
+
+
+def _mirrored(seed: int) -> Case:
+    case = clean(seed)
+    flip = np.array([1.0, -1.0, 1.0])
+    return replace(case, c=case.c * flip, m=case.m * flip)
+
+
+def _scale(seed: int) -> Case:
+    case = clean(seed)
+    return replace(case, c=case.c * (1.03 if seed % 2 else 0.97))
+
+
+def _encoder(seed: int) -> Case:
+    world = make_world(seed)
+    q = world.q.copy()
+    q[:, 1 + seed % 4] += np.radians(2.5)
+    return observe(world, true_poses(world), believed=chain_poses(world.believed, q))
+
+
+def _shuffled(seed: int) -> Case:
+    case = clean(seed)
+    return case.with_poses(case.X_BF[np.random.default_rng([seed, 11]).permutation(case.n)])
+
+
+def _random_turns(seed: int) -> Case:
+    case = clean(seed)
+    R = Rotation.random(case.n, random_state=seed).as_matrix()
+    return case.with_poses(pose(R, case.X_BF[:, :3, 3]))
+
+
+UNKNOWN: dict[str, Callable[[int], Case]] = {
+    "poses inverted": _inverted,
+    "wrong rotation convention": _euler,
+    "scans and poses shifted by one": _shifted,
+    "scanner axes mirrored": _mirrored,
+    "scanner scale error": _scale,
+    "joint zero off by 2.5 degrees": _encoder,
+    "scans of other poses": _shuffled,
+    "rotations without meaning": _random_turns,
+}
+"""What each does to a set, by seed. Of the last three no model has the name: "unexplained", or a kinematics file, is right."""

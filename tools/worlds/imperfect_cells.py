@@ -1,0 +1,138 @@
+"""Simulates hand-eye pose pairs whose errors no solver's noise model has: a wrong camera matrix, a wrong robot, corners as seen."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, nearest_rotation, pose
+from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate
+from weldcal.calibration.hand_eye.joints import flange_poses
+from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
+from weldcal.calibration.hand_eye.problem import full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arrays import Array
+from weldcal.models.errors import WeldcalError
+
+KINDS = ("corners only", "camera", "robot", "both", "target poses", "heavy tails", "poor camera")
+"""What is wrong besides the corners' own noise; "target poses" and "heavy tails": no corners, but poses with noise of their own (normal, or Student's t of
+three degrees of freedom)."""
+_ARMS = ("ur10e", "ur5e")
+_WIDTH, _HEIGHT = 1280.0, 960.0
+_LEAST = 6  # corners in an image that is kept
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Pairs of one cell: ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as estimated, ``X`` (4, 4)
+    and ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this ``kind``."""
+
+    kind: str
+    F: Array
+    G: Array
+    X: Array
+    Y: Array
+
+
+def imperfect_cell(kind: str, seed: int) -> Cell:
+    """One cell with a wrist camera and a board; numbers are drawn from ranges that cells have (metres, rad, pixels).
+
+    8 to 60 poses about a work point, scattered or on a path, with turns of 6 to 35 degrees; a board of 0.1 to 0.3 m, 0.3 to 1 m away,
+    whose origin is its corner; corners read to 0.1 to 0.6 px. ``camera``: focal lengths off by 0.5 %, principal point by 5 px, a
+    distortion of 0.02 (rms). ``robot``: joint offsets of 0.1 degrees, lengths of 0.5 mm, turns of 0.05 degrees. The board's pose
+    is OpenCV's solvePnP with the wrong camera matrix.
+    """
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    arm = load_chain(_ARMS[int(rng.integers(len(_ARMS)))])
+    n = round(float(np.exp(rng.uniform(np.log(8.0), np.log(60.0)))))
+    wrong_camera, wrong_robot = kind in ("camera", "both", "poor camera"), kind in ("robot", "both")
+    much = 3.0 if kind == "poor camera" else 1.0
+    errors = np.zeros((arm.n, 6))
+    if wrong_robot:
+        errors = rng.normal(size=(arm.n, 6)) * np.radians([0.05, 0.05, 0.1, 0.0, 0.0, 0.0])
+        errors[:, 3:] = rng.normal(size=(arm.n, 3)) * 5e-4
+    focal = rng.uniform(900.0, 1800.0)
+    K = np.array([[focal, 0.0, 0.5 * _WIDTH], [0.0, focal, 0.5 * _HEIGHT], [0.0, 0.0, 1.0]])
+    true_K, true_bend = K.copy(), np.zeros(5)
+    if wrong_camera:
+        true_K[0, 0] *= 1.0 + 0.005 * much * rng.normal()
+        true_K[1, 1] = true_K[0, 0] * (1.0 + 0.001 * rng.normal())
+        true_K[:2, 2] += 5.0 * much * rng.normal(size=2)
+        true_bend[:2] = 0.02 * much * rng.normal(size=2)
+    pixel = rng.uniform(0.1, 0.6)
+    rows, columns, side = int(rng.integers(4, 9)), int(rng.integers(5, 12)), rng.uniform(0.012, 0.03)
+    flat = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * side
+    board: Array = np.column_stack([flat, np.zeros(len(flat))]).astype(np.float64)
+    X = pose(exp_rotation(rng.normal(size=3) * 0.7), rng.normal(size=3) * 0.05)
+    middle = np.radians([0.0, -80.0, 110.0, -120.0, -90.0, 0.0]) + rng.normal(size=6) * 0.2
+    distance = rng.uniform(0.3, 1.0)
+    seen_at = pose(
+        exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(rng.normal(size=3) * 0.3),
+        np.array([0.0, 0.0, distance]),
+    )
+    seen_at[:3, 3] -= seen_at[:3, :3] @ board.mean(axis=0)
+    Y = flange_poses(arm, middle[None], errors)[0] @ X @ seen_at
+    spread = np.radians(rng.uniform(6.0, 35.0)) * np.array([0.4, 0.4, 0.4, 1.0, 1.0, 1.0])
+    path = bool(rng.integers(2))
+    F, G = [], []
+    walk = np.zeros(6)
+    for _ in range(4000):
+        walk = 0.85 * walk + 0.53 * rng.normal(size=6) if path else rng.normal(size=6)
+        q = (middle + spread * walk)[None]
+        true = inverse(flange_poses(arm, q, errors)[0] @ X) @ Y
+        found = _read(true, kind, board, true_K, true_bend, K, pixel, rng)
+        if found is not None:
+            F.append(flange_poses(arm, q, np.zeros((arm.n, 6)))[0])
+            G.append(found)
+        if len(F) == n:
+            break
+    return Cell(kind, np.array(F), np.array(G), X, Y)
+
+
+def _read(
+    true: Array, kind: str, board: Array, true_K: Array, bend: Array, K: Array, pixel: float, rng: np.random.Generator
+) -> Array | None:
+    """The board's pose as a program estimates it, None where too little of it is in the image."""
+    in_camera = board @ true[:3, :3].T + true[:3, 3]
+    if float(in_camera[:, 2].min()) < 0.1:
+        return None
+    turn = cv2.Rodrigues(true[:3, :3])[0]
+    at = np.asarray(cv2.projectPoints(board, turn, true[:3, 3], true_K, bend)[0], dtype=float)[:, 0]
+    inside = ((at > 0.0) & (at < [_WIDTH, _HEIGHT])).all(axis=1)
+    if int(inside.sum()) < max(_LEAST, int(0.6 * len(board))):
+        return None
+    if kind in ("target poses", "heavy tails"):
+        tail = 1.0 if kind == "target poses" else 1.0 / float(np.sqrt(rng.chisquare(3.0) / 3.0))
+        size = tail * pixel / 0.3
+        noise = pose(exp_rotation(rng.normal(size=3) * 3e-3 * size), rng.normal(size=3) * 1e-3 * size)
+        return np.asarray(true @ noise)
+    read = at + pixel * rng.normal(size=at.shape)
+    good, turn, shift = cv2.solvePnP(board[inside], read[inside], K, None, turn.copy(), true[:3, 3:].copy(), True)
+    if not good:
+        return None
+    return pose(nearest_rotation(np.asarray(cv2.Rodrigues(turn)[0], dtype=float)), np.asarray(shift, dtype=float)[:, 0])
+
+
+WEIGHTINGS: dict[str, tuple[Candidate, ...]] = {
+    "weldcal": CANDIDATES,
+    "least squares alone": CANDIDATES[:1],
+    "rotations alone": CANDIDATES[5:6],
+}
+NO_ANSWER = 1e9  # the ratio where weldcal gives none: the worst one
+
+
+def ratios(kind: str, seed: int) -> dict[str, list[float]]:
+    """Held-out errors (deg, mm) of each of WEIGHTINGS in one cell over the best of OpenCV's methods in that column."""
+    cell = imperfect_cell(kind, seed)
+    theirs = [opencv_held_out(m, cell.F, cell.G) for m in METHODS]
+    whole = [h for h in theirs if np.isfinite(h.translation).all()]
+    best = min(h.rms_deg for h in whole), min(h.rms_translation for h in whole)
+    out = {}
+    for name, weightings in WEIGHTINGS.items():
+        try:
+            ours = solve_problem(full_problem(cell.F, cell.G), config=HandEyeConfig(candidates=weightings)).held_out
+            out[name] = [ours.rms_deg / best[0], ours.rms_translation / best[1]]
+        except WeldcalError:
+            out[name] = [NO_ANSWER, NO_ANSWER]
+    return out

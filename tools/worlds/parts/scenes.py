@@ -1,0 +1,204 @@
+"""Simulated scans of parts from STEP files among clutter on a table, ray-cast for any scanner preset."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from weldcal.models.mesh import TriMesh, merge
+from weldcal.models.scanners import ScannerPreset
+from weldcal.models.workpieces.reading import read_shape
+from weldcal.models.workpieces.seam_input import SeamSource, seam_of
+from weldcal.models.workpieces.seams import DrawnSeam
+from weldcal.tools.worlds.parts.plates import box, cast, looking_at, table
+from weldcal.tools.worlds.parts.step_parts import PARTS
+
+Floats = NDArray[np.float64]
+MIDDLE = np.array([0.6, 0.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A part with its drawn seam in frame P, m."""
+
+    name: str
+    mesh: TriMesh
+    seam: DrawnSeam
+
+
+@dataclass(frozen=True, eq=False)
+class PartScene:
+    """A scan p_BS (H,W,3) m, NaN where nothing was measured, the scanner's position and the true pose."""
+
+    cloud_B: Floats
+    eye_B: Floats
+    X_BP: RigidTransform
+
+
+@cache
+def subject(name: str) -> Subject:
+    """One of the made parts, read back from its STEP file and its seam's CSV."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = PARTS[name]()
+        step, csv = made.write(Path(folder))
+        shape = read_shape(step, "mm")
+        return Subject(name, shape.mesh, seam_of(shape, SeamSource(csv, (), "forward", 0.0, 0.0), made.joint))
+
+
+def standing(
+    mesh: TriMesh, rng: np.random.Generator, tilt_rad: float, lift_m: float, spread_m: float
+) -> RigidTransform:
+    """X_BP of a part as it is drawn (its z up), at any turn, wedged up by a tilt in any direction."""
+    heading, tilt = rng.uniform(-math.pi, math.pi), tilt_rad * math.sqrt(rng.uniform())
+    axis = tilt * np.array([math.cos(heading), math.sin(heading)])
+    R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(
+        rng.uniform(-math.pi, math.pi)
+    )
+    turned = mesh.vertices @ R.matrix().T
+    middle = 0.5 * (turned.min(axis=0) + turned.max(axis=0))
+    at = MIDDLE[:2] + rng.uniform(-spread_m, spread_m, size=2) - middle[:2]
+    return RigidTransform(R, [at[0], at[1], lift_m - float(turned[:, 2].min()) + 0.0003])
+
+
+def lying(mesh: TriMesh, rng: np.random.Generator, spread_m: float) -> RigidTransform:
+    """X_BP of a part on one of its sides or upside down."""
+    over = RotationMatrix.MakeXRotation(0.5 * math.pi * int(rng.integers(1, 4)))
+    if rng.uniform() < 0.5:
+        over = RotationMatrix.MakeYRotation(0.5 * math.pi * int(rng.integers(1, 4)))
+    X = RigidTransform(over, np.zeros(3))
+    return standing(mesh.transformed(X), rng, 0.0, 0.0, spread_m) @ X
+
+
+def vice(mesh_B: TriMesh) -> list[TriMesh]:
+    """Two jaws along the part's longer sides that hide its lower third, and the vice's bed beyond its ends."""
+    low, high = mesh_B.bounds
+    middle, size = 0.5 * (low + high), high - low
+    long = int(size[1] > size[0])
+    height = max(0.004, low[2] + 0.3 * size[2])
+    found = []
+    for side in (-1.0, 1.0):
+        jaw = box(1.1 * size[long], 0.03, height) if long == 0 else box(0.03, 1.1 * size[long], height)
+        at = [middle[0], middle[1], 0.0]
+        at[1 - long] += side * (0.5 * size[1 - long] + 0.0155)
+        found.append(jaw.transformed(RigidTransform(at)))
+    return found
+
+
+def without_spots(cloud_B: Floats, mesh_B: TriMesh, rng: np.random.Generator, count: int) -> Floats:
+    """The scan without round spots on the part, as a shiny face leaves them: each has a radius of 10 to 30 mm."""
+    left = cloud_B.copy()
+    low, high = mesh_B.bounds
+    on = cloud_B[((cloud_B > low - 0.002) & (cloud_B < high + 0.002)).all(axis=-1)]
+    for _ in range(count if len(on) else 0):
+        middle = on[rng.integers(len(on))]
+        left[np.linalg.norm(cloud_B - middle, axis=-1) < rng.uniform(0.01, 0.03)] = np.nan
+    return left
+
+
+def clutter(mesh_B: TriMesh, rng: np.random.Generator, count: int) -> list[TriMesh]:
+    """Boxes, pipes and a fixture's clamps beside the part, none through it: each drawn anew until it is clear of its bounds."""
+    low, high = mesh_B.bounds
+    found: list[TriMesh] = []
+    for _ in range(200):
+        if len(found) == count:
+            break
+        size = rng.uniform([0.02, 0.02, 0.005], [0.12, 0.08, 0.09])
+        one = box(*size)
+        if rng.uniform() < 0.35:
+            from weldcal.models.mesh import revolve
+
+            r, h = rng.uniform(0.012, 0.045), rng.uniform(0.02, 0.12)
+            one = revolve(np.array([[0.0, 0.0], [r, 0.0], [r, h], [0.0, h]]), 48)
+        X = RigidTransform(
+            RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi)),
+            [*(MIDDLE[:2] + rng.uniform(-0.28, 0.28, size=2)), 0.0],
+        )
+        one = one.transformed(X)
+        a, b = one.bounds
+        clear = [(a[k] > high[k] + 0.004) or (b[k] < low[k] - 0.004) for k in range(2)]
+        if any(clear) and not any(_meet(one, other) for other in found):
+            found.append(one)
+    return found
+
+
+def _meet(a: TriMesh, b: TriMesh) -> bool:
+    (la, ha), (lb, hb) = a.bounds, b.bounds
+    return bool(((la < hb) & (lb < ha))[:2].all())
+
+
+def clamps(mesh_B: TriMesh, rng: np.random.Generator, count: int) -> list[TriMesh]:
+    """Fingers of a fixture that reach over the part from outside and rest on it."""
+    low, high = mesh_B.bounds
+    found = []
+    for _ in range(count):
+        angle = rng.uniform(-math.pi, math.pi)
+        d = np.array([math.cos(angle), math.sin(angle)])
+        half = 0.5 * (high - low)[:2]
+        rim = 0.5 * (low + high)[:2] + d * min(half[0] / max(abs(d[0]), 1e-6), half[1] / max(abs(d[1]), 1e-6))
+        X = RigidTransform(RotationMatrix.MakeZRotation(angle), [*(rim + 0.02 * d), float(high[2]) + 0.001])
+        found.append(box(0.08, 0.02, 0.015).transformed(X))
+    return found
+
+
+def scan_scene(
+    mesh: TriMesh,
+    scanner: ScannerPreset,
+    seed: int,
+    *,
+    objects: int = 5,
+    fingers: int = 1,
+    tilt_rad: float = math.radians(4.0),
+    slant_rad: float = 0.35,
+    spread_m: float = 0.05,
+    spots: int = 0,
+    on_side: bool = False,
+    in_vice: bool = False,
+    twice: bool = False,
+) -> PartScene:
+    """A part among clutter under a scanner that hangs roughly above it; everything random follows from the seed.
+
+    spots: round holes in the scan of the part; twice: an equal part lies beside it.
+    """
+    rng = np.random.default_rng([seed, 1801])
+    on_blocks = rng.uniform() < 0.3
+    X = standing(mesh, rng, tilt_rad, rng.uniform(0.01, 0.04) if on_blocks else 0.0, spread_m)
+    if on_side:
+        X = lying(mesh, rng, spread_m)
+    elif in_vice:
+        X = standing(mesh, np.random.default_rng([seed, 1802]), 0.0, 0.0, spread_m)
+        X = RigidTransform(RotationMatrix.MakeZRotation(0.5 * math.pi * int(rng.integers(4))), X.translation())
+        middle = 0.5 * np.sum(mesh.transformed(X).bounds, axis=0) - MIDDLE
+        X = RigidTransform(X.rotation(), X.translation() - [middle[0], middle[1], 0.0])
+    mesh_B = mesh.transformed(X)
+    around, slant = rng.uniform(-math.pi, math.pi), slant_rad * math.sqrt(rng.uniform())
+    target = MIDDLE + np.array([0.0, 0.0, 0.02])
+    far = rng.uniform(0.78, 0.95)
+    eye = target + far * np.array(
+        [math.sin(slant) * math.cos(around), math.sin(slant) * math.sin(around), math.cos(slant)]
+    )
+    X_BC = looking_at(eye, target)
+    X_BC = RigidTransform(X_BC.rotation() @ RotationMatrix.MakeZRotation(rng.uniform(-0.5, 0.5)), eye)
+    others = clutter(mesh_B, rng, objects) + clamps(mesh_B, rng, fingers) + (vice(mesh_B) if in_vice else [])
+    if twice:
+        wide = mesh_B.bounds[1, 0] - mesh_B.bounds[0, 0] + 0.02
+        others.append(mesh_B.transformed(RigidTransform([-wide if MIDDLE[0] < X.translation()[0] else wide, 0.0, 0.0])))
+    cloud = cast([mesh_B, table(), *others], X_BC, scanner, seed)
+    return PartScene(without_spots(cloud, mesh_B, rng, spots) if spots else cloud, eye, X)
+
+
+def block() -> TriMesh:
+    """A casting-like block of five boxes of unequal size: no turn maps it to itself."""
+    parts = [
+        box(0.14, 0.09, 0.02),
+        box(0.05, 0.04, 0.07).transformed(RigidTransform([-0.035, 0.018, 0.0])),
+        box(0.03, 0.05, 0.045).transformed(RigidTransform([0.045, -0.012, 0.0])),
+        box(0.02, 0.02, 0.032).transformed(RigidTransform([0.005, -0.03, 0.0])),
+    ]
+    return merge(*parts)

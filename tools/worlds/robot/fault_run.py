@@ -1,0 +1,220 @@
+"""One fault of the robot link on the test bench: it is injected, observed, repaired, and held against what must follow."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.errors import WeldcalError
+from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
+from weldcal.tools.worlds.robot.bench import OUTPUT, SPEED_M_S, Bench, StoppedUnasked
+from weldcal.tools.worlds.robot.cases import GO, REFUSE, REST_S, STOP, Case
+
+GOING_S = 0.4
+TURN_S = 0.5  # in which an arm that goes on is at its speed again
+STARTS = 3
+# faults of a loaded computer: a wrong result with one of these is tried again, and counted
+LOADED = ("LINK_STALE", "COMMAND_LATE", "WORKER_DIED")
+PLAYED_S = 0.25
+HASTE_S = 0.1
+STILL_RAD = 0.0005
+_SPEED_OFF = 0.1 * SPEED_M_S
+ENDED_S = 3.0  # a worker without its cell brakes, ends the program and closes its connections
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """The result of one fault. Times count from the fault; `problems` is empty where the result is as required."""
+
+    name: str
+    must: str
+    did: str  # stopped, went on, refused
+    fault: str
+    sentence: str
+    rest_after_ms: float | None = None
+    travel_mm: float | None = None
+    seen_after_ms: float | None = None
+    played: str = ""  # what the dashboard said to Play after the repair
+    problems: tuple[str, ...] = ()
+    retries: int = 0  # attempts that the load of this computer ended; also among `unasked_stops`
+
+    @property
+    def ok(self) -> bool:
+        """Whether the result is as required."""
+        return not self.problems
+
+    @property
+    def line(self) -> str:
+        """The outcome as one line of text."""
+        parts = [] if self.ok else ["WRONG"]
+        parts.append(self.did)
+        if self.rest_after_ms is not None and self.travel_mm is not None:
+            parts.append(f"at rest after {self.rest_after_ms:.0f} ms and {self.travel_mm:.1f} mm")
+        return ", ".join(parts) + (f": {self.sentence}" if self.sentence else "")
+
+
+def run_case(bench: Bench, case: Case, *, hasty: bool = False, attempts: int = STARTS) -> Outcome:
+    """Injects one fault and observes; leaves the controller in order, without a link.
+
+    `hasty`: after a stop the worker is killed instead of asked to end, and it is watched for less long. `attempts`: how
+    often a case may be tried where the load of this computer spoils it.
+    """
+    for retries in range(attempts):
+        overruns = bench.emulator.state()["overruns"]
+        try:
+            outcome = _at_start(bench, case) if case.must == REFUSE else _running(bench, case, hasty)
+            busy = outcome.fault in LOADED or bench.emulator.state()["overruns"] > overruns
+            if not outcome.ok and busy and retries < attempts - 1:
+                continue
+            return replace(outcome, retries=retries)
+        except StoppedUnasked as error:
+            reason = str(error)
+        except WeldcalError as error:
+            reason = str(error)
+            break
+        finally:
+            bench.end(kill=hasty)
+            recover(bench)
+    return Outcome(
+        name=case.name, must=case.must, did="failed", fault="", sentence=reason, problems=(reason,), retries=retries
+    )
+
+
+def recover(bench: Bench) -> None:
+    emulator = bench.emulator
+    emulator.do("recover")
+    load = UrRtde().load()
+    emulator.do("set_payload", mass=load.mass_kg, cog=list(load.cog_m))
+    emulator.wait("runtime_state", "STOPPED")
+    emulator.do("set_q", q=bench.home.tolist())
+
+
+def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
+    children: list[int] = []
+    if case.wrist_3:
+        bench.emulator.do("set_q", q=[*bench.home[:5].tolist(), case.wrist_3])
+    if case.elsewhere:
+        children = bench.start_elsewhere()
+    else:
+        bench.start(wired=case.wired, process=case.process)
+    bench.cruise()
+    at = case.throw(bench)
+    time.sleep(GOING_S)
+    if case.must != STOP:
+        paused = case.must == GO and not case.may_rest and bench.at_rest_after(at, REST_S)["rest_after_s"] is not None
+        if not paused and bench.stream.state.fault is Fault.NONE:
+            speed = _speed_of_the_way(bench)
+            problems = [] if abs(speed - SPEED_M_S) < _SPEED_OFF else [f"its speed is {speed:.4f} m/s"]
+            problems += _burnt(bench, case, at)
+            return Outcome(
+                name=case.name, must=case.must, did="went on", fault="", sentence="", problems=tuple(problems)
+            )
+    time.sleep(max(0.0, case.watch_s - GOING_S - (HASTE_S if hasty else 0.0)))
+    return _stopped(bench, case, at, children, PLAYED_S - (HASTE_S if hasty else 0.0))
+
+
+def _speed_of_the_way(bench: Bench) -> float:
+    """The tool's speed; on a busy computer the arm may be in one of its turns by now, which take 0.2 s."""
+    until = time.monotonic() + TURN_S
+    while abs((speed := bench.tool_speed()) - SPEED_M_S) >= _SPEED_OFF and time.monotonic() < until:
+        time.sleep(0.01)
+    return speed
+
+
+def _stopped(bench: Bench, case: Case, at: float, children: Sequence[int], played_s: float) -> Outcome:
+    found = bench.at_rest_after(at + case.slow_s, case.rest_s - case.slow_s)
+    problems: list[str] = []
+    rest, travel = found["rest_after_s"], found["travel_m"]
+    if not found["ok"]:
+        problems.append(f"not at rest within {case.rest_s} s, or moved again: {found}")
+    if case.must == GO:
+        problems.append("it should have gone on")
+    fault, sentence, seen = Fault.NONE, "", None
+    if case.elsewhere:
+        while (left := [number for number in children if _alive(number)]) and time.monotonic() < at + ENDED_S:
+            time.sleep(0.02)
+        if left:
+            problems.append(f"processes were left behind: {left}")
+    else:
+        state = bench.stream.state
+        fault, sentence, seen = state.fault, state.status.fault or "", 1e3 * (state.fault_time - at)
+        if fault not in case.faults:
+            problems.append(f"it said {fault.name}, not {' or '.join(sorted(f.name for f in case.faults))}")
+    q_before = np.array(bench.emulator.state()["q"])
+    played = _repair_and_play(bench, case, played_s)
+    turned = float(np.abs(np.array(bench.emulator.state()["q"]) - q_before).max())
+    if turned > STILL_RAD:
+        problems.append(f"a joint turned by {turned:.4f} rad when Play was pressed")
+    if case.resumes and not played.startswith("Starting"):
+        problems.append(f"the controller answered Play with {played!r}")
+    again = bench.at_rest_after(at + case.slow_s, case.rest_s - case.slow_s)
+    if again["moved_again_s"] is not None and found["moved_again_s"] is None:
+        problems.append(f"it moved {again['moved_again_s']:.3f} s after the fault, when Play was pressed: {played}")
+    summary = bench.emulator.ask(check="summary")
+    if summary["moves_without_a_command"]:
+        problems.append("it moved without a command")
+    problems += _burnt(bench, case, at)
+    rest_ms, travel_mm = (None if value is None else 1e3 * float(value) for value in (rest, travel))
+    name = fault.name if fault else ""
+    return Outcome(
+        name=case.name,
+        must=case.must,
+        did="stopped",
+        fault=name,
+        sentence=sentence,
+        rest_after_ms=rest_ms,
+        travel_mm=travel_mm,
+        seen_after_ms=seen,
+        played=played,
+        problems=tuple(problems),
+    )
+
+
+def _burnt(bench: Bench, case: Case, at: float) -> list[str]:
+    """What is wrong with the process output, where the case has one."""
+    if not (case.wired or case.process):
+        return []
+    last = bench.emulator.ask(check="output_on_after", fault_time=at, output=OUTPUT)["last_on_s"]
+    wrong = last is not None and last > case.burns_s
+    return [f"the process output was on {last:.3f} s after the fault"] if wrong else []
+
+
+def _repair_and_play(bench: Bench, case: Case, watch_s: float) -> str:
+    """Repair the fault and press Play without a new start, while commands continue to arrive."""
+    for action in case.repair:
+        bench.emulator.do(action.name)
+        time.sleep(action.after_s)
+    played = bench.press_play()
+    time.sleep(watch_s)
+    return played
+
+
+def _at_start(bench: Bench, case: Case) -> Outcome:
+    bench.emulator.do("reset_checker")
+    at = case.throw(bench)
+    problems: list[str] = []
+    sentence = ""
+    try:
+        prepared = PrepareRobot(UrRtde(host=bench.host), load_arm())
+        if prepared.handle is not None:
+            prepared.handle.close()
+        problems.append("it started")
+    except WeldcalError as error:
+        sentence = str(error)
+        if case.says.lower() not in sentence.lower():
+            problems.append(f"its sentence does not say {case.says!r}")
+    found = bench.at_rest_after(at, REST_S)
+    if not found["ok"]:
+        problems.append("it moved")
+    return Outcome(name=case.name, must=case.must, did="refused", fault="", sentence=sentence, problems=tuple(problems))
+
+
+def _alive(process: int) -> bool:
+    try:
+        with open(f"/proc/{process}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] not in ("Z", "X")
+    except OSError:
+        return False

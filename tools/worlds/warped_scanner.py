@@ -1,0 +1,97 @@
+"""Observations by a scanner that errs by another model than the one that is fitted, and calibrations from them."""
+
+from functools import cache
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+from scipy.ndimage import map_coordinates, spline_filter
+
+from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.calibration.eye_on_base.observations import corrected_observation
+from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import position_errors
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
+from weldcal.models.arrays import Array
+from weldcal.models.depth_noise import device_warp
+
+WARP_M = 0.8e-3
+"""Largest depth error at ``REFERENCE_M``: 0.2 % of it, as a real scanner showed."""
+REFERENCE_M = 0.4
+X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
+NOISE_M, NOISE_RAD, NOISE_RATIO = 1e-4, 1e-3, 6e-4  # of a centre and a normal per axis, and of a hole circle's ratio
+_FIELD = 0.5  # half of what the scanner sees over its distance
+_BORDER = 12  # pixels
+_REACH = np.array([0.12, 0.10, 0.06])  # m, of the places round the middle of the field
+_MIDDLE = np.array([0.0, 0.0, REFERENCE_M])
+WORK_C = np.array([0.02, -0.05, 0.38])
+
+
+@cache
+def _splines(device: int, warp_m: float) -> Array:
+    """Coefficients of the cubic splines through the device's depth errors, with room for the border's continuation."""
+    image = np.pad(np.asarray(device_warp((401, 401), warp_m, device), dtype=float), _BORDER, mode="edge")
+    return np.asarray(spline_filter(image, 3, mode="nearest"))
+
+
+def warped_point(p_C: Array, device: int, warp_m: float = WARP_M) -> Array:
+    """Where a scanner whose depth is off by a field of cosines over its image puts a point (3,) m; no polynomial in x and y."""
+    column, row = ((1.0 + p_C[k] / p_C[2] / _FIELD) * 200.0 for k in (0, 1))
+    place = [[row + _BORDER], [column + _BORDER]]
+    off = float(map_coordinates(_splines(device, warp_m), place, order=3, mode="nearest", prefilter=False)[0])
+    return np.asarray(p_C * (1.0 + off * (p_C[2] / REFERENCE_M) ** 2 / p_C[2]))
+
+
+def warped_observations(
+    device: int, n: int, seed: int, warp_m: float = WARP_M
+) -> tuple[list[Observation], dict[str, HolePattern]]:
+    """Observations (n) and hole circles by such a scanner; both follow from where it puts the points of the flange."""
+    rng, observations, patterns, h = np.random.default_rng((device, seed)), [], {}, 0.02
+    for k in range(n):
+        true = _MIDDLE + rng.uniform(-_REACH, _REACH)
+        R_CR = RollPitchYaw(
+            np.pi + rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), rng.uniform(-3, 3)
+        ).ToRotationMatrix()
+        x, y = (
+            (warped_point(true + h * axis, device, warp_m) - warped_point(true - h * axis, device, warp_m)) / (2.0 * h)
+            for axis in R_CR.matrix().T[:2]
+        )
+        normal = np.cross(x, y)
+        normal = normal / np.linalg.norm(normal) + NOISE_RAD * rng.standard_normal(3)
+        p_C = warped_point(true, device, warp_m) + NOISE_M * rng.standard_normal(3)
+        name = f"p{k:02d}"
+        observations.append(Observation(name, X_BC @ RigidTransform(R_CR, true), p_C, normal / np.linalg.norm(normal)))
+        ratio = 0.5 * float(np.linalg.norm(x) + np.linalg.norm(y)) + NOISE_RATIO * rng.standard_normal()
+        patterns[name] = HolePattern(
+            holes_C=np.zeros((4, 3)),
+            angles_rad=np.zeros(4),
+            center_C=p_C,
+            X_CR=RigidTransform(R_CR, p_C),
+            ratio=ratio,
+            rms_m=0.0,
+        )
+    return observations, patterns
+
+
+def calibrate_warped(
+    device: int, n: int, warp_m: float = WARP_M
+) -> tuple[CalibrationEstimate, CalibrationEstimate, SelfCalibration]:
+    """Without a correction, and as ``weldcal calibrate`` does it, with its verdict on the scanner."""
+    observations, patterns = warped_observations(device, n, 0, warp_m)
+    rigid = estimate_eye_on_base(observations, SolveConfig(hypotheses=60))
+    scanner, _, estimate = apply_self_calibration(observations, rigid, patterns)
+    assert scanner is not None
+    return rigid, estimate, scanner
+
+
+def new_errors(
+    device: int, estimate: CalibrationEstimate, scanner: SelfCalibration | None, warp_m: float = WARP_M
+) -> Array:
+    """Errors (60,) m at places that the calibration did not use, with an observation's noise."""
+    new, _ = warped_observations(device, 60, 1, warp_m)
+    correction = None if scanner is None else scanner.accepted
+    return position_errors(
+        estimate.X_BC, new if correction is None else [corrected_observation(correction, o) for o in new]
+    )
