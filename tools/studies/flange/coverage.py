@@ -226,7 +226,13 @@ def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Cov
         true.append(float(np.mean(warped_scanner.new_errors(device, estimate, scanner))))
     pose, point = inside / max(runs, 1)
     return Coverage(
-        poses, runs, float(pose), float(point), float(np.mean(stated) / np.mean(true)), corrected=True, warped=True
+        poses=poses,
+        runs=runs,
+        pose=float(pose),
+        point=float(point),
+        held_out_over_true=float(np.mean(stated) / np.mean(true)),
+        corrected=True,
+        warped=True,
     )
 
 
