@@ -5,7 +5,7 @@ import difflib
 import json
 import math
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -271,6 +271,20 @@ def shown(value: Any) -> str:
 
 Part = TypeVar("Part")
 
+LIKENESS = 0.6
+"""Smallest likeness (0 to 1) of a word that is suggested."""
+
+
+def nearest(word: str, known: Iterable[str], likeness: float = LIKENESS) -> str | None:
+    """Find the known word that is most like ``word``; None where none is like it."""
+    return next(iter(difflib.get_close_matches(word, list(known), 1, likeness)), None)
+
+
+def did_you_mean(word: str, known: Iterable[str], otherwise: str, likeness: float = LIKENESS) -> str:
+    """The end of a sentence about an unknown word: the nearest known one, or ``otherwise``."""
+    near = nearest(word, known, likeness)
+    return otherwise if near is None else f"did you mean '{near}'?"
+
 
 def read_part(kind: type[Part], document: Any, file: str, place: str = "") -> Part:
     """A part of a file as its dataclass; ``place`` names the part in messages, such as `tip`.
@@ -283,8 +297,8 @@ def read_part(kind: type[Part], document: Any, file: str, place: str = "") -> Pa
     types_ = get_type_hints(kind)
     for key in document:
         if key not in types_:
-            near = difflib.get_close_matches(str(key), types_, 1, 0.5)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(types_)}."
+            near = nearest(str(key), types_, 0.5)
+            hint = f"did you mean {near}?" if near else f"known are {', '.join(types_)}."
             raise InputError(f"'{file}': {_dotted(place, str(key))} is not a known key: {hint}")
     read: Any = {key: _value(types_[key], value, file, _dotted(place, key)) for key, value in document.items()}
     return kind(**read)

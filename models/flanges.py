@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, circle, merge, plane_mesh, revolve, triangulate_polygon, wall
 
@@ -179,7 +180,8 @@ def get_flange(name: str, *, pin_angle_rad: float | None = None) -> FlangeStanda
             raise InputError(
                 f"No flange is named: write 'flange:' in dataset.yaml, or add --flange; known are {', '.join(STANDARDS)}."
             )
-        raise InputError(f"Flange '{name}' is not known: use one of {', '.join(STANDARDS)}.")
+        listed = f"use one of {', '.join(STANDARDS)}."
+        raise InputError(f"Flange '{name}' is not known: {did_you_mean(name, STANDARDS, listed)}")
     return flange if pin_angle_rad is None else replace(flange, pin_angle_rad=pin_angle_rad)
 
 

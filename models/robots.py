@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pydrake.math import RigidTransform
 
 from weldcal.models.arms.chain import Chain, is_urdf, load_chain
+from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange
 
@@ -230,7 +231,8 @@ def get_robot(name: str) -> Robot:
     key = name.strip().lower().replace("-", "_").replace(" ", "_")
     robot = ROBOTS.get(ALIASES.get(key, key))
     if robot is None:
-        raise InputError(f"Robot '{name}' is not known: use one of {', '.join(ROBOTS)}.")
+        listed = f"use one of {', '.join(ROBOTS)}."
+        raise InputError(f"Robot '{name}' is not known: {did_you_mean(key, (*ROBOTS, *ALIASES), listed)}")
     return robot
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from weldcal.models.depth_noise import Depth, DepthNoise, measured_points, noisy_depth
-from weldcal.models.documents import read_document, read_part
+from weldcal.models.documents import did_you_mean, read_document, read_part
 from weldcal.models.errors import InputError
 
 LARGEST_PX = 8192
@@ -328,7 +328,8 @@ def get_scanner(name: str, width: int | None = None, height: int | None = None) 
     else:
         preset = SCANNERS.get(name.strip().lower().replace("-", "_"))
     if preset is None:
-        raise InputError(f"Scanner '{name}' is not known: use one of {', '.join(SCANNERS)}, or a scanner file (.yaml).")
+        listed = f"use one of {', '.join(SCANNERS)}, or a scanner file (.yaml)."
+        raise InputError(f"Scanner '{name}' is not known: {did_you_mean(name, SCANNERS, listed)}")
     if width is None:
         if height is not None:
             raise InputError("A scanner is resized by its width: give the width too, or omit the height.")

@@ -4,7 +4,8 @@ import dataclasses as dc
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role, SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
@@ -31,7 +32,10 @@ JobOf = TypeVar("JobOf", bound=AddedJob, covariant=True)
 
 @dataclass(frozen=True, eq=False)
 class Cell(Generic[JobOf]):
-    """The Diagram and its named parts; `person` may hold and end its run. The caller that builds a cell must close its station."""
+    """The Diagram and its named parts; `person` may hold and end its run. The caller that builds a cell must close its station.
+
+    `logs`: the sinks of the logged values by name; in the Diagram the sink of NAME is called `log_NAME`.
+    """
 
     diagram: Diagram
     station: Station
@@ -39,6 +43,16 @@ class Cell(Generic[JobOf]):
     job: JobOf
     logs: dict[str, VectorLogSink]
     person: Person = dc.field(default_factory=Person)
+
+    @property
+    def plant(self) -> MultibodyPlant | None:
+        """The simulated plant, finalized; None where no device of the station is simulated."""
+        return None if self.station.world is None else self.station.world.plant
+
+    @property
+    def scene_graph(self) -> SceneGraph | None:
+        """The simulated plant's SceneGraph; None where no device of the station is simulated."""
+        return None if self.station.world is None else self.station.world.scene_graph
 
 
 def build_cell(
@@ -117,6 +131,8 @@ def _build(
         visualizer.set_name("meshcat_visualizer")
         builder.Connect(wiring.out("query_object"), visualizer.query_object_input_port())
     logs = {name: LogVectorOutput(port, builder, LOG_PERIOD_S) for name, port in added.ports.logged.items()}
+    for name, sink in logs.items():
+        sink.set_name(f"log_{name}")
     diagram = builder.Build()
     diagram.set_name("cell")
     return Cell(diagram, station, scenario, added, logs)

@@ -30,6 +30,7 @@ LOOKS = {
 AT_REST_RAD_S = 1e-3
 COMMANDED_RAD_S = 1e-6
 PERSON_CHECK_S = 0.02
+STOPPED_BY_OPERATOR = "The operator stopped the run with Ctrl-C"
 COMES_TO_REST_S = 1.0  # longest time that a run continues after the end of its job until the arm is at rest
 OVERTIME_S = 5.0  # added to the time limit at which the job holds itself
 
@@ -82,6 +83,11 @@ class Run(Generic[JobOf]):
     def reason(self) -> str | None:
         """Why the job was held; None where it was completed."""
         return self.interrupted or self.command.reason
+
+    @property
+    def ended_by_operator(self) -> bool:
+        """Whether the operator ended the run: with Ctrl-C, on the dashboard or in the 3D view."""
+        return self.held and (self.cell.person.ends or (self.interrupted or "").startswith(STOPPED_BY_OPERATOR))
 
     def raise_if_interrupted(self) -> None:
         """For a study of many runs, which a person ends with any one of them.
@@ -207,11 +213,7 @@ def run_cell(
             simulator.Initialize()
             simulator.AdvanceTo(cell.job.maximum_time_s + OVERTIME_S)
     except KeyboardInterrupt as stop:
-        who = (
-            "The operating system ended the run (SIGTERM)"
-            if "SIGTERM" in stop.args
-            else "A person stopped the run with Ctrl-C"
-        )
+        who = "The operating system ended the run (SIGTERM)" if "SIGTERM" in stop.args else STOPPED_BY_OPERATOR
         run.interrupted = f"{who}, in the phase '{run.command.phase}'."
     finally:
         simulator.clear_monitor()  # it knows the run, and the run the simulator: C++ would keep both

@@ -25,7 +25,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, rand
 from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND, PlacedArm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
-from weldcal.systems.jobs.tablet.messages import TabletTruth
+from weldcal.systems.jobs.tablet.config import TabletTruth
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 from weldcal.systems.recording.answers import RepeatedBackground

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydrake.geometry import Meshcat
 
 from weldcal.calibration.data import clouds
+from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.flange import fit as flange_fit
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.hand_eye.files import PosePairs
@@ -30,7 +32,7 @@ Floats = npt.NDArray[np.floating[Any]]
 FLANGE = "iso9409-1-50-4-m6"
 
 __all__ = [
-    "build_cell", "calibrate", "fit_flange", "hand_eye", "load_scenario", "read_cloud", "run", "verify",
+    "build_cell", "calibrate", "fit_flange", "hand_eye", "load_scenario", "read_calibration", "read_cloud", "run", "verify",
 ]  # fmt: skip
 
 
@@ -98,6 +100,18 @@ def read_cloud(file: str | Path, unit: str = "m") -> Floats:
     return metres * clouds.read_cloud(Path(file))
 
 
+def read_calibration(file: str | Path) -> CalibrationResult:
+    """Read a calibration: the folder that `calibrate` wrote, or its calibration.yaml.
+
+    Returns:
+        `.X_BC` (X_FC of a scanner on the flange has the same name), `.covariance` (6, 6); `.correct(points_C)` corrects scanned points.
+
+    Raises:
+        InputError: there is no calibration, or it cannot be read.
+    """
+    return load_result(Path(file))
+
+
 def fit_flange(points_C: Floats, flange: str = FLANGE) -> FlangeFit:
     """Find a robot's flange in a scan (N, 3), or organised (H, W, 3) with NaN where invalid; metres, camera frame.
 
@@ -132,13 +146,19 @@ def hand_eye(robot: Floats, camera: Floats, mounting: str = "eye_in_hand") -> Ha
     return solve_pairs(pairs)
 
 
-def build_cell(scenario: Scenario | str, seed: int = 0) -> Cell[Any]:
+def build_cell(scenario: Scenario | str, seed: int = 0, meshcat: Meshcat | None = None) -> Cell[Any]:
     """Build the Drake Diagram of a scenario (or of its name or path); close its `.station` after use.
+
+    Args:
+        meshcat: viewer of the cell; None: no viewer.
+
+    Returns:
+        `.diagram`; `.plant` and `.scene_graph` of its simulation, finalized; `.logs`, the VectorLogSinks by name.
 
     Raises:
         InputError, UnreachableScanner: the scenario cannot be run.
     """
-    return build(load_scenario(scenario) if isinstance(scenario, str) else scenario, seed)
+    return build(load_scenario(scenario) if isinstance(scenario, str) else scenario, seed, meshcat)
 
 
 def run(scenario: str, out: str | Path, seed: int = 0, *, recording: bool = True) -> dict[str, object]:

@@ -137,7 +137,9 @@ def _short(value: object) -> str:
     if value is None or isinstance(value, bool):
         return {True: "yes", False: "no", None: ""}[value]
     if isinstance(value, float):
-        return f"{value:.3g}" if not math.isnan(value) else ""
+        if math.isnan(value):
+            return ""
+        return f"{value:,.0f}" if 1000.0 <= abs(value) < 1e12 else f"{value:.3g}"
     if isinstance(value, str | int):
         return str(value)
     if isinstance(value, Mapping):

@@ -95,6 +95,16 @@ class CalibrationResult:
         """Name of the pose: X_BC, or X_FC of a scanner on the flange."""
         return "X_BC" if self.configuration == ON_BASE else "X_FC"
 
+    def correct(self, points_C: Array) -> Array:
+        """Correct measured points (..., 3) m of the camera frame for the scanner's own errors, as the pose expects them.
+
+        Returns:
+            The corrected points (..., 3) m; the same points where the result has no `scanner_correction`. NaN stays NaN.
+        """
+        correction = correction_from_document(self.scanner_correction)
+        points = np.asarray(points_C, dtype=float)
+        return points if correction is None else correction.points(points)
+
 
 def software_version() -> str:
     """Name and version of this software, for the record."""
@@ -316,11 +326,25 @@ def export_ur_pose(X_BC: RigidTransform) -> str:
     return "p[" + ", ".join(f"{v:.9f}" for v in (*X_BC.translation(), *rotation_vector(X_BC.rotation()))) + "]\n"
 
 
-def correction_note(result: CalibrationResult) -> str | None:
-    """Note for users of X_BC in other programs that it applies to corrected points; None where it needs none."""
+def correction_hint(symbol: str, file: Path | str = RESULT_FILE) -> str:
+    """Where a user of the pose finds the scanner correction: the file, and the Python call that applies it."""
+    return (
+        f"{symbol} applies to corrected scanner points. The correction is in {file}, scanner_correction; in Python: "
+        f"weldcal.read_calibration({str(file)!r}).correct(points)."
+    )
+
+
+def correction_note(result: CalibrationResult, file: Path | str | None = None) -> str | None:
+    """Note for users of X_BC that it applies to corrected points; None where it needs none.
+
+    Args:
+        file: the calibration.yaml, for a reader who can use it; None: for another program, with the correction as a formula.
+    """
     said = []
     correction = correction_from_document(result.scanner_correction)
-    if correction is not None:
+    if correction is not None and file is not None:
+        said.append(correction_hint(result.symbol, file))
+    elif correction is not None:
         said.append(
             "X_BC applies to corrected scanner points: multiply every point (x, y, z), in metres, by "
             f"{correction.formula} before use, or calibrate with --no-scanner-correction."

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.kinematics import ArmModel, known_arms, load_arm
 from weldcal.models.arrays import Array
+from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
 
 RESIDUAL = 1e-9  # m and rad: what a returned solution fulfils
@@ -70,7 +71,8 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
         return chain_of(load_arm(name, kinematics))
     path = _HERE / name / "chain.yaml"
     if name not in known_chains():
-        raise InputError(f"There is no arm {name!r}; choose one of: {', '.join(known_chains())}.")
+        listed = f"choose one of: {', '.join(known_chains())}."
+        raise InputError(f"There is no arm {name!r}; {did_you_mean(name, known_chains(), listed)}")
     data: dict[str, Any] = yaml_load_file(str(path))
     joints = data["joints"]
     lower, upper, velocity = (np.array([float(j[key]) for j in joints]) for key in ("lower", "upper", "velocity"))

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem, OutputPort
 
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.messages import JobCommand
@@ -30,15 +30,19 @@ class AddedJob(ABC):
 
     def command(self, root: Context) -> JobCommand:
         """The job's command to the first arm; `root` is a context of the whole Diagram."""
-        port = self.ports.commands[0]
-        found: JobCommand = port.Eval(port.get_system().GetMyContextFromRoot(root))
+        found: JobCommand = self.value(self.ports.commands[0], root)
         return found
 
     def state(self, root: Context) -> Any:
         """The job's state; `root` is a context of the whole Diagram."""
-        return self.ports.state.Eval(self.ports.state.get_system().GetMyContextFromRoot(root))
+        return self.value(self.ports.state, root)
 
-    def view(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    @staticmethod
+    def value(port: OutputPort, root: Context) -> Any:
+        """The value of an output port; `root` is a context of the whole Diagram."""
+        return port.Eval(port.get_system().GetMyContextFromRoot(root))
+
+    def view(self) -> tuple[Array, Array]:
         """Position and target of the viewer's camera, (3,) m in B each."""
         return np.array([1.30, -0.68, 0.78]), np.array([0.42, 0.0, 0.42])
 

@@ -5,11 +5,13 @@ import math
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin
 
+import numpy as np
+
 from weldcal.calibration.published.algorithm1 import named_cost
 from weldcal.calibration.refinement.kinematics_choice import LEAST as LEAST_OF_ARM
 from weldcal.calibration.refinement.local_field import LEAST as LEAST_OF_FIELD
 from weldcal.calibration.refinement.refined import LIVE_KINDS, PLAIN
-from weldcal.models.arms.kinematics import known_arms
+from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.systems.drivers.config import NoDevice
@@ -122,11 +124,28 @@ def _check(key: str, name: str, number: float) -> None:
     if not math.isfinite(number):
         raise InputError(f"{key} must be finite, not {number}.")
     if abs(number) > largest(name):
-        raise InputError(f"{key} is {number:g}; the largest possible size is {largest(name):g}.")
+        bound = f"at most {largest(name):g}" if number > 0.0 else f"at least {-largest(name):g}"
+        raise InputError(f"{key} is {number:g}; it may be {bound}.")
     if name in POSITIVE and number <= 0.0:
         raise InputError(f"{key} must be a positive number, not {number:g}.")
     if name in NOT_NEGATIVE and number < 0.0:
         raise InputError(f"{key} must not be negative, and it is {number:g}.")
+
+
+def check_home(home_deg: list[float], arm: str, key: str = "home_deg") -> None:
+    """Check that an arm can be at home; `key` is the scenario's name of ``home_deg`` (6,).
+
+    Raises:
+        InputError: a joint is outside its limits; the message names the first one.
+    """
+    model = load_arm(arm)
+    limits = np.degrees([model.position_lower, model.position_upper]).T
+    for joint, (angle, (low, high)) in enumerate(zip(home_deg, limits, strict=True), start=1):
+        if not low <= angle <= high:
+            raise InputError(
+                f"{key} puts joint {joint} of the {arm} at {angle:g} deg, and its limits are {low:g} to {high:g} deg: give an angle "
+                "between them."
+            )
 
 
 SLOWEST_FACTOR = 0.05
@@ -213,6 +232,7 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     found = job_of(scenario)  # raises for the parts of two jobs
     check_numbers(scenario)
+    check_home(scenario.home_deg, scenario.arm)
     check_inputs(scenario)
     if found.key and scenario.base != PoseConfig():
         raise InputError(

@@ -2,7 +2,6 @@
 
 import dataclasses as dc
 import re
-from difflib import get_close_matches
 from functools import cache, partial, reduce
 from operator import or_
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, get_args, get_origin
 
 from pydrake.common.yaml import yaml_load, yaml_load_typed
 
-from weldcal.models.documents import parse_document
+from weldcal.models.documents import did_you_mean, nearest, parse_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, read_text
 from weldcal.models.scanners import get_scanner, is_scanner_file
@@ -20,8 +19,6 @@ from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.discovery import jobs
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
-
-NEAREST = 0.6  # smallest likeness of a suggestion
 
 
 def check_keys(schema: type, document: Any, place: str = "") -> None:
@@ -58,9 +55,9 @@ def _check_value(kind: Any, value: Any, place: str) -> None:
 
 
 def _suggestion(word: str, known: Any, mark: str = "") -> str:
-    near = get_close_matches(word, list(known), n=1, cutoff=NEAREST)
-    if near:
-        return f"; the nearest one is '{mark}{near[0]}'"
+    near = nearest(word, known)
+    if near is not None:
+        return f"; the nearest one is '{mark}{near}'"
     listed = ", ".join(f"{mark}{name}" for name in known)
     return f"; known are {listed}"
 
@@ -116,7 +113,8 @@ def _read(name: str, before: tuple[Path, ...]) -> Scenario:
         asked = (
             f"{before[-1].name} extends '{name}', which does not exist" if before else f"There is no scenario '{name}'"
         )
-        raise InputError(f"{asked}: choose one of {', '.join(scenario_names())} or give a YAML file.")
+        listed = f"choose one of {', '.join(scenario_names())} or give a YAML file."
+        raise InputError(f"{asked}: {did_you_mean(name, scenario_names(), listed)}")
     if path.resolve() in before:
         raise InputError(f"{before[0].name} extends itself by way of {path.name}: remove one `extends`.")
     text = read_text(path, LARGEST_DOCUMENT)

@@ -37,7 +37,9 @@ VIEW_OF_PHASE = {
 ZOOM = {CELL: 1.0, SCANNER: 1.7, SEAM: 1.0}
 PERIOD_S = 0.1
 MOVED_M, STEP_M = 0.01, 0.002
-"""Farther than this from where it was put, a person has moved it; the seam's camera moves by such steps."""
+"""Farther than this from where it was put, the user has moved it; the seam's camera moves by such steps."""
+START_M = np.array([(0.0, -3.0, 1.0), (3.0, 0.0, 1.0), (0.0, 0.0, 0.0)])
+"""Where a page's camera is until Meshcat's own values reach it, (n, 3) m: a page that reports one has just been opened or reloaded."""
 SEAM_VIEW_M = 0.17  # of the seam's camera from what it looks at
 _EYE_M, _LOOKS_M = 0.12, 0.75  # along the scanner's axis: in front of its drawn axes, and where it looks
 _LEAN = 0.05  # off a vertical axis, which a viewer cannot look along
@@ -112,8 +114,11 @@ class CameraDirector(LeafSystem):
         following = following if following in views.known else CELL
         shown = {name: port.Eval(context) for name, port in self._shown.items()}
         self._note(context.get_time(), following, *self._place(following, shown))
-        if views.wanted != MOVED and self._moved():
+        report = self._report()
+        if report is not None and views.wanted != MOVED and self._moved(report):
             views.wanted = MOVED
+        elif report is not None and views.wanted == MOVED and self._reloaded(report):
+            views.wanted = FOLLOW
         if views.wanted == MOVED:
             self._last = None
             return EventStatus.Succeeded()
@@ -131,16 +136,26 @@ class CameraDirector(LeafSystem):
         self._put.append(eye)
         self._last, self._views.showing = (view, eye, target), view
 
-    def _moved(self) -> bool:
-        """Whether a browser has reported a camera since the last look that stands where none was put."""
+    def _report(self) -> Array | None:
+        """The camera (3,) m of the browser that changed last; None where no browser has reported since the last call."""
         X_WCamera = self._meshcat.GetTrackedCameraPose()
         if X_WCamera is None:
-            return False
+            return None
         p = np.array(X_WCamera.translation())
         if self._reported is not None and np.linalg.norm(p - self._reported) < 1e-6:
-            return False
-        first, self._reported = self._reported is None, p
-        return not first and bool(self._put) and min(float(np.linalg.norm(p - q)) for q in self._put) > MOVED_M
+            return None
+        self._reported = p
+        return p
+
+    def _moved(self, p: Array) -> bool:
+        """Whether the camera at `p` (3,) m is neither where one was put nor where a page begins."""
+        return bool(self._put) and float(np.linalg.norm([*self._put, *START_M] - p, axis=1).min()) > MOVED_M
+
+    def _reloaded(self, p: Array) -> bool:
+        """Whether the only browser shows a camera at `p` (3,) m that Meshcat gave it: its page was reloaded after it was moved."""
+        given = [*START_M, *([self._put[-1]] if self._put else [])]
+        only = self._meshcat.GetNumActiveConnections() <= 1
+        return only and float(np.linalg.norm(given - p, axis=1).min()) < 1e-3
 
     def _note(self, time: float, view: str, eye: Array, target: Array) -> None:
         """Keep the followed camera for the recording."""

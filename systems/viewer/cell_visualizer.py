@@ -158,7 +158,7 @@ class CellVisualizer(LeafSystem):
         time = context.get_time()
         seen = {name: port.Eval(context) for name, port in self._ports.items()}
         status: CalibrationStatus = seen["calibration_status"]
-        self._draw_groups(seen["job_state"].command.phase, time)
+        self._draw_groups(seen["job_state"].phase, time)
         self._draw_scan(seen["scan"], time)
         self._draw_fit(seen["flange_estimate"], status, time)
         self._draw_calibration(status, time)

@@ -22,6 +22,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools import console
 from weldcal.tools.cli.app import app
 from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
 
 HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
 
@@ -206,6 +207,37 @@ def test_every_failure_is_a_sentence(failure: Exception, words: str, capsys: pyt
     assert "Traceback" not in said.err
 
 
+def test_ctrl_c_ends_with_130_and_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as end, console.boundary(json_wanted=True, debug=False):
+        raise KeyboardInterrupt
+    assert end.value.exit_code == 130
+    said = capsys.readouterr()
+    assert said.err.startswith("weldcal: The operator ended the command.")
+    assert len(said.err.splitlines()) == 1
+    assert json.loads(said.out)["state"] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ["weld", "--scenario", "straight_grove"],
+            "There is no scenario 'straight_grove': did you mean 'straight_groove'?",
+        ),
+        (["weld", "--robot", "emulatd"], "There is no robot 'emulatd': did you mean 'emulated'?"),
+        (["hand-eye", "ax-yb", "poses.csv", "--robot", "ur10ee"], "There is no arm 'ur10ee'; did you mean 'ur10e'?"),
+        (["benchmark", "part-welds", "--part", "bracke"], "There is no part 'bracke': did you mean 'bracket'?"),
+    ],
+)
+def test_a_slip_of_the_keyboard_gets_the_nearest_name(
+    arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    finished = CliRunner().invoke(app, arguments)
+    assert finished.exit_code == 1
+    assert words in finished.stderr
+
+
 def test_debug_shows_where_it_happened(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit), console.boundary(json_wanted=False, debug=True):
         raise RuntimeError("bad luck")
@@ -221,6 +253,48 @@ def test_a_job_that_is_held_ends_with_1_and_says_why(capsys: pytest.CaptureFixtu
     said = capsys.readouterr()
     assert json.loads(said.out)["state"] == "held"
     assert "The tag was not seen." in said.err
+
+
+@pytest.mark.parametrize(
+    ("options", "stated"), [((), False), (("--browser",), True), (("--share",), True), (("--no-browser",), False)]
+)
+def test_json_says_that_it_opens_no_page(
+    options: tuple[str, ...], stated: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stop(*_: object) -> None:
+        raise InputError("Far enough.")
+
+    monkeypatch.setattr("weldcal.tools.commands.demo.run_procedure", stop)
+    arguments = ["demo", "--json", *options, "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["weldcal", *arguments])
+    found = CliRunner().invoke(app, arguments)
+    assert "Far enough." in found.stderr
+    assert ("no page is opened" in found.stderr) == stated
+
+
+def test_a_runs_page_shows_its_result_before_it_closes() -> None:
+    happened: list[str] = []
+    first = FirstScreen(Findings(unseen=8), Expected("error", "0.2 mm", "8 poses"), Next("Verify it."))
+
+    def show(what: FirstScreen | None, folder: Path | None) -> None:
+        happened.append(f"shown {what is first}")
+
+    call = Call("demo", {}, ExitStack())
+    call.keep_page(lambda *_: happened.append("the first run's"), lambda: happened.append("closed first"))
+    call.keep_page(show, lambda: happened.append("closed"))
+    report("demo", Outcome({"state": "done"}, first=first), call)
+    call.close_page()
+    call.close_page()
+    assert happened == ["closed first", "shown True", "closed"]
+
+
+def test_what_no_scan_can_show_and_the_pose_does_not_need_is_no_row(capsys: pytest.CaptureFixture[str]) -> None:
+    summary = {"state": "done", "unobservable": ["A rotation of the flange about its own axis."]}
+    first = FirstScreen(Findings(unseen=8), Expected("error", "0.2 mm", "8 poses"), Next("Verify it."))
+    report("calibrate", Outcome(summary, first=first), Call("calibrate", {}, ExitStack()))
+    assert "unobservable" not in capsys.readouterr().out
+    report("calibrate", Outcome(summary, first=first), Call("calibrate", {"json": True}, ExitStack()))
+    assert "unobservable" in capsys.readouterr().out
 
 
 def test_a_person_reads_short_values_with_their_units_and_every_refusal() -> None:

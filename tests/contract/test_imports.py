@@ -31,7 +31,7 @@ TRUTH_IS_KNOWN = (
         "systems/jobs/motion/job.py",
     ),  # what the log may show
     *("systems/jobs/mounting/job.py", "systems/jobs/tablet/job.py"),  # what a report compares with
-    "systems/jobs/tablet/messages.py",  # what it is made of
+    "systems/jobs/tablet/config.py",  # what it is made of
     "systems/recording/tap.py",  # what a recording leaves out
 )
 

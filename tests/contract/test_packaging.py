@@ -18,19 +18,22 @@ from tests.places import ROOT
 
 FOLDERS = ("models", "calibration", "welding", "systems", "tools")
 PROJECT_FILES = ("pyproject.toml", "README.md", "LICENSE", "NOTICE")
+ROOT_FILES = ("__init__.py", "py.typed")
+LINK = ".typing/weldcal"  # to the root: what is built, or installed, has it as the package's folder
 
 
 @dataclass(frozen=True)
 class Built:
-    """The files that a build left."""
+    """The files that a build left, and the copy of the repository that was built."""
 
     wheel: Path
     sdist: Path
+    copy: Path
 
 
 def source_files() -> set[str]:
     """Every file of the package that must arrive: Python, YAML, URScript, templates, styles, scripts of pages, type markers."""
-    return {
+    return set(ROOT_FILES) | {
         path.relative_to(ROOT).as_posix()
         for folder in FOLDERS
         for path in (ROOT / folder).rglob("*")
@@ -45,8 +48,10 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
     ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
     for folder in FOLDERS:
         shutil.copytree(ROOT / folder, copy / folder, ignore=ignored)
-    for name in PROJECT_FILES:
+    for name in PROJECT_FILES + ROOT_FILES:
         shutil.copy(ROOT / name, copy / name)
+    (copy / LINK).parent.mkdir()
+    (copy / LINK).symlink_to("..")
     out = tmp_path_factory.mktemp("dist")
     command = [
         sys.executable,
@@ -64,7 +69,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
     assert finished.returncode == 0, finished.stdout + finished.stderr
     (wheel,) = out.glob("*.whl")
     (sdist,) = out.glob("*.tar.gz")
-    return Built(wheel, sdist)
+    return Built(wheel, sdist, copy)
 
 
 def test_the_list_of_packages_is_complete() -> None:
@@ -107,7 +112,7 @@ def test_the_wheel_has_its_command_and_its_licences(built: Built) -> None:
 def test_the_sdist_holds_what_a_build_needs(built: Built) -> None:
     with tarfile.open(built.sdist) as sdist:
         names = {name.split("/", 1)[1] for name in sdist.getnames() if "/" in name}
-    assert source_files() <= names
+    assert {f"{LINK}/{name}" for name in source_files()} <= names
     assert set(PROJECT_FILES) <= names
 
 
@@ -133,3 +138,41 @@ def test_an_installed_wheel_works_far_from_the_repository(built: Built, tmp_path
     )
     assert finished.returncode == 0, finished.stderr
     assert set(finished.stdout.split()) == {path.name for path in (ROOT / "models" / "scenarios").glob("*.yaml")}
+
+
+USER_PROGRAM = """
+import weldcal, weldcal.added
+weldcal.nothing
+weldcal.added.found
+reveal_type(weldcal.__version__)
+"""
+# The functions' own modules are left out, which saves their minute.
+FAST = """
+[mypy]
+[mypy-weldcal.tools.*]
+follow_imports = skip
+"""
+
+
+def test_type_checkers_find_an_editable_install(built: Built, tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", "env"], check=True, cwd=tmp_path, timeout=60)
+    python = tmp_path / "env" / "bin" / "python"
+    (site,) = (tmp_path / "env" / "lib").glob("python*/site-packages")
+    libraries = [path for path in sys.path if path.endswith("site-packages")]
+    (site / "libraries.pth").write_text("\n".join(libraries))
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--editable", str(built.copy)]
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", *options]
+    subprocess.run(install, check=True, capture_output=True, timeout=120)
+    (built.copy / "added.py").write_text("found: int = 1\n")
+    (tmp_path / "user.py").write_text(USER_PROGRAM)
+    (tmp_path / "mypy.ini").write_text(FAST)
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
+    command = [sys.executable, "-P", "-m", "mypy", "--python-executable", str(python), "user.py"]
+    checked = subprocess.run(
+        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
+    )
+    lines = [line.split(":", 1)[1] for line in checked.stdout.splitlines() if line.startswith("user.py")]
+    assert lines == [
+        '3: error: Module has no attribute "nothing"  [attr-defined]',
+        '5: note: Revealed type is "str"',
+    ], "with a file that was added after the install\n" + checked.stdout

@@ -132,7 +132,7 @@ def test_ctrl_c_brings_the_arm_to_rest_and_ends_the_program(controller: Emulator
         raise KeyboardInterrupt
 
     result = run_until(controller, tmp_path / "run", "approach_above", interrupt)
-    assert result.summary()["reason"] == "A person stopped the run with Ctrl-C, in the phase 'approach_above'."
+    assert result.summary()["reason"] == "The operator stopped the run with Ctrl-C, in the phase 'approach_above'."
     phases = [name for name, _, _ in result.run.phases]
     assert phases[:3] == ["start", "move_home", "park"], "it stood elsewhere, and went home first"
 

@@ -23,8 +23,8 @@ from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.studies.motion.moves import SeenFromHand, hand_moves, observed_frames
 from weldcal.tools.worlds.flange_frames import flange_frame
+from weldcal.tools.worlds.moves import SeenFromHand, hand_moves, observed_frames
 
 SECONDS, EVERY = 12.0, 3
 TARGET = "iso9409-1-50-4-m6"

@@ -24,8 +24,8 @@ from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate_motion import calibrate_motion
-from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
 from weldcal.tools.worlds.flange_frames import empty_frame, flange_frame
+from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 SECONDS = 6.0
 FLANGE = "iso9409-1-50-4-m6"

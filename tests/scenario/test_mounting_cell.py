@@ -17,8 +17,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.jobs.mounting.calibrator import solve_mounting
 from weldcal.systems.jobs.mounting.job import mounting_scene
-from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
-from weldcal.systems.jobs.mounting.procedure import MountingProcedure
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
@@ -158,6 +157,12 @@ def test_what_does_not_belong_together_is_refused_before_any_work(tmp_path: Path
     refused("calibrate_only", "robot_2: !SimulatedUr {}", "second robot belongs to co_manipulation")
     refused("co_manipulation", "robot_2: !NoDevice {}", "robot_2")
     refused("eye_on_arm", "mounting: {spread_deg: -3.0}", "positive")
+    second = "mounting: {second_arm: {home_deg: [0.0, -400.0, 110.0, -120.0, -90.0, 0.0]}}"
+    refused(
+        "co_manipulation",
+        second,
+        "second_arm.home_deg puts joint 2 of the ur10e at -400 deg, and its limits are -360 to 360",
+    )
     with pytest.raises(InputError, match="has no mounting part"):
         run_mounting_live(
             load_scenario("calibrate_only"), RunOptions(scenario="calibrate_only", out=tmp_path), lambda *_: None
@@ -243,7 +248,7 @@ def test_a_person_holds_the_procedure_on_its_way(alone: Alone) -> None:
     alone.tell(hold=[1.0])
     alone.simulator.AdvanceTo(alone.simulator.get_context().get_time() + 0.05)
     assert alone.state.phase == "held"
-    assert alone.state.reason.startswith("A person ended the job")
+    assert alone.state.reason.startswith("The operator ended the job in phase")
     command = alone.procedure.GetOutputPort("job").Eval(alone.simulator.get_context())
     assert (command.finished, command.held, command.mode) == (True, True, "hold")
 

@@ -17,10 +17,8 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.plan import plan_touches
-from weldcal.systems.jobs.profiler.planning_context import PlanningContext
-from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure
-from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.jobs.profiler.plan import PlanningContext, plan_touches
+from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
@@ -143,7 +141,7 @@ def test_profiles_that_show_nothing_hold_it_with_a_sentence(alone: Alone) -> Non
     for _ in range(300):
         if alone.state.phase == "held":
             break
-        alone.tell(profile=AbstractValue.Make(ProfileScan(alone.state.sequence, 1.0, nothing)))
+        alone.tell(profile=AbstractValue.Make(ProfileScan(alone.state.trigger, 1.0, nothing)))
         alone.run(0.1)
     assert alone.state.phase == "held"
     assert "edge" in alone.state.reason
@@ -171,7 +169,7 @@ def test_a_person_holds_it(alone: Alone) -> None:
     alone.tell(hold=[1.0])
     alone.run(0.04)
     assert alone.state.phase == "held"
-    assert alone.state.reason.startswith("A person ended the job")
+    assert alone.state.reason.startswith("The operator ended the job in phase")
 
 
 @pytest.mark.parametrize(

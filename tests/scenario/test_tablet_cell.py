@@ -14,8 +14,8 @@ from pydrake.systems.analysis import Simulator
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
-from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
-from weldcal.systems.jobs.tablet.planning import plan_tablet
+from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.job import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
@@ -171,7 +171,7 @@ def test_a_person_holds_the_visit(alone: Alone) -> None:
     alone.tell(hold=[1.0])
     alone.run(0.05)
     assert (alone.state.phase, alone.state.finished) == ("held", True)
-    assert "A person ended the job, in the phase 'descend'" in alone.state.reason
+    assert "The operator ended the job in phase 'descend'" in alone.state.reason
 
 
 def test_a_touch_at_a_time_that_no_pose_is_known_for_is_not_used(alone: Alone) -> None:

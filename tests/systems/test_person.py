@@ -83,7 +83,8 @@ def test_a_person_ends_the_job_also_while_it_is_held(held: bool) -> None:
 
     run = run_cell(made(person), watch)
     assert run.held
-    assert (run.reason or "").startswith("A person ended the job, in the phase")
+    assert run.ended_by_operator
+    assert (run.reason or "").startswith("The operator ended the job in phase")
     assert run.held_by_person == int(held)
 
 

@@ -56,30 +56,29 @@ from weldcal.systems.drivers.simulated.tablet_world import SimulatedTablet, Tabl
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
 from weldcal.systems.drivers.ur.touch_probe import ProbeInput, Touches, UrTouchProbeInput
-from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
-from weldcal.systems.jobs.motion.collector import MotionCollector
-from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord, MotionState
-from weldcal.systems.jobs.motion.procedure import MotionProcedure
-from weldcal.systems.jobs.motion.recorder import MotionRecorder
+from weldcal.systems.jobs.motion.collector import MotionCalibrator, MotionCollector, MotionRecorder
+from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProcedure, MotionRecord, MotionState
 from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
 from weldcal.systems.jobs.mounting.job import mounting_scene
-from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
-from weldcal.systems.jobs.mounting.procedure import MountingProcedure
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
+from weldcal.systems.jobs.procedure import Procedure
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.planning_context import PlanningContext
-from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure
-from weldcal.systems.jobs.profiler.robot_error import RobotError
-from weldcal.systems.jobs.profiler.state import ProfilerState
-from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
-from weldcal.systems.jobs.tablet.planning import plan_tablet
+from weldcal.systems.jobs.profiler.job import RobotError
+from weldcal.systems.jobs.profiler.plan import PlanningContext
+from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
+from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.job import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletProcedure, TabletState
-from weldcal.systems.jobs.touch.config import TouchConfig
-from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchPlanner, TouchPlanning
+from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchConfig, TouchPlanner, TouchPlanning
 from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
-from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
-from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig, IterativeCalibrator
+from weldcal.systems.jobs.weld.iterative_calibrator import (
+    CalibrationPosePlanner,
+    CalibratorConfig,
+    IterativeCalibrator,
+    NextPose,
+)
 from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobPlan, JobSequencer, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
@@ -128,6 +127,9 @@ JOB = JobPlan(
     verification_scans=1,
     verification_limit_m=5e-4,
     required_error_m=1e-4,
+)
+TOUCH = TouchMotion(
+    q_home=Q_HOME, descent_m_s=3e-3, press_m=1e-3, deepest_m=6e-3, move_timeout_s=20.0, maximum_time_s=240.0
 )
 
 
@@ -214,7 +216,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     TouchPlanner: lambda: TouchPlanner(
         TouchPlanning(cast("SeamPlanning", None), X, ScannerCorrection(), TouchConfig())
     ),
-    TouchProcedure: lambda: TouchProcedure(the_arm(), TOOL, TouchMotion(Q_HOME, 3e-3, 1e-3, 6e-3, 20.0, 240.0)),
+    TouchProcedure: lambda: TouchProcedure(the_arm(), TOOL, TOUCH),
     WristCamera: lambda: WristCamera(RenderedWristCamera(), 0),
     MountingProcedure: lambda: MountingProcedure((), 0, 0, (Q_HOME, None)),
     MountingCalibrator: lambda: MountingCalibrator(
@@ -519,7 +521,7 @@ def test_every_system_of_this_room_is_tested_here() -> None:
     for module in pkgutil.walk_packages(weldcal.systems.__path__, "weldcal.systems."):
         members = inspect.getmembers(importlib.import_module(module.name), inspect.isclass)
         found |= {c for _, c in members if issubclass(c, LeafSystem) and c.__module__.startswith("weldcal.")}
-    found -= {LeafSystem, BackgroundSystem}  # the base classes have no ports of their own
+    found -= {LeafSystem, BackgroundSystem, Procedure}  # the base classes have no ports of their own
     assert found == set(MAKERS) == set(KINDS)
 
 

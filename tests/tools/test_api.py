@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform, RollPitchYaw
 
 import weldcal
@@ -39,7 +41,11 @@ def test_importing_weldcal_loads_nothing_else_and_shows_its_functions() -> None:
     finished = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True)
     assert finished.stdout.split() == sorted(weldcal.__all__)
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
-        weldcal.calibrat  # noqa: B018
+        weldcal.calibrat  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_weldcal_states_its_installed_version() -> None:
+    assert weldcal.__version__ == version("weldcal")
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (3, 3, 4), (2, 4, 4)])
@@ -52,3 +58,18 @@ def test_an_example_is_not_written_over_something(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="is not empty: choose another folder"):
         write_example(tmp_path, 0)
+
+
+def test_a_cell_shows_its_plant_its_viewer_and_its_named_logs() -> None:
+    meshcat = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
+    cell = weldcal.build_cell("straight_groove", meshcat=meshcat)
+    try:
+        assert cell.plant is not None
+        assert cell.plant.is_finalized()
+        assert cell.plant.GetMyContextFromRoot(cell.diagram.CreateDefaultContext()).num_continuous_states() >= 0
+        assert cell.scene_graph is not None
+        assert cell.diagram.HasSubsystemNamed("meshcat_visualizer")
+        assert cell.logs
+        assert all(cell.diagram.GetSubsystemByName(f"log_{name}") is sink for name, sink in cell.logs.items())
+    finally:
+        cell.station.close()

@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -131,11 +132,16 @@ class Call:
         self.written: Path | None = None
         self._title, self._stack = title, stack
         self._report: console.Progress | None = None
+        self._page: tuple[Callable[[FirstScreen | None, Path | None], None], Callable[[], None]] | None = None
 
     @property
     def live(self) -> dict[str, Any]:
         """The options of a live run; with --json no browser is opened."""
         found = {name: self.given[name] for name in (*LIVE, "record") if name in self.given}
+        if self.json and (found.get("share") or "--browser" in sys.argv):
+            console.emit_warning(
+                "With --json no page is opened: --browser and --share have no effect. Omit --json to see the run."
+            )
         return found | ({"browser": found["browser"] and not self.json} if "browser" in found else {})
 
     def folder(self, command: str, name: str) -> Path:
@@ -148,6 +154,22 @@ class Call:
         check_writable(self.written)
         self._stack.enter_context(whole_result(self.written))
         return self.written
+
+    def keep_page(self, show: "Callable[[FirstScreen | None, Path | None], None]", close: Callable[[], None]) -> None:
+        """Keeps the dashboard of a run open until its result is printed; one of an earlier run closes."""
+        self.close_page()
+        self._page = show, close
+
+    def show_result(self, first: "FirstScreen | None") -> None:
+        """Shows the result on the dashboard that is open."""
+        if self._page is not None:
+            self._page[0](first, self.written)
+
+    def close_page(self) -> None:
+        """Closes the dashboard that is open."""
+        if self._page is not None:
+            self._page[1]()
+        self._page = None
 
     def farm(self, folder: Path) -> "Farm":
         """Where the tasks of a study run whose results are written to ``folder``."""
@@ -215,14 +237,16 @@ def command(
             _check_numbers(given)
             shared = {name: given.pop(name) for name in names}
             json, debug = shared.get("json", False), shared["debug"]
-            with console.boundary(json_wanted=json, debug=debug), ExitStack() as stack:
-                call = Call(title, shared, stack)
-                if call.out is not None:
-                    check_writable(call.out)
-                    stack.enter_context(whole_result(call.out))
-                outcome = body(call, **given)
-            if outcome is not None:
-                report(title, outcome if isinstance(outcome, Outcome) else Outcome(outcome), call)
+            with ExitStack() as pages:
+                with console.boundary(json_wanted=json, debug=debug), ExitStack() as stack:
+                    call = Call(title, shared, stack)
+                    pages.callback(call.close_page)
+                    if call.out is not None:
+                        check_writable(call.out)
+                        stack.enter_context(whole_result(call.out))
+                    outcome = body(call, **given)
+                if outcome is not None:
+                    report(title, outcome if isinstance(outcome, Outcome) else Outcome(outcome), call)
 
         own = list(inspect.signature(body, eval_str=True).parameters.values())[1:]
         shared = [
@@ -283,6 +307,7 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     Raises:
         typer.Exit: with code 1.
     """
+    call.show_result(outcome.first)
     summary = outcome.summary
     state = str(summary.get("state", "done"))
     if call.json:
@@ -294,6 +319,8 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
         console.emit_text(outcome.text)
     else:
         values = dict(summary if outcome.values is None else outcome.values)
+        if outcome.first is not None:
+            values.pop("unobservable", None)  # what matters to the pose is among the first screen's concerns
         if outcome.first is not None and isinstance(warnings := values.get("warnings"), list):
             said_there = (*outcome.first.concerns, *outcome.first.notes)
             values["warnings"] = [text for text in warnings if text not in said_there]

@@ -1,13 +1,17 @@
-"""`weldcal calibrate DATASET`: estimates X_BC and its uncertainty from a folder of scans and writes exports and a report."""
+"""`weldcal calibrate`: estimates X_BC and its uncertainty from a folder of scans, and writes exports and a report."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.motion_dataset import is_motion
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
@@ -21,16 +25,36 @@ from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.refined import KINEMATICS_FILE, REFINEMENTS, Plain, Refined
-from weldcal.calibration.refinement.stated_arm import joint_angles
+from weldcal.calibration.refinement.refined import (
+    KINEMATICS_FILE,
+    REFINEMENTS,
+    Plain,
+    Refined,
+    refine_arm,
+    refine_locally,
+)
+from weldcal.calibration.refinement.stated_arm import joint_angles, require_joint_angles
 from weldcal.calibration.touch.arm_prior import observed_document
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
+from weldcal.tools.cli.discovery import other_command
+from weldcal.tools.cli.options import (
+    MOTION,
+    Call,
+    CorrectionOption,
+    FlangeOption,
+    LimitOption,
+    Outcome,
+    command,
+    option,
+    switch,
+)
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.contradictions import estimate_consistent
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
-from weldcal.tools.commands.refine import Refinable, refine_calibration
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
 from weldcal.tools.report.files import csv_text
@@ -38,6 +62,106 @@ from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.render import write_atomic
 
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
+
+
+@command(
+    "calibrate",
+    options=(*MOTION, "record"),
+    short_help="Calibrate a scanner from scans, or live in a scenario.",
+)
+def calibrate(
+    call: Call,
+    dataset: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A folder with poses and clouds (docs/datasets.md), a ROS recording; in motion stream.csv."
+        ),
+    ] = None,
+    scenario: Annotated[str | None, option("--scenario", "NAME", "Calibrate live in this scenario instead.")] = None,
+    robot: Annotated[
+        str | None,
+        option(
+            "--robot",
+            "NAME",
+            "For a dataset: the arm, if dataset.yaml does not name it. Live: simulated, emulated or a controller's address.",
+        ),
+    ] = None,
+    flange: FlangeOption = None,
+    centres: Annotated[
+        bool, switch("--centres", "Also write centres.csv: the flange centre found in each scan of a dataset.")
+    ] = False,
+    scanner_correction: CorrectionOption = True,
+    poses: Annotated[
+        str | None,
+        option("--poses", "FROM:TO", "Of a dataset: use only the scans from one id to another, such as p09: or :p08."),
+    ] = None,
+    refine: Annotated[
+        str | None,
+        option(
+            "--refine",
+            "KIND",
+            "Of a dataset: local (a field of what the calibration leaves), joints or links (errors of the arm; needs its joint angles).",
+        ),
+    ] = None,
+    kinematics: Annotated[
+        Path | None,
+        option(
+            "--kinematics",
+            "FILE",
+            "With --refine joints or links: the arm's factory calibration, which the controller uses.",
+        ),
+    ] = None,
+    axis_turn: Annotated[
+        float | None,
+        option(
+            "--axis-turn",
+            "DEG",
+            "Known rotation of the hole pattern about the flange axis; one to three scans are then enough.",
+        ),
+    ] = None,
+    limit_mm: LimitOption = None,
+) -> Outcome | Mapping[str, object] | None:
+    """Calibrate a scanner from a folder of flange scans and robot poses, or live in a scenario."""
+    if (dataset is None) == (scenario is None):
+        raise typer.BadParameter("give either a dataset folder or --scenario NAME")
+    if scenario is not None:
+        if poses is not None or refine is not None or kinematics is not None:
+            raise typer.BadParameter("--poses, --refine and --kinematics are for a dataset; omit them with --scenario")
+        if limit_mm is not None:
+            raise typer.BadParameter("--limit-mm is for a dataset; a scenario states calibration.required_error_mm")
+        return other_command("calibrate-live").body(call, scenario, robot=robot)
+    assert dataset is not None
+    if is_motion(dataset):
+        if poses is not None or axis_turn is not None or refine is not None:
+            raise typer.BadParameter(
+                "--poses, --refine and --axis-turn are for scans at rest; omit them with a recording in motion"
+            )
+        moving = other_command("calibrate-motion").body
+        return moving(call, dataset, robot=robot, flange=flange, centres=centres, limit_mm=limit_mm)
+    report = calibrate_dataset(
+        dataset,
+        call.folder("calibrate", dataset.resolve().name),
+        robot=robot,
+        flange=flange,
+        seed=call.seed,
+        progress=call.progress,
+        centres=centres,
+        correct_scanner=scanner_correction,
+        axis_turn_deg=axis_turn,
+        poses=poses,
+        refine=refine,
+        kinematics=kinematics,
+        limit_mm=limit_mm,
+    )
+    rows = {} if report.algorithm1 is None else {"Algorithm 1": report.algorithm1.sentence}
+    if report.refinement is not None:
+        rows["refinement"] = str(report.refinement["sentence"])
+    interval = report.held_out_interval_mm
+    if interval is not None:
+        rows |= report.interval_rows
+        rows["mean error of as many new scans"] = f"{interval[0]:.3f} to {interval[1]:.3f} mm (95 %)"
+    rows["error budget"] = report.budget.sentence
+    return Outcome(report.summary(), rows=rows, first=report.first)
 
 
 def calibrate_dataset(
@@ -105,19 +229,17 @@ def calibrate_dataset(
         tell("refining", 0.73)
         refined = refine_calibration(
             refine,
-            Refinable(
-                data,
-                Plain(
-                    observations=observations,
-                    corrected=tuple(corrected),
-                    patterns=seen.patterns,
-                    estimate=estimate,
-                    correction=None if scanner is None else scanner.accepted,
-                    correct_scanner=correct_scanner and not few,
-                ),
-                robot or data.header.robot,
-                kinematics,
+            data,
+            Plain(
+                observations=observations,
+                corrected=tuple(corrected),
+                patterns=seen.patterns,
+                estimate=estimate,
+                correction=None if scanner is None else scanner.accepted,
+                correct_scanner=correct_scanner and not few,
             ),
+            robot or data.header.robot,
+            kinematics,
             seed=seed,
         )
         estimate, corrected = refined.estimate, list(refined.observations)
@@ -224,6 +346,28 @@ def calibrate_dataset(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
+
+
+def refine_calibration(
+    kind: str, data: Dataset, plain: Plain, robot: str, kinematics: Path | None, *, seed: int
+) -> Refined:
+    """Refine a calibration by ``kind`` of REFINEMENTS; it stays as it is, but for nested held-out errors, where that does not help.
+
+    Raises TooFewPoses and other InputErrors where the data cannot be refined in this way.
+    """
+    if kind == "local":
+        return refine_locally(plain, seed=seed)
+    if robot not in known_arms():
+        raise InputError(
+            f"Errors of the arm (--refine {kind}) are written as Universal Robots' kinematics: name one of {', '.join(known_arms())} with "
+            "--robot, or use --refine local."
+        )
+    arm = load_chain(robot, kinematics)
+    ids = [o.id for o in plain.observations]
+    poses = {p.id: p.X_BR for p in data.pairs} or data.poses
+    q = require_joint_angles(data, ids, arm, np.array([poses[id].GetAsMatrix4() for id in ids]))
+    note = f"{robot}, refined by weldcal calibrate --refine {kind}"
+    return refine_arm(kind, plain, q, arm, note=note, seed=seed)
 
 
 def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:

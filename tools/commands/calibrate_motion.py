@@ -3,8 +3,10 @@
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import load_motion_dataset
@@ -17,6 +19,7 @@ from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
+from weldcal.tools.cli.options import Call, FlangeOption, LimitOption, Outcome, command, option, switch
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.files import csv_text
@@ -26,6 +29,29 @@ from weldcal.tools.report.render import write_atomic
 
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 _MOST_TURNED = 50  # poses whose orientations are compared
+
+
+@command("calibrate-motion", hidden=True, short_help="Calibrate a scanner from a recording in motion.")
+def calibrate_recording(
+    call: Call,
+    dataset: Annotated[Path, typer.Argument(help="A recording in motion: dataset.yaml, stream.csv, clouds.")],
+    robot: Annotated[str | None, option("--robot", "NAME", "The arm, if dataset.yaml does not name it.")] = None,
+    flange: FlangeOption = None,
+    centres: Annotated[bool, switch("--centres", "Also write centres.csv: the flange centre in each frame.")] = False,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Calibrate a scanner from a recording in motion, as `weldcal calibrate` does for such a folder."""
+    report = calibrate_motion(
+        dataset,
+        call.folder("calibrate", dataset.resolve().name),
+        robot=robot,
+        flange=flange,
+        seed=call.seed,
+        progress=call.progress,
+        centres=centres,
+        limit_mm=limit_mm,
+    )
+    return Outcome(report.summary(), first=report.first)
 
 
 def calibrate_motion(

@@ -23,8 +23,7 @@ from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.commands.touch import run_touches
-from weldcal.tools.commands.weld import run_calibration_live, run_scenario
-from weldcal.tools.report.first_screen import FirstScreen
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 
@@ -74,19 +73,6 @@ def run_procedure(options: RunOptions, progress: Progress) -> RunResult:
     """
     scenario = load_scenario(options.scenario)
     return RUNNERS.get(kind_of(scenario), run_any)(scenario, options, progress)
-
-
-def calibrate_live(options: RunOptions, progress: Progress) -> tuple[dict[str, object], FirstScreen]:
-    """Run `calibrate --scenario`: the mounting or motion job, or only the calibration of the weld job; JSON object and first screen."""
-    scenario = load_scenario(options.scenario)
-    if kind_of(scenario) == "mounting":
-        mounted = run_mounting_live(scenario, options, progress)
-        return mounted.summary(), mounted.first
-    if kind_of(scenario) == "motion":
-        moved = run_motion_live(scenario, options, progress)
-        return moved.summary(), moved.first
-    found = run_calibration_live(options, progress)
-    return found.calibration_summary(), found.first
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,10 +23,9 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.systems.jobs.motion.calibrator import posed_stream
-from weldcal.systems.jobs.motion.config import MotionJob
-from weldcal.systems.jobs.motion.job import AddedMotion
-from weldcal.systems.jobs.motion.messages import MotionRecord
+from weldcal.systems.jobs.motion.collector import posed_stream
+from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
+from weldcal.systems.jobs.motion.procedure import MotionRecord
 from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_names
@@ -165,15 +164,24 @@ def monitor_recording(
     X_FR = data.X_FR
     if body is None:
         seen = see_frames(
-            data, standard, motion, X_BC=result.X_BC, seed=seed,
+            data,
+            standard,
+            motion,
+            X_BC=result.X_BC,
+            seed=seed,
             tell=lambda fraction: tell("tracking the flange", 0.85 * fraction),
-        )  # fmt: skip
+        )
         frames, refused = seen.observed, seen.refused
     else:
         frames, motion, X_FR, refused = see_link(
-            data, result, standard, body, fused=fused, seed=seed,
+            data,
+            result,
+            standard,
+            body,
+            fused=fused,
+            seed=seed,
             tell=lambda fraction: tell(f"tracking the {body}", 0.85 * fraction),
-        )  # fmt: skip
+        )
     tell("testing for drift", 0.85)
     config = DriftConfig(false_alarms_per_hour=false_alarms_per_hour)
     watched = watch(result, frames, motion, X_FR=X_FR, dropped=refused, config=config)
@@ -262,8 +270,10 @@ def causes(watched: Watched) -> str:
 def _warnings(result: CalibrationResult, data: MotionDataset, watched: Watched, refused: int, flange: str) -> list[str]:
     h, out = data.header, []
     for what, was, now in (
-        ("robot", result.robot, h.robot), ("flange", result.flange, flange), ("scanner", result.scanner, h.scanner),
-    ):  # fmt: skip
+        ("robot", result.robot, h.robot),
+        ("flange", result.flange, flange),
+        ("scanner", result.scanner, h.scanner),
+    ):
         if was and now and was != now:
             out.append(f"The calibration was made with the {what} '{was}', this recording with '{now}'.")
     if len(watched.ids) < _FEW:
@@ -319,13 +329,18 @@ class LiveMonitor:
         job: AddedMotion = run.cell.job
         live = job.drift(run.root)
         found: dict[str, Any] = {
-            "state": "held" if run.held else "done", "scenario": self.options.scenario, "seed": self.options.seed,
+            "state": "held" if run.held else "done",
+            "scenario": self.options.scenario,
+            "seed": self.options.seed,
             "robot": self.finished.robot,
             "live": {
-                "frames": live.frames, "dropped": live.dropped, "alarmed": live.alarmed, "summary": live.summary,
+                "frames": live.frames,
+                "dropped": live.dropped,
+                "alarmed": live.alarmed,
+                "summary": live.summary,
                 "drift": [drift_document(e) for e in live.events],
             },
-        }  # fmt: skip
+        }
         if run.reason:
             found["reason"] = run.reason
         found |= run.timing()
@@ -391,7 +406,12 @@ def monitor_live(
     collected, arm = added.record(finished.run.root), finished.cell.station.arm
     data: MotionDataset | None = None
     if added.recorder is not None and collected.seen:
-        added.recorder.finish(posed_stream(collected, arm), scenario.arm, feature_standard(scenario).designation, scenario.scanner.scanner())  # type: ignore[attr-defined]  # fmt: skip
+        added.recorder.finish(
+            posed_stream(collected, arm),
+            scenario.arm,
+            feature_standard(scenario).designation,
+            scenario.scanner.scanner(),  # type: ignore[attr-defined]
+        )
         data = load_motion_dataset(options.out / "recording")
     report = None
     if collected.seen:

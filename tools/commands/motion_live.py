@@ -10,16 +10,15 @@ from pydrake.common.yaml import yaml_dump_typed
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.motion.calibrator import posed_stream
-from weldcal.systems.jobs.motion.config import MotionJob
-from weldcal.systems.jobs.motion.job import AddedMotion
-from weldcal.systems.jobs.motion.messages import MotionRecord
+from weldcal.systems.jobs.motion.collector import posed_stream
+from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
+from weldcal.systems.jobs.motion.procedure import MotionRecord
 from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.calibration import error_summary
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import motion_screen
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
@@ -70,9 +69,7 @@ class MotionOutcome:
         if e is None:
             expected = Expected("error in the middle of the frames, 95 %", "not known", "there is no calibration")
             found = Findings(against=against or ["There is no calibration."], unseen=0)
-            return FirstScreen(
-                found, expected, Next("Settle the reason, then run the job again."), more={"pose": "none was found"}
-            )
+            return FirstScreen(found, expected, after_hold(run.ended_by_operator), more={"pose": "none was found"})
         seen = self.record.seen
         p_C = np.array([fit.center_C for _, fit in seen])
         return motion_screen(

@@ -17,8 +17,7 @@ from weldcal.calibration.planning.moves import closed_moves, recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic
-from weldcal.systems.jobs.motion.config import MotionJob
-from weldcal.systems.jobs.motion.job import plan_corners
+from weldcal.systems.jobs.motion.job import MotionJob, plan_corners
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario

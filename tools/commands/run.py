@@ -6,7 +6,7 @@ import platform
 import time
 import webbrowser
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +18,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
+from weldcal.models.documents import nearest
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
 from weldcal.systems.cell import Cell, build_cell
@@ -55,6 +56,7 @@ from weldcal.tools.report.run import RunOptions
 SIMULATED, EMULATED = "simulated", "emulated"
 EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this pace they do with other load
 SLOWEST_PACE = 0.05
+ALMOST = 0.8  # likeness to "emulated" from which on a word is a slip and not the name of a host
 GRAVITY = 9.82  # m/s^2, as a controller has it
 RECORDING: Final = "recording.mcap"
 _PACKAGES = ("drake", "numpy", "scipy", "open3d", "opencv-python-headless", "numba")
@@ -64,7 +66,13 @@ RECORDED = (*LIVE, "record")
 
 def run_options(call: Call, command: str, scenario: str, **more: Any) -> RunOptions:
     """The options of a run; its folder is named after the command and the scenario."""
-    return RunOptions(scenario=scenario, out=call.folder(command, scenario), seed=call.seed, **{**call.live, **more})
+    return RunOptions(
+        scenario=scenario,
+        out=call.folder(command, scenario),
+        seed=call.seed,
+        keep_page=call.keep_page,
+        **{**call.live, **more},
+    )
 
 
 def named_once(name: str | None, scenario: str, preset: str) -> str:
@@ -188,7 +196,8 @@ def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> 
     from weldcal.tools.dashboard.server import Dashboard  # Flask takes a moment to load
 
     source = DashboardSource(LiveView(), person)
-    with closing(Dashboard(source, meshcat.web_url(), options.share)) as dashboard:
+    with ExitStack() as stack:
+        dashboard = stack.enter_context(closing(Dashboard(source, meshcat.web_url(), options.share)))
         console.emit_address("dashboard", dashboard.url)
         if dashboard.shared_url is not None:
             console.emit_address("read-only for the network", dashboard.shared_url)
@@ -199,6 +208,8 @@ def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> 
         finally:
             if not source.ended:
                 source.end(held=True, reason="The run has failed: the reason is in the terminal.", replays=False)
+        if options.keep_page is not None:
+            options.keep_page(source.conclude, stack.pop_all().close)
 
 
 def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTransform) -> None:
@@ -258,6 +269,9 @@ def chosen_robot(
         return
     kind, _, address = word.partition("@")
     if kind != EMULATED:
+        near = nearest(word, (SIMULATED, EMULATED), ALMOST)
+        if near is not None:
+            raise InputError(f"There is no robot '{word}': did you mean '{near}'? Or give the address of a controller.")
         host = controller_address(word)
         if pace is not None and not is_loopback(host):
             raise InputError(

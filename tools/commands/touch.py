@@ -8,7 +8,7 @@ from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.touch.judge import judge_touches
 from weldcal.calibration.touch.table import read_touches, touches_text
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.touch.config import TouchConfig
+from weldcal.systems.jobs.touch.planner import TouchConfig
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario

@@ -18,8 +18,8 @@ from weldcal.systems.jobs.mounting.job import AddedMounting
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.procedure import PLANS
 from weldcal.systems.jobs.tablet.job import AddedVisit
-from weldcal.systems.jobs.touch.config import TouchConfig
 from weldcal.systems.jobs.touch.job import AddedTouches
+from weldcal.systems.jobs.touch.planner import TouchConfig
 from weldcal.systems.jobs.touch.procedure import Felt
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point

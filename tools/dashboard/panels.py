@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord, MotionState
-from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
-from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionRecord, MotionState
+from weldcal.systems.jobs.mounting.procedure import MountingState, MountingStatus
+from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.jobs.tablet.procedure import TabletState
 from weldcal.systems.jobs.touch.procedure import TouchState
 from weldcal.systems.motion.drift_monitor import DriftStatus

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.tablet.messages import WristPicture
+from weldcal.systems.jobs.tablet.config import WristPicture
 from weldcal.systems.messages import FlangeEstimate, Scan
 from weldcal.systems.viewer.live import Moment
 

@@ -23,6 +23,7 @@ PERIOD_S = 0.1
 QUIET_S = 1.0  # something is sent at least so often: a page that hears nothing for longer says so
 STREAMS = 12
 LAST_WORDS_S = 0.6
+FILES_S = 6.0  # for an open page to load the recording and the report, which it shows when the program has ended
 _PAGE = Path(__file__).parent / "page"
 
 
@@ -84,6 +85,7 @@ class Dashboard:
         self.source = source
         self._closing = threading.Event()
         self._streams = 0
+        self._sent: set[str] = set()
         self._servers: list[BaseWSGIServer] = []
         self._connections = _Connections()
         key = secrets.token_urlsafe(24)
@@ -99,6 +101,9 @@ class Dashboard:
         """Stop serving; the pages that are open get the last values first. A second call has no effect."""
         if self._closing.is_set():
             return
+        until = time.monotonic() + FILES_S
+        while self._streams and set(self.source.files) - self._sent and time.monotonic() < until:
+            time.sleep(0.02)
         until = time.monotonic() + LAST_WORDS_S
         self._closing.set()
         while self._streams and time.monotonic() < until:
@@ -124,7 +129,7 @@ class Dashboard:
         """The pages: with a key they have buttons, with a token they are under it; `view_url` is the 3D view's address."""
         root = "" if token is None else f"/{token}"
         app = Flask("weldcal.dashboard", template_folder=str(_PAGE), static_folder=None)
-        frames = "'none'" if view_url is None else view_url
+        frames = "'none'" if view_url is None else f"'self' {view_url}"
 
         @app.before_request
         def refuse_foreign_names() -> None:
@@ -135,6 +140,8 @@ class Dashboard:
         def restrict(response: Response) -> Response:
             response.headers["Content-Security-Policy"] = (
                 f"default-src 'self'; img-src 'self' data:; frame-src {frames}; frame-ancestors 'none'; base-uri 'none'"
+                if request.endpoint != "result_file"
+                else "default-src 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'self'; base-uri 'none'"
             )
             response.headers["X-Content-Type-Options"] = "nosniff"
             response.headers["Referrer-Policy"] = "no-referrer"
@@ -171,6 +178,14 @@ class Dashboard:
             return Response(self._events(), mimetype="text/event-stream")
 
         if key is not None:
+
+            @app.get("/result/<name>")
+            def result_file(name: str) -> Response:
+                if name not in self.source.files:
+                    abort(404)
+                sent = Response(self.source.files[name].read_bytes(), mimetype="text/html")
+                sent.call_on_close(lambda: self._sent.add(name))
+                return sent
 
             @app.post("/act/<what>")
             def act(what: str) -> Response:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from pathlib import Path
 from typing import Any
 
 from weldcal.systems.person import Person
 from weldcal.systems.phase_words import phase_words
-from weldcal.systems.viewer.live import LiveView
+from weldcal.systems.viewer.live import LiveView, Moment
 from weldcal.tools.dashboard.facts import Facts
 from weldcal.tools.dashboard.panels import panel, stage_of
 from weldcal.tools.dashboard.picture import picture_number, picture_png
@@ -27,8 +28,13 @@ from weldcal.tools.dashboard.values import (
     weld_rows,
     weld_values,
 )
+from weldcal.tools.report.first_screen import FirstScreen
 
 BY = "the dashboard"
+PAGES = ("recording.html", "report.html")
+"""What the page shows of a run that has ended."""
+LEFT_OUT = ("verdict", "next", "rotation vector", "quaternion wxyz", "4 x 4, m")
+"""Rows of the first screen that the page shows elsewhere, or leaves to the report."""
 PACE_OVER_S = 2.0
 
 
@@ -41,6 +47,8 @@ class DashboardSource:
         self._stage, self._share = "", 0.0
         self._ended: tuple[str, str | None] | None = None
         self.replays = False
+        self.result: dict[str, Any] | None = None
+        self.files: dict[str, Path] = {}
         self._paces: deque[tuple[float, float]] = deque(maxlen=50)
 
     def stage(self, text: str, share: float) -> None:
@@ -52,6 +60,20 @@ class DashboardSource:
         """Take how the run ended, and whether the 3D view repeats it from now on."""
         self.replays = replays
         self._ended = (HELD if held and not self.person.ends else ENDED if held else DONE, reason)
+
+    def conclude(self, first: FirstScreen | None, folder: Path | None) -> None:
+        """Take the result: the first screen and the folder that holds report.html and recording.html; None: there is none."""
+        if folder is not None:
+            self.files = {name: folder / name for name in PAGES if (folder / name).exists()}
+        rows = {} if first is None else {n.strip(): t for n, t in first.rows().items() if n.strip() not in LEFT_OUT}
+        self.result = {
+            "verdict": None if first is None else first.verdict,
+            "tone": "" if first is None else first.tone,
+            "reason": "" if first is None else first.reason,
+            "rows": [[name, text] for name, text in rows.items()],
+            "files": list(self.files),
+            "folder": "" if folder is None else str(folder.absolute()),
+        }
 
     @property
     def ended(self) -> bool:
@@ -91,6 +113,7 @@ class DashboardSource:
             "state": state,
             "line": line,
             "replay": self.replays,
+            "result": self.result,
             "title": facts.title,
             "robot": facts.robot,
             "can": {
@@ -101,7 +124,7 @@ class DashboardSource:
             },
             "steps": steps(facts, "done" if state == DONE else stage_of(moment)),
             "share": round(self._share, 3) if running else 1.0,
-            "left_s": left_s(facts, moment, self._share) if running else None,
+            "left_s": self._left_s(moment) if running else None,
             "time_s": round(moment.time, 1),
             "pace": {"asked": person.pace or 0.0, "now": self._pace(moment.time)},
             "weld": weld,
@@ -115,6 +138,11 @@ class DashboardSource:
                 "band": facts.band_mm if weld else None,
             },
         }
+
+    def _left_s(self, moment: Moment) -> float | None:
+        """Seconds of the wall clock that are left, about, at the pace that was asked for."""
+        left = left_s(self.facts, moment, self._share)
+        return left if left is None or not self.person.pace else round(left / self.person.pace)
 
     def _state(self) -> tuple[str, str]:
         """The state in large letters, and the line under it: by whom and why, or what the arm does."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
 from weldcal.systems.viewer.cameras import CAMERAS, FOLLOW, Views

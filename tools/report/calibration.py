@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import CalibrationResult, correction_note, export_ros2, matrix4
+from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note, export_ros2, matrix4
 from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
 from weldcal.calibration.eye_on_base.nested import bootstrap_interval, mean_interval
 from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
@@ -117,7 +117,8 @@ class CalibrationReport:
         tolerance = None
         if self.limit_mm is not None:
             tolerance = Tolerance("the error at the work point, 95 %,", figure, self.limit_mm, "--limit-mm")
-        notes = [*filter(None, (correction_note(r),)), *refused_note(self.refused, len(r.poses)), *self._refined]
+        corrected = correction_note(r, self.out / RESULT_FILE)
+        notes = [*filter(None, (corrected,)), *refused_note(self.refused, len(r.poses)), *self._refined]
         found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),))
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import export_ros2
+from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
+from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.next_scan import next_scan
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
@@ -24,6 +24,7 @@ from weldcal.tools.report.first_screen import (
     Next,
     ShownPose,
     Tolerance,
+    after_hold,
     refused_note,
     work_point_error,
     work_point_expected,
@@ -81,7 +82,7 @@ class DemoResult:
     def warnings(self) -> tuple[str, ...]:
         """What the job warned of and did not hold for."""
         sequencer = self.run.cell.job.sequencer
-        return sequencer.job_state(sequencer.GetMyContextFromRoot(self.run.root)).warnings
+        return sequencer.state_in(sequencer.GetMyContextFromRoot(self.run.root)).warnings
 
     @property
     def first(self) -> FirstScreen:
@@ -118,11 +119,7 @@ class DemoResult:
         concerns = (*self.warnings, *estimate.warnings)
         notes = [*refused_note(status.refused, self.n_scans), *self.arm_note]
         if estimate.scanner is not None:
-            # as calibration.yaml says to programs that use X_BC
-            notes.insert(
-                0,
-                f"X_BC applies to corrected scanner points: multiply every point, in metres, by {estimate.scanner.formula}.",
-            )
+            notes.insert(0, correction_hint("X_BC", self.folder / RESULT_FILE))
         found = Findings(against=against, tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
         return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())
@@ -167,7 +164,8 @@ class DemoResult:
     def _next(self) -> Next:
         folder, robot = self.folder, self.robot != "simulated"
         if self.state == "held":
-            return Next(
+            return after_hold(
+                self.run.ended_by_operator,
                 "Settle the reason; nothing goes on by itself. The doctor looks at scans and weld.",
                 f"weldcal doctor {folder}",
             )

@@ -293,6 +293,11 @@ class FirstScreen:
         }
 
 
+def after_hold(ended: bool, advice: str = "Settle the reason, then run the job again.", command: str = "") -> Next:
+    """What to do after a run that was held; `ended`: the operator ended it, so there is no fault to look for."""
+    return Next("The operator ended this run. Run it again for a result.") if ended else Next(advice, command)
+
+
 def point_covariance(X: RigidTransform, covariance: Array, p: Array) -> Array:
     """Covariance (3, 3) m^2 of a point at ``p`` (3,) m of the parent's axes, mapped by ``X`` with covariance (6, 6) [rotation; translation].
 

@@ -25,7 +25,7 @@ from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.mounting.job import FOOT, AddedMounting
-from weldcal.systems.jobs.mounting.messages import MountingStatus
+from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
     Expected,
@@ -33,6 +33,7 @@ from weldcal.tools.report.first_screen import (
     FirstScreen,
     Next,
     Tolerance,
+    after_hold,
     expected_error,
     point_covariance,
     radius_95,
@@ -101,7 +102,7 @@ class MountingReport:
         what = f"error {1e3 * self.job.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
         if result is None:
             found = Findings(against=against or ["There is no result."], unseen=0)
-            after = Next("Settle the reason, then run the job again.")
+            after = after_hold(self.run.ended_by_operator)
             return FirstScreen(
                 found, Expected(what, "not known", "there is no calibration"), after, more={"pose": "none was found"}
             )

@@ -14,7 +14,7 @@ from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.estimates import pose_sigmas
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
-from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
     Expected,
@@ -23,6 +23,7 @@ from weldcal.tools.report.first_screen import (
     Next,
     ShownPose,
     Tolerance,
+    after_hold,
     point_covariance,
     radius_95,
 )
@@ -228,7 +229,7 @@ class ProfilerLive:
             against=against, tolerance=tolerance, no_tolerance=_NO_KEY, unseen=unseen, concerns=concerns
         )
         if held:
-            after = Next("Settle the reason, then run the job again.")
+            after = after_hold(self.run.ended_by_operator)
         else:
             after = Next(
                 "Take the same scans with your own profiler and calibrate from the file.",

@@ -1,5 +1,6 @@
 """What every run has: its options, and the section of its report on how late each velocity left the Diagram."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -9,8 +10,11 @@ from matplotlib.figure import Figure
 
 from weldcal.systems.runner import Run
 from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
+from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, plain, svg
 from weldcal.tools.report.render import fixed
+
+KeepPage = Callable[[Callable[[FirstScreen | None, Path | None], None], Callable[[], None]], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +33,7 @@ class RunOptions:
         recording: write the viewer's recording.html.
         share: show the dashboard, read-only, to the network too.
         record: write recording.mcap, which `weldcal replay` plays back.
+        keep_page: takes the dashboard when the run has ended, as what shows its result and what closes it; None: it closes at once.
     """
 
     scenario: str
@@ -43,6 +48,7 @@ class RunOptions:
     recording: bool = True
     share: bool = False
     record: bool = False
+    keep_page: KeepPage | None = None
 
 
 def robot_timing(run: Run[Any]) -> dict[str, object]:

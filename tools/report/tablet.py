@@ -15,7 +15,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance, after_hold
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 from weldcal.tools.report.run import robot_timing
@@ -70,13 +70,11 @@ def visits_screen(
     return FirstScreen(found, expected, _next(tolerance), (), more)
 
 
-def run_screen(first: FirstScreen | None, reason: str, found: Mapping[str, object]) -> FirstScreen:
+def run_screen(first: FirstScreen | None, reason: str, found: Mapping[str, object], ended: bool = False) -> FirstScreen:
     """Of a run in simulation: its calibration's (None: it was held before), with the errors that the simulation knows."""
     if first is None:
         lost = Findings(against=[reason or "The job was held."], unseen=0)
-        return FirstScreen(
-            lost, NOTHING, Next("Settle the reason, then run the job again."), more={"pose": "none was found"}
-        )
+        return FirstScreen(lost, NOTHING, after_hold(ended), more={"pose": "none was found"})
     unseen = found["unseen_touch_mm"]
     assert isinstance(unseen, Mapping)
     truth = (

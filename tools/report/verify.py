@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import CalibrationResult, correction_note
+from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
@@ -86,7 +86,7 @@ class VerifyReport:
             tolerance=tolerance,
             unseen=len(new),
             concerns=self.warnings,
-            notes=tuple(filter(None, (correction_note(r),))),
+            notes=tuple(filter(None, (correction_note(r, RESULT_FILE),))),
             settled=settled,
         )
         if len(new):

@@ -240,6 +240,18 @@ def done(results: Results) -> list[Result]:
     return [r for r in results.values() if r.get("state") != FAILED]
 
 
+def whole(results: Results) -> Results:
+    """The results of a study that needs every case.
+
+    Raises:
+        InputError: a case was refused.
+    """
+    for name, found in results.items():
+        if found.get("state") == FAILED:
+            raise InputError(f"{name}: {found['reason']}")
+    return results
+
+
 def runs_csv(cases: Cases, results: Results) -> str:
     """One line a case: its name, arguments and results; members of an object are named "a.b", lists stay JSON text."""
     lines = [{"case": name} | _flat(cases.get(name, {})) | _flat(found) for name, found in results.items()]

@@ -15,7 +15,7 @@ from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.picture_scene import add_picture_scene
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.jobs.tablet.messages import TabletTruth, WristPicture
+from weldcal.systems.jobs.tablet.config import TabletTruth, WristPicture
 from weldcal.systems.leaf_system import LeafSystem
 
 RENDERER = "wrist"

@@ -42,8 +42,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.jobs.tablet.config import TabletConfig
-from weldcal.systems.jobs.tablet.messages import TabletTouch, TabletTruth
+from weldcal.systems.jobs.tablet.config import TabletConfig, TabletTouch, TabletTruth
 from weldcal.systems.leaf_system import LeafSystem
 
 GLASS, NIB = "tablet_glass", "pen_nib"  # names of the two contact geometries

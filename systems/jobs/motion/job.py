@@ -1,6 +1,6 @@
 """The motion job: calibrates a streaming scanner and its clock, or watches a calibration, while the flange moves in a cube."""
 
-from dataclasses import dataclass
+import dataclasses as dc
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +14,11 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
-from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
-from weldcal.systems.jobs.motion.collector import MotionCollector
-from weldcal.systems.jobs.motion.config import MotionJob, check_motion
-from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord
-from weldcal.systems.jobs.motion.procedure import MotionProcedure
-from weldcal.systems.jobs.motion.recorder import MotionRecorder
-from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
-from weldcal.systems.jobs.weld.settings import feature_on_flange, feature_standard
-from weldcal.systems.messages import CalibrationStatus, JobCommand
+from weldcal.systems.jobs.motion.collector import MotionCalibrator, MotionCollector, MotionRecorder
+from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProcedure, MotionRecord
+from weldcal.systems.jobs.weld.job import POLL_S, add_drift_view, add_stream
+from weldcal.systems.jobs.weld.settings import feature_on_flange
+from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.motion.clear_moves import clear_move, station_bodies
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.frame_queue import FrameQueue
@@ -30,15 +26,49 @@ from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
-from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
+
+LEAST_FRAMES, MOST_FRAMES = 40, 5000
+
+
+@dc.dataclass(kw_only=True)
+class MotionJob:
+    """The flange moves between corners of a cube while the scanner streams."""
+
+    centre_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.30])  # of the cube, in the base
+    edge_mm: float = 200.0
+    # largest lean of the flange from the scanner's direction, drawn from the seed for each corner
+    lean_deg: float = 15.0
+    frames: int = 400  # frames with the flange that are wanted
+    speed_m_s: float = 0.25  # largest speed of the flange
+    queue: int = 2  # frames that wait for the fit
+    record: bool = False  # write what streams as a recording in motion, to `recording` in the result folder
+    recording_folder: str = ""  # set by the command
+    watch: str = ""  # a calibration that is watched for drift instead of calibrating; set by `weldcal monitor`
+    false_alarms_per_hour: float = 1e-3  # that are accepted of the drift test
+
+
+def check_motion(job: MotionJob) -> None:
+    """Check the part's numbers. Raises InputError: one sentence that says what to change."""
+    if len(job.centre_m) != 3 or not np.isfinite(job.centre_m).all():
+        raise InputError("motion.centre_m must be three numbers, in metres.")
+    if not 20.0 <= job.edge_mm <= 1000.0:
+        raise InputError(f"motion.edge_mm must be from 20 to 1000, and it is {job.edge_mm:g}.")
+    if not 0.0 <= job.lean_deg <= 30.0:
+        raise InputError(f"motion.lean_deg must be from 0 to 30, and it is {job.lean_deg:g}.")
+    if not LEAST_FRAMES <= job.frames <= MOST_FRAMES:
+        raise InputError(f"motion.frames must be from {LEAST_FRAMES} to {MOST_FRAMES}, and it is {job.frames}.")
+    if not 0.01 <= job.speed_m_s <= 1.0:
+        raise InputError(f"motion.speed_m_s must be from 0.01 to 1, and it is {job.speed_m_s:g}.")
+    if not 1 <= job.queue <= 8:
+        raise InputError(f"motion.queue must be from 1 to 8, and it is {job.queue}.")
+
 
 CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]], dtype=np.float64) - 0.5  # no four in a plane
 _TRIES = 40  # leans drawn for a corner
-_POLL_S = 0.004  # of the queue and the estimator: a twelfth of a frame
 
 
-@dataclass(frozen=True, eq=False)
+@dc.dataclass(frozen=True, eq=False)
 class MotionPlanned:
     """Joint angles (6,) rad of the corners, the scanner's delay (s) as known from its data sheet, and what is watched, if anything."""
 
@@ -48,7 +78,7 @@ class MotionPlanned:
     watched: CalibrationResult | None = None
 
 
-@dataclass(eq=False, kw_only=True)
+@dc.dataclass(eq=False, kw_only=True)
 class AddedMotion(AddedJob):
     """The systems of the job; it has a `calibrator` or, where it watches a calibration, a `monitor`."""
 
@@ -66,16 +96,14 @@ class AddedMotion(AddedJob):
 
     def record(self, root: Context) -> MotionRecord:
         """What was collected so far."""
-        port = self.collector.GetOutputPort("record")
-        found: MotionRecord = port.Eval(self.collector.GetMyContextFromRoot(root))
+        found: MotionRecord = self.value(self.collector.GetOutputPort("record"), root)
         return found
 
     def calibration(self, root: Context) -> MotionCalibration:
         """The result, where it is there."""
         if self.calibrator is None:
             return MotionCalibration()
-        port = self.calibrator.GetOutputPort("calibration")
-        found: MotionCalibration = port.Eval(self.calibrator.GetMyContextFromRoot(root))
+        found: MotionCalibration = self.value(self.calibrator.GetOutputPort("calibration"), root)
         return found
 
     def drift(self, root: Context) -> DriftStatus:
@@ -84,7 +112,7 @@ class AddedMotion(AddedJob):
 
     def counts(self, root: Context) -> tuple[int, int]:
         """Frames that were taken from the queue, and frames that were dropped."""
-        taken, dropped, _ = self.queue.GetOutputPort("counts").Eval(self.queue.GetMyContextFromRoot(root))
+        taken, dropped, _ = self.value(self.queue.GetOutputPort("counts"), root)
         return int(taken), int(dropped)
 
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
@@ -137,7 +165,7 @@ class Motion(Job[MotionPlanned]):
     def add(self, wiring: Wiring, spine: Spine, plan: MotionPlanned) -> AddedMotion:
         """See Job."""
         scenario, station, c = wiring.scenario, wiring.station, wiring.scenario.calibration
-        job, standard, X_FR = scenario.part(MotionJob), feature_standard(scenario), feature_on_flange(scenario, station)
+        job, X_FR = scenario.part(MotionJob), feature_on_flange(scenario, station)
         assert job is not None
         watched = plan.watched
         factor = scenario.job.speed_factor
@@ -147,38 +175,29 @@ class Motion(Job[MotionPlanned]):
         procedure = wiring.add(
             "motion_procedure",
             MotionProcedure(
-                plan.corners, plan.q_home, job.frames, share, maximum_time_s=maximum_time_s, calibrates=watched is None
+                plan.corners,
+                plan.q_home,
+                job.frames,
+                speed_share=share,
+                maximum_time_s=maximum_time_s,
+                calibrates=watched is None,
             ),
-        )  # fmt: skip
-        queue = wiring.add("frame_queue", FrameQueue(job.queue, _POLL_S))
-        estimator = wiring.add(
-            "flange_estimator",
-            FlangeEstimator(
-                arm=station.arm, X_FR=X_FR, standard=standard, X_BC_guess=c.mounting_guess.pose() if watched is None else watched.X_BC,
-                guess_radius_m=c.guess_radius_mm * 1e-3, background=station.background, period_s=_POLL_S, delay_s=plan.delay_s,
-            ),
-        )  # fmt: skip
+        )
+        queue = FrameQueue(job.queue, POLL_S)
+        X_BC = c.mounting_guess.pose() if watched is None else watched.X_BC
+        nominal = wiring.constant("nominal_scanner", CalibrationStatus())
+        estimate, scan = add_stream(wiring, spine, "flange_estimator", X_FR, X_BC, plan.delay_s, queue, nominal)
         collector = wiring.add("motion_collector", MotionCollector())
-        estimate, state = estimator.GetOutputPort("flange_estimate"), procedure.GetOutputPort("state")
-        record = collector.GetOutputPort("record")
-        wiring.connect(queue, stream=wiring.out("scanner.stream"), flange_estimate=estimate)
+        state, record = procedure.GetOutputPort("state"), collector.GetOutputPort("record")
         wiring.connect(
-            estimator,
-            scan=queue.GetOutputPort("scan"),
-            job=wiring.constant("no_ordered_scan", JobCommand()),
-            history=spine.arm.history,
-            calibration_status=wiring.constant("nominal_scanner", CalibrationStatus()),
+            collector,
+            flange_estimate=estimate,
+            state=state,
+            position_measured=spine.arm.position,
+            sample_time=wiring.out(f"{FIRST}.sample_time"),
         )
         wiring.connect(
-            collector, flange_estimate=estimate, state=state,
-            position_measured=spine.arm.position, sample_time=wiring.out(f"{FIRST}.sample_time"),
-        )  # fmt: skip
-        wiring.connect(
-            procedure,
-            settled_goal=spine.arm.settled_goal,
-            robot_status=spine.arm.status,
-            record=record,
-            hold=spine.end,
+            procedure, settled_goal=spine.arm.settled_goal, robot_status=spine.arm.status, record=record, hold=spine.end
         )
         calibrator, monitor = None, None
         if watched is None:
@@ -187,11 +206,9 @@ class Motion(Job[MotionPlanned]):
             wiring.connect(procedure, calibration=calibrator.GetOutputPort("calibration"))
         else:
             monitored = MonitoredCalibration.of(watched, plan.delay_s, false_alarms_per_hour=job.false_alarms_per_hour)
-            monitor = wiring.add("drift_monitor", DriftMonitor(station.arm, X_FR, monitored, period_s=_POLL_S))
+            monitor = wiring.add("drift_monitor", DriftMonitor(station.arm, X_FR, monitored, period_s=POLL_S))
             wiring.connect(monitor, flange_estimate=estimate, history=spine.arm.history)
-        if wiring.meshcat is not None and monitor is not None:
-            view = wiring.add("drift_view", DriftView(wiring.meshcat, 0.5 * standard.outer_m, scenario.visualization))
-            wiring.connect(view, drift=monitor.GetOutputPort("drift"), flange_estimate=estimate)
+            add_drift_view(wiring, monitor, estimate)
         wiring.feed("scanner.streaming", procedure.GetOutputPort("streaming"))
         recorder = None
         if job.record and job.recording_folder:
@@ -201,7 +218,7 @@ class Motion(Job[MotionPlanned]):
         for name in ("scanner_capture", "joints"):  # for reports only
             if station.diagram.HasOutputPort(f"cheat.{name}"):
                 logged[name] = wiring.out(f"cheat.{name}")
-        shown = {"record": record, "scan": queue.GetOutputPort("scan"), "flange_estimate": estimate}
+        shown = {"record": record, "scan": scan, "flange_estimate": estimate}
         if calibrator is not None:
             shown["calibration"] = calibrator.GetOutputPort("calibration")
         if monitor is not None:
@@ -232,11 +249,8 @@ def plan_corners(
         InputError: a corner is out of reach, or the arm would touch the table or itself on the way.
     """
     X_BC = scenario.calibration.mounting_guess.pose()
-    centre, bodies, X_RF = (
-        np.array(job.centre_m),
-        station_bodies(station),
-        feature_on_flange(scenario, station).inverse(),
-    )
+    centre, bodies = np.array(job.centre_m), station_bodies(station)
+    X_RF = feature_on_flange(scenario, station).inverse()
     found: list[Array] = []
     for corner in CORNERS:
         p = centre + 1e-3 * job.edge_mm * corner

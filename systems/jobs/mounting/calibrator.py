@@ -23,7 +23,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.mounting.messages import HeldOut, MountingState, MountingStatus, NextBest, SeenCircle
+from weldcal.systems.jobs.mounting.procedure import HeldOut, MountingState, MountingStatus, NextBest, SeenCircle
 from weldcal.systems.jobs.weld.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory

@@ -20,10 +20,10 @@ from weldcal.systems.drivers.simulated.second_arm import place_second_arm
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
 from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
-from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
-from weldcal.systems.jobs.mounting.procedure import MountingProcedure
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
+from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.station import Station
@@ -58,9 +58,7 @@ class AddedMounting(AddedJob):
 
     def status(self, root: Context) -> MountingStatus:
         """The present result of the calibration."""
-        status: MountingStatus = self.calibrator.GetOutputPort("status").Eval(
-            self.calibrator.GetMyContextFromRoot(root)
-        )
+        status: MountingStatus = self.value(self.calibrator.GetOutputPort("status"), root)
         return status
 
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
@@ -87,6 +85,9 @@ class Mounting(Job[MountingPlanned]):
             second_robot=not isinstance(scenario.robot_2, NoDevice),
             weld=scenario.job.weld,
         )
+        job = scenario.part(MountingJob)
+        if job is not None and job.second_arm is not None:
+            check_home(job.second_arm.home_deg, job.second_arm.arm, "mounting.second_arm.home_deg")
 
     def furnish(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None

@@ -1,25 +1,103 @@
 """MountingProcedure: visits the planned poses with one arm or two, scans at each, holds out some scans, returns home."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, State
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
 
+from weldcal.calibration.hand_eye.mountings import TargetObservation
+from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
-from weldcal.systems.leaf_system import LeafSystem
-from weldcal.systems.messages import JobCommand, UrStatus
+from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
+from weldcal.systems.messages import JobCommand, Message, UrStatus
 from weldcal.systems.motion.clear_moves import stands_at
 
-ENDS = ("done", "held")
+Route = tuple[tuple[int, Array], ...]
+"""Moves one after the other: number of the arm, and its joints (6,) rad."""
 
 
-class MountingProcedure(LeafSystem):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MountingState(ProcedureState):
+    """State of the procedure."""
+
+    moving: int = 0  # number of the arm that moves
+    route: Route = ()  # the moves after the present one
+    visit: int = -1  # index of the planned pose
+    purpose: str = ""  # of the newest scan: calibrate, or verify at a held-out pose
+    label: str = ""  # of the pose at the end of the route; empty: home
+
+
+@dataclass(frozen=True, eq=False)
+class SeenCircle(Message):
+    """One scan with the circle: the arms' poses, the observation, and the visible share of the circle's edge."""
+
+    label: str
+    pose: MountingPose
+    observation: TargetObservation
+    coverage: float
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of the calibration's prediction of the circle in a held-out scan."""
+
+    label: str
+    error_m: float
+    tilt_rad: float
+
+
+@dataclass(frozen=True)
+class NextBest:
+    """A pose to add: joints (6,) rad, X_BF of the first arm, and the predicted sigma (3-D, m) of a scanned point without and
+    with it."""
+
+    q: Array
+    q_2: Array | None
+    X_BF: RigidTransform
+    sigma_before_m: float
+    sigma_after_m: float
+
+    def sentence(self) -> str:
+        """The proposal as one sentence for the operator."""
+        joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.q))
+        second = "" if self.q_2 is None else f", second arm [{', '.join(f'{v:.0f}' for v in np.degrees(self.q_2))}] deg"
+        p = 1e3 * self.X_BF.translation()
+        return (
+            f"joints [{joints}] deg{second} (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the "
+            f"sigma of a scanned point from {1e3 * self.sigma_before_m:.4f} to {1e3 * self.sigma_after_m:.4f} mm."
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MountingStatus(Message):
+    """The calibration after its newest scan."""
+
+    sequence: int = 0
+    seen: tuple[SeenCircle, ...] = ()
+    refused: tuple[tuple[str, str], ...] = ()
+    result: HandEyeResult | None = None
+    sigma_work_m: float = np.inf  # predicted error (3-D, rms) of a point at the scanner's best distance
+    history: tuple[tuple[int, float], ...] = ()
+    held_out: tuple[HeldOut, ...] = ()
+    next_best: NextBest | None = None
+    done: bool = False
+    message: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MountingInputs(Inputs):
+    """Inputs of the procedure at one tick."""
+
+    settled_goal_2: float
+    robot_status_2: UrStatus
+    status: MountingStatus
+
+
+class MountingProcedure(Procedure[MountingState, MountingInputs]):
     """Runs the procedure; a robot fault, or a goal that is not reached, holds it with a reason.
 
     .. pydrake_system::
@@ -27,23 +105,27 @@ class MountingProcedure(LeafSystem):
         name: MountingProcedure
         input_ports:
         - settled_goal
-        - settled_goal_2
         - robot_status
-        - robot_status_2
-        - status
         - hold
         - position_measured
+        - settled_goal_2
+        - robot_status_2
+        - status
         output_ports:
         - job
         - job_2
-        - trigger
         - state
+        - trigger
 
     One arm moves at a time: towards a pose the second arm first, towards home the first arm first, so that the move home is
     the reversed move from home. An arm that is not at home moves there first. `hold` (1) is the operator's stop request. The
     first `scans` poses of the plan are for the calibration (fewer where the required error is reached earlier), the next
-    `held_out` poses for its verification.
+    `held_out` poses for its verification. The ports of the second arm stay open where there is one arm.
     """
+
+    inputs = MountingInputs
+    moves = ("move",)
+    commands = ("job", "job_2")
 
     def __init__(
         self,
@@ -51,116 +133,69 @@ class MountingProcedure(LeafSystem):
         scans: int,
         held_out: int,
         home: tuple[Array, Array | None],
+        *,
         timeout_s: float = 60.0,
         maximum_time_s: float = np.inf,
         period_s: float = 0.008,
     ) -> None:
-        super().__init__()
-        self._plan, self._scans, self._held_out = tuple(plan), scans, held_out
-        self.home, self._timeout_s, self._maximum_time_s = home, timeout_s, maximum_time_s
-        self._settled = [self.DeclareVectorInputPort(n, 1) for n in ("settled_goal", "settled_goal_2")]
-        self._robots = [
-            self.DeclareAbstractInputPort(n, AbstractValue.Make(UrStatus())) for n in ("robot_status", "robot_status_2")
-        ]
-        self._status = self.DeclareAbstractInputPort("status", AbstractValue.Make(MountingStatus()))
-        self._hold = self.DeclareVectorInputPort("hold", 1)
-        self._position = self.DeclareVectorInputPort("position_measured", 6)
-        self._state = self.DeclareAbstractState(AbstractValue.Make(MountingState()))
-        ticket = {self.abstract_state_ticket(self._state)}
-        for arm, name in enumerate(("job", "job_2")):
-            self.DeclareAbstractOutputPort(
-                name, lambda: AbstractValue.Make(JobCommand()), partial(self._job, arm=arm), ticket
-            )
-        self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
-        self.DeclareStateOutputPort("state", self._state)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+        super().__init__(MountingState(), move_timeout_s=timeout_s, maximum_time_s=maximum_time_s, period_s=period_s)
+        self._plan, self._scans, self._held_out, self.home = tuple(plan), scans, held_out, home
+        self._homeward: Route = tuple((arm, q) for arm, q in enumerate(home) if q is not None)
+        second = () if home[1] is not None else ("settled_goal_2", "robot_status_2")
+        self.read(*second, settled_goal_2=0.0, robot_status_2=UrStatus(), status=MountingStatus())
 
-    def _update(self, context: Context, state: State) -> None:
-        old: MountingState = context.get_abstract_state(self._state).get_value()
-        new = self._next(old, context)
-        if new is not old:
-            state.get_mutable_abstract_state(self._state).set_value(new)
+    def look(self, context: Context, s: MountingState) -> MountingInputs:
+        """See Procedure: the arm that moves, and the arm that is not ready."""
+        now = super().look(context, s)
+        robot = now.robot if not now.robot.ready else now.robot_status_2
+        return replace(now, robot=robot, settled_goal=int(now.settled_goal_2) if s.moving else now.settled_goal)
 
-    def _next(self, s: MountingState, context: Context) -> MountingState:
-        now = context.get_time()
-        if s.phase in ENDS:
-            return s
-        for port in self._robots[: 1 if self.home[1] is None else 2]:
-            robot: UrStatus = port.Eval(context)
-            if not robot.ready:
-                reason = robot.fault or "The robot does not obey velocity commands."
-                return replace(s, phase="held", since=now, reason=reason)
-        if self._hold.Eval(context)[0] > 0.5:
-            return replace(
-                s, phase="held", since=now, reason=f"A person ended the job, on the way to {s.label or 'home'}."
-            )
-        if now > self._maximum_time_s:
-            reason = f"The job took longer than its {self._maximum_time_s:.0f} s; allow more with job.maximum_time_s."
-            return replace(s, phase="held", since=now, reason=reason)
-        if s.phase == "start":
-            if not stands_at(self._position.Eval(context), self.home[0]):
-                return _go(s, self._homeward(), "", now)
-            return self._visit(s, 0, now)
-        if s.phase == "move":
-            if int(self._settled[s.moving].Eval(context)[0]) == s.goal_id:
-                return self._arrived(s, now)
-            if now - s.since > self._timeout_s:
-                return replace(s, phase="held", since=now, reason=f"An arm did not reach {s.label or 'home'} in time.")
-            return s
-        status: MountingStatus = self._status.Eval(context)
-        if status.sequence != s.trigger:
-            return s
-        if s.purpose == "calibrate" and (status.done or s.visit + 1 >= self._scans):
-            # the held-out poses are approached from home, wherever the calibration ended
-            return _go(replace(s, visit=self._scans - 1), self._homeward(), "", now)
-        if s.visit + 1 >= self._scans + self._held_out:
-            return _go(s, self._homeward(), "", now)
-        return self._visit(s, s.visit + 1, now)
+    def where(self, s: MountingState) -> str:
+        """See Procedure."""
+        return f"{s.phase} {s.label}".rstrip()
 
-    def _arrived(self, s: MountingState, now: float) -> MountingState:
+    def command(self, s: MountingState, arm: int = 0) -> JobCommand:
+        """See Procedure."""
+        command = super().command(s)
+        return command if s.moving == arm else replace(command, mode="hold", q_goal=None)
+
+    def _start(self, s: MountingState, now: MountingInputs) -> MountingState:
+        if not stands_at(now.q, self.home[0]):
+            return self._follow(s, now, self._homeward, "")
+        return self._visit(s, now, 0)
+
+    def _arrived(self, s: MountingState, now: MountingInputs) -> MountingState:
         if s.route:
-            return _go(s, s.route, s.label, now)
+            return self._follow(s, now, s.route, s.label)
         if s.label:
-            return replace(s, phase="scan", since=now, trigger=s.trigger + 1)
+            return self.request(s, now, "scan")
         if s.visit + 1 < self._scans + self._held_out:
-            return self._visit(s, s.visit + 1, now)
-        return replace(s, phase="done", since=now)
+            return self._visit(s, now, s.visit + 1)
+        return self.enter(s, now, "done")
 
-    def _visit(self, s: MountingState, k: int, now: float) -> MountingState:
+    def _scanned(self, s: MountingState, now: MountingInputs) -> MountingState:
+        if now.status.sequence != s.trigger:
+            return s
+        if s.purpose == "calibrate" and (now.status.done or s.visit + 1 >= self._scans):
+            # the held-out poses are approached from home, wherever the calibration ended
+            return self._follow(replace(s, visit=self._scans - 1), now, self._homeward, "")
+        if s.visit + 1 >= self._scans + self._held_out:
+            return self._follow(s, now, self._homeward, "")
+        return self._visit(s, now, s.visit + 1)
+
+    def _visit(self, s: MountingState, now: MountingInputs, k: int) -> MountingState:
         pose, aside = self._plan[k], k >= self._scans
         label = f"aside{k - self._scans + 1:02d}" if aside else f"pose{k + 1:02d}"
-        route: tuple[tuple[int, Array], ...] = ((0, pose.q),)
+        route: Route = ((0, pose.q),)
         if pose.q_2 is not None:
             route = ((1, pose.q_2), *route)
         if pose.via_home:
-            route = (*self._homeward(), *route)
-        return _go(replace(s, visit=k, purpose="verify" if aside else "calibrate"), route, label, now)
+            route = (*self._homeward, *route)
+        return self._follow(replace(s, visit=k, purpose="verify" if aside else "calibrate"), now, route, label)
 
-    def _homeward(self) -> tuple[tuple[int, Array], ...]:
-        first = ((0, self.home[0]),)
-        return first if self.home[1] is None else (*first, (1, self.home[1]))
+    def _follow(self, s: MountingState, now: MountingInputs, route: Route, label: str) -> MountingState:
+        """Start a route."""
+        (arm, q), rest = route[0], route[1:]
+        return self.go(s, now, "move", q, moving=arm, route=rest, label=label)
 
-    def _job(self, context: Context, output: Any, arm: int) -> None:
-        s: MountingState = context.get_abstract_state(self._state).get_value()
-        moving = s.phase == "move" and s.moving == arm
-        output.set_value(
-            JobCommand(
-                phase=s.phase,
-                mode="move" if moving else "hold",
-                goal_id=s.goal_id,
-                q_goal=s.q_goal if moving else None,
-                finished=s.phase in ENDS,
-                held=s.phase == "held",
-                reason=s.reason or None,
-            )
-        )
-
-    def _trigger(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(context.get_abstract_state(self._state).get_value().trigger))
-
-
-def _go(s: MountingState, route: tuple[tuple[int, Array], ...], label: str, now: float) -> MountingState:
-    """Start a route; `label` of the pose at its end, empty for home."""
-    (arm, q), rest = route[0], route[1:]
-    moving = replace(s, phase="move", since=now, goal_id=s.goal_id + 1, moving=arm, q_goal=np.array(q))
-    return replace(moving, route=rest, label=label)
+    steps: ClassVar = {"start": _start, "move": _arrived, "scan": _scanned}

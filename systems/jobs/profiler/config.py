@@ -3,9 +3,9 @@
 import dataclasses as dc
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
 STAGES = ("edge", "sphere", "seam")
@@ -88,7 +88,7 @@ class ProfilerJob:
     sphere: SphereStage = dc.field(default_factory=SphereStage)
     seam: SeamStage = dc.field(default_factory=SeamStage)
     robot_sigma_mm: float = (
-        0.06  # per axis: error of the flange position reported by the controller, drawn at each pose
+        0.06  # per axis: error of the flange position that the controller reports, drawn at each pose
     )
     clearance_mm: float = 6.0  # nominal distance between torch or profiler and the scanned object
     near_mm: float = 72.0  # the depth range of the calibration
@@ -102,7 +102,7 @@ def pose_of(xyz_m: list[float], rpy_deg: list[float]) -> RigidTransform:
     return RigidTransform(RollPitchYaw(np.deg2rad(rpy_deg)), xyz_m)
 
 
-def edge_as_thought(job: ProfilerJob) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def edge_as_thought(job: ProfilerJob) -> tuple[Array, Array]:
     """The nominal edge: a point (3,) m of the straightedge's edge and its direction (3,), in B."""
     X = pose_of(job.straightedge.xyz_m, job.straightedge.rpy_deg)
     return np.array(X.translation()), X.rotation().matrix()[:, 0].copy()

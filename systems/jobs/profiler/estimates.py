@@ -26,9 +26,8 @@ SMOOTHING_M = 0.004  # seam wavelengths below about six times this are treated a
 FAR_SIGMAS = 4.0  # times the scatter about the smooth seam; points beyond it are rejected
 TRIALS = 3  # rounds of outlier rejection
 ARC_SIGMAS = 4.0  # largest distance of a sample that counts as part of the arc
-ARC_COSINE = (
-    0.84  # rms over 60 degrees to both sides: samples are noisy in z only, and an arc's normals are inclined to z
-)
+# rms over 60 degrees to both sides: samples are noisy in z only, and an arc's normals are inclined to z
+ARC_COSINE = 0.84
 WINDOW_M = 0.012  # beyond the depth range and the sphere's radius; farther samples belong to another object
 NEAREST_PERCENT = 3.0  # of a profile's depths; the share of spikes towards the sensor is smaller
 WIDER_M = 0.5e-3  # noise may make a circle larger than the sphere
@@ -181,9 +180,8 @@ def find_sphere(
         except FeatureNotFound:
             lost += 1
             continue
-        if (
-            circle[2] > radius + WIDER_M
-        ):  # a run of samples that is not a section of this sphere: a face, or an edge of another object
+        # a run of samples that is not a section of this sphere: a face, or an edge of another object
+        if circle[2] > radius + WIDER_M:
             lost += 1
             continue
         arcs[one.kind][0].append(one.q)

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.kinematics import ArmModel, jacobian
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.config import NoDevice
@@ -15,15 +16,45 @@ from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.profiler.config import ProfilerJob, check_profiler_job
-from weldcal.systems.jobs.profiler.planning_context import PlanningContext
-from weldcal.systems.jobs.profiler.procedure import PLANS, ProfilerProcedure
-from weldcal.systems.jobs.profiler.robot_error import RobotError
-from weldcal.systems.jobs.profiler.state import ProfilerState
-from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.jobs.profiler.plan import PlanningContext
+from weldcal.systems.jobs.profiler.procedure import PLANS, ProfilerProcedure, ProfilerState
+from weldcal.systems.leaf_system import LeafSystem
+from weldcal.systems.messages import JobCommand
+from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
+
+
+class RobotError(LeafSystem):
+    """Adds joint offsets so that the reported flange position differs from the true one, drawn for each goal.
+
+    .. pydrake_system::
+
+        name: RobotError
+        input_ports:
+        - position_measured
+        - job
+        output_ports:
+        - position
+
+    Both positions (6) rad. The error of the flange's position is `sigma_m` per axis, the orientation has none. It is constant
+    for one goal, including the touch after a move and a whole pass.
+    """
+
+    def __init__(self, arm: ArmModel, sigma_m: float, seed: int) -> None:
+        super().__init__()
+        self._arm, self._sigma_m, self._seed = arm, sigma_m, seed
+        self._position = self.DeclareVectorInputPort("position_measured", 6)
+        self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
+        self.DeclareVectorOutputPort("position", 6, self._add)
+
+    def _add(self, context: Context, output: BasicVector) -> None:
+        job: JobCommand = self._job.Eval(context)
+        q = np.array(self._position.Eval(context))
+        shift = self._sigma_m * np.random.default_rng([self._seed, job.goal_id]).standard_normal(3)
+        output.SetFromVector(q + np.linalg.solve(jacobian(self._arm, q), np.concatenate([np.zeros(3), shift])))
 
 
 @dataclass(eq=False)
@@ -71,10 +102,7 @@ class Profiler(Job[PlanningContext]):
         table_z_m = scenario.calibration.table_z_m
         fixture = draw_fixture(drawn_pose(p), *error, job, rng, table_z_m, part, X_BP)
         return Furnishing(
-            profiler=fixture,
-            time_step_s=fixture.time_step_s,
-            parts=(fixture, fixture.truth),
-            contacts_read=True,
+            profiler=fixture, time_step_s=fixture.time_step_s, parts=(fixture, fixture.truth), contacts_read=True
         )
 
     def position_error(self, scenario: Scenario, arm: ArmModel, seed: int) -> LeafSystem | None:
@@ -98,7 +126,14 @@ class Profiler(Job[PlanningContext]):
         profiler = wiring.scenario.profiler
         assert isinstance(profiler, RenderedProfiler)
         procedure = wiring.add(
-            "profiler_procedure", ProfilerProcedure(plan, profiler, wiring.seed, wiring.station.background)
+            "profiler_procedure",
+            ProfilerProcedure(
+                plan,
+                profiler,
+                wiring.seed,
+                wiring.station.background,
+                move_timeout_s=MOVE_TIMEOUT_S / wiring.scenario.job.speed_factor,
+            ),
         )
         wiring.connect(
             procedure,

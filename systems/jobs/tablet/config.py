@@ -1,4 +1,4 @@
-"""Configuration of the tablet job: nominal pen and tablet, and the motion."""
+"""Configuration and messages of the tablet job: nominal pen and tablet, the motion, pictures and touches."""
 
 import dataclasses as dc
 
@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.messages import Message
 from weldcal.systems.scenario.schema import Scenario
 
 MOST_LANDMARKS = 100
@@ -53,7 +55,7 @@ class TabletConfig:
         """The nominal X_BT."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
-    def landmarks_m(self) -> NDArray[np.float64]:
+    def landmarks_m(self) -> Array:
         """Landmarks (n, 2) m of the page from its first, row by row."""
         return 1e-3 * np.array(
             [[i * self.across_mm, j * self.down_mm] for j in range(self.rows) for i in range(self.columns)]
@@ -108,3 +110,32 @@ def check_pen(pen: PenConfig) -> None:
         raise InputError("tablet.pen.tip_m must be at least 0.03 m in front of the flange.")
     if pen.radius_mm <= 0.0 or pen.stiffness_N_per_m <= 0.0 or pen.mounting_mm < 0.0:
         raise InputError("tablet.pen: radius_mm and stiffness_N_per_m must be positive, mounting_mm not negative.")
+
+
+@dc.dataclass(frozen=True, eq=False)
+class WristPicture(Message):
+    """One picture: grey (h, w) uint8 and depth (h, w) m with its noise; `sequence` 0 before the first."""
+
+    sequence: int = 0
+    capture_time: float = -np.inf
+    grey: NDArray[np.uint8] = dc.field(default_factory=lambda: np.empty((0, 0), dtype=np.uint8))
+    depth_m: Array = dc.field(default_factory=lambda: np.empty((0, 0)))
+
+
+@dc.dataclass(frozen=True, eq=False)
+class TabletTouch(Message):
+    """One touch as the page records it: position (2,) px from the first landmark, to a tenth; `sequence` 0 before the first."""
+
+    sequence: int = 0
+    time: float = -np.inf
+    position_px: Array = dc.field(default_factory=lambda: np.full(2, np.nan))
+    down: bool = False
+
+
+@dc.dataclass(frozen=True, eq=False)
+class TabletTruth(Message):
+    """Ground truth of the simulation: camera and pen tip (its centre, at rest) on the flange, tablet in the base."""
+
+    X_FC: RigidTransform
+    p_FP: Array
+    X_BT: RigidTransform

@@ -1,28 +1,20 @@
 """TabletProcedure: takes one picture of the tablet, then lowers the pen onto each landmark until the tablet detects it."""
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, State
 
-from weldcal.models.arms.kinematics import ArmModel, jacobian
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
-from weldcal.systems.leaf_system import LeafSystem
-from weldcal.systems.messages import JobCommand, Message, UrStatus
+from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
+from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
+from weldcal.systems.messages import Message
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
-MOVES = ("to_start", "to_look", "to_above", "lift", "to_home")
-ENDS = ("done", "held")
 PICTURE_TIMEOUT_S = 8.0
 # added to a descent's longest time, so that a touch at its end can still be reported
 LATE_TOUCH_S = 0.2
-_MODES = {
-    **dict.fromkeys(MOVES, "move"),
-    "descend": "weld",
-}  # the command mode in which the arbiter selects the servo velocity
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,189 +42,120 @@ class Touched(Message):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TabletState(Message):
-    """State of the procedure."""
+class TabletState(ProcedureState):
+    """State of the procedure; `trigger` is the number of the requested picture."""
 
-    phase: str = "start"  # start, to_start, to_look, look, to_above, descend, lift, to_home, done, held
-    since: float = 0.0
-    goal_id: int = 0
-    q_goal: Array | None = None
     landmark: int = 0
-    trigger: int = 0
     # number of touches at the start of this descent, so that a bounce during the lift does not count for the next one
     felt_before: int = 0
     touches: tuple[Touched, ...] = ()
     q_look: Array = field(default_factory=lambda: np.full(6, np.nan))
-    reason: str = ""
-
-    @property
-    def finished(self) -> bool:
-        """Whether the procedure commands no more motion."""
-        return self.phase in ENDS
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TabletSeen:
+class TabletInputs(Inputs):
     """Inputs of the procedure at one tick."""
 
-    time: float
-    q: Array
-    settled_goal: int
-    robot: UrStatus
-    hold: bool
     history: PoseHistory
     picture: WristPicture
     touch: TabletTouch
 
 
-def next_state(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> TabletState:
-    """The state after this tick; the same object where nothing changed."""
-    if s.finished:
-        return s
-    stop = _why_stop(s, seen, plan)
-    if stop:
-        return replace(s, phase="held", since=seen.time, reason=stop)
-    arrived = s.goal_id > 0 and seen.settled_goal == s.goal_id
-    if s.phase in MOVES:
-        return _after_move(s, seen, plan) if arrived else s
-    if s.phase == "start":
-        return _go(s, "to_start", plan.q_home, seen.time)
-    if s.phase == "look":
-        q = seen.history.joints_at(seen.picture.capture_time) if seen.picture.sequence == s.trigger else None
-        return s if q is None else _go(replace(s, q_look=q), "to_above", plan.q_above[0], seen.time)
-    if seen.touch.sequence > s.felt_before:
-        q = seen.history.joints_at(seen.touch.time)
-        if q is None:
-            return s
-        touches = (*s.touches, Touched(s.landmark, seen.touch.position_px, q, seen.touch.time))
-        return _go(replace(s, touches=touches), "lift", plan.q_above[s.landmark], seen.time)
-    if seen.time - s.since > plan.longest_descent_s:
-        reason = f"The pen did not touch the tablet at landmark {s.landmark + 1}: check the tablet's pose."
-        # lift along the descent first: home is not straight above
-        return _go(replace(s, reason=reason), "lift", plan.q_above[s.landmark], seen.time)
-    return s
-
-
-def _after_move(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> TabletState:
-    if s.phase == "to_start":
-        return _go(s, "to_look", plan.q_look, seen.time)
-    if s.phase == "to_look":
-        return replace(s, phase="look", since=seen.time, trigger=s.trigger + 1)
-    if s.phase == "to_above":
-        return replace(s, phase="descend", since=seen.time, felt_before=seen.touch.sequence)
-    if s.phase == "lift" and not s.reason and s.landmark + 1 < len(plan.q_above):
-        return _go(replace(s, landmark=s.landmark + 1), "to_above", plan.q_above[s.landmark + 1], seen.time)
-    if s.phase == "lift":
-        return _go(s, "to_home", plan.q_home, seen.time)
-    return replace(s, phase="held" if s.reason else "done", since=seen.time)
-
-
-def _why_stop(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> str:
-    """The reason why the procedure must be held; empty where there is none."""
-    if not seen.robot.ready:
-        return seen.robot.fault or f"The robot stopped: {seen.robot.safety_mode}."
-    if seen.hold:
-        return f"A person ended the job, in the phase '{s.phase}'."
-    if seen.time > plan.maximum_time_s:
-        return f"The job took longer than {plan.maximum_time_s:.0f} s; allow more with job.maximum_time_s."
-    if s.phase in MOVES and seen.time - s.since > plan.move_timeout_s:
-        return f"The arm did not come to rest at its goal within {plan.move_timeout_s:.0f} s."
-    if s.phase == "look" and seen.time - s.since > PICTURE_TIMEOUT_S:
-        return f"No picture arrived within {PICTURE_TIMEOUT_S:.0f} s of its trigger."
-    if s.phase == "descend" and seen.time - s.since > plan.longest_descent_s + LATE_TOUCH_S:
-        return "The arm's pose at the time of a touch is not known: check the clocks."
-    return ""
-
-
-class TabletProcedure(LeafSystem):
+class TabletProcedure(Procedure[TabletState, TabletInputs]):
     """Runs the procedure; a robot fault, the operator, or a descent without a touch holds it with a reason.
 
     .. pydrake_system::
 
         name: TabletProcedure
         input_ports:
-        - position_measured
         - settled_goal
         - robot_status
+        - hold
+        - position_measured
         - history
         - picture
         - touch
-        - hold
         output_ports:
         - job
-        - descent
-        - trigger
         - state
+        - trigger
+        - descent
 
     `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the pen descends; `descent`
     (6) rad/s moves the pen straight down, zero otherwise; `hold` (1) is the operator's stop request.
     """
 
+    inputs = TabletInputs
+    moves = ("to_start", "to_look", "to_above", "lift", "to_home")
+    driven = ("descend",)
+    velocity_port = "descent"
+
     def __init__(self, arm: ArmModel, plan: TabletPlan, period_s: float = 0.004) -> None:
-        super().__init__()
+        timeouts = {
+            "look": (PICTURE_TIMEOUT_S, f"No picture arrived within {PICTURE_TIMEOUT_S:.0f} s of its trigger."),
+            "descend": (
+                plan.longest_descent_s + LATE_TOUCH_S,
+                "The arm's pose at the time of a touch is not known: check the clocks.",
+            ),
+        }
+        super().__init__(
+            TabletState(),
+            move_timeout_s=plan.move_timeout_s,
+            maximum_time_s=plan.maximum_time_s,
+            timeouts=timeouts,
+            period_s=period_s,
+        )
         self._arm, self._plan = arm, plan
-        self._position = self.DeclareVectorInputPort("position_measured", 6)
-        self._settled = self.DeclareVectorInputPort("settled_goal", 1)
-        self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
-        self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
-        self._picture = self.DeclareAbstractInputPort("picture", AbstractValue.Make(WristPicture()))
-        self._touch = self.DeclareAbstractInputPort("touch", AbstractValue.Make(TabletTouch()))
-        self._hold = self.DeclareVectorInputPort("hold", 1)
-        self._state = self.DeclareAbstractState(AbstractValue.Make(TabletState()))
-        out = self.DeclareDiscreteState(np.zeros(6))
-        ticket = {self.abstract_state_ticket(self._state)}
-        self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job, ticket)
-        self.DeclareStateOutputPort("descent", out)
-        self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
-        self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(TabletState()), self._show, ticket)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+        self.read(history=PoseHistory(), picture=WristPicture(), touch=TabletTouch())
 
-    def stands(self, context: Context) -> TabletState:
-        """State of the procedure in this system's context."""
-        state: TabletState = context.get_abstract_state(self._state).get_value()
-        return state
+    def drive(self, s: TabletState, now: TabletInputs) -> tuple[TabletState, Array]:
+        """See Procedure: the pen moves straight down."""
+        twist = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -self._plan.descent_m_s])
+        return self.guarded(s, now, self._arm, self._plan.p_FP, twist)
 
-    def _update(self, context: Context, state: State) -> None:
-        old = self.stands(context)
-        seen = TabletSeen(
-            time=context.get_time(),
-            q=np.array(self._position.Eval(context)),
-            settled_goal=int(self._settled.Eval(context)[0]),
-            robot=self._status.Eval(context),
-            hold=bool(self._hold.Eval(context)[0] > 0.5),
-            history=self._history.Eval(context),
-            picture=self._picture.Eval(context),
-            touch=self._touch.Eval(context),
-        )
-        new = next_state(old, seen, self._plan)
-        if new is not old:
-            state.get_mutable_abstract_state(self._state).set_value(new)
-        velocity = np.zeros(6)
-        if new.phase == "descend":
-            twist = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -self._plan.descent_m_s])
-            velocity = np.linalg.solve(jacobian(self._arm, seen.q, self._plan.p_FP), twist)
-        state.get_mutable_discrete_state().set_value(velocity)
+    def _start(self, s: TabletState, now: TabletInputs) -> TabletState:
+        return self.go(s, now, "to_start", self._plan.q_home)
 
-    def _job(self, context: Context, output: Any) -> None:
-        s = self.stands(context)
-        output.set_value(
-            JobCommand(
-                phase=s.phase,
-                mode=_MODES.get(s.phase, "hold"),
-                goal_id=s.goal_id,
-                q_goal=s.q_goal,
-                finished=s.finished,
-                held=s.phase == "held",
-                reason=s.reason or None,
-            )
-        )
+    def _started(self, s: TabletState, now: TabletInputs) -> TabletState:
+        return self.go(s, now, "to_look", self._plan.q_look)
 
-    def _trigger(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(self.stands(context).trigger))
+    def _arrived(self, s: TabletState, now: TabletInputs) -> TabletState:
+        return self.request(s, now, "look")
 
-    def _show(self, context: Context, output: Any) -> None:
-        output.set_value(self.stands(context))
+    def _look(self, s: TabletState, now: TabletInputs) -> TabletState:
+        q = now.history.joints_at(now.picture.capture_time) if now.picture.sequence == s.trigger else None
+        return s if q is None else self.go(s, now, "to_above", self._plan.q_above[0], q_look=q)
 
+    def _above(self, s: TabletState, now: TabletInputs) -> TabletState:
+        return self.enter(s, now, "descend", felt_before=now.touch.sequence)
 
-def _go(s: TabletState, phase: str, q_goal: Array, now: float) -> TabletState:
-    return replace(s, phase=phase, since=now, goal_id=s.goal_id + 1, q_goal=np.array(q_goal))
+    def _descend(self, s: TabletState, now: TabletInputs) -> TabletState:
+        q_above = self._plan.q_above[s.landmark]
+        if now.touch.sequence > s.felt_before:
+            q = now.history.joints_at(now.touch.time)
+            if q is None:
+                return s
+            touches = (*s.touches, Touched(s.landmark, now.touch.position_px, q, now.touch.time))
+            return self.go(s, now, "lift", q_above, touches=touches)
+        if now.time - s.since > self._plan.longest_descent_s:
+            reason = f"The pen did not touch the tablet at landmark {s.landmark + 1}: check the tablet's pose."
+            # lift along the descent first: home is not straight above
+            return self.go(s, now, "lift", q_above, reason=self.because(s, reason))
+        return s
+
+    def _lifted(self, s: TabletState, now: TabletInputs) -> TabletState:
+        following = s.landmark + 1
+        if not s.reason and following < len(self._plan.q_above):
+            return self.go(s, now, "to_above", self._plan.q_above[following], landmark=following)
+        return self.go(s, now, "to_home", self._plan.q_home)
+
+    steps: ClassVar = {
+        "start": _start,
+        "to_start": _started,
+        "to_look": _arrived,
+        "look": _look,
+        "to_above": _above,
+        "descend": _descend,
+        "lift": _lifted,
+        "to_home": Procedure.end,
+    }

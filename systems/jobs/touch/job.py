@@ -14,8 +14,7 @@ from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
-from weldcal.systems.jobs.touch.config import TouchConfig, check_touch
-from weldcal.systems.jobs.touch.planner import TouchPlanner, TouchPlanning
+from weldcal.systems.jobs.touch.planner import TouchConfig, TouchPlanner, TouchPlanning, check_touch
 from weldcal.systems.jobs.touch.procedure import Felt, TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.jobs.weld.job import seam_planning
@@ -105,12 +104,12 @@ class TouchJob(Job[TouchPlanning]):
         assert isinstance(scenario.finger_camera, FingerCameraConfig)
         slower = 1.0 / scenario.job.speed_factor
         motion = TouchMotion(
-            np.deg2rad(scenario.home_deg),
-            1e-3 * config.descent_mm_s,
-            1e-3 * config.press_mm,
-            1e-3 * (config.deepest_mm + config.press_mm),
-            MOVE_TIMEOUT_S * slower,
-            scenario.job.maximum_time_s * slower,
+            q_home=np.deg2rad(scenario.home_deg),
+            descent_m_s=1e-3 * config.descent_mm_s,
+            press_m=1e-3 * config.press_mm,
+            deepest_m=1e-3 * (config.deepest_mm + config.press_mm),
+            move_timeout_s=MOVE_TIMEOUT_S * slower,
+            maximum_time_s=scenario.job.maximum_time_s * slower,
         )
         planner = wiring.add("touch_planner", TouchPlanner(plan, station.background))
         finger = wiring.add(

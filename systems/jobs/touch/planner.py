@@ -2,9 +2,9 @@
 
 import dataclasses as dc
 import itertools
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
@@ -14,20 +14,75 @@ from weldcal.calibration.planning.clearance import arm_bodies
 from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.calibration.touch.table import around, fit_touched_plane
 from weldcal.models.arms.inverse import nearest_solution
-from weldcal.models.errors import WeldcalError
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.touch.config import TouchConfig
-from weldcal.systems.jobs.weld.levelled import plan_root_anyhow
-from weldcal.systems.jobs.weld.seam_planner import CLEAR_OF_PART_M, SeamObstructed, SeamOutOfReach, SeamPlanning
+from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice
+from weldcal.systems.jobs.weld.seam_planner import (
+    CLEAR_OF_PART_M,
+    SeamObstructed,
+    SeamOutOfReach,
+    SeamPlanning,
+    plan_root_anyhow,
+)
 from weldcal.systems.messages import JobCommand, Message, Scan
+from weldcal.systems.scenario.schema import FILE, Scenario
 from weldcal.welding.seam.curve import SeamCurve
+
+FEWEST, MOST = 3, 60
+_POSITIVE = ("aside_mm", "clearance_mm", "descent_mm_s", "press_mm", "deepest_mm")
+
+
+@dc.dataclass(kw_only=True)
+class TouchConfig:
+    """`touch:` places on the part beside its groove, and how the tip goes down to them."""
+
+    # a result of calibrate or demo: its folder, or calibration.yaml
+    result: str = dc.field(default="", metadata=FILE)
+    points: int = 8  # along the seam, on both sides in turn
+    aside_mm: float = 9.0  # of the groove's middle, where the face is flat
+    clearance_mm: float = 20.0  # of the tip above the face, where the descent begins; the torch hangs as low as the tip
+    descent_mm_s: float = 3.0
+    press_mm: float = 1.0  # deflection of the tip at which it has touched
+    deepest_mm: float = 5.0  # below the scanned face, where the touch is abandoned
+    turn_deg: float = 20.0  # of the tool to either side, from touch to touch
+
+
+def check_touch(scenario: Scenario) -> None:
+    """Check the touch job of a scenario; a scenario without one passes.
+
+    Raises:
+        InputError: one sentence that says what to change.
+    """
+    touch = scenario.part(TouchConfig)
+    if touch is None:
+        return
+    if scenario.job.calibrate or scenario.job.weld:
+        raise InputError(
+            "The touch job neither calibrates nor welds: write job: {calibrate: false, weld: false}, or run it with weldcal verify RESULT "
+            "--scenario NAME."
+        )
+    if not touch.result or not Path(touch.result).exists():
+        raise InputError(f"touch.result must be a result of weldcal calibrate, and there is none at '{touch.result}'.")
+    if not scenario.welds or scenario.workpiece is None or not isinstance(scenario.finger_camera, FingerCameraConfig):
+        raise InputError("A touch needs a tool with a soft tip, a finger_camera and a workpiece in the scenario.")
+    if isinstance(scenario.scanner, NoDevice):
+        raise InputError("A touch needs the scanner that was calibrated: write scanner: in the scenario.")
+    for name in _POSITIVE:
+        if not getattr(touch, name) > 0.0:
+            raise InputError(f"touch.{name} must be a positive number, not {getattr(touch, name):g}.")
+    if not FEWEST <= touch.points <= MOST:
+        raise InputError(f"touch.points must be from {FEWEST} to {MOST}, not {touch.points}.")
+    if not 0.0 <= touch.turn_deg <= 45.0:
+        raise InputError(f"touch.turn_deg must be from 0 to 45, and it is {touch.turn_deg:g}.")
+
 
 _COLUMN_M = 0.003  # points of the scan this near to a line along `up` show the face's height there
 _FLAT_M = 0.004  # of the face around a place, to which a plane is fitted
 _LEAST_COLUMN, _LEAST_FLAT = 5, 8  # points
 
-Joints = NDArray[np.float64]
+Joints = Array
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -35,11 +90,11 @@ class Place(Message):
     """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal in the base."""
 
     q_above: Joints
-    p_C: NDArray[np.float64]
-    n_C: NDArray[np.float64]
+    p_C: Array
+    n_C: Array
     sigma_m: float
-    p_B: NDArray[np.float64]
-    n_B: NDArray[np.float64]
+    p_B: Array
+    n_B: Array
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -126,9 +181,7 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
     return PlannedTouches(scan.sequence, tuple(places))
 
 
-def _face(
-    raw: NDArray[np.float64], points_B: NDArray[np.float64], p_B: NDArray[np.float64], up: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _face(raw: Array, points_B: Array, p_B: Array, up: Array) -> tuple[Array, Array, float]:
     """Plane of the face on the line through p_B along ``up``: point and normal towards the scanner as scanned, and the sigma, m."""
     away = points_B - p_B
     height = away @ up

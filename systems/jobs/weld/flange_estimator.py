@@ -14,6 +14,7 @@ from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.motion.frames import IN_MOTION
 from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
@@ -131,7 +132,7 @@ def streamed_guess(
     return FlangeGuess(expected, radius_m + 0.5 * standard.outer_m, X_CR.rotation().matrix()[:, 2])
 
 
-def seen_about(points_C: NDArray[np.float32], center_C: NDArray[np.float64], radius_m: float) -> NDArray[np.float32]:
+def seen_about(points_C: NDArray[np.float32], center_C: Array, radius_m: float) -> NDArray[np.float32]:
     """The rows and columns (h, w, 3) of a scan (H, W, 3) m that hold all its points within ``radius_m`` of a place, and some more;
     the whole scan where a coarse look finds none."""
     coarse = points_C[::_COARSE, ::_COARSE]

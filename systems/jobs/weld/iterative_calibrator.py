@@ -1,18 +1,19 @@
-"""IterativeCalibrator: estimates X_BC from the flange estimates until its expected error is small enough."""
+"""IterativeCalibrator: estimates X_BC until its error is small enough; CalibrationPosePlanner: the next pose."""
 
 import dataclasses as dc
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, State
 
-from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
+from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
+from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, predicted_sigma
 from weldcal.calibration.published.algorithm1 import (
     COST_AXES,
     Algorithm1State,
@@ -21,15 +22,111 @@ from weldcal.calibration.published.algorithm1 import (
     named_cost,
 )
 from weldcal.calibration.published.icp import make_verification
-from weldcal.calibration.refinement.refined import PLAIN
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.calibration.refinement.refined import PLAIN, Plain, Refined, refine_arm, refine_locally
+from weldcal.models.arms.chain import chain_of
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.weld.refinement import refined_status
-from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, VerificationResult
+from weldcal.systems.leaf_system import LeafSystem
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, Refinement, VerificationResult
 from weldcal.systems.motion.pose_recorder import PoseHistory
+
+TIME_S = 120.0  # for which the job waits, at rest, for the folds beside a robot
+
+
+def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_scanner: bool) -> CalibrationStatus:
+    """The status with its estimate refined by ``kind`` of LIVE_KINDS, or as it was with the reason; ``arm`` is the one that observed.
+
+    The choice is that of `weldcal calibrate --refine`; live scans have no hole patterns.
+    """
+    estimate = status.estimate
+    if estimate is None or kind == PLAIN:
+        return status
+    corrected = tuple(corrected_observation(status.correction, o) for o in status.observations)
+    solve = partial(solve_jointly, start=estimate.X_BC, correct_scanner=correct_scanner)
+    plain = Plain(
+        observations=status.observations,
+        corrected=corrected,
+        patterns={},
+        estimate=estimate,
+        correction=estimate.scanner,
+        correct_scanner=correct_scanner,
+        solve=solve,
+    )
+    try:
+        if kind == "local":
+            found = refine_locally(plain, seed=0)
+        else:
+            note = f"{arm.name}, refined by a live calibration (calibration.refine: {kind})"
+            found = refine_arm(kind, plain, np.array(status.joints), chain_of(arm), note=note, seed=0)
+        return dc.replace(status, estimate=found.estimate, refinement=_message(kind, found, arm))
+    except WeldcalError as error:
+        return dc.replace(status, refinement=Refinement(kind=kind, sentence=f"The calibration is not refined: {error}"))
+
+
+def _message(kind: str, found: Refined, arm: ArmModel) -> Refinement:
+    corrected = None
+    if found.stack is not None:
+        corrected = with_link_transforms(arm, found.stack, "", "The refined kinematics")
+    return Refinement(
+        kind=kind,
+        sentence=found.sentence,
+        accepted=found.accepted,
+        arm=corrected,
+        local_field=found.field,
+        kinematics=found.kinematics,
+        arm_errors=found.arm,
+        document=found.document(kind),
+    )
+
+
+@dc.dataclass(frozen=True, eq=False)
+class NextPose(Message):
+    """The pose to visit after the calibration status with this sequence number; q (6,) rad, None when none is left."""
+
+    after_sequence: int = -1
+    index: int = 0
+    label: str = ""
+    q: Array | None = None
+
+
+class CalibrationPosePlanner(LeafSystem):
+    """Steps through the planned poses, the most informative first, one for each scan that the calibrator has processed.
+
+    .. pydrake_system::
+
+        name: CalibrationPosePlanner
+        input_ports:
+        - calibration_status
+        output_ports:
+        - next_pose
+
+    The plan is made before any motion (and raises where the scanner cannot be reached). pose_planning orders it greedily by
+    the information that each pose adds, so that each prefix is the greedy set of that size.
+    """
+
+    def __init__(self, plan: tuple[PlannedPose, ...], period_s: float = 0.02) -> None:
+        super().__init__()
+        self._plan = plan
+        self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
+        self._state = self.DeclareAbstractState(
+            AbstractValue.Make(NextPose(-1, 0, "pose01", plan[0].q if plan else None))
+        )
+        self.DeclareStateOutputPort("next_pose", self._state)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        status: CalibrationStatus = self._status.Eval(context)
+        newest: NextPose = context.get_abstract_state(self._state).get_value()
+        if status.sequence <= newest.after_sequence:
+            return
+        index = status.sequence  # one pose per scan
+        q = self._plan[index].q if index < len(self._plan) else None
+        new = NextPose(status.sequence, index, f"pose{index + 1:02d}", q)
+        state.get_mutable_abstract_state(self._state).set_value(new)
 
 
 @dc.dataclass(frozen=True, kw_only=True)
@@ -40,7 +137,7 @@ class CalibratorConfig:
     required_error_m: float
     minimum_scans: int
     maximum_scans: int
-    p_BWork: NDArray[np.float64]
+    p_BWork: Array
     cost: str = "translation"
     work_radius_m: float = 0.2
     cost_axes: tuple[str, ...] = COST_AXES
@@ -102,7 +199,7 @@ def digest(
     X_BR: RigidTransform | None,
     standard: FlangeStandard,
     config: CalibratorConfig,
-    q: NDArray[np.float64] | None = None,
+    q: Array | None = None,
     arm: ArmModel | None = None,
 ) -> CalibrationStatus:
     """Compute the status after one more flange estimate; an unusable scan is listed as refused with its label and the reason.
@@ -147,7 +244,7 @@ def digest(
     return dc.replace(status, predicted_error_m=expected_error(status.estimate, config.p_BWork))
 
 
-def expected_error(estimate: CalibrationEstimate, p_BWork: NDArray[np.float64]) -> float:
+def expected_error(estimate: CalibrationEstimate, p_BWork: Array) -> float:
     """Expected error (m, rms) of the base position of a point seen at the work point, from the estimate's covariance."""
     return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BWork))))
 
@@ -174,3 +271,40 @@ def _algorithm_1(
     cost = named_cost(config.cost, config.work_radius_m, config.cost_axes)
     state = status.algorithm_1 or algorithm1_start(config.required_error_m, config.maximum_scans)
     return algorithm1_step(state, observation, status.verification_cloud, cost)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class NextScan(Message):
+    """A planned pose that was not visited, and the expected error (m) of a scanned point at the work point without and with it."""
+
+    pose: PlannedPose
+    error_now_m: float
+    error_then_m: float
+
+    def sentence(self) -> str:
+        """The proposal as one sentence for the operator."""
+        joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.pose.q))
+        p = 1e3 * self.pose.X_BF.translation()
+        return (
+            f"joints [{joints}] deg (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the expected "
+            f"error at the work point from {1e3 * self.error_now_m:.3f} to {1e3 * self.error_then_m:.3f} mm."
+        )
+
+
+def next_scan(status: CalibrationStatus, poses: tuple[PlannedPose, ...], p_BWork: np.ndarray) -> NextScan | None:
+    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work point
+    most; None before the first estimate, or where all were visited.
+
+    The gain is computed by the planner; the present error is the estimate's.
+    """
+    left = poses[status.sequence :]
+    if status.estimate is None or not left or not status.observations:
+        return None
+    config = PlannerConfig(work_point_B=(float(p_BWork[0]), float(p_BWork[1]), float(p_BWork[2])))
+    X_BC: RigidTransform = status.estimate.X_BC
+    seen = [o.X_BR for o in status.observations]
+    before = predicted_sigma(seen, X_BC, config)
+    after = [predicted_sigma([*seen, p.X_BR], X_BC, config) for p in left]
+    best = int(np.argmin(after))
+    share = after[best] / before if np.isfinite(before) else 1.0
+    return NextScan(left[best], status.predicted_error_m, share * status.predicted_error_m)

@@ -6,15 +6,16 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, OutputPort
 
+from weldcal.calibration.motion.drift.sequential import DriftConfig
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
+from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
-from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
-from weldcal.systems.jobs.weld.iterative_calibrator import IterativeCalibrator
+from weldcal.systems.jobs.weld.iterative_calibrator import CalibrationPosePlanner, IterativeCalibrator
 from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobSequencer
 from weldcal.systems.jobs.weld.settings import (
@@ -26,19 +27,94 @@ from weldcal.systems.jobs.weld.settings import (
     servo_config,
     work_point,
 )
-from weldcal.systems.jobs.weld.watch import add_watch
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
-from weldcal.systems.messages import CalibrationStatus, PlannedSeam
-from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
+from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
+from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
+from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase
+
+POLL_S = 0.004  # of the frame queue, the estimator of its frames and the monitor: a twelfth of a frame
+# between two stops a UR10e comes back to 0.05 mm (its data sheet), and a stop is no move of the scanner
+WELD_DRIFT = DriftConfig(floor_m=5e-5, floor_rad=5e-5)
+# a pose that the scenario states without its accuracy: only changes since the first frame are told
+UNKNOWN = np.diag([0.02**2] * 3 + [0.01**2] * 3)
+
+
+def add_stream(
+    wiring: Wiring,
+    spine: Spine,
+    name: str,
+    X_FR: RigidTransform,
+    X_BC: RigidTransform,
+    delay_s: float,
+    queue: FrameQueue,
+    status: OutputPort,
+) -> tuple[OutputPort, OutputPort]:
+    """Add a queue of the streaming scanner's frames and an estimator called `name`; returns its estimates, and the queue's frames."""
+    scenario, station = wiring.scenario, wiring.station
+    wiring.add("frame_queue", queue)
+    estimator = wiring.add(
+        name,
+        FlangeEstimator(
+            arm=station.arm,
+            X_FR=X_FR,
+            standard=feature_standard(scenario),
+            X_BC_guess=X_BC,
+            guess_radius_m=scenario.calibration.guess_radius_mm * 1e-3,
+            background=station.background,
+            period_s=POLL_S,
+            delay_s=delay_s,
+        ),
+    )
+    estimate, scan = estimator.GetOutputPort("flange_estimate"), queue.GetOutputPort("scan")
+    job = wiring.constant("no_ordered_scan", JobCommand())
+    wiring.connect(queue, stream=wiring.out("scanner.stream"), flange_estimate=estimate)
+    wiring.connect(estimator, scan=scan, job=job, history=spine.arm.history, calibration_status=status)
+    return estimate, scan
+
+
+def add_drift_view(wiring: Wiring, monitor: DriftMonitor, estimate: OutputPort) -> None:
+    """Show what the monitor finds in the 3D view, where there is one."""
+    if wiring.meshcat is not None:
+        radius_m = 0.5 * feature_standard(wiring.scenario).outer_m
+        view = wiring.add("drift_view", DriftView(wiring.meshcat, radius_m, wiring.scenario.visualization))
+        wiring.connect(view, drift=monitor.GetOutputPort("drift"), flange_estimate=estimate)
+
+
+def add_watch(
+    wiring: Wiring, spine: Spine, sequencer: JobSequencer, status: OutputPort, X_FR: RigidTransform
+) -> DriftMonitor | None:
+    """Add the watch and connect it to the sequencer; None where the scanner does not stream, and nothing is added.
+
+    The calibration that the job makes is watched from when it is done, one that the scenario states from the start.
+    """
+    scenario, station, c = wiring.scenario, wiring.station, wiring.scenario.calibration
+    scanner, job = scenario.scanner, scenario.job
+    if not isinstance(scanner, StreamingScanner):
+        return None
+    delay_s = scanner.stream().delay_s
+    stated = None if job.calibrate or job.X_BC is None else job.X_BC.pose()
+    watched = None if stated is None else MonitoredCalibration(stated, UNKNOWN, delay_s=delay_s, config=WELD_DRIFT)
+    X_BC, queue = stated or c.mounting_guess.pose(), FrameQueue()
+    estimate, _ = add_stream(wiring, spine, "streamed_flange_estimator", X_FR, X_BC, delay_s, queue, status)
+    monitor = wiring.add(
+        "drift_monitor", DriftMonitor(station.arm, X_FR, watched, WELD_DRIFT, period_s=POLL_S, delay_s=delay_s)
+    )
+    wiring.connect(monitor, flange_estimate=estimate, history=spine.arm.history, calibration_status=status)
+    wiring.connect(sequencer, drift=monitor.GetOutputPort("drift"))
+    wiring.feed("scanner.streaming", sequencer.GetOutputPort("scanner_streaming"))
+    add_drift_view(wiring, monitor, estimate)
+    return monitor
+
 
 # Completed share of a run at the start of a phase, for the progress bar: calibration, planning, weld.
 SHARES = {
@@ -97,12 +173,12 @@ class WeldJob(AddedJob):
 
     def planned_seam(self, root: Context) -> PlannedSeam:
         """The seam planner's newest plan; empty in a job that does not weld."""
-        plan: PlannedSeam = self.welding.seam.Eval(self.welding.seam.get_system().GetMyContextFromRoot(root))
+        plan: PlannedSeam = self.value(self.welding.seam, root)
         return plan
 
     def servo_report(self, root: Context) -> ServoReport:
         """The servo's newest report."""
-        report: ServoReport = self.welding.report.Eval(self.welding.report.get_system().GetMyContextFromRoot(root))
+        report: ServoReport = self.value(self.welding.report, root)
         return report
 
     def view(self) -> tuple[Array, Array]:
@@ -172,7 +248,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         wiring.connect(calibrator, flange_estimate=estimator.GetOutputPort("flange_estimate"), history=history)
         wiring.connect(chooser, calibration_status=status)
         welding = _add_welding(wiring, spine, config, sequencer, status)
-        monitor = add_watch(wiring, spine, sequencer, status, X_FR, standard)
+        monitor = add_watch(wiring, spine, sequencer, status, X_FR)
         wiring.feed("scanner.trigger", sequencer.GetOutputPort("scan_trigger"))
         wiring.connect(
             sequencer,
@@ -187,33 +263,18 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             arm_stopped=spine.switch.GetOutputPort("arm_stopped"),
         )
         state = sequencer.GetOutputPort("job_state")
+        results = {
+            "flange_estimate": estimator.GetOutputPort("flange_estimate"),
+            "calibration_status": status,
+            "planned_seam": welding.seam,
+        }
+        shown = {**results, "scan": wiring.out("scanner.scan"), "servo_report": welding.report}
         if wiring.meshcat is not None:
-            drawn = {
-                "job_state": state,
-                "calibration_status": status,
-                "flange_estimate": estimator.GetOutputPort("flange_estimate"),
-                "scan": wiring.out("scanner.scan"),
-                "planned_seam": welding.seam,
-                "servo_report": welding.report,
-            }
+            drawn = {**shown, "job_state": state}
             add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, work_point(scenario), drawn)
         logged = dict(welding.logged)
         if logged:
             logged["torch_on"] = spine.switch.GetOutputPort("process_on")
-        results = {
-            "job": command,
-            "flange_estimate": estimator.GetOutputPort("flange_estimate"),
-            "calibration_status": status,
-            "planned_seam": welding.seam,
-        }
-        shown = {
-            "calibration_status": status,
-            "next_pose": chooser.GetOutputPort("next_pose"),
-            "scan": wiring.out("scanner.scan"),
-            "flange_estimate": estimator.GetOutputPort("flange_estimate"),
-            "planned_seam": welding.seam,
-            "servo_report": welding.report,
-        }
         ports = JobPorts(
             commands=(command,),
             state=state,
@@ -221,8 +282,8 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             torch_wanted=welding.torch_wanted,
             margin=welding.margin,
             logged=logged,
-            results=results,
-            shown=shown,
+            results={"job": command, **results},
+            shown={**shown, "next_pose": chooser.GetOutputPort("next_pose")},
         )
         return WeldJob(
             scenario=scenario,

@@ -3,11 +3,11 @@
 import dataclasses as dc
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import numpy.typing as npt
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
@@ -19,21 +19,54 @@ from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.weld.levelled import plan_root_anyhow
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
-from weldcal.welding.locate.planning import PlanningMethod, RootPlan
+from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.room import check_ends, check_room
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import check_length, touch_start_pose
+
+_Z = (0.0, 0.0, 1.0)
+
+
+def plan_root_anyhow(
+    points_B: npt.NDArray[np.floating],
+    workpiece: WeldPart,
+    X_BP_guess: RigidTransform,
+    method: PlanningMethod,
+    eye_B: Array,
+    up_B: Array,
+    plan: Callable[..., RootPlan] = plan_root,
+) -> RootPlan:
+    """`plan_root` where up_B (3,), the direction against gravity in the base, may differ from the base's z.
+
+    Finding a part takes up for +z: the scan is turned about the base's origin, and the result is turned back.
+
+    Raises:
+        WeldcalError: as plan_root.
+    """
+    if tuple(up_B) == _Z:
+        return plan(points_B, workpiece, X_BP_guess, method, eye_B)
+    R_BU = RotationMatrix.MakeFromOneVector(up_B, 2)
+    X_UB = RigidTransform(R_BU.inverse(), np.zeros(3))
+    if method.start_B is not None:
+        x, y, z = X_UB @ np.array(method.start_B)
+        method = dc.replace(method, start_B=(x, y, z))
+    R_UB = X_UB.rotation().matrix()
+    found = plan(points_B @ R_UB.T, workpiece, X_UB @ X_BP_guess, method, R_UB @ eye_B)
+    R = R_BU.matrix()
+    X_BP = None if found.X_BP is None else X_UB.inverse() @ found.X_BP
+    return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
+
 
 CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
 CLEAR_OF_PART_M = 0.002
@@ -50,7 +83,7 @@ class SeamPlanning:
     workpiece: WeldPart
     X_BP_guess: RigidTransform
     config: ServoConfig
-    q_near: NDArray[np.float64]
+    q_near: Array
     clearance_m: float
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
@@ -64,7 +97,7 @@ class SeamPlanning:
             return None
         return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
 
-    def field_at(self, points_B: NDArray[np.float64]) -> NDArray[np.float64]:
+    def field_at(self, points_B: Array) -> Array:
         """The local field (n, 3) m at points (n, 3) m of the part, for the orientation in which the flange would weld them as drawn.
 
         Where that orientation is none of the calibration's, or the points lie far from its poses, this is zero.
@@ -74,13 +107,11 @@ class SeamPlanning:
         R = touch_start_pose(seam, self.config).rotation() @ self.tool.X_FT.rotation().inverse()
         return self.local_field.at_places(points_B, R.matrix())
 
-    def tip_to_torch(self, seam: SeamCurve, q_start: NDArray[np.float64]) -> TipToTorch:
+    def tip_to_torch(self, seam: SeamCurve, q_start: Array) -> TipToTorch:
         """What errors of the arm do between tip and torch along a seam."""
         return tip_to_torch(self.arm, self.tool, seam, q_start, self.arm_errors)
 
-    def waypoints(
-        self, seam: SeamCurve, X_BP: RigidTransform | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def waypoints(self, seam: SeamCurve, X_BP: RigidTransform | None) -> tuple[Array, Array, Array]:
         """Joint positions of the approach; see arm_waypoints. Beside a high part they are higher above the seam than the clearance.
 
         Raises:
@@ -206,13 +237,7 @@ def plan_seam(
 _LEVEL = math.cos(math.radians(20.0))
 
 
-def check_weld_path(
-    planning: SeamPlanning,
-    seam: SeamCurve,
-    q_start: NDArray[np.float64],
-    q_above: NDArray[np.float64],
-    q_retract: NDArray[np.float64],
-) -> None:
+def check_weld_path(planning: SeamPlanning, seam: SeamCurve, q_start: Array, q_above: Array, q_retract: Array) -> None:
     """Check that approach, weld and retreat keep away from the cell's surroundings.
 
     Raises:
@@ -244,9 +269,7 @@ def check_weld_path(
             )
 
 
-def check_moves(
-    planning: SeamPlanning, X_BP: RigidTransform, q_above: NDArray[np.float64], q_retract: NDArray[np.float64]
-) -> None:
+def check_moves(planning: SeamPlanning, X_BP: RigidTransform, q_above: Array, q_retract: Array) -> None:
     """Check that the moves to the seam and from it, to other seams too, keep clear of the part.
 
     Raises:
@@ -279,7 +302,7 @@ def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, lengt
     return _cut(line @ R.T + X_BP.translation(), ups, tool, length_m)
 
 
-def _cut(line: NDArray[np.float64], ups: NDArray[np.float64], tool: WeldingTool, length_m: float | None) -> SeamCurve:
+def _cut(line: Array, ups: Array, tool: WeldingTool, length_m: float | None) -> SeamCurve:
     """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is still in it."""
     if length_m is None:
         return SeamCurve.from_points(line, up=ups)
@@ -300,13 +323,8 @@ def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_
 
 
 def arm_waypoints(
-    arm: ArmModel,
-    tool: WeldingTool,
-    seam: SeamCurve,
-    config: ServoConfig,
-    q_near: NDArray[np.float64],
-    clearance_m: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    arm: ArmModel, tool: WeldingTool, seam: SeamCurve, config: ServoConfig, q_near: Array, clearance_m: float
+) -> tuple[Array, Array, Array]:
     """Joint positions (6,) rad at the touch start, above it, and above the far end.
 
     Raises:
@@ -330,7 +348,7 @@ def arm_waypoints(
     return q_start, q_above, q_retract
 
 
-def _away(up: NDArray[np.float64], vertical: NDArray[np.float64]) -> NDArray[np.float64]:
+def _away(up: Array, vertical: Array) -> Array:
     """Direction (3,) out of a joint: vertical on a level face, along the bisector of a leaning joint."""
     return vertical if float(up @ vertical) > _LEVEL else up
 
@@ -375,7 +393,7 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
         q_above=q_above,
         q_retract=q_retract,
         points_B=points_B,
-        summary="the pose of the part is from the fixture's drawing; the scan was not used",
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
+        summary="the pose of the part is from the fixture's drawing; the scan was not used",
     )

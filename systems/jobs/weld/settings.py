@@ -16,8 +16,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.workpieces.part import numbered
 from weldcal.models.workpieces.seat import Press, Seated
-from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig
-from weldcal.systems.jobs.weld.refinement import TIME_S
+from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
 from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+import weldcal
 from weldcal.calibration.data.results import (
     CalibrationResult,
     IcpRecord,
     PoseRecord,
+    correction_note,
     export_all,
     export_json,
     export_ros2,
@@ -195,3 +197,17 @@ def test_a_covariance_that_is_none_is_refused(result: CalibrationResult, tmp_pat
     save_result(replace(result, covariance=-np.eye(6)), tmp_path)
     with pytest.raises(InputError, match=r"covariance\.matrix is no covariance"):
         load_result(tmp_path)
+
+
+def test_a_result_corrects_points_and_names_how(result: CalibrationResult, tmp_path: Path) -> None:
+    points = np.array([[0.1, -0.2, 0.7], [np.nan, 0.0, 0.5]])
+    assert np.array_equal(result.correct(points), points, equal_nan=True)
+    assert correction_note(result, tmp_path) is None
+    corrected = replace(result, scanner_correction={"scale": 1.002, "gradient_per_m": [0.01, -0.01]})
+    assert corrected.correct(points)[0] == pytest.approx(points[0] * (1.002 + 0.01 * 0.1 + 0.01 * 0.2), abs=1e-12)
+    file = save_result(corrected, tmp_path)
+    note = correction_note(corrected, file) or ""
+    assert f"The correction is in {file}, scanner_correction" in note
+    assert "multiply" not in note
+    call = note.split("in Python: ")[1].rstrip(".")
+    assert eval(call, {"weldcal": weldcal, "points": points})[0] == pytest.approx(corrected.correct(points)[0])

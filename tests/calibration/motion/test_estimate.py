@@ -17,7 +17,7 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.arrays import Array
-from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
+from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 SECONDS = 13.0
 WORK = np.array([0.0, 0.0, 0.75])

@@ -11,7 +11,7 @@ from weldcal.calibration.motion.expected import best_motion, expected_of_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
+from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 NOISE = {"centre_sigma_m": 4.2e-5, "normal_sigma": 5e-4}
 

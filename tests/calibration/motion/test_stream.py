@@ -10,7 +10,7 @@ from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.arrays import Array
-from weldcal.tools.studies.motion.moves import cube_moves
+from weldcal.tools.worlds.moves import cube_moves
 
 T = np.random.default_rng(1).uniform(0.5, 5.5, 800)
 

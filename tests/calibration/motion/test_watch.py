@@ -16,7 +16,7 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import synchronise
 from weldcal.calibration.planning.moves import recorded_stream
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
+from weldcal.tools.worlds.moves import cube_moves, observed_frames
 
 DELAY_S = 0.140
 

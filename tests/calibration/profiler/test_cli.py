@@ -20,7 +20,7 @@ from weldcal.calibration.profiler.record import load_record
 from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.profiler.worlds import CLEAN, SphereWorld, sphere_trial
+from weldcal.tools.worlds.profiler import CLEAN, SphereWorld, sphere_trial
 
 STATE = EdgeState(
     Rotation.from_euler("xyz", [170.0, -9.0, 52.0], degrees=True).as_matrix(),

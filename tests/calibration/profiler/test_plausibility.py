@@ -17,7 +17,7 @@ from weldcal.calibration.profiler.sphere.joint import _clearly_less, choose_mode
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.calibration.profiler.sphere.radius import check_radius, free_radius
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.profiler.worlds import CLEAN, RADIUS_M, SphereWorld, sphere_trial
+from weldcal.tools.worlds.profiler import CLEAN, RADIUS_M, SphereWorld, sphere_trial
 
 
 def some() -> SphereData:

@@ -32,7 +32,7 @@ from weldcal.calibration.profiler.sphere.linear import (
 )
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.profiler.worlds import CLEAN, RADIUS_M, SphereTrial, SphereWorld, sphere_trial
+from weldcal.tools.worlds.profiler import CLEAN, RADIUS_M, SphereTrial, SphereWorld, sphere_trial
 
 DATA = SHARED_DATA / "profiler"
 MM = 1e-3

@@ -22,7 +22,7 @@ from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit
 from weldcal.calibration.tablet.wrist.fit import fit_wrist
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.tablet.paper import published_touches
+from weldcal.tools.worlds.tablet import published_touches
 
 
 @pytest.fixture

@@ -14,8 +14,7 @@ from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_
 from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
 from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.tools.studies.tablet.paper import published_touches
-from weldcal.tools.studies.tablet.world import TabletNoise, TabletTrial, simulate_trial
+from weldcal.tools.worlds.tablet import TabletNoise, TabletTrial, published_touches, simulate_trial
 
 SYNTH = SHARED_DATA / "profiler/tablet_synth.npz"
 EXACT = TabletNoise(

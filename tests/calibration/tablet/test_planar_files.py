@@ -18,7 +18,7 @@ from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.tablet.planar import VisitFits, best_model, fit_visit
-from weldcal.tools.studies.tablet.world import TabletTrial, simulate_trial
+from weldcal.tools.worlds.tablet import TabletTrial, simulate_trial
 
 Fields = dict[str, Any]
 PER_LANDMARK = ("uv", "depth", "hand", "theta_deg", "delta_px", "tablet_px")

@@ -23,7 +23,7 @@ from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.rendered_profiler import RayFan, RenderedProfiler, drawn_pose, measured_profile
 from weldcal.systems.jobs.discovery import job_of
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.robot_error import RobotError
+from weldcal.systems.jobs.profiler.job import RobotError
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station

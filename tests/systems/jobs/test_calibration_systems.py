@@ -16,11 +16,12 @@ from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.flanges import get_flange
-from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator, estimate_flange
 from weldcal.systems.jobs.weld.iterative_calibrator import (
+    CalibrationPosePlanner,
     CalibratorConfig,
     IterativeCalibrator,
+    NextPose,
     digest,
     expected_error,
     verify_at,

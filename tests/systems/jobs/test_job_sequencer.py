@@ -14,9 +14,9 @@ from pydrake.systems.analysis import Simulator
 
 from tests.systems.cells import Q_HOME
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, HeldOut
-from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
 from weldcal.systems.jobs.weld.job import SHARES
-from weldcal.systems.jobs.weld.sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
+from weldcal.systems.jobs.weld.sequencer import PHASES, JobInputs, JobPlan, JobSequencer, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
 from weldcal.systems.motion.drift_monitor import DriftStatus
@@ -54,31 +54,32 @@ class World:
     """What the sequencer sees, changed by hand; time goes on by a tick at each look."""
 
     def __init__(self, plan: JobPlan = PLAN, state: JobState | None = None) -> None:
-        self.plan, self.state, self.time = plan, state or JobState(), 0.0
-        self.seen = Seen(
+        self.system, self.plan = JobSequencer(plan), plan
+        self.state, self.time = state or JobState(), 0.0
+        self.now = JobInputs(
             time=0.0,
             robot=UrStatus(),
             settled_goal=0,
             q=Q_HOME,
             next_pose=NextPose(0, 0, "pose01", Q_HOME),
-            calibration=CalibrationStatus(),
-            seam=PlannedSeam(),
-            servo=ServoReport(),
+            calibration_status=CalibrationStatus(),
+            planned_seam=PlannedSeam(),
+            servo_report=ServoReport(),
         )
 
     @property
     def command(self) -> JobCommand:
-        return self.state.command
+        return self.system.command(self.state)
 
     @property
     def phase(self) -> str:
-        return self.state.command.phase
+        return self.state.phase
 
     def look(self, duration: float = 0.02, **changes: Any) -> str:
         """Let the time pass, with one look at its end."""
         self.time += duration
-        self.seen = dc.replace(self.seen, time=self.time, **changes)
-        self.state = next_job_state(self.state, self.seen, self.plan)
+        self.now = dc.replace(self.now, time=self.time, **changes)
+        self.state = self.system.next_state(self.state, self.now)
         return self.phase
 
     def arrive(self) -> str:
@@ -89,14 +90,16 @@ class World:
     def digest(self, **changes: Any) -> str:
         """The calibrator takes in the newest scan, and the pose planner looks at what it says."""
         n = self.command.scan_sequence
-        counts = self.seen.calibration.calibration_scans + int(self.command.scan_purpose == "calibrate")
-        status = dc.replace(self.seen.calibration, sequence=n, calibration_scans=counts, **changes)
-        return self.look(0.3, calibration=status, next_pose=NextPose(n, n, f"pose{n + 1:02d}", np.full(6, 0.01 * n)))
+        counts = self.now.calibration_status.calibration_scans + int(self.command.scan_purpose == "calibrate")
+        status = dc.replace(self.now.calibration_status, sequence=n, calibration_scans=counts, **changes)
+        return self.look(
+            0.3, calibration_status=status, next_pose=NextPose(n, n, f"pose{n + 1:02d}", np.full(6, 0.01 * n))
+        )
 
 
 def in_phase(phase: str, **command: Any) -> World:
     """A job in the middle of a phase."""
-    return World(state=JobState(JobCommand(phase=phase, goal_id=5, scan_sequence=4, **command)))
+    return World(state=JobState(phase=phase, goal_id=5, trigger=4, **command))
 
 
 def test_a_whole_job_goes_through_its_phases_in_order() -> None:
@@ -118,15 +121,15 @@ def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     assert world.command.q_goal is Q_HOME
     assert world.arrive() == "scan_workpiece"
     assert world.command.scan_purpose == "workpiece"
-    assert world.look(0.3, seam=PLANNED) == "approach_above"
+    assert world.look(0.3, planned_seam=PLANNED) == "approach_above"
     assert world.command.q_goal is PLANNED.q_above
     assert world.arrive() == "approach"
     assert world.command.q_goal is PLANNED.q_start
     assert not world.command.process_on
     assert world.arrive() == "weld"
     assert (world.command.mode, world.command.process_on, world.command.streaming) == ("weld", True, True)
-    assert world.look(5.0, servo=ServoReport(phase="TRACK", torch_on=True)) == "weld"
-    assert world.look(20.0, servo=ServoReport(phase="DONE")) == "retract"
+    assert world.look(5.0, servo_report=ServoReport(phase="TRACK", torch_on=True)) == "weld"
+    assert world.look(20.0, servo_report=ServoReport(phase="DONE")) == "retract"
     assert (world.command.process_on, world.command.streaming) == (False, False)
     assert world.arrive() == "home"
     assert world.arrive() == "done"
@@ -143,12 +146,12 @@ def test_every_seam_is_scanned_planned_and_welded_in_turn() -> None:
         assert world.arrive() == "scan_workpiece"
         assert (world.command.seam, world.command.scan_sequence) == (number, number + 1)
         assert world.look(0.3) == "scan_workpiece", "the plan of the seam before is no plan"
-        assert world.look(0.3, seam=dc.replace(PLANNED, sequence=number + 1)) == "approach_above"
+        assert world.look(0.3, planned_seam=dc.replace(PLANNED, sequence=number + 1)) == "approach_above"
         assert world.arrive() == "approach"
         assert world.arrive() == "weld"
-        assert world.look(20.0, servo=ServoReport(phase="DONE")) == "retract"
+        assert world.look(20.0, servo_report=ServoReport(phase="DONE")) == "retract"
         assert world.arrive() == ("home" if number else "park")
-        world.seen = dc.replace(world.seen, servo=ServoReport())
+        world.now = dc.replace(world.now, servo_report=ServoReport())
     assert world.arrive() == "done"
 
 
@@ -198,9 +201,9 @@ def test_it_waits_for_the_arm_to_have_been_still_for_its_dwell_time() -> None:
 
 
 def test_it_does_not_go_to_a_pose_that_was_chosen_before_the_newest_scan() -> None:
-    world = in_phase("scan_pose", scan_purpose="calibrate")
+    world = in_phase("scan_pose", purpose="calibrate")
     old = NextPose(3, 3, "pose04", Q_HOME)
-    assert world.look(0.1, calibration=CalibrationStatus(sequence=4), next_pose=old) == "scan_pose"
+    assert world.look(0.1, calibration_status=CalibrationStatus(sequence=4), next_pose=old) == "scan_pose"
     assert world.look(0.1, next_pose=NextPose(4, 4, "pose05", Q_HOME)) == "move_to_pose"
 
 
@@ -224,8 +227,8 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         "The robot stopped: PROTECTIVE",
     ),
     "robot fault": ("park", 0.1, {"robot": UrStatus(fault="WALL: it hit a wall.")}, "^WALL: it hit a wall.$"),
-    "a singular arm": ("weld", 0.1, {"arm_stopped": True}, "too near to a singular position"),
-    "a person's wish": ("weld", 0.1, {"hold_requested": True}, "A person ended the job, in the phase 'weld'"),
+    "a singular arm": ("weld", 0.1, {"arm_stopped": 1.0}, "too near to a singular position"),
+    "the operator's wish": ("weld", 0.1, {"hold": True}, "The operator ended the job in phase 'weld'"),
     "time is up": ("weld", 241.0, {}, "took longer than its 240 s, in the phase 'weld'"),
     "goal not reached": ("move_to_pose", 21.0, {}, "did not come to rest at its goal within 20 s"),
     "cloud pose not reached": ("move_to_verification_cloud", 21.0, {}, "did not come to rest at its goal within 20 s"),
@@ -237,44 +240,44 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
     "no more poses": (
         "scan_pose",
         0.1,
-        {"calibration": status(), "next_pose": NO_POSE},
+        {"calibration_status": status(), "next_pose": NO_POSE},
         "free more of the workspace\\.$",
     ),
     "no more poses after refused scans": (
         "scan_pose",
         0.1,
-        {"calibration": status(refused=(("pose03", "it is too dark"),) * 3), "next_pose": NO_POSE},
+        {"calibration_status": status(refused=(("pose03", "it is too dark"),) * 3), "next_pose": NO_POSE},
         r"poses are used up: .* Scans that could not be used: 3\. The last one: it is too dark",
     ),
     "required error not reached": (
         "scan_pose",
         0.1,
-        {"calibration": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.234e-3)},
+        {"calibration_status": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.234e-3)},
         r"did not reach the required 0\.100 mm: after 8 scans it expects 0\.234 mm",
     ),
     "required error reached from too few usable scans": (
         "scan_pose",
         0.1,
-        {"calibration": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.023e-3)},
+        {"calibration_status": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.023e-3)},
         r"^Only 0 of 8 scans could be used, and the calibration needs 6 .*0\.023 mm at the work point, within the required 0\.100 mm",
     ),
     "no calibration at all": (
         "scan_pose",
         0.1,
-        {"calibration": status(calibration_scans=8, refused=(("pose01", "it is too dark"),))},
+        {"calibration_status": status(calibration_scans=8, refused=(("pose01", "it is too dark"),))},
         "No calibration after 8 scans: it is too dark",
     ),
     "no calibration from good scans": (
         "scan_pose",
         0.1,
-        {"calibration": status(calibration_scans=8, message="they lie in one plane")},
+        {"calibration_status": status(calibration_scans=8, message="they lie in one plane")},
         "No calibration after 8 scans: they lie in one plane",
     ),
     "off at the held-out pose": (
         "scan_verify",
         0.1,
         {
-            "calibration": status(
+            "calibration_status": status(
                 verifications=(VerificationResult("pose08", 0.9e-3, 0.0), VerificationResult("pose09", 0.1e-3, 0.0))
             )
         },
@@ -283,25 +286,40 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
     "no calibration to verify": (
         "scan_verify",
         0.1,
-        {"calibration": status(verifications=(VerificationResult("pose08", np.inf, np.inf),) * 2)},
+        {"calibration_status": status(verifications=(VerificationResult("pose08", np.inf, np.inf),) * 2)},
         "inf mm off at the held-out pose",
     ),
     "workpiece not found": (
         "scan_workpiece",
         0.1,
-        {"seam": PlannedSeam(sequence=4, reason="The plate is not there.")},
+        {"planned_seam": PlannedSeam(sequence=4, reason="The plate is not there.")},
         "The plate is not there",
     ),
-    "no seam and no reason": ("scan_workpiece", 0.1, {"seam": PlannedSeam(sequence=4)}, "No seam could be planned"),
-    "weld fault": ("weld", 0.1, {"servo": ServoReport(phase="FAULT", reason="Tag hidden: clean it.")}, "Tag hidden"),
-    "weld fault without a reason": ("weld", 0.1, {"servo": ServoReport(phase="FAULT")}, "The welding servo stopped"),
+    "no seam and no reason": (
+        "scan_workpiece",
+        0.1,
+        {"planned_seam": PlannedSeam(sequence=4)},
+        "No seam could be planned",
+    ),
+    "weld fault": (
+        "weld",
+        0.1,
+        {"servo_report": ServoReport(phase="FAULT", reason="Tag hidden: clean it.")},
+        "Tag hidden",
+    ),
+    "weld fault without a reason": (
+        "weld",
+        0.1,
+        {"servo_report": ServoReport(phase="FAULT")},
+        "The welding servo stopped",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", list(HOLDS))
 def test_it_holds_and_says_why(name: str) -> None:
     phase, duration, changes, said = HOLDS[name]
-    world = in_phase(phase, mode="weld" if phase == "weld" else "move", process_on=phase == "weld")
+    world = in_phase(phase, process_on=phase == "weld")
     assert world.look(duration, **changes) == "held"
     command = world.command
     assert (command.mode, command.process_on, command.held, command.finished) == ("hold", False, True, True)
@@ -316,15 +334,15 @@ def test_every_phase_that_waits_for_something_can_end_in_a_hold() -> None:
 
 
 def test_a_held_job_stays_held_when_the_cause_is_gone() -> None:
-    world = in_phase("weld", mode="weld", process_on=True)
+    world = in_phase("weld", process_on=True)
     world.look(0.1, robot=UrStatus(fault="stopped"))
     held = world.state
-    world.look(5.0, robot=UrStatus(), settled_goal=5, servo=ServoReport(phase="DONE"))
+    world.look(5.0, robot=UrStatus(), settled_goal=5, servo_report=ServoReport(phase="DONE"))
     assert world.state is held
 
 
 def test_a_finished_job_stays_finished() -> None:
-    world = World(state=JobState(JobCommand(phase="done", finished=True)))
+    world = World(state=JobState(phase="done"))
     done = world.state
     world.look(500.0, robot=UrStatus(fault="stopped"))
     assert world.state is done
@@ -356,7 +374,7 @@ def test_the_system_passes_its_command_on_to_everyone() -> None:
     assert system.GetOutputPort("scan_trigger").Eval(context)[0] == 1.0
     assert system.GetOutputPort("streaming").Eval(context)[0] == 0.0
     state: JobState = system.GetOutputPort("job_state").Eval(context)
-    assert state is system.job_state(context)
+    assert state is system.state_in(context)
     assert [phase for _, phase in state.log] == ["start", "park", "scan_workpiece"]
     system.GetInputPort("hold").FixValue(context, [1.0])
     simulator.AdvanceTo(0.55)
@@ -378,8 +396,8 @@ def test_a_scanner_that_moved_holds_the_job_before_the_weld_and_warns_during_it(
     world = World()
     world.look(drift=moved)
     assert world.phase == "held"
-    assert world.state.command.reason == moved.summary
-    welding = JobState(JobCommand(phase="weld", mode="weld", process_on=True))
+    assert world.state.reason == moved.summary
+    welding = JobState(phase="weld", process_on=True)
     world = World(state=welding)
     world.look(drift=moved)
     assert world.phase == "weld"

@@ -21,7 +21,7 @@ from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.weld.refinement import refined_status
+from weldcal.systems.jobs.weld.iterative_calibrator import refined_status
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.scenario.arm import corrected_arm
 from weldcal.systems.scenario.checks import check_scenario

@@ -19,10 +19,9 @@ from weldcal.calibration.touch.table import read_touches, touches_text
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, link_frames
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.touch.config import TouchConfig
 from weldcal.systems.jobs.touch.job import AddedTouches
-from weldcal.systems.jobs.touch.planner import Place, PlannedTouches, TouchPlanning, plan_touches
-from weldcal.systems.jobs.touch.procedure import FRAMES, Felt, TouchMotion, TouchSeen, TouchState, next_touch_state
+from weldcal.systems.jobs.touch.planner import Place, PlannedTouches, TouchConfig, TouchPlanning, plan_touches
+from weldcal.systems.jobs.touch.procedure import FRAMES, Felt, TouchInputs, TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import CLEAR_OF_PART_M
@@ -31,7 +30,9 @@ from weldcal.systems.messages import Scan, UrStatus
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.welding.servo.state import DeflectionSample
 
-MOTION = TouchMotion(Q_HOME, 3e-3, 1e-3, 6e-3, 20.0, 500.0)
+MOTION = TouchMotion(
+    q_home=Q_HOME, descent_m_s=3e-3, press_m=1e-3, deepest_m=6e-3, move_timeout_s=20.0, maximum_time_s=500.0
+)
 FACE_Z = 0.02
 
 
@@ -81,6 +82,7 @@ class Bench:
     """The procedure in a light world: moves end at once, and a rigid face lies at a height under the place."""
 
     def __init__(self, planned: PlannedTouches, face_m: float = 0.0) -> None:
+        self.procedure = TouchProcedure(the_arm(), TOOL, MOTION)
         self.state, self.time, self.height, self.face_m = TouchState(), 0.0, 0.015, face_m
         self.plan, self.frame, self.blind, self.hold = dc.replace(planned, sequence=1), 0, False, False
 
@@ -96,17 +98,17 @@ class Bench:
             deflection = np.array([0.0, 0.0, max(self.face_m - self.height, 0.0) + 1e-4])
             sample = DeflectionSample(self.time, RigidTransform(), deflection, True)
             felt = Deformation(self.frame, sample)
-            seen = TouchSeen(
+            now = TouchInputs(
                 time=self.time,
                 q=Q_HOME,
                 settled_goal=self.state.goal_id,
                 robot=UrStatus(),
                 hold=self.hold,
-                plan=self.plan,
-                finger=felt,
+                planned_touches=self.plan,
+                deformation=felt,
                 height=self.height,
             )
-            self.state = next_touch_state(self.state, seen, MOTION)
+            self.state = self.procedure.next_state(self.state, now)
             if self.state.finished or (until and self.state.phase == until):
                 break
         return self.state
@@ -126,7 +128,7 @@ def test_each_place_is_touched_once_and_the_free_tip_s_reading_is_its_zero(plann
     [
         ({"face_m": -0.02}, "met nothing at place 1"),
         ({"blind": True}, "does not see the tip's tag"),
-        ({"hold": True}, "A person ended the job"),
+        ({"hold": True}, "The operator ended the job in phase 'zero'."),
     ],
 )
 def test_what_goes_wrong_holds_the_job_with_a_reason(

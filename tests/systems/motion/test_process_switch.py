@@ -21,6 +21,7 @@ from weldcal.systems.motion.spine import ProcessSwitch
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
 
 WELD = JobCommand(phase="weld", mode="weld", process_on=True)
+WELDING = JobState(phase="weld", process_on=True)
 ON_THE_WAY = np.array([0.0, 0.0, 0.0, 0.0, 0.008, 0.0])
 
 
@@ -30,15 +31,15 @@ class Welding:
     def __init__(self, cell: Cell) -> None:
         self.diagram = cell.diagram
         self.root = cell.diagram.CreateDefaultContext()
-        self.job(WELD)
+        self.job(WELDING)
         self.report(Phase.TRACK, torch_on=True)
         self.arm(Q_HOME)
 
     def context(self, name: str) -> Context:
         return self.diagram.GetSubsystemByName(name).GetMyMutableContextFromRoot(self.root)
 
-    def job(self, command: JobCommand) -> None:
-        self.context("job_sequencer").SetAbstractState(0, JobState(command))
+    def job(self, state: JobState) -> None:
+        self.context("job_sequencer").SetAbstractState(0, state)
 
     def report(self, phase: Phase, *, torch_on: bool) -> None:
         command = WeldingCommand(ON_THE_WAY, torch_on, phase, None, Diagnostics())
@@ -81,8 +82,8 @@ def stretched() -> np.ndarray:
 # What stops a weld, and whether the arm is still told to move in that same moment.
 CAUSES: dict[str, tuple[Callable[[Welding], None], bool]] = {
     "a fault of the servo": (lambda w: w.report(Phase.FAULT, torch_on=False), True),
-    "a held job": (lambda w: w.job(dc.replace(WELD, mode="hold", process_on=False, held=True, finished=True)), False),
-    "a job that only takes back its consent": (lambda w: w.job(dc.replace(WELD, process_on=False)), True),
+    "a held job": (lambda w: w.job(dc.replace(WELDING, phase="held")), False),
+    "a job that only takes back its consent": (lambda w: w.job(dc.replace(WELDING, process_on=False)), True),
     "a person": (lambda w: w.person_holds(), True),
     "a protective stop of the robot": (lambda w: w.arm(Q_HOME, fault=1.0), False),
     "the guard of the arm's singularities": (lambda w: w.arm(stretched()), False),

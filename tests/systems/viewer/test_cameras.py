@@ -1,6 +1,8 @@
-"""The cameras follow the phase, stay where a person moved them, and frame what they are named after."""
+"""The cameras follow the phase, stay where the user moved them, and frame what they are named after."""
 
 from __future__ import annotations
+
+import time
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.browser import Browser
 from weldcal.systems.messages import JobCommand, PlannedSeam
 from weldcal.systems.viewer.cameras import (
     CELL,
@@ -15,6 +18,7 @@ from weldcal.systems.viewer.cameras import (
     MOVED,
     SCANNER,
     SEAM,
+    START_M,
     CameraDirector,
     Views,
     scanner_view,
@@ -30,11 +34,11 @@ HALF_FIELD = np.deg2rad(37.5)  # of Meshcat's camera
 
 
 class Viewer:
-    """Stands for Meshcat: notes where the camera is put, and reports where a person has moved it."""
+    """Stands for Meshcat: notes where the camera is put, and reports where the user has moved it."""
 
     def __init__(self) -> None:
         self.eye, self.target = np.zeros(3), np.zeros(3)
-        self.puts = 0
+        self.puts, self.browsers = 0, 1
         self.reported: RigidTransform | None = None
 
     def SetCameraPose(self, eye: np.ndarray, target: np.ndarray) -> None:
@@ -46,6 +50,9 @@ class Viewer:
 
     def GetTrackedCameraPose(self) -> RigidTransform | None:
         return self.reported
+
+    def GetNumActiveConnections(self) -> int:
+        return self.browsers
 
 
 class Job:
@@ -96,6 +103,49 @@ def test_a_camera_that_was_moved_stays_until_one_is_picked() -> None:
     assert job.views.pick(FOLLOW)
     assert job.phase("weld") == SEAM
     assert not job.views.pick("under the table")
+
+
+@pytest.mark.parametrize("start", START_M)
+def test_a_page_that_opens_or_reloads_has_not_moved_the_camera(start: np.ndarray) -> None:
+    job = Job()
+    job.phase("scan_pose")
+    job.viewer.reported = RigidTransform(start)
+    job.viewer.browsers = 2
+    assert job.phase("weld") == SEAM
+    assert job.views.wanted == FOLLOW
+
+
+@pytest.mark.parametrize(("browsers", "wanted"), [(1, FOLLOW), (2, MOVED)])
+def test_a_reload_after_a_move_follows_again(browsers: int, wanted: str) -> None:
+    job = Job()
+    job.phase("scan_pose")
+    job.viewer.reported = RigidTransform(job.viewer.eye + np.array([0.05, 0.0, 0.0]))
+    job.phase("scan_pose")
+    assert job.views.wanted == MOVED
+    job.viewer.reported, job.viewer.browsers = RigidTransform(job.viewer.eye), browsers
+    job.phase("weld")
+    assert job.views.wanted == wanted, "a second browser leaves the first one's camera alone"
+
+
+def test_a_real_page_may_be_reloaded(browser: Browser) -> None:
+    meshcat, views = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}")), Views()
+    director = CameraDirector(meshcat, views, CELL_VIEW, {}, RigidTransform())
+    context = director.CreateDefaultContext()
+    director.GetInputPort("job").FixValue(context, AbstractValue.Make(JobCommand()))
+    reported: set[tuple[float, ...]] = set()
+    for opened in range(2):
+        browser.open(meshcat.web_url() + "/?tracked_camera=on")
+        until, at_eye = time.monotonic() + 8.0, False
+        while time.monotonic() < until and not (at_eye and len(reported) > 1):
+            director._direct(context)
+            X = meshcat.GetTrackedCameraPose()
+            at_eye = X is not None and np.allclose(X.translation(), CELL_VIEW[0], atol=1e-3)
+            reported |= {tuple(X.translation().round(3))} if X is not None else set()
+            time.sleep(0.01)
+        assert at_eye
+        assert views.wanted == FOLLOW, f"opened {opened + 1} times, with cameras at {reported}"
+        reported.clear()
+    browser.rest()
 
 
 def test_a_real_meshcat_takes_the_cameras() -> None:

@@ -23,7 +23,7 @@ from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
-from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, PlannedSeam, Scan
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, PlannedSeam, Scan
 from weldcal.systems.phase_words import TEXT
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.viewer.cell_visualizer import ROOT, CellVisualizer, face_residuals
@@ -255,7 +255,7 @@ SEAM = SeamCurve.from_points(np.column_stack([np.full(30, 0.65), np.linspace(-0.
 
 
 def test_the_planned_seam_appears_with_the_drawing_where_it_was_found(viewer: Viewer) -> None:
-    viewer.show(planned_seam=PlannedSeam(sequence=1, seam=SEAM), job_state=JobState(JobCommand(phase="approach_above")))
+    viewer.show(planned_seam=PlannedSeam(sequence=1, seam=SEAM), job_state=JobState(phase="approach_above"))
     viewer.run(0.15)
     assert viewer.has("seam/planned")
     assert not viewer.has("cad"), "no registration, no drawing"

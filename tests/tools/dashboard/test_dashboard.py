@@ -20,7 +20,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
 from tests.browser import Browser, Pixels, colours
-from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
 from weldcal.systems.person import Person
@@ -30,6 +30,7 @@ from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.dashboard.facts import Facts
 from weldcal.tools.dashboard.server import Dashboard
 from weldcal.tools.dashboard.source import DashboardSource
+from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
 from weldcal.tools.report.run import RunOptions
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
@@ -50,6 +51,13 @@ FACTS = Facts(
     band_mm=(0.4, 5.0),
 )
 SEAM = SeamCurve.from_points(np.linspace([0.5, 0.0, 0.0], [0.6, 0.0, 0.0], 40))
+RESULT = FirstScreen(
+    Findings(tolerance=Tolerance("the error", 0.2, 0.3, "--limit-mm"), unseen=8),
+    Expected("error at the work point, 95 %", "0.213 mm", "8 unseen poses"),
+    Next("See it again."),
+    (ShownPose("X_BC", "pose of the scanner C in the robot's base B", RigidTransform([0.65, 0.0, 0.95])),),
+    {"torch": "0.025 mm (95 % of the weld)"},
+)
 SIZES = {"desktop": (1440, 900), "tablet": (1024, 768), "phone": (390, 844)}
 
 
@@ -262,6 +270,48 @@ def test_what_a_person_needs_is_on_the_page_at_every_size(
     assert share == pytest.approx(1.0 if size == "phone" else 0.65, abs=0.01)
     browser.screenshot(tmp_path / f"{size}.png")
     assert browser.console_messages() == []
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_the_page_keeps_result_report_and_replay_when_the_program_has_ended(
+    browser: Browser, source: DashboardSource, size: str, tmp_path: Path
+) -> None:
+    view = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
+    (tmp_path / "recording.html").write_text(view.StaticHtml())
+    (tmp_path / "report.html").write_text("<html><body><h1>The report</h1><script>var ran = 1;</script></body></html>")
+    dashboard = Dashboard(source, view.web_url())
+    browser.resize(*SIZES[size])
+    welding(source.live)
+    opened(browser, dashboard.url, "RUNNING")
+    assert not browser.run("return document.getElementById('result').offsetHeight")
+    source.end(held=False, reason=None, replays=True)
+    source.conclude(RESULT, tmp_path)
+    dashboard.close()
+    del view
+    browser.wait("document.getElementById('pages')?.children.length === 2 && chosen === 'recording.html'")
+    text = browser.text()
+    for words in ("use it", "the error is 0.200 mm", "torch", "0.025 mm", "x_bc", str(tmp_path).lower(), "replay"):
+        assert words in text.lower(), words
+    assert browser.run("return document.getElementById('state').textContent") == "DONE"
+    assert not browser.run("return document.getElementById('live_view').offsetHeight"), "its server is gone"
+    bar = "const r = document.querySelector('.replay').getBoundingClientRect(); const f = loaded['recording.html'].getBoundingClientRect();"
+    assert browser.run(bar + "return r.bottom <= f.top + 1 && f.height > 200"), "nothing covers REPLAY"
+    pixels = browser.screenshot(tmp_path / f"done_{size}.png", until=lambda picture: colours(picture) > 60)
+    assert colours(pixels) > 60, "the replay is drawn"
+    browser.run("choose('report.html')")
+    assert browser.run(
+        "return loaded['report.html'].contentWindow.ran === 1 && loaded['report.html'].offsetHeight > 200"
+    )
+    assert browser.run("return document.documentElement.scrollWidth <= innerWidth")
+    browser.screenshot(tmp_path / f"report_{size}.png")
+    browser.rest()
+
+
+def test_the_time_left_follows_the_pace_that_was_asked_for(source: DashboardSource) -> None:
+    welding(source.live)
+    assert source.values()["left_s"] == 12
+    source.person.ask_pace(0.1)
+    assert source.values()["left_s"] == 120
 
 
 def test_a_page_that_hears_nothing_says_so(browser: Browser, page: Dashboard, source: DashboardSource) -> None:

@@ -14,10 +14,10 @@ from pydrake.math import RigidTransform
 
 from tests.browser import Browser
 from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.systems.jobs.motion.messages import MotionRecord, MotionState
-from weldcal.systems.jobs.mounting.messages import HeldOut, MountingState, MountingStatus, NextBest
+from weldcal.systems.jobs.motion.procedure import MotionRecord, MotionState
+from weldcal.systems.jobs.mounting.procedure import HeldOut, MountingState, MountingStatus, NextBest
 from weldcal.systems.jobs.profiler.estimates import Taken
-from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.jobs.tablet.procedure import TabletState, Touched
 from weldcal.systems.jobs.touch.planner import Place
 from weldcal.systems.jobs.touch.procedure import Felt, TouchState

@@ -240,6 +240,7 @@ def _run(name: str, **job: Any) -> Any:
         cell=cell,
         root=context,
         held=False,
+        ended_by_operator=False,
         reason=None,
         clock=None,
         seconds=10.0,

@@ -23,6 +23,7 @@ from weldcal.tools.report.first_screen import (
     Next,
     ShownPose,
     Tolerance,
+    after_hold,
     check_limit,
     decide,
     point_covariance,
@@ -106,6 +107,11 @@ def test_the_error_of_a_mapped_point_is_that_of_drawn_poses() -> None:
     S = point_covariance(X, root @ root.T, np.asarray(X @ p_C))
     assert np.cov(off.T) == pytest.approx(S, rel=0.05, abs=0.03 * float(np.trace(S)))
     assert np.mean(np.linalg.norm(off, axis=1) < radius_95(S)) == pytest.approx(0.95, abs=0.01)
+
+
+def test_a_run_that_the_operator_ended_has_no_fault_to_look_for() -> None:
+    assert after_hold(True).text.startswith("The operator ended this run.")
+    assert after_hold(False).text.startswith("Settle the reason")
 
 
 @pytest.mark.parametrize("width", [60, 100])

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.motion.drift import Trial, _watched, expected_late, found_by_angle, knock_trial
-from weldcal.tools.studies.motion.feature_world import Change, WorldConfig
+from weldcal.tools.worlds.features import Change, WorldConfig
 
 
 def test_the_short_form_meets_the_targets(tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_the_short_form_meets_the_targets(tmp_path: Path) -> None:
     assert result["false_alarms"] == 0
     assert result["largest_statistic"] < 0.8 * result["threshold"]
     assert max(result["creep_mm_when_found"]) < 0.2
-    assert (tmp_path / "trials.csv").read_text().count("\n") == 4
+    assert (tmp_path / "runs.csv").read_text().count("\n") == 5
 
 
 def test_a_trial_says_what_the_change_was() -> None:

@@ -10,9 +10,23 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.files import cases, fuzz, readers, worker
-from weldcal.tools.studies.files.cases import ACCEPTED, CRASH, GOOD, HANG, INTERNAL, MEMORY, REFUSED, WRONG, judge
-from weldcal.tools.studies.files.readers import READERS, Reader
+from weldcal.tools.studies import fuzz_files as fuzz
+from weldcal.tools.worlds import damaged_files as cases
+from weldcal.tools.worlds import damaged_reading
+from weldcal.tools.worlds.damaged_files import (
+    ACCEPTED,
+    CRASH,
+    GOOD,
+    HANG,
+    INTERNAL,
+    MEMORY,
+    READERS,
+    REFUSED,
+    WRONG,
+    Reader,
+    judge,
+)
+from weldcal.tools.worlds.damaged_reading import Child, too_much
 
 SLOW = ("scenario",)  # a tenth of a second each
 
@@ -80,10 +94,10 @@ def test_the_child_is_watched_and_ended(tmp_path: Path, monkeypatch: pytest.Monk
         "    said = 'memory' if case == 3 else 'accepted'\n"
         "    print(json.dumps({'said': said, 'detail': '', 'seconds': 0.1}), flush=True)\n"
     )
-    monkeypatch.setattr(fuzz, "WORKER", ("-c", code))
-    with fuzz._Child(tmp_path / "place") as child:
+    monkeypatch.setattr(damaged_reading, "WORKER", ("-c", code))
+    with Child(tmp_path / "place") as child:
         assert child.ask(READERS[0], 0, 0)[0].said == ACCEPTED
-        monkeypatch.setattr(fuzz, "WATCHDOG_S", 0.5)
+        monkeypatch.setattr(damaged_reading, "WATCHDOG_S", 0.5)
         begin = time.monotonic()
         assert child.ask(READERS[0], 0, 1)[0].said == HANG
         assert time.monotonic() - begin < 5.0
@@ -91,12 +105,12 @@ def test_the_child_is_watched_and_ended(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_gigabyte_and_ten_times_the_file_are_allowed() -> None:
-    assert not worker.too_much(1024**3 + 10 * 5, 5)
-    assert worker.too_much(1024**3 + 10 * 5 + 1, 5)
+    assert not too_much(1024**3 + 10 * 5, 5)
+    assert too_much(1024**3 + 10 * 5 + 1, 5)
 
 
 def test_findings_are_kept_and_end_in_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuzz._Child, "ask", lambda self, reader, seed, case: (cases.Verdict(WRONG, "x"), 0.1))
+    monkeypatch.setattr(Child, "ask", lambda self, reader, seed, case: (cases.Verdict(WRONG, "x"), 0.1))
     result = fuzz.fuzz_files(READERS[:1], 2, 0, tmp_path)
     assert result.summary()["state"] == "failed"
     assert "silently wrong" in str(result.summary()["reason"])
@@ -106,5 +120,5 @@ def test_findings_are_kept_and_end_in_exit_code_1(tmp_path: Path, monkeypatch: p
 
 
 def test_numbers_that_are_not_finite_are_found_anywhere() -> None:
-    assert readers.all_finite([{"a": [1.0]}, None, "x"])
-    assert not readers.all_finite([{"a": [float("nan")]}])
+    assert cases.all_finite([{"a": [1.0]}, None, "x"])
+    assert not cases.all_finite([{"a": [float("nan")]}])

@@ -193,7 +193,7 @@ def test_without_data_the_simulated_parts_are_reported(tmp_path: Path) -> None:
     found = json.loads(result.stdout.strip().splitlines()[-1])
     assert found["pairs"] == {}
     assert any("only the simulated parts" in note for note in found["notes"])
-    page = (tmp_path / "o/report.html").read_text()
-    assert "No data folder was given" in page
-    assert "only the simulated" in page
+    table = (tmp_path / "o/table.md").read_text()
+    assert "No data folder was given" in table
+    assert "only the simulated" in table
     assert {p.name for p in (tmp_path / "o/figures").iterdir()} == {"costs.svg", "fig9_noise.svg", "fig10_steps.svg"}

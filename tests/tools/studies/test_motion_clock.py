@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,20 +13,22 @@ import pytest
 from scipy.stats import chi2
 
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
-from weldcal.tools.studies.motion.clock import run_clock_study
-from weldcal.tools.studies.motion.exact import exact_errors
-from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
+from weldcal.tools.farm.run import Farm
+from weldcal.tools.studies.motion.clock import STUDY, cases
+from weldcal.tools.worlds.moves import cube_moves, exact_errors, observed_frames
 
 
 def test_a_short_run_keeps_the_targets(tmp_path: Path) -> None:
-    found = run_clock_study(4, tmp_path, duration_s=12.0)
-    for kind in found.values():
-        assert (np.abs(kind.scaled) < 4.0).all()
-        assert kind.work_mm.max() < 0.10
-        assert kind.turn_deg.max() < 0.02
-        assert 0.3 < kind.nees.mean() < 2.5
-    assert np.abs(found["device"].errors[:, 6]).max() < 5e-4
-    assert "offset_coverage" in (tmp_path / "motion_clock.md").read_text()
+    STUDY.run(Farm(tmp_path, 0), cases(4, 12.0, 0))
+    runs = json.loads((tmp_path / "summary.json").read_text())
+    for line in csv.DictReader((tmp_path / "runs.csv").open()):
+        assert (np.abs(json.loads(line["scaled"])) < 4.0).all()
+        assert line["clock"] == "arrival" or abs(json.loads(line["errors"])[6]) < 5e-4
+    for kind in (runs["arrival"], runs["device"]):
+        assert kind["work_worst_mm"] < 0.10
+        assert kind["turn_worst_deg"] < 0.02
+        assert 0.3 < kind["nees"] < 2.5
+    assert "offset_coverage" in (tmp_path / "table.md").read_text()
 
 
 def test_a_wrong_offset_is_counted() -> None:
@@ -33,9 +37,10 @@ def test_a_wrong_offset_is_counted() -> None:
         assert right.clock.offset_s is not None
         return replace(right, clock=replace(right.clock, offset_s=right.clock.offset_s + 0.01))
 
-    found = run_clock_study(2, duration_s=8.0, estimate=wrong)["arrival"]
-    assert found.coverage == 0.0
-    assert found.summary()["offset_rms_ms"] == pytest.approx(10.0, abs=4.0)
+    given = {name: case | {"estimate": wrong} for name, case in cases(2, 8.0, 0).items()}
+    found = STUDY.here(given).figures["arrival"]
+    assert found["offset_coverage"] == 0.0
+    assert found["offset_rms_ms"] == pytest.approx(10.0, abs=4.0)
 
 
 def test_an_exact_fit_errs_as_it_says() -> None:

@@ -16,10 +16,9 @@ from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.depth_noise import DepthNoise
 from weldcal.models.errors import InputError
 from weldcal.models.scanner_streams import ScannerStream, get_stream
-from weldcal.models.scanners import depth_to_points
-from weldcal.tools.studies.motion.command import DataRequest, write_motion_data
-from weldcal.tools.studies.motion.disturbance import Disturbance
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld
+from weldcal.models.scanners import depth_to_points, get_scanner
+from weldcal.tools.worlds.disturbance import Disturbance, disturbance_of
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
 
 SMALL = MotionOptions(size=(534, 400), noise_mm=0.0, frames=4, surroundings=False)
 
@@ -114,11 +113,12 @@ def test_delays_have_a_floor_a_tail_and_the_stated_mean() -> None:
 
 
 def test_the_recording_is_read_back_and_the_truth_lies_outside(tmp_path: Path) -> None:
-    request = DataRequest(folder=tmp_path, seed=3, frames=4, width=267, surroundings=False)
-    said = write_motion_data(request, lambda *_: None)
+    preset = get_scanner("motioncam_3d_stream", 267)
+    world = MotionWorld(MotionOptions(seed=3, frames=4, size=(preset.width, preset.height), surroundings=False))
+    write_motion_dataset(world, tmp_path / "dataset", tmp_path / "truth.json", lambda *_: None)
     read = load_motion_dataset(tmp_path / "dataset")
     truth = json.loads((tmp_path / "truth.json").read_text())
-    assert said["frames"] == len(read.frames) == 4
+    assert len(world.captures) == len(read.frames) == 4
     assert not read.warnings
     assert not read.refused
     assert not list((tmp_path / "dataset").rglob("*truth*"))
@@ -129,7 +129,6 @@ def test_the_recording_is_read_back_and_the_truth_lies_outside(tmp_path: Path) -
         assert 0.118 < late < 0.3
         offset = 1e3 * (truth["capture_s"][frame.id] - frame.device)
         assert offset == pytest.approx(truth["device_clock"]["offset_ms_at_middle"], abs=0.2)
-    world = MotionWorld(request.options())
     k = len(read.stream.time) // 2
     p = world.path.pose(read.stream.time[k] - 1000.0).translation()
     assert np.linalg.norm(read.stream.poses[k, :3, 3] - p) < 5e-5
@@ -156,4 +155,4 @@ def test_what_happens_to_the_cell() -> None:
     assert cold == 5e-4
     assert warm < 1e-7
     with pytest.raises(InputError, match="--knock takes 4 or 7 numbers"):
-        DataRequest(folder=Path("x"), knock="1,2").options()
+        disturbance_of(knock="1,2")

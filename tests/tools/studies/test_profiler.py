@@ -11,16 +11,15 @@ from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.profiler import command
-from weldcal.tools.studies.profiler.command import run_profiler_study
+from weldcal.tools.studies.profiler import reproduce
 from weldcal.tools.studies.profiler.edge import edge_rows
 from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines
-from weldcal.tools.studies.profiler.pieces import groove_mesh, scan_groove
-from weldcal.tools.studies.profiler.results import ProfilerStudyOptions
-from weldcal.tools.studies.profiler.sets import made_edge_trials
-from weldcal.tools.studies.profiler.sphere import METHODS, WorldData, measure
-from weldcal.tools.studies.profiler.worlds import SphereWorld, sphere_trial
+from weldcal.tools.studies.profiler.reproduce import ProfilerStudyOptions, run_profiler_study
+from weldcal.tools.studies.profiler.sphere import METHODS, measure
 from weldcal.tools.studies.targets import Target
+from weldcal.tools.worlds.edge_trials import made_edge_trials
+from weldcal.tools.worlds.profiler import SphereWorld, sphere_trial
+from weldcal.tools.worlds.profiler_parts import WorldData, groove_mesh, scan_groove
 
 
 def test_on_other_edges_the_joint_method_is_near_its_bound_and_the_papers_is_not() -> None:
@@ -83,7 +82,7 @@ def test_targets_of_the_fixed_files_do_not_decide_on_other_worlds(
 ) -> None:
     missed = Target("frustum, length", "mm", 0.053, 0.042)
     study = SimpleNamespace(met=False, summary=lambda: {"state": "failed"}, targets=lambda: [missed])
-    monkeypatch.setattr(command, "run_profiler_study", lambda options, progress: study)
+    monkeypatch.setattr(reproduce, "run_profiler_study", lambda options, progress: study)
     found = CliRunner().invoke(app, ["reproduce", "profiler", *data, "--out", str(tmp_path / "out")])
     assert found.exit_code == code, found.output
     assert "MISSED" in found.output

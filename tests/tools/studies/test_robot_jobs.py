@@ -15,7 +15,7 @@ def test_a_person_who_stops_a_job_stops_the_study(tmp_path: Path, monkeypatch: p
     begun: list[int] = []
 
     def stop() -> None:
-        raise KeyboardInterrupt("A person stopped the run with Ctrl-C, in the phase 'weld'.")
+        raise KeyboardInterrupt("The operator stopped the run with Ctrl-C, in the phase 'weld'.")
 
     def stopped(scenario: object, options: object) -> object:
         begun.append(1)

@@ -7,7 +7,7 @@ import pytest
 
 from weldcal.models.errors import InputError
 from weldcal.tools.studies.motion.whole_body import run_whole_body
-from weldcal.tools.studies.motion.world import MotionOptions
+from weldcal.tools.worlds.motion import MotionOptions
 
 
 def test_a_wrist_link_is_tracked_as_well_as_the_flange(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ class TabletDemo:
     def first(self) -> FirstScreen:
         """The first screen."""
         made = None if self.calibration is None else replace(self.calibration, no_tolerance=NO_KEY).first
-        return run_screen(made, self.run.reason or "", self.found)
+        return run_screen(made, self.run.reason or "", self.found, self.run.ended_by_operator)
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `tablet demo`."""

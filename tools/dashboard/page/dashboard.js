@@ -185,6 +185,53 @@ function picture(v) {
   img.onerror = () => { img.hidden = true; };
 }
 
+// --- the result ----------------------------------------------------------------------------------------------------------
+// The recording and the report are loaded while the program still serves them, so that they stay when it has ended.
+const PAGE_NAMES = { "recording.html": "Replay", "report.html": "Report" };
+const loaded = {};
+let chosen = "";
+
+function choose(name) {
+  chosen = name;
+  for (const [other, frame] of Object.entries(loaded)) frame.hidden = other !== name;
+  show("live_view", !loaded[name]);
+  if (loaded[name]) loaded[name].contentWindow.dispatchEvent(new Event("resize"));
+  show("replay", name !== "report.html");
+  for (const b of el("pages").children) b.setAttribute("aria-pressed", String(b.dataset.key === name));
+}
+
+function load(name) {
+  const frame = element("iframe");
+  frame.title = PAGE_NAMES[name];
+  frame.hidden = true;
+  frame.onload = () => {
+    let body = null;
+    try { body = frame.contentDocument && frame.contentDocument.body; } catch { return; }
+    if (!body || !body.childElementCount) return;
+    loaded[name] = frame;
+    const b = element("button", PAGE_NAMES[name]);
+    b.type = "button"; b.dataset.key = name;
+    b.addEventListener("click", () => choose(name));
+    if (name === "recording.html") el("pages").prepend(b); else el("pages").append(b);
+    show("pages", true);
+    choose(name === "recording.html" || !chosen ? "recording.html" : chosen);
+  };
+  frame.src = "result/" + name;
+  document.querySelector(".view").append(frame);
+}
+
+function result(v) {
+  const r = v.result;
+  show("result", !!r);
+  if (!r || !changed("result", r)) return;
+  say("verdict", r.verdict || "");
+  el("verdict").className = r.tone;
+  say("reason", r.reason);
+  el("result_rows").replaceChildren(...r.rows.flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
+  say("result_folder", r.folder ? "All files are in " + r.folder + ". To open the report later: weldcal view " + r.folder : "");
+  if (el("pages") && !v.closing) r.files.forEach(load);
+}
+
 // --- values --------------------------------------------------------------------------------------------------------------
 function update(v) {
   last = v;
@@ -207,6 +254,9 @@ function update(v) {
     if (s.is === "now") li.setAttribute("aria-current", "step");
     return li;
   }));
+  document.querySelector(".view").classList.toggle("ended", v.replay);
+  if (chosen) show("replay", v.replay && chosen !== "report.html");
+  result(v);
   scene(v);
   panel(v);
   picture(v);

@@ -58,14 +58,14 @@ def _frame_figures(results: Results) -> Figures:
     whole = [r for r in results.values() if r["kind"] == "whole"]
     good = [r["error_m"] for r in whole if r["reason"] is None]
     missed = [(k, r["reason"]) for k, r in enumerate(whole) if "mistaken" not in r]
-    centre = statistics((1e3 * e for e in good), "rms", "max")
+    centre = statistics(good, "rms", "max")
     return {
         "frames": len(whole),
         "found": len(good),
         "mistaken": sum(r.get("mistaken", False) for r in whole),
         "imagined": sum(r.get("imagined", False) for r in results.values()),
-        "centre_rms_mm": centre["rms"],
-        "centre_max_mm": centre["max"] if good else 0.0,
+        "centre_rms_mm": 1e3 * centre["rms"],
+        "centre_max_mm": 1e3 * centre["max"] if good else 0.0,
         "missed": [{"frame": k, "reason": why} for k, why in missed],
     }
 
@@ -116,7 +116,7 @@ def _hidden_figures(results: Results) -> Figures:
                 "way": way,
                 "frames": len(all_),
                 "found": len(good),
-                "centre_rms_mm": statistics((1e3 * r["error_m"] for r in good), "rms")["rms"],
+                "centre_rms_mm": 1e3 * statistics((r["error_m"] for r in good), "rms")["rms"],
                 "normalised": statistics((r["normalised"] for r in good), "mean")["mean"],
                 "coverage": statistics((r["coverage"] for r in good), "mean")["mean"] if good else 0.0,
                 "missed": [r["reason"] for r in all_ if r["reason"] is not None],

@@ -1,9 +1,9 @@
 """`weldcal benchmark drift`: knocks, creeps and quiet hours of a watched calibration, on a world of features."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
-from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +14,17 @@ from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter
 from weldcal.calibration.motion.drift.residuals import CLOCK
 from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arrays import Array
-from weldcal.tools.console import Progress
-from weldcal.tools.report.files import records_csv, write_json
-from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.motion.feature_world import Change, World, WorldConfig, simulate
+from weldcal.models.errors import InputError
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
 from weldcal.tools.studies.targets import Target, all_met
+from weldcal.tools.worlds.features import Change, World, WorldConfig, simulate
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
 WITHIN_S = 2.0
 CREEP_M_S, CREEP_MOST_M = 2e-5 / 60.0, 2e-4
 _KNOCK_S, _AFTER_S = (25.0, 35.0), 10.0
 _CREEP_START_S = 60.0
-_TOLD_EVERY = 200  # frames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,45 +47,49 @@ class Trial:
     told: float
 
 
-@dataclass(frozen=True)
-class Size:
-    """How much is run: knocks, creeps, quiet hours."""
-
-    knocks: int = 200
-    creeps: int = 8
-    hours: float = 10.0
-
-
-def run_drift_study(
-    out: Path | None, size: Size, *, stamps: str = "device", seed: int = 0, progress: Progress | None = None
-) -> tuple[dict[str, object], list[Target]]:
-    """Run the trials; write trials.csv and result.json to ``out``. The result's state is "failed" where a target is missed."""
-    tell: Progress = progress or (lambda stage, fraction: None)
+def one_recording(kind: str, seed: int, stamps: str, hours: float = 0.0) -> Mapping[str, object]:
+    """Watch one recording: a ``kind`` of change as a Trial, or "quiet" hours in which nothing happens."""
     world = WorldConfig(stamps=stamps)
-    trials: list[Trial] = []
-    for k in range(size.knocks):
-        tell("knocks", 0.3 * k / size.knocks)
-        trials.append(knock_trial(world, seed + k, turn=k % 2 == 1))
-    for k in range(size.creeps):
-        tell("creeps", 0.3 + 0.1 * k / size.creeps)
-        trials.append(creep_trial(world, seed + 5000 + k))
-    alarmed, largest, threshold = quiet_hours(
-        world, size.hours, seed + 9000, lambda f: tell("quiet hours", 0.4 + 0.6 * f)
-    )
+    if kind != "quiet":
+        return asdict(creep_trial(world, seed) if kind == "creep" else knock_trial(world, seed, turn=kind == "turn"))
+    alarmed, largest, threshold = quiet_hours(world, hours, seed)
+    return {
+        "kind": kind, "stamps": stamps, "hours": hours, "largest_statistic": largest, "threshold": threshold,
+        "alarmed": [
+            {
+                "kind": e.kind, "time_s": e.time_s, "found_s": e.found_s, "statistic": e.statistic, "model": e.model,
+                "translation_mm": (1e3 * e.translation_m).tolist(), "rotation_deg": np.degrees(e.rotation_rad).tolist(),
+            }
+            for e in alarmed
+        ],
+    }  # fmt: skip
+
+
+def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cases:
+    """Knocks, of which every other one shifts and turns, creeps, and one recording of quiet hours."""
+    kinds = [("turn" if k % 2 else "shift", seed + k) for k in range(knocks)]
+    kinds += [("creep", seed + 5000 + k) for k in range(creeps)]
+    out: dict[str, dict[str, Any]] = {f"{kind} {n}": {"kind": kind, "seed": n, "stamps": stamps} for kind, n in kinds}
+    return out | {"quiet": {"kind": "quiet", "seed": seed + 9000, "stamps": stamps, "hours": hours}}
+
+
+def _figures(results: Results) -> Figures:
+    quiet = whole(results)["quiet"]
+    trials = [Trial(**_numbers(r)) for r in results.values() if r["kind"] != "quiet"]
     knocks = [t for t in trials if t.kind != "creep"]
     found = np.array([t.found_after_s for t in knocks])
     creeps = np.array([t.found_after_s for t in trials if t.kind == "creep"])
     reached = 1e3 * CREEP_M_S * np.where(np.isnan(creeps), np.inf, creeps)
-    early = sum(t.false_alarms for t in trials)
+    early, hours = sum(t.false_alarms for t in trials), quiet["hours"]
     targets = [
         Target(f"knocks found within {WITHIN_S:g} s", "%", _percent(found <= WITHIN_S), 100.0, "≥"),
-        Target(f"false alarms in {size.hours:g} quiet hours", "", float(len(alarmed)), 0.0),
+        Target(f"false alarms in {hours:g} quiet hours", "", float(len(quiet["alarmed"])), 0.0),
         Target("false alarms before a change", "", float(early), 0.0),
         Target("creep when found", "mm", float(reached.max(initial=0.0)), 1e3 * CREEP_MOST_M, over="worst"),
     ]
-    result: dict[str, object] = {
+    return {
         "state": "done" if all_met(targets) else "failed",
-        "stamps": stamps,
+        "stamps": quiet["stamps"],
         "knocks": len(knocks),
         "found_within_2_s": int((found <= WITHIN_S).sum()),
         "found": int(np.isfinite(found).sum()),
@@ -99,28 +102,56 @@ def run_drift_study(
         "latest": [asdict(t) for t in sorted(knocks, key=lambda t: -np.nan_to_num(t.found_after_s, nan=np.inf))[:5]],
         "turns_by_angle_to_the_view": found_by_angle(knocks),
         "creep_mm_when_found": reached.tolist(),
-        "quiet_hours": size.hours,
-        "false_alarms": len(alarmed),
-        "alarmed": [
-            {
-                "kind": e.kind,
-                "time_s": e.time_s,
-                "found_s": e.found_s,
-                "statistic": e.statistic,
-                "model": e.model,
-                "translation_mm": (1e3 * e.translation_m).tolist(),
-                "rotation_deg": np.degrees(e.rotation_rad).tolist(),
-            }
-            for e in alarmed
-        ],
-        "largest_statistic": largest,
-        "threshold": threshold,
+        "quiet_hours": hours,
+        "false_alarms": len(quiet["alarmed"]),
+        "alarmed": quiet["alarmed"],
+        "largest_statistic": quiet["largest_statistic"],
+        "threshold": quiet["threshold"],
         "targets": [{**t._asdict(), "met": t.met} for t in targets],
     }
-    if out is not None:
-        write_atomic(out / "trials.csv", records_csv(trials))
-        write_json(out / "result.json", result)
-    return result, targets
+
+
+def _numbers(result: Mapping[str, Any]) -> dict[str, Any]:
+    """A trial's fields; JSON has null for NaN."""
+    return {name: float("nan") if value is None else value for name, value in result.items()}
+
+
+def _targets(figures: Figures) -> list[Target]:
+    return [Target(**{name: t[name] for name in Target._fields}) for t in figures["targets"]]
+
+
+def _rows(figures: Figures) -> Iterable[Row]:
+    for r in figures["turns_by_angle_to_the_view"]:
+        found, shown = r["found_within_2_s_percent"], r["shown_median"]
+        yield f"{r['from_deg']:g} to {r['to_deg']:g}", f"{r['turns']}", f"{found:.0f}", f"{shown:.3g}"
+
+
+STUDY = Study(
+    name="drift",
+    what="How soon knocks of 0.2 mm or 0.03 degrees and creeps of the scanner are found, and false alarms in quiet hours.",
+    case=one_recording,
+    figures=_figures,
+    header=("turns about an axis so far from the view, deg", "turns", "found within 2 s, %", "shown, thresholds"),
+    rows=_rows,
+    targets=_targets,
+    numbers=3,
+)
+
+
+@command("benchmark drift", short_help="Measure how soon a moved scanner is found.", options=FARM, hidden=True)
+def benchmark_drift(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Recordings with a knock: every other one shifts, turns.", min=2)] = 200,
+    creeps: Annotated[int, option("--creeps", "N", "Recordings with a creep.", min=1)] = 8,
+    hours: Annotated[float, option("--hours", "H", "Simulated hours in which nothing happens.", min=0.01)] = 10.0,
+    stamps: Annotated[str, option("--stamps", "KIND", "device (0.1 ms) or arrival (15 ms, skewed).")] = "device",
+    quick: Annotated[bool, switch("--quick", "Few recordings and minutes: seconds instead of an hour.")] = False,
+) -> Outcome:
+    """Measure the drift test: how soon knocks of 0.2 mm or 0.03 degrees and creeps are found, and false alarms."""
+    if stamps not in ("device", "arrival"):
+        raise InputError(f"Stamps are 'device' or 'arrival', not '{stamps}'.")
+    size = (2, 1, 0.01) if quick else (runs, creeps, hours)
+    return STUDY.outcome(call, cases(*size, stamps, call.seed))
 
 
 def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> Trial:
@@ -149,9 +180,7 @@ def creep_trial(world: WorldConfig, seed: int) -> Trial:
     return _trial("creep", seed, events, _CREEP_START_S, shift, np.zeros(3), float(abs(axis @ view)), *said)
 
 
-def quiet_hours(
-    world: WorldConfig, hours: float, seed: int, tell: Callable[[float], None] | None = None
-) -> tuple[list[DriftEvent], float, float]:
+def quiet_hours(world: WorldConfig, hours: float, seed: int) -> tuple[list[DriftEvent], float, float]:
     """False alarms, the largest statistic and the threshold over hours in which nothing happens."""
     w = simulate(world, 3600.0 * hours, seed)
     test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / world.frame_s)
@@ -159,8 +188,6 @@ def quiet_hours(
     for k in range(len(w.rows)):
         test.update(w.rows.part(slice(k, k + 1)))
         largest = max(largest, test.statistic)
-        if tell is not None and k % _TOLD_EVERY == 0:
-            tell(k / len(w.rows))
     test.finish()
     return test.events, largest, test.threshold
 

@@ -1,8 +1,10 @@
 """Report page and pictures of the motion study: Table 1, the track, the history of errors, the quality of both modes."""
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from weldcal.models.arrays import Array
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, svg
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.motion.results import COMPONENTS, MotionStudy, Row
@@ -34,23 +36,28 @@ def track_picture(study: MotionStudy) -> bytes:
     return svg(figure)
 
 
+def _components(axes: Axes, study: MotionStudy, errors: Array, first: int) -> None:
+    """Three components over the seconds that a reader can follow: rotation (``first`` 0) or translation (3)."""
+    shown = study.history_t < study.history_t[0] + _SECONDS
+    for k in range(3):
+        axes.plot(
+            study.history_t[shown], errors[shown, first + k], ".-", ms=4, lw=0.8, color=_COLOURS[k],
+            label=COMPONENTS[first + k],
+        )  # fmt: skip
+    axes.legend(frameon=False, fontsize=8, ncols=3, loc="upper right")
+
+
 def history_picture(study: MotionStudy) -> bytes:
     """Fig. 6: components of the calibration's error by ICP over time, before and after synchronisation."""
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
     every = figure.subplots(2, 2, sharex=True, sharey="row")
-    shown = study.history_t < study.history_t[0] + _SECONDS
     for column, (title, errors) in enumerate(
         (("poses at arrival", study.history_before), ("joint estimate of X_BC and clock", study.history_after))
     ):
         for row, (first, unit) in enumerate(((3, "mm"), (0, "degrees"))):
             axes = every[row, column]
-            for k in range(3):
-                axes.plot(
-                    study.history_t[shown], errors[shown, first + k], ".-", ms=4, lw=0.8, color=_COLOURS[k],
-                    label=COMPONENTS[first + k],
-                )  # fmt: skip
+            _components(axes, study, errors, first)
             plain(axes, "time, s" if row else "", unit if not column else "")
-            axes.legend(frameon=False, fontsize=8, ncols=3, loc="upper right")
             if not row:
                 axes.set_title(title, fontsize=10)
     return svg(figure)
@@ -59,15 +66,9 @@ def history_picture(study: MotionStudy) -> bytes:
 def after_picture(study: MotionStudy) -> bytes:
     """The right half of Fig. 6 in its own scale."""
     figure = Figure(figsize=(9.0, 3.0), layout="constrained")
-    shown = study.history_t < study.history_t[0] + _SECONDS
     for axes, first, unit in zip(figure.subplots(1, 2), (3, 0), ("mm", "degrees"), strict=True):
-        for k in range(3):
-            axes.plot(
-                study.history_t[shown], study.history_after[shown, first + k], ".-", ms=4, lw=0.8, color=_COLOURS[k],
-                label=COMPONENTS[first + k],
-            )  # fmt: skip
+        _components(axes, study, study.history_after, first)
         plain(axes, "time, s", unit)
-        axes.legend(frameon=False, fontsize=8, ncols=3, loc="upper right")
     return svg(figure)
 
 
@@ -109,7 +110,8 @@ def motion_report(study: MotionStudy) -> str:
         "motion_study.html.j2",
         study=study,
         targets=[(t.what, fixed(t.value, 3), t.wanted, t.verdict) for t in study.targets],
-        missed=sum(not t.met for t in study.targets if t.decides),
+        missed=sum(not t.met for t in study.targets),
+        deciding=sum(not t.met for t in study.targets if t.decides),
         table_1=table_rows(study.rows),
         errors=[(name, fixed(a, 3), fixed(b, 3), fixed(c, 4)) for name, (a, b, c) in study.X_errors.items()],
         compensation=[(name, fixed(a, 3), fixed(b, 3)) for name, (a, b) in study.compensation.items()],

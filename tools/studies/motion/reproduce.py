@@ -3,7 +3,9 @@
 import json
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +22,33 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.published.icp import Verification, face_cloud, icp_error, make_verification, sight
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.harness import MISSED
 from weldcal.tools.studies.motion.report import motion_report
 from weldcal.tools.studies.motion.results import MotionStudy, MotionStudyOptions, Quality, Row, Track
-from weldcal.tools.studies.motion.static_mode import Look, StaticMode, noise_of_face
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
+from weldcal.tools.studies.targets import print_targets
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
+from weldcal.tools.worlds.static_scans import Look, StaticMode, noise_of_face
 
 _ICP_FRAMES, _QUICK_FRAMES = 120, 10  # for Table 1 and Fig. 6
 _REACH_M = 0.01
 _TO_MM = np.array([*[np.degrees(1.0)] * 3, *[1e3] * 3])
+
+
+@command("reproduce motion", short_help="Repeat the paper on calibration in motion.")
+def motion(
+    call: Call,
+    quick: Annotated[bool, switch("--quick", "A seventh of the pixels and 90 frames; decides nothing.")] = False,
+    frames: Annotated[int | None, option("--frames", "N", "Frames in motion.", min=40, show_default="600")] = None,
+) -> Outcome:
+    """Repeat the flange paper on motion: Table 1, Eq. 21, Fig. 5, 6 and 9; the recording and its truth are kept. 15 min."""
+    options = MotionStudyOptions(call.folder("reproduce", "motion"), call.seed, quick, frames)
+    study = run_motion_study(options, call.progress)
+    text = partial(print_targets, "calibration in motion", study.targets)
+    return Outcome(study.summary(), text=text, problem="" if study.met else MISSED)
 
 
 def run_motion_study(options: MotionStudyOptions, progress: Progress) -> MotionStudy:

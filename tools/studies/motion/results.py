@@ -1,6 +1,6 @@
 """Results of the motion study: errors of both modes as the paper's Table 1 lists them, the clock, tracking, quality, targets."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +97,6 @@ class MotionStudy:
     n_frames: int
     n_seen: int
     wall_seconds: float
-    notes: tuple[str, ...] = field(default_factory=tuple)
 
     @property
     def targets(self) -> tuple[Target, ...]:

@@ -8,8 +8,9 @@ import os
 import time
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -28,10 +29,11 @@ from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld
-from weldcal.tools.studies.targets import Target
+from weldcal.tools.studies.targets import Target, print_targets
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld
 
 _POLL_S = 0.004
 _STEP_S = 0.004
@@ -79,6 +81,15 @@ class Throughput:
             "load_average": self.load_average, "cores": os.cpu_count(), "points_per_second": self.pixels * self.fps, "paper": _PAPER,
             "targets": [{"what": t.what, "reached": t.value, "wanted": t.wanted, "met": t.met} for t in self.targets],
         }  # fmt: skip
+
+
+@command("benchmark motion-speed", short_help="Measure frames per second beside an arm's control.", hidden=True)
+def benchmark_speed(
+    call: Call, seconds: Annotated[float, option("--seconds", "S", "Length of the stream.", min=2.0)] = 30.0
+) -> Outcome:
+    """Fit half-megapixel frames at 20 per second beside an arm's control: frames per second, and arrival to estimate."""
+    found = run_throughput(call.folder("benchmark", "motion"), seconds, call.seed, call.progress)
+    return Outcome(found.summary(), text=partial(print_targets, "streamed scans", found.targets))
 
 
 def run_throughput(folder: Path, seconds: float, seed: int, progress: Progress, *, rendered: int = 40) -> Throughput:

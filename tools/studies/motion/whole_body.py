@@ -3,6 +3,7 @@
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -13,15 +14,34 @@ from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arms.link_mesh import link_index
+from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.commands.monitor_body import see_link
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
-from weldcal.tools.studies.targets import Target, all_met
+from weldcal.tools.studies.targets import Target, all_met, print_targets
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
 
 LINK = "wrist_1_link"
 WITHIN = 2.0
 _SIGMA = 1e-5  # rad and m: the calibration of the study is the truth, so that what is left is tracking
+
+
+@command("benchmark whole-body", short_help="Compare tracking by the flange with tracking by a link.", hidden=True)
+def benchmark_whole_body(
+    call: Call,
+    frames: Annotated[int, option("--frames", "N", "Frames of the recording.", min=12)] = 200,
+    width: Annotated[int, option("--width", "PX", "Width of the scanner's image.", min=64)] = 1068,
+    noise_mm: Annotated[
+        float | None, option("--noise-mm", "MM", "Noise of one pixel.", show_default="the scanner's")
+    ] = None,
+    body: Annotated[str, option("--body", "LINK", "The link that is tracked.")] = LINK,
+) -> Outcome:
+    """Compare the tracking error of the flange with that of a link, by its mesh and by a model fused from the scans."""
+    options = MotionOptions(
+        frames=frames, size=(width, round(0.749 * width)), noise_mm=noise_mm, seed=call.seed, surroundings=False
+    )
+    summary, targets = run_whole_body(call.folder("benchmark", "whole-body"), options, body, call.progress)
+    return Outcome(summary, text=lambda: print_targets("Whole body", targets))
 
 
 def run_whole_body(

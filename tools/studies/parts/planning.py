@@ -161,7 +161,7 @@ PLANNED, REFUSED = "planned", "refused"
 
 @dataclass(frozen=True)
 class Trouble:
-    """A kind of scene. others: what else stands there; drawing: what is looked for, None: the part itself; must: what the
+    """A kind of scene. others: objects beside the part; drawing: what is looked for, None: the part itself; must: what the
     answer has to be, empty where a plan with an honest sigma and a refusal are both right.
     """
 
@@ -203,7 +203,7 @@ def _bar(width_m: float) -> Callable[[np.random.Generator], list[TriMesh]]:
 
 
 def _clutter(rng: np.random.Generator) -> list[TriMesh]:
-    """Boxes around the part, some as high as it, and one that stands on its edge."""
+    """Boxes around the part, some as high as it, and one on its edge."""
     meshes = []
     for _ in range(8):
         angle, far = rng.uniform(-math.pi, math.pi), rng.uniform(0.16, 0.32)

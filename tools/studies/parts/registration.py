@@ -159,13 +159,13 @@ class Refusal:
 
 
 def sphere(radius: float) -> TriMesh:
-    """A ball standing on z = 0, m."""
+    """A ball that rests on z = 0, m."""
     a = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 33)
     return revolve(np.column_stack([radius * np.cos(a) * (np.abs(a) < 1.57), radius * (1.0 + np.sin(a))]), 64)
 
 
 def pipe(radius: float, wall: float, height: float) -> TriMesh:
-    """A pipe standing on z = 0, m."""
+    """A pipe that rests on z = 0, m."""
     inner = radius - wall
     return revolve(np.array([[inner, 0.0], [radius, 0.0], [radius, height], [inner, height], [inner, 0.0]]), 72)
 

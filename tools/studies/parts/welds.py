@@ -6,6 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
+from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
@@ -43,7 +44,8 @@ def run_part_welds(
     chosen = list(PARTS) if names is None else list(names)
     unknown = [name for name in chosen if name not in PARTS]
     if unknown:
-        raise InputError(f"There is no part '{unknown[0]}': choose from {', '.join(PARTS)}.")
+        listed = f"choose from {', '.join(PARTS)}."
+        raise InputError(f"There is no part '{unknown[0]}': {did_you_mean(unknown[0], PARTS, listed)}")
     trial = trial or Trial()
     rows: list[dict[str, object]] = []
     runs = [(name, seed) for name in chosen for seed in seeds]

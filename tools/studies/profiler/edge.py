@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial
+from weldcal.tools.worlds.edge_trials import TRANSLATIONS, EdgeTrial
 
 COUNTS = (10, 15, 20, 25)
 METHODS = ("paper", "joint")
@@ -145,13 +145,3 @@ def ball_points(trial: EdgeTrial, R: Floats, t: Floats) -> Floats:
     assert trial.ball_poses is not None
     p = np.stack([trial.ball[..., 0], np.zeros(trial.ball.shape[:2]), trial.ball[..., 1]], axis=2) @ R.T + t
     return np.asarray(np.einsum("nij,nmj->nmi", trial.ball_poses.rotation, p) + trial.ball_poses.translation[:, None])
-
-
-def all_sets(
-    trials_of: Callable[[str], Iterable[EdgeTrial]], names: tuple[str, ...], progress: Callable[[str, float], None]
-) -> list[EdgeRow]:
-    """Rows of the sets named."""
-    rows: list[EdgeRow] = []
-    for k, name in enumerate(names):
-        rows += edge_rows(name, trials_of(name), lambda share, k=k: progress(names[k], (k + share) / len(names)))  # type: ignore[misc]
-    return rows

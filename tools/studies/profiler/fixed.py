@@ -18,9 +18,10 @@ from weldcal.calibration.profiler.sphere.joint import leave_one_out_m
 from weldcal.calibration.profiler.sphere.model import SphereData
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.studies.profiler.edge import TARGETS
-from weldcal.tools.studies.profiler.sets import MM, NOISE, EdgeError, EdgeTrial, fixed_edge_trials, rms, sigma_of
-from weldcal.tools.studies.profiler.sphere import METHODS, SEAM_FEATURES, WorldResult, fixed_worlds
+from weldcal.tools.studies.profiler.sphere import METHODS, SEAM_FEATURES, WorldResult
 from weldcal.tools.studies.targets import Target
+from weldcal.tools.worlds.edge_trials import MM, NOISE, EdgeError, EdgeTrial, fixed_edge_trials, rms, sigma_of
+from weldcal.tools.worlds.profiler_parts import fixed_worlds
 
 DEGENERATE = {
     "collinear": "positions on a line",

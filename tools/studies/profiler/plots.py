@@ -1,6 +1,6 @@
 """Pictures of the profiler study: Fig. 6 to 8 of the edge paper, the seam's deviations and the frustum."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 
 from weldcal.tools.report.pictures import OURS, PLANNED, plain, svg
 from weldcal.tools.studies.profiler.edge import COUNTS, EdgeRow
-from weldcal.tools.studies.profiler.results import TargetLine
 from weldcal.tools.studies.profiler.sphere import METHODS, WorldResult
 
 PAPER = PLANNED
@@ -62,11 +61,11 @@ def _panels(
         axes.set_title(titles[name], fontsize=9)
         plain(axes, "rotations", "")
     panels[0].set_ylabel(y)
-    _legend(picture, panels[0])
+    legend(picture, panels[0])
     return svg(picture)
 
 
-def _legend(picture: Figure, axes: Axes) -> None:
+def legend(picture: Figure, axes: Axes) -> None:
     """One legend for all panels, over them."""
     handles, labels = axes.get_legend_handles_labels()
     picture.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 4), frameon=False, fontsize=8)
@@ -97,7 +96,7 @@ def seam(results: list[WorldResult]) -> bytes:
         axes.set_title(title, fontsize=9, loc="left")
         plain(axes, "", "off, mm")
     panels[-1].set_xlabel("station along the seam")
-    _legend(picture, panels[0])
+    legend(picture, panels[0])
     return svg(picture)
 
 
@@ -118,26 +117,4 @@ def frustum(result: WorldResult) -> bytes:
     axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
     axes.set_box_aspect((1, 1, 0.45))
     axes.view_init(elev=38, azim=-60)
-    return svg(picture)
-
-
-def over_seeds(lines: Sequence[TargetLine]) -> bytes:
-    """Every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
-    picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
-    axes = picture.add_subplot()
-    for k, line in enumerate(lines):
-        axes.plot(line.values / line.target, np.full(len(line.values), k), "o", ms=4, mew=0, alpha=0.5, color=OURS,
-                  label="one seed" if k == 0 else None)  # fmt: skip
-        low, high = np.nanmin(line.bounds) / line.target, np.nanmax(line.bounds) / line.target
-        axes.plot([low, high], [k + 0.28] * 2, "-", lw=3, color="0.45", solid_capstyle="round",
-                  label="its bound, over the seeds" if k == 0 else None)  # fmt: skip
-        if line.fixed is not None:
-            axes.plot(line.fixed.value / line.target, k, "D", ms=5, mfc="none", mec="black", mew=1.4,
-                      label="the fixed files" if k == 0 else None)  # fmt: skip
-    axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
-    axes.set_yticks(range(len(lines)), [f"{line.what}, {line.target:g} {line.unit}" for line in lines], fontsize=8)
-    axes.invert_yaxis()
-    plain(axes, "reached over target", "")
-    axes.set_xlim(left=0.0)
-    _legend(picture, axes)
     return svg(picture)

@@ -1,13 +1,90 @@
-"""Report page of the profiler study: targets, both papers' tables compared with ours, and pictures."""
+"""Results of the profiler study with their targets, and its report page: both papers' tables compared with ours, and pictures."""
+
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.profiler import edge, plots, sphere
+from weldcal.tools.studies.profiler.edge import EdgeRow, edge_figures, edge_targets
 from weldcal.tools.studies.profiler.fixed import figure_text
-from weldcal.tools.studies.profiler.results import ProfilerStudy
+from weldcal.tools.studies.profiler.sphere import WorldResult, sphere_figures, sphere_targets
+from weldcal.tools.studies.targets import Target, all_met
 
 Lines = list[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class ProfilerStudyOptions:
+    """Output folder; folder of the fixed files, or None to make trials from `seed`; whether in short form."""
+
+    folder: Path
+    data: Path | None = None
+    seed: int = 0
+    quick: bool = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProfilerStudy:
+    """Everything that the study computed.
+
+    Attributes:
+        names: the sets of edge trials.
+        ball: (n, m, 3) m, profiles of a ball, brought into one frame by the joint method.
+        fixed: targets of what only the fixed files hold.
+    """
+
+    options: ProfilerStudyOptions
+    names: tuple[str, ...]
+    edge: tuple[EdgeRow, ...]
+    sphere: tuple[WorldResult, ...]
+    ball: np.ndarray
+    fixed: tuple[Target, ...]
+    wall_seconds: float
+
+    def of(self, method: str) -> list[WorldResult]:
+        """A method's results over the worlds."""
+        return [r for r in self.sphere if r.method == method]
+
+    def targets(self) -> list[Target]:
+        """Every target; the limits were set on the fixed files."""
+        reached = sphere_figures(self.sphere)
+        for r in self.edge:
+            if r.met is not None:
+                reached |= edge_figures(r.name, (r.rotation_deg, r.translation_mm))
+        wanted = [*edge_targets(self.names), *sphere_targets()]
+        return [*(Target(what, unit, reached[what], limit) for what, unit, limit in wanted), *self.fixed]
+
+    @property
+    def met(self) -> bool:
+        """Whether all targets are met."""
+        return all_met(self.targets())
+
+    def summary(self) -> dict[str, object]:
+        """The result for JSON."""
+        return {
+            "state": "done",
+            "met": self.met,
+            "data": "fixed files" if self.options.data else f"seed {self.options.seed}",
+            "targets": [
+                {"what": t.what, "unit": t.unit, "reached": t.value, "target": t.limit, "verdict": t.verdict}
+                for t in self.targets()
+            ],
+            "edge": self.edge,
+            "sphere": [
+                {
+                    "world": r.world,
+                    "method": r.method,
+                    "points_mm": r.points_mm,
+                    "seam_mm": r.seam_mm,
+                    "boss": r.boss_error,
+                }
+                for r in self.sphere
+            ],
+            "wall_seconds": self.wall_seconds,
+            "written_to": self.options.folder,
+        }
 
 
 def target_lines(study: ProfilerStudy) -> Lines:

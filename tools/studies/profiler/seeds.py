@@ -1,11 +1,13 @@
 """Every target of the profiler study over many seeds: figures, their Cramer-Rao bounds, and the fixed files."""
 
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
@@ -15,112 +17,46 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.errors import InputError
-from weldcal.tools.console import Progress
-from weldcal.tools.report.files import write_json
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
+from weldcal.tools.report.pictures import OURS, plain, svg
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
 from weldcal.tools.studies.profiler.edge import TARGETS, edge_figures, edge_targets
-from weldcal.tools.studies.profiler.plots import over_seeds
-from weldcal.tools.studies.profiler.results import Reached, TargetLine
-from weldcal.tools.studies.profiler.sets import EdgeTrial, fixed_edge_trials, made_edge_trials, rms
+from weldcal.tools.studies.profiler.plots import legend
 from weldcal.tools.studies.profiler.sphere import (
     METHODS,
-    MM,
-    WorldData,
     WorldResult,
     cloud_of,
-    fixed_worlds,
     joint_records,
-    made_worlds,
     measured,
     named_figures,
     seam_features,
     sphere_figures,
     sphere_targets,
 )
+from weldcal.tools.worlds.edge_trials import fixed_edge_trials, made_edge_trials, rms
+from weldcal.tools.worlds.profiler_parts import MM, WorldData, fixed_worlds, made_worlds
 
 TRIALS = {"free": 20}
 WORLDS, GROOVES, BOSSES = 8, 3, 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class SeedStudy:
-    """All lines, the mean squared error in units of the bound (6 expected) of the edge's trials, and how long it took."""
+def one_seed(seed: int | None = None, data: str | None = None) -> Mapping[str, object]:
+    """Every figure of a seed, or of the fixed files in the folder ``data``, with its Cramer-Rao bound.
 
-    folder: Path
-    first: int
-    count: int
-    lines: tuple[TargetLine, ...]
-    nees: float
-    trials: int
-    wall_seconds: float
-
-    def summary(self) -> dict[str, object]:
-        """For JSON."""
-        return {
-            "state": "done",
-            "seeds": [self.first, self.first + self.count - 1],
-            "edge_nees": self.nees,
-            "edge_trials": self.trials,
-            "lines": [
-                {
-                    "what": line.what, "unit": line.unit, "target": line.target, "median": float(np.median(line.values)),
-                    "least": float(line.values.min()), "largest": float(line.values.max()), "met": line.met,
-                    "bound": float(np.median(line.bounds)), "over_bound": line.over_bound,
-                    "fixed_files": None if line.fixed is None else line.fixed.value,
-                    "fixed_files_bound": None if line.fixed is None else line.fixed.bound,
-                    "values": line.values, "bounds": line.bounds,
-                }
-                for line in self.lines
-            ],
-            "wall_seconds": self.wall_seconds,
-            "written_to": self.folder,
-        }  # fmt: skip
-
-
-def run_profiler_seeds(folder: Path, first: int, count: int, data: Path | None, progress: Progress) -> SeedStudy:
-    """Every target for `count` seeds, and for the fixed files where their folder is given; writes seeds.json and seeds.svg.
-
-    Raises:
-        InputError: the fixed files are not in the folder named.
+    Returns:
+        values and bounds (mm or deg) by the names of their targets, and the squared errors of the edge's trials in units of
+        the bound.
     """
-    if data is not None and not data.is_dir():
-        raise InputError(f"There is no folder '{data}': give the one with edge_features.npz and sphere.npz.")
-    start = time.monotonic()
-    nees: list[float] = []
-    fixed: dict[str, Reached] = {}
     if data is not None:
-        progress("fixed files", 0.0)
-        fixed = _all({n: fixed_edge_trials(data, n) for n in TARGETS}, fixed_worlds(data, WORLDS), 0, [])
-    found: list[dict[str, Reached]] = []
-    for k in range(count):
-        progress(f"seed {first + k}", (k + 0.5) / (count + 0.5))
-        seed = first + k
+        trials = {n: fixed_edge_trials(Path(data), n) for n in TARGETS}
+        worlds, number = fixed_worlds(Path(data), WORLDS), 0
+    else:
+        assert seed is not None
         trials = {n: made_edge_trials(n, TRIALS.get(n.split("_")[0], 10), seed) for n in TARGETS}
-        found.append(_all(trials, made_worlds(WORLDS, seed, GROOVES, BOSSES), seed, nees))
-    lines = tuple(
-        TargetLine(what, unit, target, tuple(f[what] for f in found), fixed.get(what))
-        for what, unit, target in [*edge_targets(TARGETS), *sphere_targets()]
-    )
-    study = SeedStudy(
-        folder=folder,
-        first=first,
-        count=count,
-        lines=lines,
-        nees=float(np.mean(nees)),
-        trials=len(nees),
-        wall_seconds=time.monotonic() - start,
-    )
-    write_json(folder / "seeds.json", study.summary())
-    write_atomic(folder / "seeds.svg", over_seeds(study.lines).decode())
-    return study
-
-
-def _all(
-    trials: dict[str, Iterator[EdgeTrial]], worlds: Iterable[WorldData], seed: int, nees: list[float]
-) -> dict[str, Reached]:
-    """Every figure and its bound; the squared errors in units of the bound are appended to `nees`."""
+        worlds, number = made_worlds(WORLDS, seed, GROOVES, BOSSES), seed
     values: dict[str, float] = {}
     bounds: dict[str, float] = {}
+    nees: list[float] = []
     for name, every in trials.items():
         errors, least = [], []
         for trial in every:
@@ -130,10 +66,113 @@ def _all(
         nees += [e.nees for e in errors]
         values |= edge_figures(name, rms(errors))
         bounds |= edge_figures(name, rms(least))
-    results, predicted = _sphere(worlds, seed)
-    values |= sphere_figures(results)
-    bounds |= predicted
-    return {what: Reached(values[what], bounds[what]) for what in values}
+    results, predicted = _sphere(worlds, number)
+    return {
+        "seed": seed, "nees": nees, "values": values | sphere_figures(results), "bounds": bounds | predicted
+    }  # fmt: skip
+
+
+def cases(first: int, count: int, data: Path | None) -> Cases:
+    """``count`` seeds, and the fixed files where their folder is given."""
+    seeds: dict[str, dict[str, Any]] = {f"seed {k}": {"seed": k} for k in range(first, first + count)}
+    return seeds if data is None else {"fixed files": {"data": str(data)}} | seeds
+
+
+def _figures(results: Results) -> Figures:
+    seeds = [r for r in whole(results).values() if r["seed"] is not None]
+    fixed = results.get("fixed files", {"values": {}, "bounds": {}})
+    lines = []
+    for what, unit, target in [*edge_targets(TARGETS), *sphere_targets()]:
+        values, bounds = (np.array([r[key][what] for r in seeds], dtype=float) for key in ("values", "bounds"))
+        lines.append({
+            "what": what, "unit": unit, "target": target, "median": float(np.median(values)),
+            "least": float(values.min()), "largest": float(values.max()), "met": int((values <= target).sum()),
+            "bound": float(np.median(bounds)), "over_bound": float(np.sqrt(np.mean(values**2) / np.mean(bounds**2))),
+            "fixed_files": fixed["values"].get(what), "fixed_files_bound": fixed["bounds"].get(what),
+            "values": values, "bounds": bounds,
+        })  # fmt: skip
+    nees = [v for r in seeds for v in r["nees"]]
+    return {
+        "seeds": [seeds[0]["seed"], seeds[-1]["seed"]], "edge_nees": float(np.mean(nees)), "edge_trials": len(nees),
+        "lines": lines,
+    }  # fmt: skip
+
+
+def _rows(figures: Figures) -> Iterable[Row]:
+    for n in figures["lines"]:
+        fixed = "" if n["fixed_files"] is None else f"{n['fixed_files']:.3f}"
+        reached = f"{n['least']:.3f} to {n['largest']:.3f} {n['unit']}"
+        yield (
+            n["what"],
+            reached,
+            f"{n['over_bound']:.2f}",
+            f"{n['target']:g}",
+            f"{n['met']} of {len(n['values'])}",
+            fixed,
+        )
+    yield (
+        "edge, squared error in units of the bound",
+        f"{figures['edge_nees']:.2f}",
+        "",
+        "6 expected",
+        f"{figures['edge_trials']} trials",
+        "",
+    )
+
+
+def over_seeds(results: Results) -> bytes:
+    """Every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
+    lines = _figures(results)["lines"]
+    picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
+    axes = picture.add_subplot()
+    for k, n in enumerate(lines):
+        axes.plot(n["values"] / n["target"], np.full(len(n["values"]), k), "o", ms=4, mew=0, alpha=0.5, color=OURS,
+                  label="one seed" if k == 0 else None)  # fmt: skip
+        low, high = np.nanmin(n["bounds"]) / n["target"], np.nanmax(n["bounds"]) / n["target"]
+        axes.plot([low, high], [k + 0.28] * 2, "-", lw=3, color="0.45", solid_capstyle="round",
+                  label="its bound, over the seeds" if k == 0 else None)  # fmt: skip
+        if n["fixed_files"] is not None:
+            axes.plot(n["fixed_files"] / n["target"], k, "D", ms=5, mfc="none", mec="black", mew=1.4,
+                      label="the fixed files" if k == 0 else None)  # fmt: skip
+    axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
+    axes.set_yticks(range(len(lines)), [f"{n['what']}, {n['target']:g} {n['unit']}" for n in lines], fontsize=8)
+    axes.invert_yaxis()
+    plain(axes, "reached over target", "")
+    axes.set_xlim(left=0.0)
+    legend(picture, axes)
+    return svg(picture)
+
+
+STUDY = Study(
+    name="profiler-seeds",
+    what="Every target of `weldcal reproduce profiler` over many seeds, beside the Cramer-Rao bound.",
+    case=one_seed,
+    figures=_figures,
+    header=("figure", "reached", "of the bound", "target", "met", "fixed files"),
+    rows=_rows,
+    plots={"seeds.svg": over_seeds},
+    group="reproduce",
+)
+
+
+@command(
+    "reproduce profiler-seeds",
+    short_help="Run every target of 'reproduce profiler' on many seeds.",
+    options=FARM,
+    hidden=True,
+)
+def profiler_seeds(
+    call: Call,
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds.", min=2)] = 12,
+    data: Annotated[Path | None, option("--data", "FOLDER", "The fixed files, shown together with the seeds.")] = None,
+) -> Outcome:
+    """Run every target of 'reproduce profiler' over many seeds and compare with the Cramer-Rao bound. 20 s per seed."""
+    if data is not None and not data.is_dir():
+        raise InputError(f"There is no folder '{data}': give the one with edge_features.npz and sphere.npz.")
+    start = time.monotonic()
+    found = STUDY.outcome(call, cases(call.seed, seeds, data))
+    more = {"wall_seconds": time.monotonic() - start, "written_to": call.written}
+    return replace(found, summary={**found.summary, **more})
 
 
 def _sphere(worlds: Iterable[WorldData], seed: int) -> tuple[list[WorldResult], dict[str, float]]:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -14,9 +15,12 @@ from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.edge.start import edge_starts
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
+from weldcal.tools.cli.subject import one_of
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
+from weldcal.tools.studies.profiler.seeds import profiler_seeds
+from weldcal.tools.worlds.edge_trials import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 
 SETS = 20
 SEARCHED = 5  # sets on which the search is tried
@@ -41,6 +45,24 @@ class SpeedRow:
     found: int | None
     rotation_deg: float
     translation_mm: float
+
+
+@command("benchmark profiler-speed", short_help="Time the profiler's calibration by an edge.", hidden=True)
+def benchmark_speed(
+    call: Call,
+    data: Annotated[
+        Path | None, option("--data", "FOLDER", "The fixed files. Without them, sets generated from the seed.")
+    ] = None,
+) -> Outcome:
+    """Time the profiler's calibration by an edge and compare it with the published method and a grid search."""
+    summary = run_profiler_benchmark(call.folder("benchmark", "profiler"), call.seed, data, call.progress)
+    return Outcome(summary, values={}, rows=lines(summary))
+
+
+@command("benchmark profiler", short_help="Measure the profiler's calibration: speed, or seeds.", options=FARM)
+@one_of("speed", speed=benchmark_speed, seeds=profiler_seeds)
+def benchmark_profiler(call: Call) -> None:
+    """Time the profiler's calibration by an edge, or run every target of 'reproduce profiler' over many seeds."""
 
 
 def run_profiler_benchmark(folder: Path, seed: int, data: Path | None, progress: Progress) -> dict[str, object]:

@@ -1,8 +1,7 @@
 """Tables 1 to 3 of the sphere paper: points, seam and frustum, by the paper's method and by the joint method."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -14,10 +13,7 @@ from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.arc import fit_circle
 from weldcal.calibration.profiler.sphere.joint import sphere_joint
 from weldcal.calibration.profiler.sphere.linear import compensate, fit_touch_sphere, sphere_center, sphere_linear
-from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
-from weldcal.models.errors import InputError
-from weldcal.tools.studies.profiler.pieces import GrooveScan, scan_boss, scan_groove
-from weldcal.tools.studies.profiler.worlds import SphereTests, SphereTrial, SphereWorld, sphere_trial
+from weldcal.tools.worlds.profiler_parts import WorldData
 
 MM = 1e-3
 METHODS = ("linear", "compensated", "joint, affine", "joint, affine+joints")
@@ -30,16 +26,6 @@ TARGET_SEAM = (0.122, 0.219, 0.146)
 TARGET_BOSS = (0.042, 0.10)
 SEAM_FEATURES = ("first edge", "root", "second edge")
 HIP_MM, SLOPE_DEG = 50.0, float(np.degrees(np.arctan2(4.0, 3.0)))
-
-
-@dataclass(frozen=True, eq=False)
-class WorldData:
-    """One world: what is calibrated from, and what is measured afterwards where there is any."""
-
-    trial: SphereTrial
-    groove: GrooveScan | None = None
-    boss: tuple[Floats, Floats] | None = None
-    sigmas: SphereSigmas | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,50 +74,6 @@ def named_figures(points: Mapping[str, float], seams: Sequence[Floats], bosses: 
     """Figures by the names of their targets: points by method, the mean of the seams, the worst of the frustums."""
     values = [*points.values(), *np.mean(seams, axis=0), *np.max(bosses, axis=0)]
     return {what: float(value) for (what, _, _), value in zip(sphere_targets(), values, strict=True)}
-
-
-def made_worlds(count: int, seed: int, grooves: int, bosses: int) -> Iterator[WorldData]:
-    """Made from seeds, as the fixed files were; no two seeds share a world."""
-    for k in range(count):
-        one = 1000 * seed + k
-        world = SphereWorld.like_the_files(one)
-        groove = scan_groove(world, one) if k < grooves else None
-        yield WorldData(sphere_trial(world, one), groove, scan_boss(world, one) if k < bosses else None)
-
-
-def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
-    """Of the fixed files.
-
-    Raises:
-        InputError: they are not there.
-    """
-    for name in ("sphere", "groove", "boss"):
-        if not (folder / f"{name}.npz").is_file():
-            raise InputError(f"There is no {name}.npz in '{folder}': omit --data to make worlds from seeds.")
-    d, g, b = (dict(np.load(folder / f"{name}.npz")) for name in ("sphere", "groove", "boss"))
-    arm = DhArm.checked(d["dh_nominal"] * [MM, np.radians(1.0), MM, np.radians(1.0)])
-    for w in range(min(count, len(d["scan_T"]))):
-        data = SphereData(
-            poses=_poses(d["scan_T"][w]),
-            profiles=[p * MM for p in d["scan_prof"][w].astype(float)],
-            radius_m=float(d["radius"]) * MM,
-            touches=_poses(d["touch_T"][w]),
-            tip=d["tip_nominal"][w] * MM,
-            arm=arm,
-            q=d["scan_q"][w],
-            touch_q=d["touch_q"][w],
-        )
-        tests = SphereTests(d["test_q_view"][w], d["test_m"][w] * MM, d["test_q_touch"][w], d["test_point"][w])
-        groove = boss = None
-        if w < len(g["q"]):
-            groove = GrooveScan(g["q"][w], g["prof"][w].astype(float) * MM, g["feat"][w] * MM, g["q_touch"][w])
-        if w < len(b["q"]):
-            boss = b["q"][w], b["prof"][w].astype(float) * MM
-        yield WorldData(SphereTrial(data, d["scan_sign"][w], d["scan_kind"][w] == 0, tests), groove, boss)
-
-
-def _poses(T: Floats) -> FlangePoses:
-    return FlangePoses(T[:, :3, :3], T[:, :3, 3] * MM)
 
 
 def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
@@ -223,12 +165,3 @@ def cloud_of(record: ProfilerRecord, arm: DhArm, q: Floats, profiles: Floats) ->
     X = _flange(record, arm, q)
     parts = [record.points_F(without_spikes(p)) @ X.rotation[k].T + X.translation[k] for k, p in enumerate(profiles)]
     return np.vstack(parts)
-
-
-def all_worlds(worlds: Iterator[WorldData], count: int, progress: Callable[[str, float], None]) -> list[WorldResult]:
-    """Every world, all methods."""
-    results: list[WorldResult] = []
-    for k, world in enumerate(worlds):
-        progress(f"world {k}", k / count)
-        results += measure(k, world)
-    return results

@@ -1,22 +1,16 @@
-"""Whole jobs on an emulated controller in real time: how late their velocities and this computer's wake-ups are."""
+"""Whole jobs on an emulated controller in real time: how late their velocities are."""
 
-import contextlib
-import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
-from weldcal.systems.host_timing import TICK_S
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
@@ -25,82 +19,10 @@ from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.run import RunOptions
+from weldcal.tools.studies.robot.host_probe import HostLateness, watched_host
 
-ABOVE_ALL = 50  # of SCHED_FIFO; cell, worker and emulated controller have SCHED_RR 1 to 3
-ANSWERS_WITHIN_S = 10.0
 BUSY = "while True: pass"
 UNDER_8_MS = 8.0
-
-
-@dataclass
-class HostLateness:
-    """Wake-ups asked for every TICK_S on each core; `lateness` holds their delays once the watch is over."""
-
-    lateness: Lateness = field(default_factory=Lateness)
-    precedence: bool = True  # whether the system gave it
-
-    @property
-    def line(self) -> str:
-        """One row of a table."""
-        late = self.lateness
-        return (
-            f"{late.on_time_percent:.3f} % of {sum(late.counts)} wake-ups of a program above all others under 4 ms, "
-            f"{late.over(8.0)} over 8 ms, latest {late.worst_ms:.1f} ms"
-        )
-
-    def summary(self) -> dict[str, object]:
-        """The JSON object."""
-        late = self.lateness
-        found = {"wake_ups": sum(late.counts), "under_4_ms_percent": late.on_time_percent, "over_8_ms": late.over(8.0)}
-        return {**found, "worst_ms": late.worst_ms, "histogram": list(late.counts), "precedence": self.precedence}
-
-
-@contextlib.contextmanager
-def watched_host() -> Iterator[HostLateness]:
-    """Watch every core of this process for the duration of the block; the result is complete at its end."""
-    found, context = HostLateness(), get_context("spawn")
-    probes = []
-    for core in sorted(os.sched_getaffinity(0)):
-        ours, its = context.Pipe()
-        process = context.Process(target=probe, args=(core, its), daemon=True)
-        process.start()
-        its.close()
-        probes.append((process, ours))
-    try:
-        for _, pipe in probes:
-            if pipe.poll(ANSWERS_WITHIN_S):
-                found.precedence = pipe.recv() and found.precedence
-        yield found
-    finally:
-        for process, pipe in probes:
-            with contextlib.suppress(OSError, EOFError):
-                pipe.send("end")
-                if pipe.poll(ANSWERS_WITHIN_S):
-                    counts, worst_ms = pipe.recv()
-                    late = found.lateness
-                    late.counts = [a + b for a, b in zip(late.counts, counts, strict=True)]
-                    late.worst_ms = max(late.worst_ms, worst_ms)
-            process.terminate()
-            process.join()
-
-
-def probe(core: int, pipe: Connection) -> None:
-    """Wake up every TICK_S on one core until something comes through the pipe. Says first whether it has precedence, and at the end
-    (counts, worst ms).
-    """
-    os.sched_setaffinity(0, {core})
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(ABOVE_ALL))
-        precedence = True
-    except OSError:
-        precedence = False
-    pipe.send(precedence)
-    late = Lateness()
-    while not pipe.poll(0.0):
-        due = time.monotonic() + TICK_S
-        time.sleep(TICK_S)
-        late.add(1e3 * max(time.monotonic() - due, 0.0))
-    pipe.send((late.counts, late.worst_ms))
 
 
 @contextmanager
@@ -191,7 +113,7 @@ def run_jobs(
         seed: of the first.
         load: busy programs beside.
         seam_mm: length of the seam to weld; the scenario's where None.
-        progress: told which job runs.
+        progress: gets the job that runs.
     """
     found = []
     overrides = "" if seam_mm is None else f"welding: {{seam_length_mm: {seam_mm}}}"

@@ -112,7 +112,7 @@ class Missed:
 
 @dataclass(frozen=True)
 class Stopped:
-    """The link stopped the arm by itself: when in the run (s), and what it said."""
+    """The link stopped the arm by itself: when in the run (s), and its reason."""
 
     at_s: float
     sentence: str

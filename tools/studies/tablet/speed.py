@@ -1,15 +1,22 @@
 """Times each tablet calibration: closed form, PnP, the paper's stages, and the published search."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar
 from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
 from weldcal.calibration.tablet.published.calibration import tablet_stage1, tablet_stage2
+from weldcal.tools.cli.options import Call, command
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.tablet.paper import published_touches
 from weldcal.tools.studies.tablet.study import PUBLISHED_EVALUATIONS, evaluation_seconds, median_seconds
-from weldcal.tools.studies.tablet.world import simulate_trial
+from weldcal.tools.worlds.tablet import published_touches, simulate_trial
+
+
+@command("benchmark tablet", short_help="Time the tablet calibrations and the published search.")
+def tablet(call: Call) -> Mapping[str, object]:
+    """Time each tablet calibration and compare it with the published search."""
+    return run_tablet_benchmark(call.folder("benchmark", "tablet"), call.seed, call.progress)
 
 
 def run_tablet_benchmark(folder: Path, seed: int, progress: Progress) -> dict[str, object]:

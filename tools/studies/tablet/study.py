@@ -22,8 +22,7 @@ from weldcal.calibration.tablet.published.chain import Model, place_landmarks
 from weldcal.calibration.tablet.published.two_stage import Fitness, Sign, fitness, stage1_residuals
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array
-from weldcal.tools.studies.tablet.paper import STAGE_1
-from weldcal.tools.studies.tablet.world import TabletTrial, simulate_trial
+from weldcal.tools.worlds.tablet import STAGE_1, TabletTrial, simulate_trial
 
 PUBLISHED_EVALUATIONS = PUBLISHED_POPULATION * PUBLISHED_GENERATIONS
 MODELS: tuple[Model, ...] = ("htm", "dh")

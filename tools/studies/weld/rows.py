@@ -275,7 +275,7 @@ class TurnResult:
     """One seam and chord: the true seam's chord map, and how the weld of its nominal plan ended.
 
     Attributes:
-        turn_deg, back_up_mm: by the true seam's chord map; possible: nothing stands against it there.
+        turn_deg, back_up_mm: by the true seam's chord map; possible: the map has no obstacle there.
         refused: before anything moved; phase, reason: how it ended; max_mm: error of what was welded in one go.
         splits_mm: where the seam was split instead; pieces_done: how many of its pieces were welded; pieces_max_mm: their
             largest error.
@@ -301,7 +301,7 @@ class TurnResult:
 
     @property
     def stalled(self) -> bool:
-        """Whether the weld neither finished nor said why not, or had to be stopped with the arc on."""
+        """Whether the weld neither finished nor gave a reason, or had to be stopped with the arc on."""
         return not self.refused and self.phase != "DONE"
 
     @property

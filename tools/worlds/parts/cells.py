@@ -60,7 +60,7 @@ class Trial:
 
     @classmethod
     def of(cls, located_by: str, seam_mm: float | None = None, refine: str = PLAIN, arm_mm: float = 0.4) -> Trial:
-        """The trial by the source of the pose: what only the drawing tells must be nearer to the truth. Raises InputError: an unknown
+        """The trial by the source of the pose: a pose from the drawing must be nearer to the truth. Raises InputError: an unknown
         refinement."""
         if refine not in REFINEMENTS:
             raise InputError(f"--refine must be {', '.join(REFINEMENTS[:-1])} or {REFINEMENTS[-1]}, not '{refine}'.")
@@ -99,7 +99,7 @@ def write_cell(part: MadePart, folder: Path, trial: Trial) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     part.write(folder)
     middle = part.line_mm[len(part.line_mm) // 2] if len(part.line_mm) > 2 else part.line_mm.mean(axis=0)
-    # Turned by 90 deg about z, standing on the table, the middle of its seam 0.65 m before the robot.
+    # Turned by 90 deg about z, on the table, the middle of its seam 0.65 m before the robot.
     text = _CELL.format(
         name=part.name,
         joint=part.joint,

@@ -29,7 +29,7 @@ class Scene:
 
 
 def box(length: float, width: float, height: float) -> TriMesh:
-    """A box standing on z = 0, m."""
+    """A box that rests on z = 0, m."""
     corners = 0.5 * np.array([(-length, -width), (length, -width), (length, width), (-length, width)])
     return extrude(corners, 0.0, height)
 

@@ -301,7 +301,7 @@ def butt() -> MadePart:
 
 
 def two_solids() -> MadePart:
-    """A T as an assembly: the web stands on the plate as a body of its own."""
+    """A T as an assembly: the web rests on the plate as a body of its own."""
     shape = assembly(box((-90, -60, -10), (180, 120, 10)), box((-90, 0, 0), (180, 8, 60)))
     return MadePart(
         name="two_solids",

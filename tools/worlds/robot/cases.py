@@ -292,7 +292,7 @@ RUNNING: tuple[Case, ...] = (
         random=False,
         short=False,
     ),
-    # nobody is left who could stop the paused program: what was commanded must be worth nothing when somebody presses Play
+    # No process is left that could stop the paused program: old commands must have no effect when an operator presses Play.
     _paused("computer dies, pause, Play after 3 s", _dies_and_is_paused, 3.0),
     _paused("pause, computer dies, Play after 3 s", _is_paused_and_dies, 3.0),
     _paused("computer dies, pause, Play after 0.5 s", _dies_and_is_paused, 0.5, short=False),

@@ -1,4 +1,4 @@
-"""One job by wire with one fault: what the job said, and what the world's own record says of arm and arc."""
+"""One job by wire with one fault: the reason of the job, and the record of the world on arm and arc."""
 
 import re
 import threading
@@ -206,7 +206,7 @@ def _throw(world: WiredWorld, controller: Emulator, it: Happening) -> None:
 
 
 def _repair(world: WiredWorld, controller: Emulator) -> None:
-    """Everything right again, as a person leaves it."""
+    """Repair every device, as an operator does."""
     for bridge in world.bridges.values():
         bridge.how = ""
     controller.fault("arc_inputs", how="", latch=False)

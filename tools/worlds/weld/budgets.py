@@ -19,7 +19,7 @@ class Budget:
 
     Attributes:
         name: as in the tables.
-        tag_sigma_m, tag_gain, tag_yaw_rad, tag_bias_m: of the deflection that the finger camera tells; latency_s: its age.
+        tag_sigma_m, tag_gain, tag_yaw_rad, tag_bias_m: of the deflection that the finger camera measures; latency_s: its age.
         lag_s: time constant of the robot's velocity.
         friction: between tip and walls; roughness_m: of the wall, one sigma; roughness_length_m: its correlation.
         plan_shift_m, plan_angle_rad, plan_height_m: how the plan is displaced as a whole; plan_warp_m: largest bend of it;

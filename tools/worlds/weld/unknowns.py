@@ -13,7 +13,7 @@ _NONE = (0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Unknowns:
-    """Ranges (low, high) from which a seed draws one world, evenly; SI units. The servo is told none of it.
+    """Ranges (low, high) from which a seed draws one world, evenly; SI units. The servo gets none of it.
 
     Attributes:
         image_bias_s, pose_bias_s: how late a picture or a pose is stamped; image_jitter_s, pose_jitter_s: one sigma of

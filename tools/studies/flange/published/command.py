@@ -1,14 +1,17 @@
-"""Runs the flange study: simulation, the authors' runs, both methods on real scans; writes tables, pictures and report."""
+"""Repeats the flange paper: simulation, the authors' runs, both methods on real scans; writes tables and pictures."""
 
 import time
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome, study_clouds
 from weldcal.tools.studies.flange.published.pairs import (
@@ -18,9 +21,12 @@ from weldcal.tools.studies.flange.published.pairs import (
     study_kinect,
     study_pairs,
 )
-from weldcal.tools.studies.flange.published.report import pictures, study_report
-from weldcal.tools.studies.flange.published.results import Study, StudyOptions
+from weldcal.tools.studies.flange.published.report import COST_HEADER, cost_rows, pictures, tables
+from weldcal.tools.studies.flange.published.results import Study as Found
+from weldcal.tools.studies.flange.published.results import StudyOptions
 from weldcal.tools.studies.flange.published.simulation import simulate
+from weldcal.tools.studies.flange.published.sphere import run_sphere_study, sphere_rows
+from weldcal.tools.studies.harness import Study
 
 NO_DATA = (
     "No data folder was given: only the simulated parts were run; give the folder that holds the recorded datasets."
@@ -31,8 +37,8 @@ _LEAST_CLOUDS = 10
 _USUAL_CLOUDS = 18  # more scans make each run of Algorithm 1 longer: fewer runs then, and the same time
 
 
-def run_study(options: StudyOptions, progress: Progress) -> Study:
-    """Run it and write table.json, figures/*.svg and report.html.
+def run_study(options: StudyOptions, progress: Progress) -> Found:
+    """Run it, and draw figures/*.svg in the folder.
 
     Raises:
         InputError: the data folder does not exist or holds no dataset, before any work.
@@ -77,7 +83,7 @@ def run_study(options: StudyOptions, progress: Progress) -> Study:
                 progress=lambda what, done, at=begin, part=width: progress(what, at + part * done),  # type: ignore[misc]
             )
             clouds.append(outcome)
-    study = Study(
+    study = Found(
         options=options,
         simulation=simulation,
         pairs=tuple(pairs),
@@ -86,11 +92,8 @@ def run_study(options: StudyOptions, progress: Progress) -> Study:
         notes=tuple(notes),
         wall_seconds=time.monotonic() - start,
     )
-    drawn = pictures(study)
-    for name, picture in drawn.items():
+    for name, picture in pictures(study).items():
         write_atomic(options.folder / "figures" / f"{name}.svg", picture)
-    write_json(options.folder / "table.json", study.summary())
-    write_atomic(options.folder / "report.html", study_report(study, drawn))
     return study
 
 
@@ -111,3 +114,53 @@ def title(data: Dataset) -> str:
     robot = TITLES.get(data.header.robot, data.header.robot.upper().replace("E", "e"))
     scanner = data.header.scanner.replace("phoxi_", "PhoXi ").replace("azure_kinect", "Azure Kinect")
     return f"{robot} & {scanner[:-1] + scanner[-1].upper() if 'PhoXi' in scanner else scanner}"
+
+
+@command("reproduce flange", short_help="Repeat the flange paper: tables, figures, Kinect data.")
+def flange(
+    call: Call,
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DATA]",
+            help="Folder of the recorded datasets. Without it only the simulated parts are run.",
+            show_default=False,
+        ),
+    ] = None,
+    quick: Annotated[bool, switch("--quick", "Fewer noise levels, realisations, shuffled orders and splits.")] = False,
+) -> Outcome:
+    """Repeat the flange paper: Table 1, Fig. 9, 10 and 11, the Kinect data, and the effect of Algorithm 1's cost."""
+    folder = call.folder("reproduce", "flange")
+    found = run_study(StudyOptions(folder, data, call.seed, quick), call.progress)
+    paper = Study(
+        name="flange",
+        what="The flange paper repeated: the effect of Algorithm 1's cost (simulated, 1 mm of noise), and its data.",
+        group="reproduce",
+        figures=lambda results: results["all"],
+        header=COST_HEADER,
+        rows=lambda figures: cost_rows(found),
+        others=lambda figures: tables(found),
+        numbers=len(COST_HEADER) - 1,
+    )
+    return paper.measured({"all": found.summary()}, folder).outcome()
+
+
+@command("reproduce flange-sphere", short_help="Repeat Table 2 of the flange paper with a sphere.")
+def flange_sphere(
+    call: Call,
+    scans: Annotated[int, option("--scans", "N", "Scans of the flange with a sphere on it.", min=20)] = 48,
+    draws: Annotated[int, option("--draws", "N", "Random draws of 4 and of 16 of them.", min=1)] = 40,
+) -> Outcome:
+    """Repeat Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same scans; and the false
+    segmentations of Table 1."""
+    folder = call.folder("reproduce", "flange-sphere")
+    summary = run_sphere_study(folder, scans, draws, call.seed, call.progress)
+    sphere = Study(
+        name="flange-sphere",
+        what="Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same scans.",
+        group="reproduce",
+        figures=lambda results: results["all"],
+        header=("calibration", "error at the flange"),
+        rows=lambda figures: sphere_rows(summary).items(),
+    )
+    return sphere.measured({"all": summary}, folder).outcome()

@@ -1,16 +1,16 @@
-"""Tables and report page of the flange study: the paper's numbers, ours, and the true errors."""
+"""Tables and pictures of the flange study: the paper's numbers, ours, and the true errors."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.flange.published import plots
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
 from weldcal.tools.studies.flange.published.results import TABLE1, Study, statistics
 from weldcal.tools.studies.flange.published.simulation import COSTS
-from weldcal.tools.studies.output import print_note, print_table
+from weldcal.tools.studies.harness import Row, Table
 
 _SIX = ("x mm", "y mm", "z mm", "roll °", "pitch °", "yaw °")
 TABLE1_HEADER = ("robot and scanner", *_SIX)
@@ -23,7 +23,6 @@ SHORT = {
     "in the flange plane, x": "plane x",
     "in the flange plane, y": "plane y",
 }
-Row = tuple[str, ...]
 
 
 def table1_rows(study: Study) -> list[Row]:
@@ -99,43 +98,34 @@ def kinect_rows(study: Study) -> list[Row]:
     ]
 
 
-def print_study(study: Study) -> None:
-    """Write the tables on stdout."""
-    tables: list[tuple[str, Row, list[Row]]] = [
-        ("What the cost chooses (simulated, 1 mm of noise)", COST_HEADER, cost_rows(study))
-    ]
+def tables(study: Study) -> list[Table]:
+    """Every table of the study that has lines."""
+    found: list[Table] = []
     if study.pairs or study.clouds:
-        tables.append(("Table 1: all pairs, no iteration", TABLE1_HEADER, table1_rows(study)))
-    tables.append(("Centre pairs: errors on pairs outside the fit", HELD_HEADER, pairs_rows(study)))
+        found.append(("Table 1: all pairs, no iteration", TABLE1_HEADER, table1_rows(study)))
+    found.append(("Centre pairs: errors on pairs outside the fit", HELD_HEADER, pairs_rows(study)))
     for c in study.clouds:
-        tables.append((f"{c.title}: fitted on {c.n_fit} scans, judged on the others", HELD_HEADER, held_out_rows(c)))
-        tables.append((f"{c.title}: share of a known error that a registration reports", SIGHT_HEADER, sight_rows(c)))
-    tables.append(("Azure Kinect: errors at the wrist ring", KINECT_HEADER, kinect_rows(study)))
-    for title, header, rows in tables:
-        if rows:
-            print_table(title, header, rows)
-    for note in study.notes:
-        print_note(note)
-    print_note(f"written to {study.options.folder}")
+        found.append((f"{c.title}: fitted on {c.n_fit} scans, judged on the others", HELD_HEADER, held_out_rows(c)))
+        found.append((f"{c.title}: share of a known error that a registration reports", SIGHT_HEADER, sight_rows(c)))
+    found.append(("Azure Kinect: errors at the wrist ring", KINECT_HEADER, kinect_rows(study)))
+    found.append(("Notes", ("data",), [(note,) for note in study.notes]))
+    return [table for table in found if table[2]]
 
 
-def _numbers(values: Iterable[float], digits: int) -> Row:
+def _numbers(values: Iterable[float], digits: int) -> tuple[str, ...]:
     return tuple(fixed(float(v), digits) for v in values)
 
 
-def _six(e: Array, degree_digits: int) -> Row:
+def _six(e: Array, degree_digits: int) -> tuple[str, ...]:
     """x, y, z in mm and roll, pitch, yaw in degrees of (6,) [rotation; translation]."""
     return (*_numbers(1e3 * e[3:], 2), *_numbers(np.degrees(e[:3]), degree_digits))
 
 
-def _held_out(name: str, reported_mm: float | None, errors_m: Array, digits: int) -> Row:
+def _held_out(name: str, reported_mm: float | None, errors_m: Array, digits: int) -> tuple[str, ...]:
     """A calibration's own figure, the true errors and their ratio."""
     true = statistics(errors_m)
     ratio = f"{true['median'] / reported_mm:.1f}×" if reported_mm else "–"
     return (name, fixed(reported_mm, digits), *_numbers(true.values(), digits), ratio)
-
-
-_CLAIM_MM = 0.28
 
 
 def pictures(study: Study) -> dict[str, bytes]:
@@ -155,95 +145,3 @@ def pictures(study: Study) -> dict[str, bytes]:
     for k in study.kinect:
         drawn[f"kinect_{k.name}"] = plots.kinect(k)
     return drawn
-
-
-def study_report(study: Study, drawn: Mapping[str, bytes]) -> str:
-    """The whole report as one self-contained HTML text."""
-    return render(
-        "flange_study.html.j2",
-        study=study,
-        drawn=drawn,
-        claim=_claim(study),
-        cards=_cards(study),
-        rows={
-            rows.__name__: rows for rows in (table1_rows, cost_rows, held_out_rows, pairs_rows, sight_rows, kinect_rows)
-        },
-        header={
-            "table1": TABLE1_HEADER,
-            "cost": COST_HEADER,
-            "held": HELD_HEADER,
-            "kinect": KINECT_HEADER,
-            "sight": SIGHT_HEADER,
-        },
-        statistics=statistics,
-        circle_sentences={c.name: circle_sentence(c) for c in study.clouds},
-        degrees=np.degrees,
-    )
-
-
-def _claim(study: Study) -> tuple[str, str]:
-    """Headline and sentence of the verdict."""
-    sentences, true = [], []
-    for p in study.pairs:
-        if p.runs is not None and p.matched:
-            true.append(_median(p.true))
-            sentences.append(f"{p.title}: reported {fixed(p.reported_mm, 2)} mm, true {fixed(true[-1], 2)} mm")
-    for c in study.clouds:
-        split = {s.name: s for s in c.splits}
-        reported = fixed(1e3 * float(np.median(split["algorithm1"].reported)), 2)
-        true.append(_median(split["algorithm1"].held_out))
-        ours = fixed(_median(split["ours"].held_out), 2)
-        sentences.append(f"{c.title}: reported {reported} mm, true {fixed(true[-1], 2)} mm; weldcal {ours} mm")
-    if not sentences:
-        chosen, every = (1e3 * float(study.simulation.costs[k].at_tcp.mean()) for k in ("truth", "all"))
-        better = "Choosing by the answer does not help where the robot works"
-        return (
-            better if chosen > every else "Algorithm 1, simulated",
-            f"Simulated: {fixed(chosen, 2)} mm where the robot works, against {fixed(every, 2)} mm for all pairs.",
-        )
-    comparison = "Comparison of the published figures with the true errors"
-    headline = f"The published {_CLAIM_MM} mm is the figure that was minimised" if min(true) > _CLAIM_MM else comparison
-    return headline, ". ".join(sentences) + ". Medians, on poses outside the fit."
-
-
-def _median(errors_m: Array) -> float:
-    """Median error, mm."""
-    return statistics(errors_m)["median"]
-
-
-def _cards(study: Study) -> list[tuple[str, str, str, str, str]]:
-    """(label, value, unit, tone, note): Algorithm 1 against its claim, weldcal against it or against all pairs."""
-    cards = []
-
-    def compare(name: str, theirs: float | None, their_note: str, ours: float, our_note: str, other: float) -> None:
-        if theirs is not None:
-            tone = "bad" if theirs > _CLAIM_MM else "good"
-            cards.append((f"Algorithm 1, {name}", fixed(theirs, 2), "mm", tone, their_note))
-        tone = "good" if ours < (other if theirs is None else theirs) else "bad"
-        cards.append((f"weldcal, {name}", fixed(ours, 2), "mm", tone, our_note))
-
-    for p in study.pairs:
-        traced = p.runs is not None and p.matched > 0
-        theirs = _median(p.true) if traced else None
-        note = f"it reported {fixed(p.reported_mm, 2)} mm; the authors' own runs"
-        ours, svd = (_median(e) for e in (p.ours, p.svd))
-        compare(p.title, theirs, note, ours, "the same pairs, held out", svd)
-    for c in study.clouds:
-        by = {s.name: _median(s.held_out) for s in c.splits}
-        note = "run again on the scans, held out"
-        compare(c.title, by["algorithm1"], note, by["ours"], "the same scans, held out", by["svd"])
-    ratio = study.simulation.ratio
-    note = f"paper: 7; yaw becomes {fixed(1.0 / float(ratio[2]), 1)} times worse"
-    cards.append(("Fig. 9: spread of x, all pairs over Algorithm 1", fixed(float(ratio[3]), 1), "", "plain", note))
-    return cards
-
-
-def circle_sentence(c: CloudsOutcome) -> str:
-    """What the published circle does on these clouds."""
-    bias = ", ".join(fixed(float(v), 2) for v in c.circle_bias_R_mm)
-    return (
-        f"The same cloud with another seed moves the published centre by {fixed(c.circle_repeat_mm, 2)} mm (rms, 3-D). On average "
-        f"it lies ({bias}) mm from the centre of the edges, in the axes of the flange: a bias that poses of one orientation "
-        f"cannot show. Two random halves of a cloud differ by {fixed(c.halves_mm('published'), 2)} mm, the edges' by "
-        f"{fixed(c.halves_mm('ours'), 3)} mm."
-    )

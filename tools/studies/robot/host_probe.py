@@ -1,0 +1,89 @@
+"""How late this computer wakes up a program that has precedence over everything: what no control loop on it can avoid.
+
+A module of its own: its processes import it, and must be ready within seconds on a busy computer.
+"""
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+
+from weldcal.systems.host_timing import TICK_S
+from weldcal.systems.wall_clock import Lateness
+
+ABOVE_ALL = 50  # of SCHED_FIFO; cell, worker and emulated controller have SCHED_RR 1 to 3
+ANSWERS_WITHIN_S = 10.0
+
+
+@dataclass
+class HostLateness:
+    """Wake-ups asked for every TICK_S on each core; `lateness` holds their delays once the watch is over."""
+
+    lateness: Lateness = field(default_factory=Lateness)
+    precedence: bool = True  # whether the system gave it
+
+    @property
+    def line(self) -> str:
+        """One row of a table."""
+        late = self.lateness
+        return (
+            f"{late.on_time_percent:.3f} % of {sum(late.counts)} wake-ups of a program above all others under 4 ms, "
+            f"{late.over(8.0)} over 8 ms, latest {late.worst_ms:.1f} ms"
+        )
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object."""
+        late = self.lateness
+        found = {"wake_ups": sum(late.counts), "under_4_ms_percent": late.on_time_percent, "over_8_ms": late.over(8.0)}
+        return {**found, "worst_ms": late.worst_ms, "histogram": list(late.counts), "precedence": self.precedence}
+
+
+@contextlib.contextmanager
+def watched_host() -> Iterator[HostLateness]:
+    """Watch every core of this process for the duration of the block; the result is complete at its end."""
+    found, context = HostLateness(), get_context("spawn")
+    probes = []
+    for core in sorted(os.sched_getaffinity(0)):
+        ours, its = context.Pipe()
+        process = context.Process(target=probe, args=(core, its), daemon=True)
+        process.start()
+        its.close()
+        probes.append((process, ours))
+    try:
+        for _, pipe in probes:
+            if pipe.poll(ANSWERS_WITHIN_S):
+                found.precedence = pipe.recv() and found.precedence
+        yield found
+    finally:
+        for process, pipe in probes:
+            with contextlib.suppress(OSError, EOFError):
+                pipe.send("end")
+                if pipe.poll(ANSWERS_WITHIN_S):
+                    counts, worst_ms = pipe.recv()
+                    late = found.lateness
+                    late.counts = [a + b for a, b in zip(late.counts, counts, strict=True)]
+                    late.worst_ms = max(late.worst_ms, worst_ms)
+            process.terminate()
+            process.join()
+
+
+def probe(core: int, pipe: Connection) -> None:
+    """Wake up every TICK_S on one core until something comes through the pipe. Says first whether it has precedence, and at the end
+    (counts, worst ms).
+    """
+    os.sched_setaffinity(0, {core})
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(ABOVE_ALL))
+        precedence = True
+    except OSError:
+        precedence = False
+    pipe.send(precedence)
+    late = Lateness()
+    while not pipe.poll(0.0):
+        due = time.monotonic() + TICK_S
+        time.sleep(TICK_S)
+        late.add(1e3 * max(time.monotonic() - due, 0.0))
+    pipe.send((late.counts, late.worst_ms))

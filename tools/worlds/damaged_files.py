@@ -1,0 +1,269 @@
+"""Damaged files for every reader of a file that a user can write: an example is built, damaged and read; a verdict says what was read."""
+
+import os
+import pickle
+import shutil
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump_typed
+
+from weldcal.calibration.data.clouds import read_cloud
+from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.results import load_result
+from weldcal.calibration.hand_eye.files import read_pairs
+from weldcal.calibration.profiler.record import load_record
+from weldcal.calibration.tablet.planar.files import load_planar
+from weldcal.calibration.tablet.result import load_tablet_result
+from weldcal.calibration.tablet.wrist.files import load_visit
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.array_files import read_grey_image
+from weldcal.models.errors import InputError
+from weldcal.systems.scenario.loading import load_scenario, scenario_class
+from weldcal.tools.commands.profiler.files import read_profiler_file
+from weldcal.tools.worlds import binary_damage, text_damage
+from weldcal.tools.worlds import file_examples as examples
+from weldcal.tools.worlds.file_examples import Files, Rng
+from weldcal.welding.record.weld_log import load_weld_log
+
+ACCEPTED, REFUSED, INTERNAL, WRONG = "accepted", "refused", "internal error", "silently wrong"
+HANG, MEMORY, CRASH, EXECUTED = "hang", "memory", "crash", "executed"
+GOOD = (ACCEPTED, REFUSED)
+GRAMMARS = text_damage.GRAMMARS | binary_damage.GRAMMARS
+_PLACES = ("a pipe", "a folder", "a device", "a loop of links", "nothing")
+_ODD_PLACE = 0.02  # share of the cases in which no regular file is there
+_UNITS = 0.05  # and in which a dataset's unit is exchanged
+_EXAMPLES = 40  # different ones of each reader
+_LONGEST = 1010  # characters of a refusal
+
+
+Values = Sequence[Any]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader: ``target`` is the file of the example that is damaged, by the grammar ``kind``; ``read`` takes the folder and
+    returns what was read, all numbers of which must be finite where ``finite``."""
+
+    name: str
+    kind: str
+    target: str
+    example: Callable[[Rng], Files]
+    read: Callable[[Path], Values]
+    finite: bool = True
+
+
+def _dataset(folder: Path) -> Values:
+    data = load_dataset(folder)
+    if data.refused:
+        raise InputError(data.refused[0][1])
+    poses = [X.GetAsMatrix34() for X in data.poses.values()]
+    guesses = [None if (X := data.guess(id)) is None else X.GetAsMatrix34() for id in data.poses]
+    centres = [v for p in data.pairs for v in (p.X_BR.GetAsMatrix34(), p.p_CR)]
+    return [asdict(data.header), *poses, *guesses, *centres, *(data.cloud(id) for id in data.clouds)]
+
+
+def _pairs(name: str) -> Callable[[Path], Values]:
+    def read(folder: Path) -> Values:
+        p = read_pairs(folder / name, mounting="eye_in_hand")
+        return [p.robot, p.camera, p.robot2, p.link, p.mode, p.X_true, p.q]
+
+    return read
+
+
+def _cloud(name: str) -> Callable[[Path], Values]:
+    return lambda folder: [read_cloud(folder / name)]
+
+
+def _profiler(name: str) -> Callable[[Path], Values]:
+    def read(folder: Path) -> Values:
+        file = read_profiler_file(folder / name)
+        X = file.poses()
+        return [file.arrays, *(file.profiles or ()), None if X is None else (X.rotation, X.translation)]
+
+    return read
+
+
+def _calibration(folder: Path) -> Values:
+    r = load_result(folder)
+    return [r.X_BC.GetAsMatrix34(), {**vars(r), "X_BC": None, "held_out_mm": None}, list(r.held_out_mm)]
+
+
+def _record(folder: Path) -> Values:
+    r = load_record(folder)
+    return [{**vars(r), "arm": None if r.arm is None else r.arm.rows, "figures": str(r.figures)}]
+
+
+def _tablet_record(folder: Path) -> Values:
+    r = load_tablet_result(folder)
+    return [None if r.X_FC is None else r.X_FC.GetAsMatrix34(), {**vars(r), "X_FC": None}]
+
+
+def _visit(folder: Path) -> Values:
+    v = load_visit(folder / "touches.csv", folder / "poses.csv", folder / "camera.yaml", seen=folder / "seen.csv")
+    poses = [X.GetAsMatrix34() for X in (*v.data.X_BF, v.data.views[0][0])]
+    return [*poses, v.data.touched_m, v.data.landmark_m, v.data.views[0][1], v.names]
+
+
+def _planar(folder: Path) -> Values:
+    return [value for v in load_planar(folder / "a.npz").visits for value in (vars(v.touches), v.rows)]
+
+
+def _scenario(folder: Path) -> Values:
+    return [yaml_dump_typed(load_scenario(str(folder / "cell.yaml")), schema=scenario_class())]
+
+
+def _weld_log(folder: Path) -> Values:
+    log = load_weld_log(folder)
+    return [dict(log.columns), list(log.phase), vars(log.process)]
+
+
+READERS = (
+    Reader("ply", "cloud", "a.ply", examples.ply, _cloud("a.ply")),
+    Reader("pcd", "cloud", "a.pcd", examples.pcd, _cloud("a.pcd"), finite=False),
+    Reader("text-cloud", "table", "a.csv", examples.text_cloud, _cloud("a.csv")),
+    Reader("npz-cloud", "npz", "a.npz", examples.npz_cloud, _cloud("a.npz"), finite=False),
+    Reader("npy-cloud", "npy", "a.npy", examples.npy_cloud, _cloud("a.npy")),
+    Reader("dataset", "yaml", "dataset.yaml", examples.dataset, _dataset),
+    Reader("poses", "table", "poses.csv", examples.dataset, _dataset),
+    Reader("pairs", "table", "pairs.csv", examples.pairs, _dataset),
+    Reader("calibration", "yaml", "calibration.yaml", examples.calibration, _calibration),
+    Reader("hand-eye-npz", "npz", "pairs.npz", examples.hand_eye_npz, _pairs("pairs.npz")),
+    Reader("hand-eye-csv", "table", "pairs.csv", examples.hand_eye_csv, _pairs("pairs.csv")),
+    Reader("hand-eye-json", "json", "pairs.json", examples.hand_eye_json, _pairs("pairs.json")),
+    Reader("hand-eye-yaml", "yaml", "pairs.yaml", examples.hand_eye_yaml, _pairs("pairs.yaml")),
+    Reader("profiler-npz", "npz", "a.npz", examples.profiler_npz, _profiler("a.npz"), finite=False),
+    Reader("profiler-csv", "table", "a.csv", examples.profiler_csv, _profiler("a.csv"), finite=False),
+    Reader("profiler-record", "yaml", "profiler.yaml", examples.profiler_record, _record),
+    Reader("touches", "table", "touches.csv", examples.tablet, _visit),
+    Reader("tablet-poses", "table", "poses.csv", examples.tablet, _visit),
+    Reader("seen", "table", "seen.csv", examples.tablet, _visit),
+    Reader("camera", "yaml", "camera.yaml", examples.tablet, _visit),
+    Reader("planar", "npz", "a.npz", examples.planar, _planar),
+    Reader("tablet-record", "yaml", "tablet.yaml", examples.tablet_record, _tablet_record),
+    Reader("scenario", "yaml", "cell.yaml", examples.scenario, _scenario),
+    Reader(
+        "kinematics",
+        "yaml",
+        "kinematics.yaml",
+        examples.kinematics,
+        lambda f: [load_arm(kinematics=f / "kinematics.yaml").stack],
+    ),
+    Reader("weld-table", "table", "weld.csv", examples.weld_log, _weld_log, finite=False),
+    Reader("weld-header", "json", "weld.json", examples.weld_log, _weld_log, finite=False),
+    Reader("image", "image", "a.png", examples.image, lambda f: [read_grey_image(f / "a.png")]),
+)
+
+
+def all_finite(value: Any) -> bool:
+    """Whether all numbers of what was read are finite."""
+    if isinstance(value, dict):
+        return all(all_finite(v) for v in value.values())
+    if isinstance(value, list | tuple):
+        return all(all_finite(v) for v in value)
+    if isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype.kind == "f"):
+        return bool(np.isfinite(value).all())
+    return True
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a reader did with a case, and its sentence or traceback."""
+
+    said: str
+    detail: str = ""
+
+
+def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, str]:
+    """The example, the damaged files, whether they contradict themselves, and what is there instead of a file ("" a file)."""
+    number = READERS.index(reader)
+    rng = np.random.default_rng((seed, number, case))
+    files = _example(number, seed, case % _EXAMPLES)
+    if rng.random() < _ODD_PLACE:
+        return files, files, True, str(rng.choice(_PLACES))
+    content = files[reader.target]
+    if reader.target == "dataset.yaml" and rng.random() < _UNITS:
+        swapped = content.replace(
+            *((b"clouds: m,", b"clouds: mm,") if rng.random() < 0.5 else (b"poses: m}", b"poses: mm}"))
+        )
+        return files, {**files, reader.target: swapped}, True, ""
+    wrong = False
+    for step in range(1 if rng.random() < 0.8 else 3):
+        try:
+            content, contradicts = GRAMMARS[reader.kind](content, rng)
+        except Exception:  # what an earlier damage left is beyond the grammar
+            break
+        wrong = contradicts and step == 0  # a second damage may undo the contradiction
+        if contradicts or not content:
+            break
+    if reader.name == "weld-table":  # its checksum stands in the header
+        wrong = True
+    return files, {**files, reader.target: content}, wrong, ""
+
+
+@lru_cache(maxsize=2 * _EXAMPLES)
+def _example(number: int, seed: int, variant: int) -> Files:
+    return READERS[number].example(np.random.default_rng((seed, number, variant, 1)))
+
+
+def lay_out(folder: Path, files: Files, target: str, place: str = "") -> None:
+    """Write the files; at the target's place something else, where ``place`` says so."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    path = folder / target
+    if place:
+        path.unlink()
+    if place == "a pipe":
+        os.mkfifo(path)
+    elif place == "a folder":
+        path.mkdir()
+    elif place == "a device":
+        path.symlink_to("/dev/zero")
+    elif place == "a loop of links":
+        path.symlink_to(path.name)
+
+
+def judge(reader: Reader, seed: int, case: int, folder: Path) -> Verdict:
+    """Build, damage and read a case in the folder, which is the working directory of this process."""
+    example, files, contradicts, place = damaged(reader, seed, case)
+    lay_out(folder, files, reader.target, place)
+    verdict, values = _read(reader, folder)
+    if any(path.name == "executed" for path in (*folder.iterdir(), *Path.cwd().iterdir())):
+        return Verdict(EXECUTED)
+    if verdict.said != ACCEPTED:
+        return verdict
+    if reader.finite and not all_finite(values):
+        return Verdict(WRONG, "numbers that are not finite were accepted")
+    if contradicts:
+        lay_out(folder, example, reader.target)
+        _, original = _read(reader, folder)
+        if digest(values) != digest(original):
+            lay_out(folder, files, reader.target, place)
+            return Verdict(WRONG, "a file that contradicts itself was accepted, with other data")
+    return verdict
+
+
+def _read(reader: Reader, folder: Path) -> tuple[Verdict, Any]:
+    try:
+        values = reader.read(folder)
+    except InputError as e:
+        sentence = str(e)
+        if not sentence or "\n" in sentence or len(sentence) > _LONGEST:
+            return Verdict(INTERNAL, f"no clear sentence ({len(sentence)} characters): {sentence[:200]}"), None
+        return Verdict(REFUSED, sentence), None
+    except Exception:
+        return Verdict(INTERNAL, traceback.format_exc(limit=-6)), None
+    return Verdict(ACCEPTED), values
+
+
+def digest(values: Any) -> str:
+    """A hash of what was read."""
+    return sha256(pickle.dumps(values)).hexdigest()
