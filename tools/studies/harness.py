@@ -178,7 +178,10 @@ class Measured:
 
     def markdown(self) -> str:
         """The tables, and below them the targets where the study has some."""
-        return "\n".join(markdown_table(header, rows) for _, header, rows in self._shown)
+        return "\n".join(
+            (f"**{title}**\n\n" if k else "") + markdown_table(header, rows)
+            for k, (title, header, rows) in enumerate(self._shown)
+        )
 
     @property
     def _shown(self) -> list[Table]:
