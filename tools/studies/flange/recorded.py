@@ -376,4 +376,4 @@ def parts(call: Call, dataset: DatasetArgument) -> Outcome:
         raise InputError(f"'{dataset}' holds no clouds to divide. Give a dataset with scans.")
     folder, clouds = PARTS.folder(call), [data.cloud(id) for id in data.clouds]
     rows = study_parts(clouds, get_flange(data.header.flange), seed=call.seed, progress=call.progress)
-    return PARTS.measured({"all": {"rows": [vars(r) for r in rows]}}, folder).outcome()
+    return PARTS.measured({"all": {"rows": rows}}, folder).outcome()

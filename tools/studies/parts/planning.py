@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +18,7 @@ from weldcal.models.workpieces.part import bend
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.report.files import records_csv
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.worlds.parts.plates import Scene, box, scan_part, sideways
 from weldcal.welding.locate.find_workpiece import find_workpiece
@@ -35,27 +36,9 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """The plan of one scan by one method; lengths in mm, NaN where it was refused; processor seconds."""
-
-    method: str
-    seed: int
-    refused: str
-    rms_mm: float = math.nan
-    worst_mm: float = math.nan
-    sigma_mm: float = math.nan
-    chi: float = math.nan
-    within_2_sigma: float = math.nan
-    seconds: float = math.nan
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trial(Plan):
-    """One scan of a part under a scanner preset."""
-
-    preset: str
-    shape: str
+JUDGED = ("rms_mm", "worst_mm", "sigma_mm", "chi", "within_2_sigma")
+Plan = dict[str, Any]
+"""The plan of one scan by one method: lengths in mm, NaN where it was refused; processor seconds."""
 
 
 def part_for(preset: str, shape: str) -> Workpiece:
@@ -105,18 +88,14 @@ def try_cad(scene: Scene, drawing: Workpiece | None = None) -> tuple[Floats, Flo
 METHODS = {"cad": try_cad, "cloud": try_cloud}
 
 
-def run_trial(scene: Scene, preset: str, shape: str, seed: int, method: str) -> Trial:
-    """Plan one scan by one method; a named refusal is a result."""
-    return Trial(preset=preset, shape=shape, method=method, seed=seed, **figures(lambda: METHODS[method](scene)))
-
-
-def figures(plan: Callable[[], tuple[Floats, Floats]]) -> dict[str, Any]:
-    """Run `plan`, which returns errors and sigmas (N,) m; the fields of a Plan that follow from it."""
+def figures(plan: Callable[[], tuple[Floats, Floats]]) -> Plan:
+    """Run `plan`, which returns errors and sigmas (N,) m, and judge it; a named refusal is a result."""
     began = time.process_time()
     try:
         error, sigma = plan()
     except WeldcalError as refusal:
-        return {"refused": f"{type(refusal).__name__}: {refusal}", "seconds": time.process_time() - began}
+        sentence, nothing = f"{type(refusal).__name__}: {refusal}", dict.fromkeys(JUDGED, math.nan)
+        return {"refused": sentence, **nothing, "seconds": time.process_time() - began}
     return {
         "refused": "",
         "rms_mm": 1e3 * _rms(error),
@@ -132,14 +111,14 @@ def _rms(values: Any) -> float:
     return math.sqrt(float(np.mean(np.square(values))))
 
 
-def summary_rows(trials: list[Trial]) -> dict[str, str]:
+def summary_rows(trials: list[Plan]) -> dict[str, str]:
     """A line per preset and method: planned of all, errors sideways (rms and worst), sigma stated, CPU seconds."""
     rows: dict[str, str] = {}
-    for preset in dict.fromkeys(t.preset for t in trials):
+    for preset in dict.fromkeys(t["preset"] for t in trials):
         for method in METHODS:
-            mine = [t for t in trials if t.preset == preset and t.method == method]
-            done = [t for t in mine if not t.refused]
-            seconds = f"; {np.mean([t.seconds for t in done]):.2f} s CPU" if done else f"; {mine[0].refused}"
+            mine = [t for t in trials if t["preset"] == preset and t["method"] == method]
+            done = [t for t in mine if not t["refused"]]
+            seconds = f"; {np.mean([t['seconds'] for t in done]):.2f} s CPU" if done else f"; {mine[0]['refused']}"
             rows[f"{preset} {method}"] = f"{len(done)} of {len(mine)} planned{error_text(done)}{seconds}"
     return rows
 
@@ -148,10 +127,10 @@ def error_text(planned: Sequence[Plan]) -> str:
     """Errors and stated sigmas of the plans, as a part of a sentence; empty for none."""
     if not planned:
         return ""
-    within = 100.0 * float(np.mean([t.within_2_sigma for t in planned]))
+    within = 100.0 * float(np.mean([t["within_2_sigma"] for t in planned]))
     return (
-        f"; error rms {_rms([t.rms_mm for t in planned]):.3f}, worst {max(t.worst_mm for t in planned):.2f} mm; sigma stated "
-        f"{_rms([t.sigma_mm for t in planned]):.3f} mm ({within:.0f} % of the line within 2 sigma)"
+        f"; error rms {_rms([t['rms_mm'] for t in planned]):.3f}, worst {max(t['worst_mm'] for t in planned):.2f} mm; sigma stated "
+        f"{_rms([t['sigma_mm'] for t in planned]):.3f} mm ({within:.0f} % of the line within 2 sigma)"
     )
 
 
@@ -176,19 +155,6 @@ class Trouble:
 TROUBLE_COLUMNS = (
     "name", "method", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "within_2_sigma", "ok", "seconds",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class TroubleTrial(Plan):
-    """One scan in one kind of trouble; must: as in Trouble."""
-
-    name: str
-    must: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether the answer is what it has to be."""
-        return self.must in ("", REFUSED if self.refused else PLANNED)
 
 
 def _bar(width_m: float) -> Callable[[np.random.Generator], list[TriMesh]]:
@@ -253,13 +219,14 @@ TROUBLES = (
 )
 
 
-def trouble_trial(trouble: Trouble, seed: int) -> TroubleTrial:
+def trouble_trial(trouble: Trouble, seed: int) -> Plan:
     """One scan, planned; held against what it has to be."""
     scanner = get_scanner(PRESET).resized(WIDEST_PX)
     others = trouble.others(np.random.default_rng([seed, 97]))
     scene = scan_part(trouble.part(), scanner, seed, tilt_rad=math.radians(5.0), spread_m=0.02, others=others)
     plan = figures(lambda: _plan(scene, trouble))
-    return TroubleTrial(name=trouble.name, must=trouble.must, method=trouble.method, seed=seed, **plan)
+    ok = trouble.must in ("", REFUSED if plan["refused"] else PLANNED)
+    return {"name": trouble.name, "method": trouble.method, "seed": seed, "ok": ok, **plan}
 
 
 def _plan(scene: Scene, trouble: Trouble) -> tuple[np.ndarray, np.ndarray]:
@@ -268,18 +235,13 @@ def _plan(scene: Scene, trouble: Trouble) -> tuple[np.ndarray, np.ndarray]:
     return try_cad(scene, None if trouble.drawing is None else trouble.drawing())
 
 
-def run_troubles(runs: int, first_seed: int) -> list[TroubleTrial]:
-    """Every kind of trouble, `runs` times."""
-    return [trouble_trial(trouble, first_seed + k) for trouble in TROUBLES for k in range(runs)]
-
-
-def trouble_rows(trials: list[TroubleTrial]) -> dict[str, str]:
+def trouble_rows(trials: list[Plan]) -> dict[str, str]:
     """A line per kind and method."""
     rows: dict[str, str] = {}
-    for name, method in dict.fromkeys((t.name, t.method) for t in trials):
-        mine = [t for t in trials if (t.name, t.method) == (name, method)]
-        done = [t for t in mine if not t.refused]
-        right = f"{sum(t.ok for t in mine)} as they have to be"
+    for name, method in dict.fromkeys((t["name"], t["method"]) for t in trials):
+        mine = [t for t in trials if (t["name"], t["method"]) == (name, method)]
+        done = [t for t in mine if not t["refused"]]
+        right = f"{sum(t['ok'] for t in mine)} as they have to be"
         rows[f"{name}, {method}"] = f"{len(done)} of {len(mine)} planned, {right}{error_text(done)}"
     return rows
 
@@ -299,28 +261,30 @@ def run_seam_planning_benchmark(
     full: images as wide as the scanner has them. troubles: occlusion, clutter and wrong workpieces as well (troubles.csv).
     """
     presets = list(SCANNERS) if presets is None else presets
-    trials: list[Trial] = []
+    trials: list[Plan] = []
     total = len(presets) * len(SHAPES) * runs
     for preset in presets:
         for shape in SHAPES:
             for k in range(runs):
                 number = FIRST_HELD_OUT + seed + k
                 scene = scan(preset, shape, number, None if full else WIDEST_PX)
-                trials += [run_trial(scene, preset, shape, number, method) for method in METHODS]
+                named = {"preset": preset, "shape": shape, "seed": number}
+                for method, plan in METHODS.items():
+                    trials.append({**named, "method": method, **figures(partial(plan, scene))})
                 progress("planning", len(trials) / (len(METHODS) * total))
-                write_atomic(out / "trials.csv", records_csv(trials, COLUMNS))
+                write_atomic(out / "trials.csv", mappings_csv(trials, COLUMNS))
     rows = summary_rows(trials)
     if troubles:
-        cases = run_troubles(runs, FIRST_HELD_OUT + seed)
-        write_atomic(out / "troubles.csv", records_csv(cases, TROUBLE_COLUMNS))
+        cases = [trouble_trial(trouble, FIRST_HELD_OUT + seed + k) for trouble in TROUBLES for k in range(runs)]
+        write_atomic(out / "troubles.csv", mappings_csv(cases, TROUBLE_COLUMNS))
         rows |= trouble_rows(cases)
-    done = [t for t in trials if not t.refused]
+    done = [t for t in trials if not t["refused"]]
     summary: dict[str, object] = {
         "state": "done",
         "trials": len(trials),
         "planned": len(done),
-        "worst_mm": max((t.worst_mm for t in done), default=math.nan),
-        "most_seconds": max((t.seconds for t in trials), default=math.nan),
+        "worst_mm": max((t["worst_mm"] for t in done), default=math.nan),
+        "most_seconds": max((t["seconds"] for t in trials), default=math.nan),
     }
     return summary, rows
 

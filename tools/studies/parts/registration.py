@@ -20,7 +20,7 @@ from weldcal.models.mesh import TriMesh, revolve
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.worlds.parts.plates import box
 from weldcal.tools.worlds.parts.scenes import PartScene, Subject, block, scan_scene, subject
@@ -225,9 +225,7 @@ def run_registration_study(
     rows: list[dict[str, object]] = []
     for k, job in enumerate(jobs):
         rows.append(job())
-        write_atomic(
-            out / "registrations.csv", csv_text(COLUMNS, ([row.get(name, "") for name in COLUMNS] for row in rows))
-        )
+        write_atomic(out / "registrations.csv", mappings_csv(rows, COLUMNS))
         progress(f"{rows[-1]['kind']}: {rows[-1]['part']}", (k + 1) / len(jobs))
     return _summed(rows)
 

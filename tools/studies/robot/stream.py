@@ -7,7 +7,7 @@ from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,8 +102,7 @@ class Tap:
         return number
 
 
-@dataclass(frozen=True)
-class Missed:
+class Missed(NamedTuple):
     """A command that came more than MISSED_S after its time: when in the run (s), and by how much it came late (s)."""
 
     at_s: float
@@ -111,23 +110,16 @@ class Missed:
 
 
 @dataclass(frozen=True)
-class Stopped:
-    """The link stopped the arm by itself: when in the run (s), and its reason."""
-
-    at_s: float
-    sentence: str
-
-
-@dataclass(frozen=True)
 class StreamReport:
-    """One stream. `fault` is empty where it went through to its end; `stops` were lived through with a new start."""
+    """One stream. `fault` is empty where it went through to its end; `stops`: when in the run (s) the link stopped the arm by itself, and its
+    reason, lived through with a new start."""
 
     seconds: float
     tap: Tap
     final: LinkState
     clock: WallClock
     fault: str
-    stops: tuple[Stopped, ...] = ()
+    stops: tuple[tuple[float, str], ...] = ()
 
     @property
     def missed(self) -> list[Missed]:
@@ -162,7 +154,7 @@ class StreamReport:
             "clock_drift_ppm": 1e6 * self.final.clock_drift,
             "diagram_late_ms": 1e3 * self.clock.late_s,
             "diagram_reanchored": self.clock.reanchored,
-            "stops": [{"id": f"at {stop.at_s:.3f} s", "reason": stop.sentence} for stop in self.stops],
+            "stops": [{"id": f"at {at_s:.3f} s", "reason": sentence} for at_s, sentence in self.stops],
             "missed_deadlines": len(missed),
             "missed": [{"id": f"at {m.at_s:.3f} s", "reason": f"{1e3 * m.late_s:.1f} ms late"} for m in missed],
         }
@@ -214,7 +206,7 @@ def run_robot_benchmark(
     Where this computer stood still for so long that the link stopped the arm, that is a stop in the report, and the stream
     goes on over a new link.
     """
-    left, stops, tap = 60.0 * minutes, list[Stopped](), None
+    left, stops, tap = 60.0 * minutes, list[tuple[float, str]](), None
     with emulator_process(host=address, seed=seed, lockstep=lockstep) as emulator:
         while True:
             prepared = PrepareRobot(UrRtde(host=emulator.host), load_arm())
@@ -230,7 +222,7 @@ def run_robot_benchmark(
             left -= report.seconds
             if report.final.fault.name not in (*LOADED, "GUARD_LATCHED") or len(stops) == MOST_STOPS:
                 break
-            stops.append(Stopped(60.0 * minutes - left, report.fault))
+            stops.append((60.0 * minutes - left, report.fault))
     report = replace(report, seconds=60.0 * minutes - left, stops=tuple(stops))
     write_json(out / "robot.json", report.summary())
     missed = ((f"{m.at_s:.3f}", f"{1e3 * m.late_s:.2f}") for m in report.missed)

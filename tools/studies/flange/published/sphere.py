@@ -1,8 +1,7 @@
 """Table 2 of the flange paper repeated in a simulated cell: a calibration sphere on the flange beside the flange, in the same scans."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.report.files import write_json
+from weldcal.tools.studies.harness import statistics
 from weldcal.tools.worlds.flange_frames import facing, sphere_frame
 
 SPHERE_RADIUS_M = 0.025
@@ -128,20 +127,9 @@ def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
     return X
 
 
-@dataclass(frozen=True)
-class SphereRow:
-    """One method with one number of pairs: errors at the flange (mm) over all draws and the scans that the draw did not use."""
-
-    method: str
-    pairs: int
-    median_mm: float
-    p95_mm: float
-    max_mm: float
-
-
 def compare_sphere(
     seed: int = 0, draws: int = 30, pool: int = 32, progress: Progress = no_progress
-) -> tuple[list[SphereRow], dict[str, object]]:
+) -> tuple[list[dict[str, object]], dict[str, object]]:
     """Sphere and flange in the same scans with 4 and with 16 pairs, judged at the flange on the others; and Table 1's false segmentations.
 
     Every judged scan is one that the calibration did not use. "flange, weldcal" corrects the scanner.
@@ -169,7 +157,8 @@ def compare_sphere(
             progress(f"{n} pairs", 0.8 + 0.1 * (k + 1) / draws)
         for method, found in errors.items():
             e = 1e3 * np.concatenate(found)
-            rows.append(SphereRow(method, n, float(np.median(e)), float(np.percentile(e, 95)), float(e.max())))
+            of = statistics(e, "median", "p95", "max")
+            rows.append({"method": method, "pairs": n, **{f"{name}_mm": v for name, v in of.items()}})
     return rows, false_segmentations([s.flange for s in scans], seed)
 
 
@@ -205,21 +194,16 @@ def false_segmentations(flanges: Sequence[Observation], seed: int = 0) -> dict[s
     }
 
 
-def run_sphere_study(
-    folder: Path, scans: int, draws: int, seed: int, progress: Progress = no_progress
-) -> dict[str, object]:
-    """The comparison as a JSON object, written to sphere.json in the folder, beside the paper's Table 2 (x, y, z mm; roll, pitch, yaw deg)."""
+def run_sphere_study(scans: int, draws: int, seed: int, progress: Progress = no_progress) -> dict[str, object]:
+    """The comparison as a JSON object, beside the paper's Table 2 (x, y, z mm; roll, pitch, yaw deg)."""
     rows, false = compare_sphere(seed, draws, scans, progress)
-    summary: dict[str, object] = {
-        "state": "done",
+    return {
         "scans": scans,
         "draws": draws,
-        "rows": [asdict(r) for r in rows],
+        "rows": rows,
         "paper_table2": {str(n): list(v) for n, v in TABLE2.items()},
         "false_segmentations": false,
     }
-    write_json(folder / "sphere.json", summary)
-    return summary
 
 
 def sphere_rows(summary: dict[str, Any]) -> dict[str, str]:
