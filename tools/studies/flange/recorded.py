@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -196,25 +196,14 @@ LEAST_HALVES = 16
 """Scans of a recording from which on its halves are calibrated; eight are the least with a choice of the scanner's correction."""
 
 
-@dataclass(frozen=True)
-class Halves:
-    """Of ``draws`` random halves: means of the stated held-out error and of the error on the other half (mm), and how many of
-    the latter lie in the interval (95 %) that the first half states. ``skipped`` halves fixed no calibration."""
-
-    draws: int
-    scans: int
-    stated_mm: float
-    new_mm: float
-    inside: int
-    skipped: int
-
-
 def study_halves(
     folder: Path, draws: int = 20, seed: int = 0, progress: Progress = no_progress, *, local: bool = False
-) -> Halves:
+) -> dict[str, Any]:
     """Calibrate from ``draws`` random halves of a dataset, choices included, and measure on the others. Deterministic for ``seed``.
 
-    ``local``: from two thirds, with the choice of a local field (--refine local).
+    ``local``: from two thirds, with the choice of a local field (--refine local). Returns means of the stated held-out error and of the error
+    on the other half (mm), how many of the latter lie in the interval (95 %) that the first half states, and how many halves fixed no
+    calibration (``skipped``).
 
     Raises InputError for a folder that is none, TooFewPoses for fewer than sixteen usable scans.
     """
@@ -240,11 +229,12 @@ def study_halves(
             continue
         interval = mean_interval(errors)
         new = float(np.mean(position_errors(X_BC, new_scans)))
-        inside = interval is not None and interval[0] < new < interval[1]
-        rows.append((float(np.nanmean(errors)), new, float(inside)))
+        within = interval is not None and interval[0] < new < interval[1]
+        rows.append((float(np.nanmean(errors)), new, float(within)))
     table = np.array(rows).reshape(-1, 3)
     stated, new = (float(1e3 * table[:, k].mean()) if len(table) else float("nan") for k in (0, 1))
-    return Halves(draws, half, stated, new, int(table[:, 2].sum()), skipped)
+    inside = int(table[:, 2].sum())
+    return {"draws": draws, "scans": half, "stated_mm": stated, "new_mm": new, "inside": inside, "skipped": skipped}
 
 
 def _ingredient(r: Ingredient) -> dict[str, object]:
@@ -350,7 +340,7 @@ def halves(
 ) -> Outcome:
     """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the other half."""
     folder, found = HALVES.folder(call), study_halves(dataset, draws, call.seed, call.progress, local=local)
-    return HALVES.measured({"all": vars(found)}, folder).outcome()
+    return HALVES.measured({"all": found}, folder).outcome()
 
 
 def _part_rows(f: Figures) -> Iterable[Row]:
