@@ -10,8 +10,9 @@ from tests.places import SHARED_DATA, needs
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
-from weldcal.tools.studies.flange.live import Station, bound_covariance, joints_of, live_scenario, redraw
+from weldcal.tools.studies.flange.live import live_scenario
 from weldcal.tools.studies.flange.recorded import Ingredient, study_few_scans, study_ingredients
+from weldcal.tools.worlds.redrawn import Station, bound_covariance, joints_of, redraw
 
 DATA = SHARED_DATA / "flange"
 Q_HOME = np.deg2rad([180.0, -70.0, 120.0, -50.0, 90.0, 0.0])

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from weldcal.models.errors import WeldcalError
-from weldcal.models.mesh import TriMesh, revolve
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.parts.plates import box
-from weldcal.tools.worlds.parts.scenes import PartScene, Subject, block, scan_scene, subject
+from weldcal.tools.worlds.parts.scenes import REFUSALS, PartScene, Subject, scan_scene, scanned_mesh, subject
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.locate.part.locating import locate_part
 from weldcal.welding.locate.part.model import PartModel
@@ -37,7 +35,6 @@ NEES_BOUND = float(chi2.ppf(0.9973, 6))  # of a pose within 3 sigma
 MEAN_TARGET_MM, MAX_TARGET_MM = 0.3, 0.8
 SAME_SURFACE_M = 1e-4
 HINT_M, HINT_RAD = 0.04, math.radians(15.0)
-MESH_NOISE_M, MESH_WAVE_M, MESH_TRIANGLES = 1e-4, 0.015, 15_000
 COLUMNS = (
     "kind", "part", "seed", "verdict", "nees", "drawn_mean_mm", "drawn_max_mm", "seam_mean_mm", "seam_max_mm", "measured",
     "cpu_s", "sentence",
@@ -81,7 +78,7 @@ def run(trial: Trial) -> dict[str, object]:
     options: dict[str, object] = {"objects": 4, "fingers": 1} if trial.kind == "plan" else dict(SCENES[trial.kind])
     scene: PartScene = scan_scene(part.mesh, scanner, number, **options)  # type: ignore[arg-type]
     rng = np.random.default_rng([trial.seed, 1803])
-    mesh = _scanned(part.mesh, rng) if trial.kind == "scanned mesh" else part.mesh
+    mesh = scanned_mesh(part.mesh, rng) if trial.kind == "scanned mesh" else part.mesh
     off = RigidTransform(RollPitchYaw(rng.uniform(-1.0, 1.0, 3) * HINT_RAD), rng.uniform(-1.0, 1.0, 3) * HINT_M)
     row: dict[str, object] = {"kind": trial.kind, "part": trial.part, "seed": trial.seed}
     start = time.process_time()
@@ -127,65 +124,6 @@ def _nees(found: PartRegistration, X_BP: RigidTransform, part: Subject) -> float
         xi = np.concatenate([Rotation.from_matrix(E.rotation().matrix()).as_rotvec(), E.translation()])
         values.append(float(xi @ np.linalg.solve(found.covariance, xi)))
     return min(values)
-
-
-def _scanned(mesh: TriMesh, rng: np.random.Generator) -> TriMesh:
-    """The part as a mesh file made from a scan: small triangles, its surface off by 0.1 mm in waves of MESH_WAVE_M."""
-    import open3d
-
-    fine: Any = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices.copy()), open3d.utility.Vector3iVector(mesh.triangles.copy())
-    )
-    fine.merge_close_vertices(1e-7)
-    while len(fine.triangles) < MESH_TRIANGLES:
-        fine = fine.subdivide_midpoint(1)
-    corners = np.asarray(fine.vertices)
-    # The triangles are slivers in places: an error of each corner by itself would fold the surface.
-    waves = rng.normal(size=(3, 3, 60)) * (2.0 * math.pi / MESH_WAVE_M / math.sqrt(3.0))
-    phase = rng.uniform(0.0, 2.0 * math.pi, size=(3, 1, 60))
-    error = MESH_NOISE_M * math.sqrt(2.0 / 60.0) * np.cos(corners @ waves + phase).sum(axis=2).T
-    return TriMesh(corners + error, np.asarray(fine.triangles, dtype=np.int64))
-
-
-@dataclass(frozen=True, eq=False)
-class Refusal:
-    """What lies in the scene, what is looked for, and the error with the words that must name why."""
-
-    there: TriMesh
-    looked_for: TriMesh
-    error: type[WeldcalError]
-    words: str
-    twice: bool = False
-
-
-def sphere(radius: float) -> TriMesh:
-    """A ball that rests on z = 0, m."""
-    a = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 33)
-    return revolve(np.column_stack([radius * np.cos(a) * (np.abs(a) < 1.57), radius * (1.0 + np.sin(a))]), 64)
-
-
-def pipe(radius: float, wall: float, height: float) -> TriMesh:
-    """A pipe that rests on z = 0, m."""
-    inner = radius - wall
-    return revolve(np.array([[inner, 0.0], [radius, 0.0], [radius, height], [inner, height], [inner, 0.0]]), 72)
-
-
-def _scaled(mesh: TriMesh, factor: float) -> TriMesh:
-    return TriMesh(mesh.vertices * factor, mesh.triangles)
-
-
-REFUSALS: dict[str, Callable[[], Refusal]] = {
-    "plain plate": lambda: Refusal(box(0.2, 0.12, 0.012), box(0.2, 0.12, 0.012), AmbiguousPart, "turning it about its"),
-    "plain pipe": lambda: Refusal(
-        pipe(0.05, 0.005, 0.09), pipe(0.05, 0.005, 0.09), AmbiguousPart, "free to turn about its z axis|looks the same"
-    ),
-    "sphere": lambda: Refusal(sphere(0.05), sphere(0.05), AmbiguousPart, "free to turn about its|looks the same"),
-    "two alike": lambda: Refusal(block(), block(), AmbiguousPart, "Two places in the scan", twice=True),
-    "another part": lambda: Refusal(block(), subject("lap").mesh, PartNotFound, "part"),
-    "another length": lambda: Refusal(box(0.2, 0.12, 0.03), box(0.26, 0.12, 0.03), PartNotFound, "part"),
-    "wrong unit": lambda: Refusal(block(), _scaled(block(), 25.4), PartNotFound, "part"),
-    "not there": lambda: Refusal(box(0.03, 0.03, 0.02), block(), PartNotFound, "part"),
-}
 
 
 def run_refusal(name: str, seed: int) -> dict[str, object]:

@@ -19,7 +19,7 @@ from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.studies.robot.host_probe import HostLateness, watched_host
+from weldcal.tools.worlds.robot.host_probe import HostLateness, watched_host
 
 BUSY = "while True: pass"
 UNDER_8_MS = 8.0

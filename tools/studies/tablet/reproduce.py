@@ -18,6 +18,7 @@ from weldcal.tools.report.pictures import OURS, THEIRS, svg
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.harness import Figures, Row, Study, Table
 from weldcal.tools.studies.tablet.study import (
+    PUBLISHED_EVALUATIONS,
     Reproduced,
     compare_models,
     compare_signs,
@@ -104,8 +105,8 @@ def run_study(seed: int, evolution_seeds: int, trials: int, progress: Progress, 
         "targets": [{"what": t.what, "reached": t.value, "limit": limit_words(t), "met": t.met} for t in targets],
         "cost": {
             **asdict(cost),
-            "published_extrapolated": cost.published,
-            "published_in_crowds_extrapolated": cost.published_in_crowds,
+            "published_extrapolated": PUBLISHED_EVALUATIONS * cost.one_evaluation,
+            "published_in_crowds_extrapolated": PUBLISHED_EVALUATIONS * cost.crowd_evaluation,
         },
         "dh_by_eq_20": dh,
         "signs": signs,
