@@ -49,13 +49,9 @@ class Ingredient:
     tilt_rad: Array
     floor_m: float
 
-    def median_sigma_m(self, seed: int = 0) -> float:
-        """How well so many errors tell their median (bootstrap standard deviation, m)."""
-        return median_sigma(self.position_m, seed)
 
-
-def median_sigma(values: Array, seed: int) -> float:
-    """Bootstrap standard deviation of the median of values (n,)."""
+def median_sigma(values: Array, seed: int = 0) -> float:
+    """How well values (n,) tell their median: its bootstrap standard deviation."""
     draws = np.random.default_rng(seed).choice(values, (_DRAWS, len(values)))
     return float(np.median(draws, axis=1).std())
 
@@ -141,10 +137,6 @@ class Draws:
     tilt_rad: Array
     refused: int
     corrected: float
-
-    def median_sigma_m(self, seed: int = 0) -> float:
-        """How well so many draws tell their median (bootstrap standard deviation, m); that all are of the same scans is not in it."""
-        return median_sigma(self.position_m, seed)
 
 
 def study_few_scans(
@@ -242,7 +234,7 @@ def _ingredient(r: Ingredient) -> dict[str, object]:
     return {
         "name": r.name,
         "position_mm": statistics(1e3 * r.position_m, "median", "mean", "p95"),
-        "median_sigma_mm": 1e3 * r.median_sigma_m(),
+        "median_sigma_mm": 1e3 * median_sigma(r.position_m),
         "tilt_deg": statistics(tilt, "median", "p95"),
         "floor_mm": 1e3 * r.floor_m,
     }
@@ -281,7 +273,7 @@ def _few(found: Sequence[Draws], draws: int) -> dict[str, object]:
     for r in (r for r in found if len(r.position_m) > 1):
         of = statistics(1e3 * r.position_m, "median", "p95")
         tilt = float(np.degrees(np.median(r.tilt_rad)))
-        row = {"scans": r.scans, "median_mm": of["median"], "median_sigma_mm": 1e3 * r.median_sigma_m()}
+        row = {"scans": r.scans, "median_mm": of["median"], "median_sigma_mm": 1e3 * median_sigma(r.position_m)}
         rows.append(row | {"p95_mm": of["p95"], "tilt_deg": tilt, "corrected": r.corrected, "refused": r.refused})
     return {"draws": draws, "rows": rows}
 

@@ -4,7 +4,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -49,46 +49,44 @@ SCENES: dict[str, Mapping[str, object]] = {
 }
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One registration: a kind of scene (a key of SCENES), a part, a seed, and whether a hint is given."""
-
-    kind: str
-    part: str
-    seed: int
-    hinted: bool
+Trial = tuple[str, str, int, bool]
+"""One registration: a kind of scene (a key of SCENES, or plan), a part, a seed, and whether a hint is given."""
 
 
 def clutter_trials(seeds: Sequence[int]) -> list[Trial]:
     """A scene a seed: kinds and parts take turns, so that twelve seeds have each part once."""
     kinds, names = list(SCENES), list(PARTS)
-    return [Trial(kinds[(s + s // 12) % len(kinds)], names[s % len(names)], s, False) for s in seeds]
+    return [(kinds[(s + s // 12) % len(kinds)], names[s % len(names)], s, False) for s in seeds]
 
 
 def plan_trials(seeds: Sequence[int], names: Sequence[str]) -> list[Trial]:
     """Every part once a seed, among few things; a hint decides between poses that look the same."""
-    return [Trial("plan", name, seed, True) for name in names for seed in seeds]
+    return [("plan", name, seed, True) for name in names for seed in seeds]
 
 
-def run(trial: Trial) -> dict[str, object]:
+def run(kind: str, name: str, seed: int, hinted: bool) -> dict[str, object]:
     """Scan, register and judge; a row of COLUMNS."""
-    part = subject(trial.part)
+    part = subject(name)
     scanner = get_scanner("phoxi_m", 824)
-    number = 1000 * list(PARTS).index(trial.part) + trial.seed
-    options: dict[str, object] = {"objects": 4, "fingers": 1} if trial.kind == "plan" else dict(SCENES[trial.kind])
+    number = 1000 * list(PARTS).index(name) + seed
+    options: dict[str, object] = {"objects": 4, "fingers": 1} if kind == "plan" else dict(SCENES[kind])
     scene: PartScene = scan_scene(part.mesh, scanner, number, **options)  # type: ignore[arg-type]
-    rng = np.random.default_rng([trial.seed, 1803])
-    mesh = scanned_mesh(part.mesh, rng) if trial.kind == "scanned mesh" else part.mesh
+    rng = np.random.default_rng([seed, 1803])
+    mesh = scanned_mesh(part.mesh, rng) if kind == "scanned mesh" else part.mesh
     off = RigidTransform(RollPitchYaw(rng.uniform(-1.0, 1.0, 3) * HINT_RAD), rng.uniform(-1.0, 1.0, 3) * HINT_M)
-    row: dict[str, object] = {"kind": trial.kind, "part": trial.part, "seed": trial.seed}
+    row: dict[str, object] = {"kind": kind, "part": name, "seed": seed}
     start = time.process_time()
     try:
         found, joint = locate_part(
-            scene.cloud_B, mesh, part.seam, None, scene.eye_B, X_BP_hint=scene.X_BP @ off if trial.hinted else None
+            scene.cloud_B, mesh, part.seam, None, scene.eye_B, X_BP_hint=scene.X_BP @ off if hinted else None
         )
     except (PartNotFound, AmbiguousPart) as error:
-        name = type(error).__name__
-        return {**row, "verdict": f"refused: {name}", "cpu_s": time.process_time() - start, "sentence": str(error)}
+        return {
+            **row,
+            "verdict": f"refused: {type(error).__name__}",
+            "cpu_s": time.process_time() - start,
+            "sentence": str(error),
+        }
     row["cpu_s"] = time.process_time() - start
     nees = _nees(found, scene.X_BP, part)
     right = nees < NEES_BOUND
@@ -157,9 +155,9 @@ def run_registration_study(
     """
     chosen = list(PARTS) if names is None else list(names)
     jobs: list[Callable[[], dict[str, object]]] = []
-    jobs += [lambda t=t: run(t) for t in clutter_trials(list(seeds)) if t.part in chosen]  # type: ignore[misc]
-    jobs += [lambda t=t: run(t) for t in plan_trials(list(plans), chosen)]  # type: ignore[misc]
-    jobs += [lambda n=n, s=s: run_refusal(n, s) for n in REFUSALS for s in refusals]  # type: ignore[misc]
+    jobs += [partial(run, *trial) for trial in clutter_trials(list(seeds)) if trial[1] in chosen]
+    jobs += [partial(run, *trial) for trial in plan_trials(list(plans), chosen)]
+    jobs += [partial(run_refusal, name, seed) for name in REFUSALS for seed in refusals]
     rows: list[dict[str, object]] = []
     for k, job in enumerate(jobs):
         rows.append(job())

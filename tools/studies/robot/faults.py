@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
-
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import FARM, Call, command, option
@@ -16,6 +14,7 @@ from weldcal.tools.cli.subject import one_of
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.harness import statistics
 from weldcal.tools.studies.robot.jobs import jobs
 from weldcal.tools.studies.robot.stream import stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
@@ -96,8 +95,8 @@ def run_fault_benchmark(
 
 
 def _spread(values: Several[float | None]) -> dict[str, float]:
-    found = np.array([value for value in values if value is not None])
-    return {"median": float(np.median(found)), "max": float(found.max())} if found.size else {}
+    found = [value for value in values if value is not None]
+    return statistics(found, "median", "max") if found else {}
 
 
 def _table(columns: tuple[str, ...], rows: Several[object]) -> str:
