@@ -15,7 +15,7 @@ from tests.places import ROOT
 BOUNDS = {
     "modules": 619,  # files with code in the five folders
     "code lines": 84_000,  # without blank lines, comments and docstrings
-    "lines of studies": 11_600,  # in tools/studies, all lines
+    "lines of studies": 10_300,  # in tools/studies, all lines
     "tests that import studies": 2,  # outside tests/tools/studies
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only

@@ -24,13 +24,7 @@ def csv_text(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
     return text.getvalue()
 
 
-def records_csv(records: Sequence[object], columns: Sequence[str] = ()) -> str:
-    """Objects of one kind, one line each: these attributes, or all that they hold."""
-    columns = columns or list(vars(records[0]))
-    return csv_text(columns, ([getattr(record, name) for name in columns] for record in records))
-
-
-def mappings_csv(rows: Sequence[Mapping[str, object]]) -> str:
-    """Mappings with the keys of the first, one line each."""
-    columns = list(rows[0])
+def mappings_csv(rows: Sequence[Mapping[str, object]], columns: Sequence[str] = ()) -> str:
+    """Mappings, one line each: these keys, or those of the first."""
+    columns = columns or list(rows[0])
     return csv_text(columns, ([row.get(name, "") for name in columns] for row in rows))

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from weldcal.calibration.data.results import software_version
 from weldcal.models.arrays import Array
@@ -38,7 +39,7 @@ from weldcal.tools.farm.run import Farm
 from weldcal.tools.farm.work import FAILED
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import markdown_table, print_note, print_table
+from weldcal.tools.studies.output import markdown_table, print_table
 from weldcal.tools.studies.targets import Target, all_met
 
 Cases = Mapping[str, Mapping[str, Any]]
@@ -90,7 +91,7 @@ class Study:
         Raises:
             InputError: the folder holds another study, or no case could be done. WorkerLost: a process has ended.
         """
-        farm = call.farm(folder or self.folder(call))
+        farm = Farm.of(folder or self.folder(call), call.given, call.progress)
         return self.run(farm if "workers" in call.given else replace(farm, workers=0), cases).outcome()
 
     def folder(self, call: Call) -> Path:
@@ -178,7 +179,10 @@ class Measured:
 
     def markdown(self) -> str:
         """The tables, and below them the targets where the study has some."""
-        return "\n".join(markdown_table(header, rows) for _, header, rows in self._shown)
+        return "\n".join(
+            (f"**{title}**\n\n" if k else "") + markdown_table(header, rows)
+            for k, (title, header, rows) in enumerate(self._shown)
+        )
 
     @property
     def _shown(self) -> list[Table]:
@@ -191,7 +195,7 @@ class Measured:
             numbers = self.study.numbers if k == 0 else 0
             print_table(title, header, rows, text=range(len(header) - numbers))
         if self.folder is not None:
-            print_note(f"written to {self.folder}")
+            Console().print(f"written to {self.folder}", highlight=False, soft_wrap=True)
 
     def write(self, folder: Path) -> None:
         """Write summary.json, table.md and table.json; the latter is what the page of all studies is made from."""

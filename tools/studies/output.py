@@ -27,8 +27,3 @@ def print_table(
     console = Console()
     console.print(table)
     console.print()
-
-
-def print_note(text: str) -> None:
-    """Write a sentence on stdout as it is."""
-    Console().print(text, highlight=False, soft_wrap=True)

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, nearest_rotation, pose
+from weldcal.calibration.geometry.se3 import exp_rotation, flange_poses, inverse, nearest_rotation, pose
 from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate
-from weldcal.calibration.hand_eye.joints import flange_poses
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem

@@ -1,11 +1,14 @@
 """Observations by a scanner that errs by another model than the one that is fitted, and calibrations from them."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.ndimage import map_coordinates, spline_filter
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.errors import CoplanarPoses
 from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.observations import corrected_observation
@@ -14,8 +17,11 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.planning.observability import check_diversity
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import device_warp
+from weldcal.tools.worlds.flange_frames import facing
 
 WARP_M = 0.8e-3
 """Largest depth error at ``REFERENCE_M``: 0.2 % of it, as a real scanner showed."""
@@ -95,3 +101,72 @@ def new_errors(
     return position_errors(
         estimate.X_BC, new if correction is None else [corrected_observation(correction, o) for o in new]
     )
+
+
+SIGMA_M, SIGMA_RAD, SIGMA_RATIO = 1e-4, 1e-3, 1e-3  # of a centre and a normal per axis, and of a hole circle's ratio
+
+
+def simulated_observations(n: int, rng: np.random.Generator) -> tuple[list[Observation], RigidTransform]:
+    """Observations (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``SIGMA_M`` and ``SIGMA_RAD`` an
+    axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane, which a calibration refuses,
+    are drawn again."""
+    X_BC = RigidTransform(
+        RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
+    )
+    while True:
+        out = [_simulated_observation(f"p{k}", X_BC, rng) for k in range(n)]
+        try:
+            check_diversity(np.array([o.p_BR for o in out]), np.ones(n, dtype=bool))
+        except CoplanarPoses:
+            continue
+        return out, X_BC
+
+
+def _simulated_observation(id: str, X_BC: RigidTransform, rng: np.random.Generator) -> Observation:
+    p = np.array([rng.uniform(-0.18, 0.18), rng.uniform(-0.13, 0.13), rng.uniform(0.5, 0.9)])
+    X_CR = facing(p, np.radians(rng.uniform(0.0, 30.0)), rng.uniform(0.0, 6.28), rng.uniform(0.0, 6.28))
+    A = np.linalg.qr(rng.standard_normal((3, 3)))[0] * rng.uniform(2e-5, 6e-5, 3)
+    covariance = A @ A.T
+    normal_sigma = rng.uniform(2e-5, 2e-4)
+    seen = p + A @ rng.standard_normal(3) + SIGMA_M * rng.standard_normal(3)
+    z = X_CR.rotation().matrix()[:, 2]
+    lean = float(np.hypot(SIGMA_RAD, normal_sigma)) * rng.standard_normal(3)
+    normal = exp_rotation(lean - z * float(z @ lean)) @ z
+    return Observation(id, X_BC @ X_CR, seen, normal, covariance, normal_sigma)
+
+
+WRONG = ScannerCorrection(1.002, (0.006, -0.004))
+"""What the simulated scanner needs: 0.2 % in scale, and up to 0.06 % per 100 mm across its image."""
+
+
+def seen_by_a_wrong_scanner(
+    observations: list[Observation], rng: np.random.Generator
+) -> tuple[list[Observation], dict[str, HolePattern]]:
+    """The same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""
+    out, patterns = [], {}
+    for o in observations:
+        seen = as_measured(np.asarray(o.p_CR))
+        J = WRONG.jacobian(seen)
+        assert o.n_C is not None
+        normal = J.T @ o.n_C
+        out.append(replace(o, p_CR=seen, n_C=normal / np.linalg.norm(normal)))
+        x, y = np.linalg.svd(np.asarray(o.n_C)[None])[2][1:]
+        ratio = 2.0 / float(x @ J @ x + y @ J @ y) + SIGMA_RATIO * rng.standard_normal()
+        R = RotationMatrix(np.column_stack([x, np.cross(o.n_C, x), o.n_C]))
+        patterns[o.id] = HolePattern(
+            holes_C=np.zeros((4, 3)),
+            angles_rad=np.zeros(4),
+            center_C=seen,
+            X_CR=RigidTransform(R, seen),
+            ratio=ratio,
+            rms_m=0.0,
+        )
+    return out, patterns
+
+
+def as_measured(p_C: Array) -> Array:
+    """Where the scanner that needs WRONG puts a point (3,) m that truly is at p_C."""
+    seen = p_C.copy()
+    for _ in range(20):  # a contraction: the correction is near the identity
+        seen = seen + p_C - WRONG.points(seen)
+    return seen

@@ -11,8 +11,7 @@ from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.calibration.hand_eye.joints import flange_poses
+from weldcal.calibration.geometry.se3 import exp_rotation, flange_poses, inverse, pose
 from weldcal.calibration.refinement.kinematics_fit import (
     ArmErrors,
     FactoryPrior,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.hand_eye.joints import flange_poses
+from weldcal.calibration.geometry.se3 import flange_poses
 from weldcal.calibration.refinement.kinematics_fit import FactoryPrior
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.inverse import nearest_solution

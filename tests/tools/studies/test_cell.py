@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.studies.cell.study import TARGETS, CellStudy, CellStudyOptions, hold_against, run_cell_study
+from weldcal.tools.farm.run import Farm
+from weldcal.tools.studies.cell.study import STUDY, TARGETS, cases, targets
 from weldcal.tools.worlds.weld.cell_run import CellRun, scatter
 
-GOOD = CellRun(
-    scenario="s_groove",
-    law="guarded",
-    seed=0,
-    completed=True,
-    reason="",
-    point_sd_mm=0.01,
-    torch_mean_mm=0.05,
-    torch_max_mm=0.2,
-    real_time_factor=1.4,
+GOOD = vars(
+    CellRun(
+        scenario="s_groove",
+        law="guarded",
+        seed=0,
+        completed=True,
+        reason="",
+        point_sd_mm=0.01,
+        torch_mean_mm=0.05,
+        torch_max_mm=0.2,
+        real_time_factor=1.4,
+    )
 )
 
 
@@ -43,43 +46,41 @@ def test_scatter_is_the_noise_and_not_the_wave_under_it() -> None:
     ],
 )
 def test_one_bad_run_misses_its_target(worse: dict[str, float], missed: list[str]) -> None:
-    reached = hold_against([GOOD, CellRun(**{**vars(GOOD), "seed": 1, **worse})])
-    assert [name for name, *_ in reached] == [name for name, *_ in TARGETS]
-    assert [name for name, _, _, ok in reached if not ok] == missed
+    reached = targets([GOOD, {**GOOD, "seed": 1, **worse}])
+    assert list(reached) == [name for name, *_ in TARGETS]
+    assert [name for name, target in reached.items() if not target.met] == missed
 
 
 def test_runs_without_a_weld_miss_every_target() -> None:
-    assert not any(
-        ok
-        for *_, ok in hold_against(
-            [CellRun(scenario="s_groove", law="guarded", seed=0, completed=False, reason="held")]
-        )
-    )
+    broken = CellRun(scenario="s_groove", law="guarded", seed=0, completed=False, reason="held")
+    assert not any(target.met for target in targets([vars(broken)]).values())
 
 
 def test_a_slow_computer_does_not_fail_the_study() -> None:
-    cell = CellStudy(CellStudyOptions(Path("out")), (), 1.0, (("real_time_factor", 0.1, 1.0, False),))
-    assert cell.met
-    assert not replace(cell, reached=(("torch_max_mm", 0.4, 0.3, False),)).met
+    assert STUDY.measured({"slow": {**GOOD, "real_time_factor": 0.1}}).met
+    assert not STUDY.measured({"off": {**GOOD, "torch_max_mm": 0.4}}).met
 
 
 @pytest.mark.parametrize("wrong", [{"scenarios": ("nowhere",)}, {"law": "magic"}])
-def test_what_is_not_known_is_refused_before_any_work(wrong: dict[str, object], tmp_path: Path) -> None:
+def test_what_is_not_known_is_refused_before_any_work(wrong: dict[str, Any], tmp_path: Path) -> None:
+    folder = tmp_path / "out"
     with pytest.raises(WeldcalError):
-        run_cell_study(CellStudyOptions(tmp_path / "out", **wrong))  # type: ignore[arg-type]
-    assert not (tmp_path / "out").exists()
+        STUDY.run(Farm(folder, 0), cases(**{"scenarios": ("s_groove",), "seeds": range(1), **wrong}))
+    assert not folder.exists()
 
 
 def test_the_table_has_every_run_and_grows_with_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def weld(name: str, seed: int, *_: object) -> CellRun:
-        written = tmp_path / "out" / "table.json"
-        assert len(json.loads(written.read_text())["runs"]) == seed if written.exists() else seed == 0
-        return CellRun(**{**vars(GOOD), "scenario": name, "seed": seed, "torch_max_mm": 0.1 * (seed + 1)})
+    folder = tmp_path / "out"
 
-    monkeypatch.setattr("weldcal.tools.studies.cell.study.weld_once", weld)
-    study = run_cell_study(CellStudyOptions(tmp_path / "out", ("l_groove",), 2))
+    def weld_once(name: str, seed: int, seam_mm: float | None, law: str) -> dict[str, Any]:
+        # the first line names the study
+        assert len((folder / "tasks.jsonl").read_text().splitlines()) == 1 + seed
+        return {**GOOD, "scenario": name, "seed": seed, "torch_max_mm": 0.1 * (seed + 1)}
+
+    monkeypatch.setattr("weldcal.tools.studies.cell.study.weld_once", weld_once)
+    study = STUDY.run(Farm(folder, 0), cases(("l_groove",), range(2)))
     assert study.met
-    assert [r.seed for r in study.runs] == [0, 1]
-    table = json.loads((tmp_path / "out" / "table.json").read_text())
+    assert [run["seed"] for run in study.figures["runs"]] == [0, 1]
+    table = json.loads((folder / "summary.json").read_text())
     assert table["targets"]["torch_max_mm"] == {"value": pytest.approx(0.2), "limit": 0.3, "met": True}
-    assert (tmp_path / "out" / "runs.csv").read_text().count("l_groove") == 2
+    assert (folder / "runs.csv").read_text().count("\nl_groove ") == 2

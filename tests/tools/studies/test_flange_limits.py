@@ -10,8 +10,9 @@ from tests.places import SHARED_DATA, needs
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
-from weldcal.tools.studies.flange.live import Station, bound_covariance, joints_of, live_scenario, redraw
-from weldcal.tools.studies.flange.recorded import Ingredient, study_few_scans, study_ingredients
+from weldcal.tools.studies.flange.live import live_scenario
+from weldcal.tools.studies.flange.recorded import median_sigma, study_few_scans, study_ingredients
+from weldcal.tools.worlds.redrawn import Station, bound_covariance, joints_of, redraw
 
 DATA = SHARED_DATA / "flange"
 Q_HOME = np.deg2rad([180.0, -70.0, 120.0, -50.0, 90.0, 0.0])
@@ -78,9 +79,7 @@ def test_the_live_target_is_measured_with_that_many_scans_and_that_arm() -> None
 def test_the_spread_of_a_median_is_that_of_many_medians() -> None:
     rng = np.random.default_rng(1)
     medians = [float(np.median(np.abs(rng.standard_normal(18)))) for _ in range(2000)]
-    stated = [
-        Ingredient("x", np.abs(rng.standard_normal(18)), np.zeros(18), 0.0).median_sigma_m(seed) for seed in range(40)
-    ]
+    stated = [median_sigma(np.abs(rng.standard_normal(18)), seed) for seed in range(40)]
     assert np.mean(stated) == pytest.approx(np.std(medians), rel=0.25)
 
 

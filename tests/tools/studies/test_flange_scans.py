@@ -8,9 +8,9 @@ from scipy.stats import binom
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.studies.flange.coverage import study_coverage
-from weldcal.tools.studies.flange.imperfect import study_light_runs
 from weldcal.tools.studies.flange.scans import FRAMES, HIDDEN, HOLES, fit_one, frame_cases, hidden_cases, hole_cases
 from weldcal.tools.worlds.flange_frames import WAYS
+from weldcal.tools.worlds.light_runs import study_light_runs
 
 ISO_50 = "iso9409-1-50-4-m6"
 HALF_MPX = 824

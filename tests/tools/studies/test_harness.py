@@ -67,7 +67,7 @@ def test_the_page_shows_each_study_with_its_command(tmp_path: Path) -> None:
     assert run.exit_code == 0, run.output
     page = (tmp_path / "page/BENCHMARK.md").read_text()
     assert "## reproduce halves" in page
-    assert "    weldcal reproduce halves" in page
+    assert "Command: `weldcal reproduce halves`" in page
     assert "| largest | 1 |" in page
     assert "met" in page
 

@@ -8,7 +8,7 @@ import signal
 import time
 
 from weldcal.systems.host_timing import TICK_S
-from weldcal.tools.studies.robot.host_probe import watched_host
+from weldcal.tools.worlds.robot.host_probe import watched_host
 
 PAUSE_S = 0.1
 

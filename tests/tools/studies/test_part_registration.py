@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from weldcal.models.scanners import get_scanner
 from weldcal.tools.studies.parts import registration
 from weldcal.tools.studies.parts.registration import NEES_BOUND, run_registration_study
-from weldcal.tools.worlds.parts.scenes import scan_scene, subject
+from weldcal.tools.worlds.parts.scenes import REFUSALS, scan_scene, subject
 from weldcal.welding.locate.part.result import PartRegistration
 
 pytest.importorskip("OCP")
@@ -32,7 +33,7 @@ def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(tmp_path: Path, monkeypa
 
     def confident(cloud: object, mesh: object, seam: object, *_: object, **__: object) -> object:
         part = subject("lap")
-        true = scan_scene(part.mesh, registration.get_scanner("phoxi_m", 824), 6000, objects=4, fingers=1).X_BP
+        true = scan_scene(part.mesh, get_scanner("phoxi_m", 824), 6000, objects=4, fingers=1).X_BP
         off = true @ RigidTransform([0.001, 0.0, 0.0])
         said = PartRegistration(
             X_BP=off,
@@ -54,7 +55,7 @@ def test_a_wrong_pose_and_a_wrong_reason_hold_the_study(tmp_path: Path, monkeypa
 
 def test_subjects_must_be_refused_for_the_right_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     assert registration.run_refusal("wrong unit", 0)["verdict"] == "refused: PartNotFound"
-    case = registration.REFUSALS["wrong unit"]()
+    case = REFUSALS["wrong unit"]()
     other = type(case)(case.there, case.looked_for, case.error, "looks the same")
-    monkeypatch.setitem(registration.REFUSALS, "wrong unit", lambda: other)
+    monkeypatch.setitem(REFUSALS, "wrong unit", lambda: other)
     assert registration.run_refusal("wrong unit", 0)["verdict"] == "wrong reason"

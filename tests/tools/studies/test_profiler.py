@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +13,8 @@ from weldcal.tools.cli.app import app
 from weldcal.tools.studies.profiler import reproduce
 from weldcal.tools.studies.profiler.edge import edge_rows
 from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines
-from weldcal.tools.studies.profiler.reproduce import ProfilerStudyOptions, run_profiler_study
+from weldcal.tools.studies.profiler.reproduce import compute
 from weldcal.tools.studies.profiler.sphere import METHODS, measure
-from weldcal.tools.studies.targets import Target
 from weldcal.tools.worlds.edge_trials import made_edge_trials
 from weldcal.tools.worlds.profiler import SphereWorld, sphere_trial
 from weldcal.tools.worlds.profiler_parts import WorldData, groove_mesh, scan_groove
@@ -58,8 +56,8 @@ def test_what_the_fixed_files_hold_besides_both_papers_tables_is_met(shared_data
 def test_a_fixed_file_that_is_missing_is_named_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "edge_features.npz").touch()
     with pytest.raises(InputError, match=r"There is no edge_sphere\.npz"):
-        run_profiler_study(ProfilerStudyOptions(tmp_path / "out", tmp_path), lambda _, __: None)
-    assert not (tmp_path / "out").exists()
+        compute(tmp_path, 0, False, lambda _, __: None)
+    assert [path.name for path in tmp_path.iterdir()] == ["edge_features.npz"]
 
 
 @pytest.mark.parametrize(
@@ -80,9 +78,10 @@ def test_everything_random_follows_from_the_seed() -> None:
 def test_targets_of_the_fixed_files_do_not_decide_on_other_worlds(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, data: list[str], code: int
 ) -> None:
-    missed = Target("frustum, length", "mm", 0.053, 0.042)
-    study = SimpleNamespace(met=False, summary=lambda: {"state": "failed"}, targets=lambda: [missed])
-    monkeypatch.setattr(reproduce, "run_profiler_study", lambda options, progress: study)
+    missed = {"what": "frustum, length", "unit": "mm", "reached": 0.053, "target": 0.042, "verdict": "MISSED"}
+    figures = {"data": "fixed files" if data else "seed 0", "targets": [missed], "edge": [], "sphere": []}
+    monkeypatch.setattr(reproduce, "compute", lambda *_: figures)
+    monkeypatch.setattr(reproduce, "_sphere_tables", lambda results: [])
     found = CliRunner().invoke(app, ["reproduce", "profiler", *data, "--out", str(tmp_path / "out")])
     assert found.exit_code == code, found.output
     assert "MISSED" in found.output

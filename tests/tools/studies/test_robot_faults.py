@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from weldcal.tools.studies.robot.faults import FaultReport
 from weldcal.tools.worlds.robot.cases import STOP
 from weldcal.tools.worlds.robot.fault_run import Outcome
@@ -13,6 +11,6 @@ def test_a_wrong_result_fails_the_study_and_is_named() -> None:
     wrong = Outcome(
         name="nothing", must=STOP, did="stopped", fault="", sentence="", problems=("not at rest within 0.3 s",)
     )
-    summary = FaultReport([wrong], [], Path()).summary()
+    summary = FaultReport([wrong], []).summary()
     assert summary["state"] == "failed"
     assert summary["wrong"] == [{"id": "nothing", "reason": "not at rest within 0.3 s"}]

@@ -244,7 +244,7 @@ def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:
     )
     assert answer.exit_code == 0, answer.output
     told = json.loads(answer.stdout.strip().splitlines()[-1])
-    written = json.loads((out / "table.json").read_text())
+    written = json.loads((out / "summary.json").read_text())
     # A sharp convex corner is put back from its two sides, within the target of its row.
     assert told["rows"]["r1_convex"]["completed"] == 1
     assert told["rows"]["r1_convex"]["met"]
@@ -258,9 +258,10 @@ def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:
     with (out / "runs" / "l_r1_convex-d60-nominal.csv").open() as file:
         ticks = list(csv.DictReader(file))
     assert {tick["phase"] for tick in ticks} >= {"TOUCH", "TRACK", "FINISH", "DONE"}
-    report = (out / "report.html").read_text()
-    assert "Corner of 1 mm, convex" in report
-    assert report.count("<svg") == 2
+    assert "L R1 convex, nominal" in (out / "table.md").read_text()
+    pictures = {path.name: path.read_text() for path in (out / "figures").iterdir()}
+    assert set(pictures) == {f"l_r1_convex-d60-nominal_{kind}.svg" for kind in ("paths", "along")}
+    assert all("<svg" in picture for picture in pictures.values())
 
 
 def test_an_unknown_row_is_one_sentence_and_exit_code_one(tmp_path: Path) -> None:

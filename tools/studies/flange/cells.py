@@ -9,8 +9,8 @@ import typer
 
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.studies.flange.imperfect import LightRuns, study_light_runs
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, statistics
+from weldcal.tools.worlds.light_runs import LightRuns, study_light_runs
 from weldcal.tools.worlds.wrong_arm import Found, judged, station, study_station
 
 

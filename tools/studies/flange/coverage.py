@@ -1,23 +1,18 @@
 """Coverage of the stated 95 % regions: shares of simulated calibrations whose regions hold the truth."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from matplotlib.figure import Figure
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform
 from scipy.stats import binom, chi2
 
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.errors import CoplanarPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, with_scanner
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
-from weldcal.calibration.flange.holes import HolePattern
-from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
-from weldcal.calibration.planning.observability import check_diversity
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
@@ -25,10 +20,9 @@ from weldcal.tools.report.pictures import svg
 from weldcal.tools.report.render import fixed, write_atomic
 from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.worlds import warped_scanner
-from weldcal.tools.worlds.flange_frames import facing
+from weldcal.tools.worlds.warped_scanner import as_measured, seen_by_a_wrong_scanner, simulated_observations
 
 LEVEL = 0.95
-SIGMA_M, SIGMA_RAD, SIGMA_RATIO = 1e-4, 1e-3, 1e-3  # of a centre and a normal per axis, and of a hole circle's ratio
 WORK_C = np.array([0.02, -0.05, 0.72])
 """The work point (3,) m in the camera."""
 Calibrated = tuple[CalibrationEstimate, RigidTransform, Array]
@@ -54,72 +48,6 @@ class Coverage:
         """Shares between which 99 % of such studies fall where the regions are exact."""
         low, high = (binom.ppf(q, self.runs, LEVEL) / self.runs for q in (0.005, 0.995))
         return float(low), float(high)
-
-
-def simulated_observations(n: int, rng: np.random.Generator) -> tuple[list[Observation], RigidTransform]:
-    """Observations (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``SIGMA_M`` and ``SIGMA_RAD`` an
-    axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane, which a calibration refuses,
-    are drawn again."""
-    X_BC = RigidTransform(
-        RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
-    )
-    while True:
-        out = [_simulated_observation(f"p{k}", X_BC, rng) for k in range(n)]
-        try:
-            check_diversity(np.array([o.p_BR for o in out]), np.ones(n, dtype=bool))
-        except CoplanarPoses:
-            continue
-        return out, X_BC
-
-
-def _simulated_observation(id: str, X_BC: RigidTransform, rng: np.random.Generator) -> Observation:
-    p = np.array([rng.uniform(-0.18, 0.18), rng.uniform(-0.13, 0.13), rng.uniform(0.5, 0.9)])
-    X_CR = facing(p, np.radians(rng.uniform(0.0, 30.0)), rng.uniform(0.0, 6.28), rng.uniform(0.0, 6.28))
-    A = np.linalg.qr(rng.standard_normal((3, 3)))[0] * rng.uniform(2e-5, 6e-5, 3)
-    covariance = A @ A.T
-    normal_sigma = rng.uniform(2e-5, 2e-4)
-    seen = p + A @ rng.standard_normal(3) + SIGMA_M * rng.standard_normal(3)
-    z = X_CR.rotation().matrix()[:, 2]
-    lean = float(np.hypot(SIGMA_RAD, normal_sigma)) * rng.standard_normal(3)
-    normal = exp_rotation(lean - z * float(z @ lean)) @ z
-    return Observation(id, X_BC @ X_CR, seen, normal, covariance, normal_sigma)
-
-
-WRONG = ScannerCorrection(1.002, (0.006, -0.004))
-"""What the simulated scanner needs: 0.2 % in scale, and up to 0.06 % per 100 mm across its image."""
-
-
-def seen_by_a_wrong_scanner(
-    observations: list[Observation], rng: np.random.Generator
-) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """The same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""
-    out, patterns = [], {}
-    for o in observations:
-        seen = as_measured(np.asarray(o.p_CR))
-        J = WRONG.jacobian(seen)
-        assert o.n_C is not None
-        normal = J.T @ o.n_C
-        out.append(replace(o, p_CR=seen, n_C=normal / np.linalg.norm(normal)))
-        x, y = np.linalg.svd(np.asarray(o.n_C)[None])[2][1:]
-        ratio = 2.0 / float(x @ J @ x + y @ J @ y) + SIGMA_RATIO * rng.standard_normal()
-        R = RotationMatrix(np.column_stack([x, np.cross(o.n_C, x), o.n_C]))
-        patterns[o.id] = HolePattern(
-            holes_C=np.zeros((4, 3)),
-            angles_rad=np.zeros(4),
-            center_C=seen,
-            X_CR=RigidTransform(R, seen),
-            ratio=ratio,
-            rms_m=0.0,
-        )
-    return out, patterns
-
-
-def as_measured(p_C: Array) -> Array:
-    """Where the scanner that needs WRONG puts a point (3,) m that truly is at p_C."""
-    seen = p_C.copy()
-    for _ in range(20):  # a contraction: the correction is near the identity
-        seen = seen + p_C - WRONG.points(seen)
-    return seen
 
 
 def study_coverage(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
@@ -164,25 +92,22 @@ def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = n
     return Coverage(poses=poses, runs=runs, pose=pose, point=point, held_out_over_true=float("nan"), corrected=True)
 
 
-def _inside(calibrate: Callable[[int], Calibrated], name: str, runs: int, progress: Progress) -> tuple[float, float]:
+def _inside(
+    calibrate: Callable[[int], Calibrated], name: str, runs: int, progress: Progress, work_C: Array = WORK_C
+) -> tuple[float, float]:
     """Shares of calibrations whose 95 % regions of X_BC and of the work point hold the truth."""
     inside = np.zeros(2)
     for k in range(runs):
         if k % 20 == 0:
             progress(name, k / runs)
         estimate, X_BC, found_BQ = calibrate(k)
-        e, p_BQ = _error(estimate.X_BC, X_BC), X_BC @ WORK_C
-        d = p_BQ - found_BQ
+        p_BQ = X_BC @ work_C
+        turn = rotation_vector(X_BC.rotation() @ estimate.X_BC.rotation().inverse())
+        e, d = np.concatenate([turn, X_BC.translation() - estimate.X_BC.translation()]), p_BQ - found_BQ
         inside[0] += float(e @ np.linalg.solve(estimate.covariance, e)) < chi2.ppf(LEVEL, 6)
         inside[1] += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < chi2.ppf(LEVEL, 3)
     pose, point = inside / max(runs, 1)
     return float(pose), float(point)
-
-
-def _error(X: RigidTransform, X_true: RigidTransform) -> Array:
-    """Error (6,) of an estimate in the tangent of its covariance."""
-    turn = rotation_vector(X_true.rotation() @ X.rotation().inverse())
-    return np.concatenate([turn, X_true.translation() - X.translation()])
 
 
 def coverage_picture(studies: list[Coverage]) -> bytes:
@@ -210,26 +135,23 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
 
 def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Coverage:
     """Calibrate ``runs`` devices, each with a warp of its own, from ``poses`` scans each."""
-    X_BC = warped_scanner.X_BC
-    inside, stated, true = np.zeros(2), [], []
-    for device in range(runs):
-        progress(f"calibrations of {poses} scans by a warped scanner", device / runs)
+    stated, true = [], []
+
+    def calibrate(device: int) -> Calibrated:
         _, estimate, scanner = warped_scanner.calibrate_warped(device, poses)
         seen = warped_scanner.warped_point(warped_scanner.WORK_C, device)
-        found = estimate.X_BC @ (seen if scanner.accepted is None else scanner.accepted.points(seen))
-        p_BQ = X_BC @ warped_scanner.WORK_C
-        turn = rotation_vector(X_BC.rotation() @ estimate.X_BC.rotation().inverse())
-        e, d = np.concatenate([turn, X_BC.translation() - estimate.X_BC.translation()]), p_BQ - found
-        inside[0] += float(e @ np.linalg.solve(estimate.covariance, e)) < chi2.ppf(LEVEL, 6)
-        inside[1] += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < chi2.ppf(LEVEL, 3)
         stated.append(float(np.mean(estimate.held_out.position_m)))
         true.append(float(np.mean(warped_scanner.new_errors(device, estimate, scanner))))
-    pose, point = inside / max(runs, 1)
+        found = seen if scanner.accepted is None else scanner.accepted.points(seen)
+        return estimate, warped_scanner.X_BC, estimate.X_BC @ found
+
+    name = f"calibrations of {poses} scans by a warped scanner"
+    pose, point = _inside(calibrate, name, runs, progress, warped_scanner.WORK_C)
     return Coverage(
         poses=poses,
         runs=runs,
-        pose=float(pose),
-        point=float(point),
+        pose=pose,
+        point=point,
         held_out_over_true=float(np.mean(stated) / np.mean(true)),
         corrected=True,
         warped=True,

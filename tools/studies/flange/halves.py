@@ -1,7 +1,5 @@
 """Difference between the flange's centres from two parts of one cloud, and its Cramer-Rao bound."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import minimize
@@ -17,18 +15,6 @@ from weldcal.systems.runner import Progress, no_progress
 PARTS = (2, 4, 8)
 _REACH_M = 0.0015  # about an edge, in which its blur shows
 _INFORMATION = float(quad(lambda z: norm.pdf(z) ** 2 / ndtr(z), -8.0, 12.0)[0])  # of a soft edge of a Poisson process
-
-
-@dataclass(frozen=True)
-class PartRow:
-    """Clouds divided into ``parts``: points in each, rms distance (mm) of two parts' centres, the least that any unbiased
-    estimate could reach (mm), and what the stated covariances expect (mm)."""
-
-    parts: int
-    points: int
-    apart_mm: float
-    bound_mm: float
-    stated_mm: float
 
 
 def edge_blur(points_C: Array, fit: FlangeFit, *, outer: bool) -> tuple[float, float]:
@@ -75,15 +61,19 @@ def center_bound(points_C: Array, fit: FlangeFit, parts: int) -> float:
 
 def study_parts(
     clouds: list[Array], standard: FlangeStandard, *, draws: int = 4, seed: int = 0, progress: Progress = no_progress
-) -> list[PartRow]:
-    """Divide each cloud (N, 3) m into 2, 4 and 8 random parts and compare the first two. Deterministic for ``seed``."""
+) -> list[dict[str, float]]:
+    """Divide each cloud (N, 3) m into 2, 4 and 8 random parts and compare the first two. Deterministic for ``seed``.
+
+    Returns a row for each: parts, points in each, rms distance (mm) of two parts' centres, the least that any unbiased estimate could reach
+    (mm), and what the stated covariances expect (mm).
+    """
     whole: list[tuple[Array, FlangeFit]] = []
     for points in clouds:
         try:
             whole.append((points, fit_flange(points, standard)))
         except FlangeNotFound:
             continue
-    rows = []
+    rows: list[dict[str, float]] = []
     for parts in PARTS:
         apart, bound, stated, size = [], [], [], []
         for k, (points, fit) in enumerate(whole):
@@ -99,6 +89,7 @@ def study_parts(
                 stated.append(float(np.trace(a.center_covariance + b.center_covariance)))
                 bound.append(center_bound(points, fit, parts) ** 2)
                 size.append(len(points) // parts)
-        rms = [1e3 * float(np.sqrt(np.mean(v))) if v else float("nan") for v in (apart, bound, stated)]
-        rows.append(PartRow(parts, int(np.median(size)) if size else 0, *rms))
+        of = {"apart_mm": apart, "bound_mm": bound, "stated_mm": stated}
+        rms = {name: 1e3 * float(np.sqrt(np.mean(v))) if v else float("nan") for name, v in of.items()}
+        rows.append({"parts": parts, "points": int(np.median(size)) if size else 0, **rms})
     return rows

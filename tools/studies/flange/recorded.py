@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -49,13 +49,9 @@ class Ingredient:
     tilt_rad: Array
     floor_m: float
 
-    def median_sigma_m(self, seed: int = 0) -> float:
-        """How well so many errors tell their median (bootstrap standard deviation, m)."""
-        return median_sigma(self.position_m, seed)
 
-
-def median_sigma(values: Array, seed: int) -> float:
-    """Bootstrap standard deviation of the median of values (n,)."""
+def median_sigma(values: Array, seed: int = 0) -> float:
+    """How well values (n,) tell their median: its bootstrap standard deviation."""
     draws = np.random.default_rng(seed).choice(values, (_DRAWS, len(values)))
     return float(np.median(draws, axis=1).std())
 
@@ -142,10 +138,6 @@ class Draws:
     refused: int
     corrected: float
 
-    def median_sigma_m(self, seed: int = 0) -> float:
-        """How well so many draws tell their median (bootstrap standard deviation, m); that all are of the same scans is not in it."""
-        return median_sigma(self.position_m, seed)
-
 
 def study_few_scans(
     folder: Path, draws: int = 60, seed: int = 0, sizes: Sequence[int] = SIZES, progress: Progress = no_progress
@@ -196,25 +188,14 @@ LEAST_HALVES = 16
 """Scans of a recording from which on its halves are calibrated; eight are the least with a choice of the scanner's correction."""
 
 
-@dataclass(frozen=True)
-class Halves:
-    """Of ``draws`` random halves: means of the stated held-out error and of the error on the other half (mm), and how many of
-    the latter lie in the interval (95 %) that the first half states. ``skipped`` halves fixed no calibration."""
-
-    draws: int
-    scans: int
-    stated_mm: float
-    new_mm: float
-    inside: int
-    skipped: int
-
-
 def study_halves(
     folder: Path, draws: int = 20, seed: int = 0, progress: Progress = no_progress, *, local: bool = False
-) -> Halves:
+) -> dict[str, Any]:
     """Calibrate from ``draws`` random halves of a dataset, choices included, and measure on the others. Deterministic for ``seed``.
 
-    ``local``: from two thirds, with the choice of a local field (--refine local).
+    ``local``: from two thirds, with the choice of a local field (--refine local). Returns means of the stated held-out error and of the error
+    on the other half (mm), how many of the latter lie in the interval (95 %) that the first half states, and how many halves fixed no
+    calibration (``skipped``).
 
     Raises InputError for a folder that is none, TooFewPoses for fewer than sixteen usable scans.
     """
@@ -240,11 +221,12 @@ def study_halves(
             continue
         interval = mean_interval(errors)
         new = float(np.mean(position_errors(X_BC, new_scans)))
-        inside = interval is not None and interval[0] < new < interval[1]
-        rows.append((float(np.nanmean(errors)), new, float(inside)))
+        within = interval is not None and interval[0] < new < interval[1]
+        rows.append((float(np.nanmean(errors)), new, float(within)))
     table = np.array(rows).reshape(-1, 3)
     stated, new = (float(1e3 * table[:, k].mean()) if len(table) else float("nan") for k in (0, 1))
-    return Halves(draws, half, stated, new, int(table[:, 2].sum()), skipped)
+    inside = int(table[:, 2].sum())
+    return {"draws": draws, "scans": half, "stated_mm": stated, "new_mm": new, "inside": inside, "skipped": skipped}
 
 
 def _ingredient(r: Ingredient) -> dict[str, object]:
@@ -252,7 +234,7 @@ def _ingredient(r: Ingredient) -> dict[str, object]:
     return {
         "name": r.name,
         "position_mm": statistics(1e3 * r.position_m, "median", "mean", "p95"),
-        "median_sigma_mm": 1e3 * r.median_sigma_m(),
+        "median_sigma_mm": 1e3 * median_sigma(r.position_m),
         "tilt_deg": statistics(tilt, "median", "p95"),
         "floor_mm": 1e3 * r.floor_m,
     }
@@ -291,7 +273,7 @@ def _few(found: Sequence[Draws], draws: int) -> dict[str, object]:
     for r in (r for r in found if len(r.position_m) > 1):
         of = statistics(1e3 * r.position_m, "median", "p95")
         tilt = float(np.degrees(np.median(r.tilt_rad)))
-        row = {"scans": r.scans, "median_mm": of["median"], "median_sigma_mm": 1e3 * r.median_sigma_m()}
+        row = {"scans": r.scans, "median_mm": of["median"], "median_sigma_mm": 1e3 * median_sigma(r.position_m)}
         rows.append(row | {"p95_mm": of["p95"], "tilt_deg": tilt, "corrected": r.corrected, "refused": r.refused})
     return {"draws": draws, "rows": rows}
 
@@ -350,7 +332,7 @@ def halves(
 ) -> Outcome:
     """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the other half."""
     folder, found = HALVES.folder(call), study_halves(dataset, draws, call.seed, call.progress, local=local)
-    return HALVES.measured({"all": vars(found)}, folder).outcome()
+    return HALVES.measured({"all": found}, folder).outcome()
 
 
 def _part_rows(f: Figures) -> Iterable[Row]:
@@ -376,4 +358,4 @@ def parts(call: Call, dataset: DatasetArgument) -> Outcome:
         raise InputError(f"'{dataset}' holds no clouds to divide. Give a dataset with scans.")
     folder, clouds = PARTS.folder(call), [data.cloud(id) for id in data.clouds]
     rows = study_parts(clouds, get_flange(data.header.flange), seed=call.seed, progress=call.progress)
-    return PARTS.measured({"all": {"rows": [vars(r) for r in rows]}}, folder).outcome()
+    return PARTS.measured({"all": {"rows": rows}}, folder).outcome()

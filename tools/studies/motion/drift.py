@@ -37,14 +37,14 @@ class Trial:
     kind: str
     seed: int
     along_view: float
-    found_after_s: float
-    time_error_s: float
-    translation_error_mm: float
-    rotation_error_deg: float
-    named: str
     false_alarms: int
     shown: float
     told: float
+    found_after_s: float = float("nan")
+    time_error_s: float = float("nan")
+    translation_error_mm: float = float("nan")
+    rotation_error_deg: float = float("nan")
+    named: str = ""
 
 
 def one_recording(kind: str, seed: int, stamps: str, hours: float = 0.0) -> Mapping[str, object]:
@@ -285,36 +285,17 @@ def _trial(
     kind: str, seed: int, events: list[DriftEvent], at: float, shift: Array, rotation: Array, view: float, shown: float, told: float
 ) -> Trial:  # fmt: skip
     early = sum(e.found_s < at for e in events)
-    later = [e for e in events if e.found_s >= at]
-    if not later:
-        nan = float("nan")
-        return Trial(
-            kind=kind,
-            seed=seed,
-            along_view=view,
-            found_after_s=nan,
-            time_error_s=nan,
-            translation_error_mm=nan,
-            rotation_error_deg=nan,
-            named="",
-            false_alarms=early,
-            shown=shown,
-            told=told,
+    missed = Trial(kind=kind, seed=seed, along_view=view, false_alarms=early, shown=shown, told=told)
+    for e in (e for e in events if e.found_s >= at):
+        return replace(
+            missed,
+            found_after_s=e.found_s - at,
+            time_error_s=e.time_s - at,
+            translation_error_mm=1e3 * float(np.linalg.norm(e.translation_m - shift)),
+            rotation_error_deg=float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))),
+            named=e.model,
         )
-    e = later[0]
-    return Trial(
-        kind=kind,
-        seed=seed,
-        along_view=view,
-        found_after_s=e.found_s - at,
-        time_error_s=e.time_s - at,
-        translation_error_mm=1e3 * float(np.linalg.norm(e.translation_m - shift)),
-        rotation_error_deg=float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))),
-        named=e.model,
-        false_alarms=early,
-        shown=shown,
-        told=told,
-    )
+    return missed
 
 
 def _percent(hits: NDArray[np.bool_]) -> float:

@@ -3,80 +3,42 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.errors import WeldcalError
-from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import SCANNERS, get_scanner
-from weldcal.models.workpieces.part import bend
-from weldcal.models.workpieces.plate import Workpiece, make_workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.report.files import records_csv
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.parts.plates import Scene, box, scan_part, sideways
+from weldcal.tools.worlds.parts.plates import (
+    PLANNED,
+    REFUSED,
+    TROUBLES,
+    WIDEST_PX,
+    Scene,
+    Trouble,
+    scan,
+    scan_part,
+    sideways,
+)
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planes import Floats
 
-WIDEST_PX = 824
 SHAPES = ("straight", "s", "l", "corner", "bent")  # l: corner radius 20 mm; corner: 4 mm; bent: s over 200 mm
-CORNER_M, BEND_M = 0.004, 0.200
 FIRST_HELD_OUT = 1000  # seeds from here on were not used while the figures of the algorithms were set
-
-
 COLUMNS = (
     "preset", "method", "shape", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "chi", "within_2_sigma", "seconds",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """The plan of one scan by one method; lengths in mm, NaN where it was refused; processor seconds."""
-
-    method: str
-    seed: int
-    refused: str
-    rms_mm: float = math.nan
-    worst_mm: float = math.nan
-    sigma_mm: float = math.nan
-    chi: float = math.nan
-    within_2_sigma: float = math.nan
-    seconds: float = math.nan
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trial(Plan):
-    """One scan of a part under a scanner preset."""
-
-    preset: str
-    shape: str
-
-
-def part_for(preset: str, shape: str) -> Workpiece:
-    """A workpiece that the preset's field of view holds in any turn."""
-    scanner = get_scanner(preset)
-    small = min(scanner.footprint_m(min(0.93, 0.97 * scanner.far_m))) < 0.35
-    kind = {"corner": "l", "bent": "s"}.get(shape, shape)
-    radius = CORNER_M if shape == "corner" else None
-    if small:
-        part = make_workpiece(kind, length_m=0.200, width_m=0.130 if kind != "l" else 0.150, radius_m=radius)
-    else:
-        part = make_workpiece(kind, length_m=0.200 if shape == "bent" else 0.300, radius_m=radius)
-    return bend(part, BEND_M) if shape == "bent" else part
-
-
-def scan(preset: str, shape: str, seed: int, widest_px: int | None = WIDEST_PX) -> Scene:
-    """A part under that preset, at most `widest_px` wide (None: as the scanner has it), in a random pose tilted by up to 5 deg."""
-    scanner = get_scanner(preset)
-    scanner = scanner.resized(widest_px) if widest_px is not None and scanner.width > widest_px else scanner
-    part = part_for(preset, shape)
-    return scan_part(part, scanner, seed, tilt_rad=math.radians(5.0), spread_m=0.0 if part.size_m[1] < 0.16 else 0.05)
+JUDGED = ("rms_mm", "worst_mm", "sigma_mm", "chi", "within_2_sigma")
+Plan = dict[str, Any]
+"""The plan of one scan by one method: lengths in mm, NaN where it was refused; processor seconds."""
 
 
 def try_cloud(scene: Scene) -> tuple[Floats, Floats]:
@@ -105,18 +67,14 @@ def try_cad(scene: Scene, drawing: Workpiece | None = None) -> tuple[Floats, Flo
 METHODS = {"cad": try_cad, "cloud": try_cloud}
 
 
-def run_trial(scene: Scene, preset: str, shape: str, seed: int, method: str) -> Trial:
-    """Plan one scan by one method; a named refusal is a result."""
-    return Trial(preset=preset, shape=shape, method=method, seed=seed, **figures(lambda: METHODS[method](scene)))
-
-
-def figures(plan: Callable[[], tuple[Floats, Floats]]) -> dict[str, Any]:
-    """Run `plan`, which returns errors and sigmas (N,) m; the fields of a Plan that follow from it."""
+def figures(plan: Callable[[], tuple[Floats, Floats]]) -> Plan:
+    """Run `plan`, which returns errors and sigmas (N,) m, and judge it; a named refusal is a result."""
     began = time.process_time()
     try:
         error, sigma = plan()
     except WeldcalError as refusal:
-        return {"refused": f"{type(refusal).__name__}: {refusal}", "seconds": time.process_time() - began}
+        sentence, nothing = f"{type(refusal).__name__}: {refusal}", dict.fromkeys(JUDGED, math.nan)
+        return {"refused": sentence, **nothing, "seconds": time.process_time() - began}
     return {
         "refused": "",
         "rms_mm": 1e3 * _rms(error),
@@ -132,15 +90,19 @@ def _rms(values: Any) -> float:
     return math.sqrt(float(np.mean(np.square(values))))
 
 
-def summary_rows(trials: list[Trial]) -> dict[str, str]:
-    """A line per preset and method: planned of all, errors sideways (rms and worst), sigma stated, CPU seconds."""
+def plan_rows(plans: list[Plan], key: str) -> dict[str, str]:
+    """A line per preset or kind of trouble (``key``) and method: planned of all, errors sideways (rms and worst), sigma stated; of the presets
+    CPU seconds, of the troubles how many are as they have to be."""
     rows: dict[str, str] = {}
-    for preset in dict.fromkeys(t.preset for t in trials):
-        for method in METHODS:
-            mine = [t for t in trials if t.preset == preset and t.method == method]
-            done = [t for t in mine if not t.refused]
-            seconds = f"; {np.mean([t.seconds for t in done]):.2f} s CPU" if done else f"; {mine[0].refused}"
-            rows[f"{preset} {method}"] = f"{len(done)} of {len(mine)} planned{error_text(done)}{seconds}"
+    for name, method in dict.fromkeys((t[key], t["method"]) for t in plans):
+        mine = [t for t in plans if (t[key], t["method"]) == (name, method)]
+        done = [t for t in mine if not t["refused"]]
+        planned = f"{len(done)} of {len(mine)} planned"
+        if key == "name":
+            rows[f"{name}, {method}"] = f"{planned}, {sum(t['ok'] for t in mine)} as they have to be{error_text(done)}"
+        else:
+            seconds = f"; {np.mean([t['seconds'] for t in done]):.2f} s CPU" if done else f"; {mine[0]['refused']}"
+            rows[f"{name} {method}"] = f"{planned}{error_text(done)}{seconds}"
     return rows
 
 
@@ -148,140 +110,28 @@ def error_text(planned: Sequence[Plan]) -> str:
     """Errors and stated sigmas of the plans, as a part of a sentence; empty for none."""
     if not planned:
         return ""
-    within = 100.0 * float(np.mean([t.within_2_sigma for t in planned]))
+    within = 100.0 * float(np.mean([t["within_2_sigma"] for t in planned]))
     return (
-        f"; error rms {_rms([t.rms_mm for t in planned]):.3f}, worst {max(t.worst_mm for t in planned):.2f} mm; sigma stated "
-        f"{_rms([t.sigma_mm for t in planned]):.3f} mm ({within:.0f} % of the line within 2 sigma)"
+        f"; error rms {_rms([t['rms_mm'] for t in planned]):.3f}, worst {max(t['worst_mm'] for t in planned):.2f} mm; sigma stated "
+        f"{_rms([t['sigma_mm'] for t in planned]):.3f} mm ({within:.0f} % of the line within 2 sigma)"
     )
 
 
 PRESET = "phoxi_m"
-PLANNED, REFUSED = "planned", "refused"
-
-
-@dataclass(frozen=True)
-class Trouble:
-    """A kind of scene. others: objects beside the part; drawing: what is looked for, None: the part itself; must: what the
-    answer has to be, empty where a plan with an honest sigma and a refusal are both right.
-    """
-
-    name: str
-    part: Callable[[], Workpiece]
-    must: str
-    method: str
-    others: Callable[[np.random.Generator], list[TriMesh]] = lambda rng: []
-    drawing: Callable[[], Workpiece] | None = None
-
-
 TROUBLE_COLUMNS = (
     "name", "method", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "within_2_sigma", "ok", "seconds",
 )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class TroubleTrial(Plan):
-    """One scan in one kind of trouble; must: as in Trouble."""
-
-    name: str
-    must: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether the answer is what it has to be."""
-        return self.must in ("", REFUSED if self.refused else PLANNED)
-
-
-def _bar(width_m: float) -> Callable[[np.random.Generator], list[TriMesh]]:
-    """A bar 60 mm over the part, across its middle."""
-
-    def made(rng: np.random.Generator) -> list[TriMesh]:
-        turn = RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi))
-        p = [0.6 + rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), 0.11]
-        return [box(0.6, width_m, 0.01).transformed(RigidTransform(turn, p))]
-
-    return made
-
-
-def _clutter(rng: np.random.Generator) -> list[TriMesh]:
-    """Boxes around the part, some as high as it, and one on its edge."""
-    meshes = []
-    for _ in range(8):
-        angle, far = rng.uniform(-math.pi, math.pi), rng.uniform(0.16, 0.32)
-        X = RigidTransform(
-            RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi)),
-            [0.6 + far * math.cos(angle), far * math.sin(angle), 0.0],
-        )
-        size = rng.uniform([0.03, 0.03, 0.01], [0.12, 0.08, 0.08])
-        meshes.append(box(*(float(v) for v in size)).transformed(X))
-    return meshes
-
-
-def _s() -> Workpiece:
-    return make_workpiece("s", length_m=0.250)
-
-
-def _flat() -> Workpiece:
-    return make_workpiece("s", length_m=0.200)
-
-
-def _bent(radius_m: float) -> Callable[[], Workpiece]:
-    return lambda: bend(_flat(), radius_m)
-
-
-TROUBLES = (
-    *(
-        Trouble(name, part, must, method, others)
-        for name, part, must, others in (
-            ("bar of 12 mm across", _s, PLANNED, _bar(0.012)),
-            ("bar of 30 mm across", _s, "", _bar(0.030)),
-            ("clutter around", _s, PLANNED, _clutter),
-            ("bent, bar of 12 mm across", _bent(BEND_M), PLANNED, _bar(0.012)),
-        )
-        for method in ("cad", "cloud")
-    ),
-    *(
-        Trouble(f"wrong: {name}", part, REFUSED, "cad", drawing=drawing)
-        for name, part, drawing in (
-            ("6 mm wider", lambda: make_workpiece("s", length_m=0.250, width_m=0.206), _s),
-            ("5 mm longer", lambda: make_workpiece("s", length_m=0.255), _s),
-            ("another groove", lambda: make_workpiece("straight", length_m=_s().size_m[0]), _s),
-            ("bent, drawn flat", _bent(BEND_M), _flat),
-            ("flat, drawn bent", _flat, _bent(BEND_M)),
-            ("bent over 230 mm, drawn 200", _bent(0.230), _bent(BEND_M)),
-        )
-    ),
-)
-
-
-def trouble_trial(trouble: Trouble, seed: int) -> TroubleTrial:
+def trouble_trial(trouble: Trouble, seed: int) -> Plan:
     """One scan, planned; held against what it has to be."""
     scanner = get_scanner(PRESET).resized(WIDEST_PX)
     others = trouble.others(np.random.default_rng([seed, 97]))
     scene = scan_part(trouble.part(), scanner, seed, tilt_rad=math.radians(5.0), spread_m=0.02, others=others)
-    plan = figures(lambda: _plan(scene, trouble))
-    return TroubleTrial(name=trouble.name, must=trouble.must, method=trouble.method, seed=seed, **plan)
-
-
-def _plan(scene: Scene, trouble: Trouble) -> tuple[np.ndarray, np.ndarray]:
-    if trouble.method == "cloud":
-        return try_cloud(scene)
-    return try_cad(scene, None if trouble.drawing is None else trouble.drawing())
-
-
-def run_troubles(runs: int, first_seed: int) -> list[TroubleTrial]:
-    """Every kind of trouble, `runs` times."""
-    return [trouble_trial(trouble, first_seed + k) for trouble in TROUBLES for k in range(runs)]
-
-
-def trouble_rows(trials: list[TroubleTrial]) -> dict[str, str]:
-    """A line per kind and method."""
-    rows: dict[str, str] = {}
-    for name, method in dict.fromkeys((t.name, t.method) for t in trials):
-        mine = [t for t in trials if (t.name, t.method) == (name, method)]
-        done = [t for t in mine if not t.refused]
-        right = f"{sum(t.ok for t in mine)} as they have to be"
-        rows[f"{name}, {method}"] = f"{len(done)} of {len(mine)} planned, {right}{error_text(done)}"
-    return rows
+    drawing = None if trouble.drawing is None else trouble.drawing()
+    plan = figures(lambda: try_cloud(scene) if trouble.method == "cloud" else try_cad(scene, drawing))
+    ok = trouble.must in ("", REFUSED if plan["refused"] else PLANNED)
+    return {"name": trouble.name, "method": trouble.method, "seed": seed, "ok": ok, **plan}
 
 
 def run_seam_planning_benchmark(
@@ -299,28 +149,30 @@ def run_seam_planning_benchmark(
     full: images as wide as the scanner has them. troubles: occlusion, clutter and wrong workpieces as well (troubles.csv).
     """
     presets = list(SCANNERS) if presets is None else presets
-    trials: list[Trial] = []
+    trials: list[Plan] = []
     total = len(presets) * len(SHAPES) * runs
     for preset in presets:
         for shape in SHAPES:
             for k in range(runs):
                 number = FIRST_HELD_OUT + seed + k
                 scene = scan(preset, shape, number, None if full else WIDEST_PX)
-                trials += [run_trial(scene, preset, shape, number, method) for method in METHODS]
+                named = {"preset": preset, "shape": shape, "seed": number}
+                for method, plan in METHODS.items():
+                    trials.append({**named, "method": method, **figures(partial(plan, scene))})
                 progress("planning", len(trials) / (len(METHODS) * total))
-                write_atomic(out / "trials.csv", records_csv(trials, COLUMNS))
-    rows = summary_rows(trials)
+                write_atomic(out / "trials.csv", mappings_csv(trials, COLUMNS))
+    rows = plan_rows(trials, "preset")
     if troubles:
-        cases = run_troubles(runs, FIRST_HELD_OUT + seed)
-        write_atomic(out / "troubles.csv", records_csv(cases, TROUBLE_COLUMNS))
-        rows |= trouble_rows(cases)
-    done = [t for t in trials if not t.refused]
+        cases = [trouble_trial(trouble, FIRST_HELD_OUT + seed + k) for trouble in TROUBLES for k in range(runs)]
+        write_atomic(out / "troubles.csv", mappings_csv(cases, TROUBLE_COLUMNS))
+        rows |= plan_rows(cases, "name")
+    done = [t for t in trials if not t["refused"]]
     summary: dict[str, object] = {
         "state": "done",
         "trials": len(trials),
         "planned": len(done),
-        "worst_mm": max((t.worst_mm for t in done), default=math.nan),
-        "most_seconds": max((t.seconds for t in trials), default=math.nan),
+        "worst_mm": max((t["worst_mm"] for t in done), default=math.nan),
+        "most_seconds": max((t["seconds"] for t in trials), default=math.nan),
     }
     return summary, rows
 

@@ -4,9 +4,9 @@ import math
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from weldcal.models.errors import WeldcalError
-from weldcal.models.mesh import TriMesh, revolve
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.parts.plates import box
-from weldcal.tools.worlds.parts.scenes import PartScene, Subject, block, scan_scene, subject
+from weldcal.tools.worlds.parts.scenes import REFUSALS, PartScene, Subject, scan_scene, scanned_mesh, subject
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.locate.part.locating import locate_part
 from weldcal.welding.locate.part.model import PartModel
@@ -37,7 +35,6 @@ NEES_BOUND = float(chi2.ppf(0.9973, 6))  # of a pose within 3 sigma
 MEAN_TARGET_MM, MAX_TARGET_MM = 0.3, 0.8
 SAME_SURFACE_M = 1e-4
 HINT_M, HINT_RAD = 0.04, math.radians(15.0)
-MESH_NOISE_M, MESH_WAVE_M, MESH_TRIANGLES = 1e-4, 0.015, 15_000
 COLUMNS = (
     "kind", "part", "seed", "verdict", "nees", "drawn_mean_mm", "drawn_max_mm", "seam_mean_mm", "seam_max_mm", "measured",
     "cpu_s", "sentence",
@@ -52,46 +49,44 @@ SCENES: dict[str, Mapping[str, object]] = {
 }
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One registration: a kind of scene (a key of SCENES), a part, a seed, and whether a hint is given."""
-
-    kind: str
-    part: str
-    seed: int
-    hinted: bool
+Trial = tuple[str, str, int, bool]
+"""One registration: a kind of scene (a key of SCENES, or plan), a part, a seed, and whether a hint is given."""
 
 
 def clutter_trials(seeds: Sequence[int]) -> list[Trial]:
     """A scene a seed: kinds and parts take turns, so that twelve seeds have each part once."""
     kinds, names = list(SCENES), list(PARTS)
-    return [Trial(kinds[(s + s // 12) % len(kinds)], names[s % len(names)], s, False) for s in seeds]
+    return [(kinds[(s + s // 12) % len(kinds)], names[s % len(names)], s, False) for s in seeds]
 
 
 def plan_trials(seeds: Sequence[int], names: Sequence[str]) -> list[Trial]:
     """Every part once a seed, among few things; a hint decides between poses that look the same."""
-    return [Trial("plan", name, seed, True) for name in names for seed in seeds]
+    return [("plan", name, seed, True) for name in names for seed in seeds]
 
 
-def run(trial: Trial) -> dict[str, object]:
+def run(kind: str, name: str, seed: int, hinted: bool) -> dict[str, object]:
     """Scan, register and judge; a row of COLUMNS."""
-    part = subject(trial.part)
+    part = subject(name)
     scanner = get_scanner("phoxi_m", 824)
-    number = 1000 * list(PARTS).index(trial.part) + trial.seed
-    options: dict[str, object] = {"objects": 4, "fingers": 1} if trial.kind == "plan" else dict(SCENES[trial.kind])
+    number = 1000 * list(PARTS).index(name) + seed
+    options: dict[str, object] = {"objects": 4, "fingers": 1} if kind == "plan" else dict(SCENES[kind])
     scene: PartScene = scan_scene(part.mesh, scanner, number, **options)  # type: ignore[arg-type]
-    rng = np.random.default_rng([trial.seed, 1803])
-    mesh = _scanned(part.mesh, rng) if trial.kind == "scanned mesh" else part.mesh
+    rng = np.random.default_rng([seed, 1803])
+    mesh = scanned_mesh(part.mesh, rng) if kind == "scanned mesh" else part.mesh
     off = RigidTransform(RollPitchYaw(rng.uniform(-1.0, 1.0, 3) * HINT_RAD), rng.uniform(-1.0, 1.0, 3) * HINT_M)
-    row: dict[str, object] = {"kind": trial.kind, "part": trial.part, "seed": trial.seed}
+    row: dict[str, object] = {"kind": kind, "part": name, "seed": seed}
     start = time.process_time()
     try:
         found, joint = locate_part(
-            scene.cloud_B, mesh, part.seam, None, scene.eye_B, X_BP_hint=scene.X_BP @ off if trial.hinted else None
+            scene.cloud_B, mesh, part.seam, None, scene.eye_B, X_BP_hint=scene.X_BP @ off if hinted else None
         )
     except (PartNotFound, AmbiguousPart) as error:
-        name = type(error).__name__
-        return {**row, "verdict": f"refused: {name}", "cpu_s": time.process_time() - start, "sentence": str(error)}
+        return {
+            **row,
+            "verdict": f"refused: {type(error).__name__}",
+            "cpu_s": time.process_time() - start,
+            "sentence": str(error),
+        }
     row["cpu_s"] = time.process_time() - start
     nees = _nees(found, scene.X_BP, part)
     right = nees < NEES_BOUND
@@ -129,65 +124,6 @@ def _nees(found: PartRegistration, X_BP: RigidTransform, part: Subject) -> float
     return min(values)
 
 
-def _scanned(mesh: TriMesh, rng: np.random.Generator) -> TriMesh:
-    """The part as a mesh file made from a scan: small triangles, its surface off by 0.1 mm in waves of MESH_WAVE_M."""
-    import open3d
-
-    fine: Any = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices.copy()), open3d.utility.Vector3iVector(mesh.triangles.copy())
-    )
-    fine.merge_close_vertices(1e-7)
-    while len(fine.triangles) < MESH_TRIANGLES:
-        fine = fine.subdivide_midpoint(1)
-    corners = np.asarray(fine.vertices)
-    # The triangles are slivers in places: an error of each corner by itself would fold the surface.
-    waves = rng.normal(size=(3, 3, 60)) * (2.0 * math.pi / MESH_WAVE_M / math.sqrt(3.0))
-    phase = rng.uniform(0.0, 2.0 * math.pi, size=(3, 1, 60))
-    error = MESH_NOISE_M * math.sqrt(2.0 / 60.0) * np.cos(corners @ waves + phase).sum(axis=2).T
-    return TriMesh(corners + error, np.asarray(fine.triangles, dtype=np.int64))
-
-
-@dataclass(frozen=True, eq=False)
-class Refusal:
-    """What lies in the scene, what is looked for, and the error with the words that must name why."""
-
-    there: TriMesh
-    looked_for: TriMesh
-    error: type[WeldcalError]
-    words: str
-    twice: bool = False
-
-
-def sphere(radius: float) -> TriMesh:
-    """A ball that rests on z = 0, m."""
-    a = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 33)
-    return revolve(np.column_stack([radius * np.cos(a) * (np.abs(a) < 1.57), radius * (1.0 + np.sin(a))]), 64)
-
-
-def pipe(radius: float, wall: float, height: float) -> TriMesh:
-    """A pipe that rests on z = 0, m."""
-    inner = radius - wall
-    return revolve(np.array([[inner, 0.0], [radius, 0.0], [radius, height], [inner, height], [inner, 0.0]]), 72)
-
-
-def _scaled(mesh: TriMesh, factor: float) -> TriMesh:
-    return TriMesh(mesh.vertices * factor, mesh.triangles)
-
-
-REFUSALS: dict[str, Callable[[], Refusal]] = {
-    "plain plate": lambda: Refusal(box(0.2, 0.12, 0.012), box(0.2, 0.12, 0.012), AmbiguousPart, "turning it about its"),
-    "plain pipe": lambda: Refusal(
-        pipe(0.05, 0.005, 0.09), pipe(0.05, 0.005, 0.09), AmbiguousPart, "free to turn about its z axis|looks the same"
-    ),
-    "sphere": lambda: Refusal(sphere(0.05), sphere(0.05), AmbiguousPart, "free to turn about its|looks the same"),
-    "two alike": lambda: Refusal(block(), block(), AmbiguousPart, "Two places in the scan", twice=True),
-    "another part": lambda: Refusal(block(), subject("lap").mesh, PartNotFound, "part"),
-    "another length": lambda: Refusal(box(0.2, 0.12, 0.03), box(0.26, 0.12, 0.03), PartNotFound, "part"),
-    "wrong unit": lambda: Refusal(block(), _scaled(block(), 25.4), PartNotFound, "part"),
-    "not there": lambda: Refusal(box(0.03, 0.03, 0.02), block(), PartNotFound, "part"),
-}
-
-
 def run_refusal(name: str, seed: int) -> dict[str, object]:
     """A subject that must be refused: right when it is, by the error and the words that name why; a row of COLUMNS."""
     case = REFUSALS[name]()
@@ -219,15 +155,13 @@ def run_registration_study(
     """
     chosen = list(PARTS) if names is None else list(names)
     jobs: list[Callable[[], dict[str, object]]] = []
-    jobs += [lambda t=t: run(t) for t in clutter_trials(list(seeds)) if t.part in chosen]  # type: ignore[misc]
-    jobs += [lambda t=t: run(t) for t in plan_trials(list(plans), chosen)]  # type: ignore[misc]
-    jobs += [lambda n=n, s=s: run_refusal(n, s) for n in REFUSALS for s in refusals]  # type: ignore[misc]
+    jobs += [partial(run, *trial) for trial in clutter_trials(list(seeds)) if trial[1] in chosen]
+    jobs += [partial(run, *trial) for trial in plan_trials(list(plans), chosen)]
+    jobs += [partial(run_refusal, name, seed) for name in REFUSALS for seed in refusals]
     rows: list[dict[str, object]] = []
     for k, job in enumerate(jobs):
         rows.append(job())
-        write_atomic(
-            out / "registrations.csv", csv_text(COLUMNS, ([row.get(name, "") for name in COLUMNS] for row in rows))
-        )
+        write_atomic(out / "registrations.csv", mappings_csv(rows, COLUMNS))
         progress(f"{rows[-1]['kind']}: {rows[-1]['part']}", (k + 1) / len(jobs))
     return _summed(rows)
 

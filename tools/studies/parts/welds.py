@@ -12,7 +12,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.commands.weld import run_scenario
-from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.parts.planning import planning
@@ -64,7 +64,7 @@ def run_part_welds(
         found = summary.get("refinement")
         refined = isinstance(found, Mapping) and found.get("accepted") is True
         rows.append({**summary, "part": name, "joint": part.joint, "seed": seed, "refined": refined})
-        write_atomic(out / "parts.csv", csv_text(COLUMNS, ([row.get(name, "") for name in COLUMNS] for row in rows)))
+        write_atomic(out / "parts.csv", mappings_csv(rows, COLUMNS))
     return _summed(rows)
 
 

@@ -126,7 +126,9 @@ def _ball_radius_mm(trial: EdgeTrial, R: Floats, t: Floats) -> float:
     """Radius of the sphere through all profiles of the ball, brought into one frame by a calibration."""
     if trial.ball is None or trial.ball_poses is None:
         return float("nan")
-    at = ball_points(trial, R, t).reshape(-1, 3)
+    p = np.stack([trial.ball[..., 0], np.zeros(trial.ball.shape[:2]), trial.ball[..., 1]], axis=2) @ R.T + t
+    poses = trial.ball_poses
+    at = (np.einsum("nij,nmj->nmi", poses.rotation, p) + poses.translation[:, None]).reshape(-1, 3)
     middle = at.mean(axis=0)
     q = at - middle
     s = np.linalg.lstsq(np.column_stack([2.0 * q, np.ones(len(q))]), np.einsum("ni,ni->n", q, q), rcond=None)[0]
@@ -137,11 +139,3 @@ def _ball_radius_mm(trial: EdgeTrial, R: Floats, t: Floats) -> float:
 
     found = least_squares(off, start, method="lm", x_scale=1e-2)
     return 1e3 * float(found.x[3])
-
-
-def ball_points(trial: EdgeTrial, R: Floats, t: Floats) -> Floats:
-    """The ball's profiles (60, m, 3) m in B by a calibration."""
-    assert trial.ball is not None
-    assert trial.ball_poses is not None
-    p = np.stack([trial.ball[..., 0], np.zeros(trial.ball.shape[:2]), trial.ball[..., 1]], axis=2) @ R.T + t
-    return np.asarray(np.einsum("nij,nmj->nmi", trial.ball_poses.rotation, p) + trial.ball_poses.translation[:, None])

@@ -21,7 +21,6 @@ from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.report.pictures import OURS, plain, svg
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
 from weldcal.tools.studies.profiler.edge import TARGETS, edge_figures, edge_targets
-from weldcal.tools.studies.profiler.plots import legend
 from weldcal.tools.studies.profiler.sphere import (
     METHODS,
     WorldResult,
@@ -139,7 +138,8 @@ def over_seeds(results: Results) -> bytes:
     axes.invert_yaxis()
     plain(axes, "reached over target", "")
     axes.set_xlim(left=0.0)
-    legend(picture, axes)
+    handles, labels = axes.get_legend_handles_labels()
+    picture.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 4), frameon=False, fontsize=8)
     return svg(picture)
 
 

@@ -1,10 +1,9 @@
 """Times the calibration of a profiler by an edge without a guess, the paper's method and a grid search."""
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -18,7 +17,8 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import write_json
+from weldcal.tools.report.render import fixed
+from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.studies.profiler.seeds import profiler_seeds
 from weldcal.tools.worlds.edge_trials import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 
@@ -31,22 +31,6 @@ SAME_DEG, SAME_MM = 0.01, 0.01  # from the optimum that a start at the truth lea
 Answer = tuple[Floats, Floats]
 
 
-@dataclass(frozen=True, kw_only=True)
-class SpeedRow:
-    """A method on sets of one kind: wall and processor seconds (median and largest), how often the optimum was found, rms error."""
-
-    method: str
-    poses: str
-    sets: int
-    median_s: float
-    most_s: float
-    processor_s: float
-    most_processor_s: float
-    found: int | None
-    rotation_deg: float
-    translation_mm: float
-
-
 @command("benchmark profiler-speed", short_help="Time the profiler's calibration by an edge.", hidden=True)
 def benchmark_speed(
     call: Call,
@@ -55,8 +39,8 @@ def benchmark_speed(
     ] = None,
 ) -> Outcome:
     """Time the profiler's calibration by an edge and compare it with the published method and a grid search."""
-    summary = run_profiler_benchmark(call.folder("benchmark", "profiler"), call.seed, data, call.progress)
-    return Outcome(summary, values={}, rows=lines(summary))
+    folder = SPEED.folder(call)
+    return SPEED.measured({"all": time_methods(call.seed, data, call.progress)}, folder).outcome()
 
 
 @command("benchmark profiler", short_help="Measure the profiler's calibration: speed, or seeds.", options=FARM)
@@ -65,8 +49,8 @@ def benchmark_profiler(call: Call) -> None:
     """Time the profiler's calibration by an edge, or run every target of 'reproduce profiler' over many seeds."""
 
 
-def run_profiler_benchmark(folder: Path, seed: int, data: Path | None, progress: Progress) -> dict[str, object]:
-    """Time them in one run on the same sets; writes benchmark.json.
+def time_methods(seed: int, data: Path | None, progress: Progress) -> dict[str, object]:
+    """Time them in one run on the same sets.
 
     Raises:
         InputError: the fixed files are not in the folder named.
@@ -78,7 +62,7 @@ def run_profiler_benchmark(folder: Path, seed: int, data: Path | None, progress:
         every = made_edge_trials(name, count, seed) if data is None else fixed_edge_trials(data, name)
         return list(every)[:count]
 
-    rows: list[SpeedRow] = []
+    rows: list[dict[str, Any]] = []
     for k, level in enumerate(("paper", "nominal")):
         free = sets(f"free_{level}", SETS)
         progress(f"40 free poses, {level} noise", 0.15 * k)
@@ -94,36 +78,32 @@ def run_profiler_benchmark(folder: Path, seed: int, data: Path | None, progress:
     rows.append(_row("joint, no guess", "25 x 10, paper noise", arcs, _joint, [_from_truth(t) for t in arcs]))
     rows.append(_row("paper, all pairs as printed", "25 x 10, paper noise", arcs, _paper_pairs, None))
     rows.append(_row("paper, centred", "25 x 10, paper noise", arcs, _paper, None))
-    free_rows = [r for r in rows if r.method == "joint, no guess" and r.poses.startswith("40")]
-    summary: dict[str, object] = {
-        "state": "done",
+    free_rows = [r for r in rows if r["method"] == "joint, no guess" and r["poses"].startswith("40")]
+    return {
         "data": "fixed files" if data is not None else f"seed {seed}",
-        "rows": [asdict(r) for r in rows],
-        "found_of_sets": [f"{r.found} of {r.sets}" for r in free_rows],
-        "slowest_s": max(r.most_s for r in free_rows),
-        "slowest_processor_s": max(r.most_processor_s for r in free_rows),
+        "rows": rows,
+        "found_of_sets": [f"{r['found']} of {r['sets']}" for r in free_rows],
+        "slowest_s": max(r["most_s"] for r in free_rows),
+        "slowest_processor_s": max(r["most_processor_s"] for r in free_rows),
         "target_s": TARGET_S,
     }
-    write_json(folder / "benchmark.json", summary)
-    return summary
 
 
-def lines(summary: dict[str, object]) -> dict[str, str]:
-    """Rows for the terminal: method and poses, then times and errors."""
-    out = {}
-    rows = summary["rows"]
-    assert isinstance(rows, list)
-    for r in rows:
-        found = "" if r["found"] is None else f", optimum found in {r['found']} of {r['sets']}"
-        error = (
-            ""
-            if np.isnan(r["rotation_deg"])
-            else f", off by {r['rotation_deg']:.3f} deg / {r['translation_mm']:.3f} mm"
-        )
-        took = f"{1e3 * r['median_s']:.1f} ms, at most {1e3 * r['most_s']:.1f}"
-        took += f" (of the processor {1e3 * r['processor_s']:.1f}, {1e3 * r['most_processor_s']:.1f})"
-        out[f"{r['method']}; {r['poses']}"] = f"{took}{found}{error}"
-    return out
+def _lines(figures: Figures) -> Iterable[Row]:
+    for r in figures["rows"]:
+        times = (f"{1e3 * r[key]:.1f}" for key in ("median_s", "most_s", "processor_s", "most_processor_s"))
+        found = "" if r["found"] is None else f"{r['found']} of {r['sets']}"
+        yield r["method"], r["poses"], *times, found, fixed(r["rotation_deg"], 3), fixed(r["translation_mm"], 3)
+
+
+SPEED = Study(
+    name="profiler",
+    what="Time of a profiler's calibration by an edge without a guess, the paper's method and a grid search.",
+    figures=lambda results: results["all"],
+    header=("method", "poses", "median ms", "most ms", "processor ms", "most ms", "optimum found", "off deg", "off mm"),
+    rows=_lines,
+    numbers=7,
+)
 
 
 def _row(
@@ -132,7 +112,8 @@ def _row(
     trials: Sequence[EdgeTrial],
     solve: Callable[[EdgeTrial], Answer | None],
     best: list[Answer] | None,
-) -> SpeedRow:
+) -> dict[str, Any]:
+    """A method on sets of one kind: wall and processor seconds (median and largest), how often the optimum was found, rms error."""
     seconds, worked, errors, found = [], [], [], 0
     for k, trial in enumerate(trials):
         start, begun = time.perf_counter(), time.process_time()
@@ -146,18 +127,18 @@ def _row(
             deg, mm = _apart(answer, best[k])
             found += bool(deg < SAME_DEG and mm < SAME_MM)
     rotation_deg, translation_mm = rms(errors)
-    return SpeedRow(
-        method=method,
-        poses=poses,
-        sets=len(trials),
-        median_s=float(np.median(seconds)),
-        most_s=max(seconds),
-        processor_s=float(np.median(worked)),
-        most_processor_s=max(worked),
-        found=None if best is None else found,
-        rotation_deg=rotation_deg,
-        translation_mm=translation_mm,
-    )
+    return {
+        "method": method,
+        "poses": poses,
+        "sets": len(trials),
+        "median_s": float(np.median(seconds)),
+        "most_s": max(seconds),
+        "processor_s": float(np.median(worked)),
+        "most_processor_s": max(worked),
+        "found": None if best is None else found,
+        "rotation_deg": rotation_deg,
+        "translation_mm": translation_mm,
+    }
 
 
 def _apart(a: Answer, b: Answer) -> tuple[float, float]:

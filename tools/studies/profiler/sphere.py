@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from weldcal.calibration.profiler.arm_errors import DhArm
-from weldcal.calibration.profiler.features.frustum import Frustum, fit_frustum, without_spikes
+from weldcal.calibration.profiler.features.frustum import fit_frustum, without_spikes
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
@@ -30,23 +30,14 @@ HIP_MM, SLOPE_DEG = 50.0, float(np.degrees(np.arctan2(4.0, 3.0)))
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WorldResult:
-    """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and the frustum."""
+    """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and of the frustum the mean
+    error (2,) of the slanted edges (mm) and of the slopes (deg)."""
 
     world: int
     method: str
     points_mm: Floats
     seam_mm: Floats | None
-    seam_each_mm: Floats | None
-    boss: Frustum | None
-    cloud: Floats | None
-
-    @property
-    def boss_error(self) -> Floats | None:
-        """Mean error (2,) of the slanted edges mm and of the slopes deg."""
-        if self.boss is None:
-            return None
-        length = np.abs(self.boss.hips_m / MM - HIP_MM).mean()
-        return np.array([length, np.abs(np.degrees(self.boss.dihedrals_rad) - SLOPE_DEG).mean()])
+    boss: Floats | None
 
 
 def sphere_targets() -> list[tuple[str, str, float]]:
@@ -66,7 +57,7 @@ def sphere_figures(results: Sequence[WorldResult]) -> dict[str, float]:
     return named_figures(
         points,
         [r.seam_mm for r in best if r.seam_mm is not None],
-        [r.boss_error for r in best if r.boss_error is not None],
+        [r.boss for r in best if r.boss is not None],
     )
 
 
@@ -133,18 +124,15 @@ def measured(
     assert tests is not None
     off = _off(record, arm, tests.q_view, tests.seen, tests.q_touch)
     points = np.array([off[tests.point == j].mean() for j in range(3)])
-    seam = each = found = cloud = None
+    seam = error = None
     if world.groove is not None and features is not None:
-        each = np.column_stack(
-            [_off(record, arm, world.groove.q, features[:, j], world.groove.q_touch[:, j]) for j in range(3)]
-        )
-        seam = each.mean(axis=0)
+        g = world.groove
+        seam = np.column_stack([_off(record, arm, g.q, features[:, j], g.q_touch[:, j]) for j in range(3)]).mean(axis=0)
     if world.boss is not None and boss:
-        cloud = cloud_of(record, arm, *world.boss)
-        found = fit_frustum(cloud)
-    return WorldResult(
-        world=k, method=method, points_mm=points, seam_mm=seam, seam_each_mm=each, boss=found, cloud=cloud
-    )
+        found = fit_frustum(cloud_of(record, arm, *world.boss))
+        length = np.abs(found.hips_m / MM - HIP_MM).mean()
+        error = np.array([length, np.abs(np.degrees(found.dihedrals_rad) - SLOPE_DEG).mean()])
+    return WorldResult(world=k, method=method, points_mm=points, seam_mm=seam, boss=error)
 
 
 def _flange(record: ProfilerRecord, arm: DhArm, q: Floats) -> FlangePoses:

@@ -1,13 +1,10 @@
 """Benchmark of the hardware link under faults: a matrix of faults, and random sequences of them."""
 
 from collections import Counter
-from collections.abc import Callable
 from collections.abc import Sequence as Several
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
-
-import numpy as np
 
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.systems.runner import Progress, no_progress
@@ -17,11 +14,12 @@ from weldcal.tools.cli.subject import one_of
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.harness import statistics
 from weldcal.tools.studies.robot.jobs import jobs
 from weldcal.tools.studies.robot.stream import stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
-from weldcal.tools.worlds.robot.cases import AT_START, RUNNING, Case
+from weldcal.tools.worlds.robot.cases import AT_START, RUNNING
 from weldcal.tools.worlds.robot.fault_run import Outcome, run_case
 from weldcal.tools.worlds.robot.sequences import Sequence, run_sequence
 
@@ -34,31 +32,12 @@ SEQUENCE_COLUMNS = (
 )  # fmt: skip
 
 
-def run_matrix(
-    bench: Bench,
-    cases: Several[Case],
-    progress: Progress = no_progress,
-    said: Callable[[Outcome], None] | None = None,
-    *,
-    hasty: bool = False,
-) -> list[Outcome]:
-    """Every case, one after the other, on one controller; each must be able to start after the one before."""
-    outcomes = []
-    for k, case in enumerate(cases):
-        progress(case.name, k / len(cases))
-        outcomes.append(run_case(bench, case, hasty=hasty))
-        if said is not None:
-            said(outcomes[-1])
-    return outcomes
-
-
 @dataclass(frozen=True)
 class FaultReport:
     """All outcomes and all sequences."""
 
     outcomes: list[Outcome]
     sequences: list[Sequence]
-    folder: Path
 
     def summary(self) -> dict[str, object]:
         """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names the results that are not as required."""
@@ -96,15 +75,16 @@ def run_fault_benchmark(
     progress: Progress = no_progress,
 ) -> FaultReport:
     """The matrix, then the random sequences, each on a controller of its own; faults.csv and sequences.csv grow row by row."""
-    report = FaultReport([], [], out)
+    report = FaultReport([], [])
     share = 150.0 / (150.0 + sequences * seconds)
 
-    def said(outcome: Outcome) -> None:
-        report.outcomes.append(outcome)
-        write_atomic(out / "faults.csv", _table(OUTCOME_COLUMNS, report.outcomes))
-
+    cases = RUNNING + AT_START
     with emulator_process(host=address, seed=seed) as emulator, no_long_garbage_collections():
-        run_matrix(Bench(emulator), RUNNING + AT_START, lambda stage, done: progress(stage, share * done), said)
+        bench = Bench(emulator)
+        for k, case in enumerate(cases):  # each must be able to start after the one before
+            progress(case.name, share * k / len(cases))
+            report.outcomes.append(run_case(bench, case, hasty=False))
+            write_atomic(out / "faults.csv", _table(OUTCOME_COLUMNS, report.outcomes))
     for k in range(sequences):
         progress(f"sequence {k + 1} of {sequences}", share + (1.0 - share) * k / sequences)
         with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
@@ -115,8 +95,8 @@ def run_fault_benchmark(
 
 
 def _spread(values: Several[float | None]) -> dict[str, float]:
-    found = np.array([value for value in values if value is not None])
-    return {"median": float(np.median(found)), "max": float(found.max())} if found.size else {}
+    found = [value for value in values if value is not None]
+    return statistics(found, "median", "max") if found else {}
 
 
 def _table(columns: tuple[str, ...], rows: Several[object]) -> str:

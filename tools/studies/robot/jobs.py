@@ -2,11 +2,11 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.studies.robot.host_probe import HostLateness, watched_host
+from weldcal.tools.worlds.robot.host_probe import HostLateness, watched_host
 
 BUSY = "while True: pass"
 UNDER_8_MS = 8.0
@@ -39,21 +39,21 @@ def busy_programs(count: int) -> Iterator[None]:
 
 @dataclass(frozen=True, kw_only=True)
 class JobTiming:
-    """One job: its seed, state and reason, the lateness of its velocities, the slowest rate, and its figures (mm)."""
+    """One job: its seed, state and reason, the lateness of its velocities, the slowest rate, and the torch's error."""
 
     seed: int
     state: str
     reason: str
-    lateness: Lateness
-    slowest_percent: float
-    slowed_s: float
-    figures: Mapping[str, Any]
+    lateness: Lateness = field(default_factory=Lateness)
+    slowest_percent: float = 0.0
+    slowed_s: float = 0.0
+    torch_mean_mm: float | None = None
 
     @property
     def line(self) -> str:
         """One row of the table."""
         late = self.lateness
-        torch = self.figures.get("torch_mean_mm")
+        torch = self.torch_mean_mm
         return (
             f"{self.state}{': ' + self.reason if self.reason else ''}; {late.on_time_percent:.2f} % of {sum(late.counts)} under "
             f"{ON_TIME_MS:.0f} ms, latest {late.worst_ms:.1f} ms; slowest {self.slowest_percent:.0f} %, {self.slowed_s:.2f} s longer"
@@ -134,15 +134,7 @@ def _job(described: Any, out: Path, name: str, seed: int) -> JobTiming:
         try:
             result = run_scenario(described, options)
         except WeldcalError as error:  # the start was refused
-            return JobTiming(
-                seed=seed,
-                state="refused",
-                reason=str(error),
-                lateness=Lateness(),
-                slowest_percent=0.0,
-                slowed_s=0.0,
-                figures={},
-            )
+            return JobTiming(seed=seed, state="refused", reason=str(error))
     result.run.raise_if_interrupted()
     summary, clock = result.summary(), result.run.clock
     assert clock is not None
@@ -153,7 +145,7 @@ def _job(described: Any, out: Path, name: str, seed: int) -> JobTiming:
         lateness=clock.lateness,
         slowest_percent=100.0 * clock.slowest_rate,
         slowed_s=clock.slowed_s,
-        figures=summary,
+        torch_mean_mm=cast(float | None, summary.get("torch_mean_mm")),
     )
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time
-from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +26,7 @@ from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.worlds.robot.fault_run import LOADED
+from weldcal.tools.worlds.robot.tap import STEP_JOINT, STEP_RAD_S, Tap
 
 RATE_HZ = 125.0
 READ_S = 0.002
@@ -38,72 +37,11 @@ MOST_STOPS = 20
 # all but the last joint swing to and fro; the last one jumps, and from its jumps the way to the motion is timed
 SWING = np.array([0.10, 0.08, 0.08, 0.10, 0.10, 0.0])  # rad/s
 SWING_HZ = 0.25
-STEP_RAD_S = 0.2
-STEP_JOINT = 5
 STEP_S = 0.5
 STEPS = (1.0, 0.0, -1.0, 0.0)
 
 
-@dataclass(kw_only=True)
-class Tap:
-    """Stands between the arm's LeafSystem and its link, and notes when what passes. Times in s of the monotonic clock."""
-
-    link: UrLink
-    command_times: array[float] = field(default_factory=lambda: array("d"))
-    ages: array[float] = field(default_factory=lambda: array("d"))
-    echoes: array[float] = field(default_factory=lambda: array("d"))
-    motions: array[float] = field(default_factory=lambda: array("d"))
-    state_now: LinkState | None = None
-    starts: list[int] = field(default_factory=lambda: [0])  # how many commands had been sent when a link began
-    _heard: int = -1
-    _wanted: float = 0.0
-    _stepped: tuple[float, float, float] | None = None  # when, from, to
-
-    def restart(self, link: UrLink) -> None:
-        """Go on with another link."""
-        self.link, self.state_now = link, None
-        self.starts.append(len(self.command_times))
-        self._heard, self._wanted, self._stepped = -1, 0.0, None
-
-    @property
-    def periods(self) -> NDArray[np.float64]:
-        """From each command to the next, s; NaN over the pause in which a link was made anew."""
-        found = np.diff(np.array(self.command_times))
-        for start in self.starts[1:]:
-            found[start - 1 : start] = np.nan
-        return found
-
-    def state(self) -> LinkState:
-        """As the link's."""
-        found = self.link.state()
-        self.state_now = found
-        if not self.command_times:
-            return found
-        self.ages.append(found.age_s)
-        if found.heard != self._heard:
-            if self._heard >= 0:  # a link's first state may know of no command yet
-                self.echoes.append(found.echo_latency_s)
-            self._heard = found.heard
-        if self._stepped is not None:
-            when, before, after = self._stepped
-            if (found.qd[STEP_JOINT] - before) / (after - before) > 0.5:
-                self.motions.append(time.monotonic() - when)
-                self._stepped = None
-        return found
-
-    def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
-        """As the link's."""
-        number, now = self.link.command(qd, process), time.monotonic()
-        self.command_times.append(now)
-        # a late computer slows the path: its small changes are no steps
-        if abs(qd[STEP_JOINT] - self._wanted) > 0.5 * STEP_RAD_S:
-            self._stepped = (now, self._wanted, float(qd[STEP_JOINT]))
-            self._wanted = float(qd[STEP_JOINT])
-        return number
-
-
-@dataclass(frozen=True)
-class Missed:
+class Missed(NamedTuple):
     """A command that came more than MISSED_S after its time: when in the run (s), and by how much it came late (s)."""
 
     at_s: float
@@ -111,23 +49,16 @@ class Missed:
 
 
 @dataclass(frozen=True)
-class Stopped:
-    """The link stopped the arm by itself: when in the run (s), and its reason."""
-
-    at_s: float
-    sentence: str
-
-
-@dataclass(frozen=True)
 class StreamReport:
-    """One stream. `fault` is empty where it went through to its end; `stops` were lived through with a new start."""
+    """One stream. `fault` is empty where it went through to its end; `stops`: when in the run (s) the link stopped the arm by itself, and its
+    reason, lived through with a new start."""
 
     seconds: float
     tap: Tap
     final: LinkState
     clock: WallClock
     fault: str
-    stops: tuple[Stopped, ...] = ()
+    stops: tuple[tuple[float, str], ...] = ()
 
     @property
     def missed(self) -> list[Missed]:
@@ -162,7 +93,7 @@ class StreamReport:
             "clock_drift_ppm": 1e6 * self.final.clock_drift,
             "diagram_late_ms": 1e3 * self.clock.late_s,
             "diagram_reanchored": self.clock.reanchored,
-            "stops": [{"id": f"at {stop.at_s:.3f} s", "reason": stop.sentence} for stop in self.stops],
+            "stops": [{"id": f"at {at_s:.3f} s", "reason": sentence} for at_s, sentence in self.stops],
             "missed_deadlines": len(missed),
             "missed": [{"id": f"at {m.at_s:.3f} s", "reason": f"{1e3 * m.late_s:.1f} ms late"} for m in missed],
         }
@@ -214,7 +145,7 @@ def run_robot_benchmark(
     Where this computer stood still for so long that the link stopped the arm, that is a stop in the report, and the stream
     goes on over a new link.
     """
-    left, stops, tap = 60.0 * minutes, list[Stopped](), None
+    left, stops, tap = 60.0 * minutes, list[tuple[float, str]](), None
     with emulator_process(host=address, seed=seed, lockstep=lockstep) as emulator:
         while True:
             prepared = PrepareRobot(UrRtde(host=emulator.host), load_arm())
@@ -230,7 +161,7 @@ def run_robot_benchmark(
             left -= report.seconds
             if report.final.fault.name not in (*LOADED, "GUARD_LATCHED") or len(stops) == MOST_STOPS:
                 break
-            stops.append(Stopped(60.0 * minutes - left, report.fault))
+            stops.append((60.0 * minutes - left, report.fault))
     report = replace(report, seconds=60.0 * minutes - left, stops=tuple(stops))
     write_json(out / "robot.json", report.summary())
     missed = ((f"{m.at_s:.3f}", f"{1e3 * m.late_s:.2f}") for m in report.missed)

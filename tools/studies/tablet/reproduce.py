@@ -1,31 +1,25 @@
-"""`weldcal reproduce tablet`: the tablet paper's tables, the signs and the models; targets, table.json and a report page."""
+"""`weldcal reproduce tablet`: the tablet paper's tables, the signs and the models, with targets."""
 
 import time
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Annotated
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from weldcal.calibration.tablet.planar.fit import fit_plane_motion, hand_over
-from weldcal.calibration.tablet.planar.linear import LinearFit, fit_linear
 from weldcal.calibration.tablet.published.calibration import StageResult
-from weldcal.calibration.tablet.published.two_stage import Fitness, Sign
+from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import write_json
-from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, svg
-from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.studies.harness import MISSED
+from weldcal.tools.report.pictures import OURS, THEIRS, svg
+from weldcal.tools.report.render import fixed
+from weldcal.tools.studies.harness import Figures, Row, Study, Table
 from weldcal.tools.studies.tablet.study import (
-    Cost,
-    HeldOutRow,
-    ModelRow,
+    PUBLISHED_EVALUATIONS,
     Reproduced,
-    SignRow,
     compare_models,
     compare_signs,
     dh_by_eq_20,
@@ -44,95 +38,119 @@ LEFT_OUT_MM = 0.46
 HELD_OUT_MM = 0.222
 CLOSED_FORM, BEST = "closed form", "PnP, rigid, pen: hands rounded to 1 mm"
 _LIMIT_WORDS = {"≤": "at most ", "<": "under ", "≥": "at least ", "±": ""}
-
-
 _LARGER = 20.0
 SIGN_WORDS = {Sign.PRINTED: "as printed (−)", Sign.NONE: "left out", Sign.CORRECTED: "reversed (+)"}
+_TITLES = {
+    ("htm", 1): "six-parameter transforms, stage 1", ("dh", 1): "Denavit-Hartenberg, stage 1",
+    ("htm", 2): "affine pair on the transforms", ("dh", 2): "affine pair on Denavit-Hartenberg",
+}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class TabletOptions:
-    """Output folder, first seed, seeds of differential evolution, and simulated trials."""
+@command("reproduce tablet", short_help="Repeat the tablet paper: Tables 7 to 12.")
+def tablet(
+    call: Call,
+    evolution_seeds: Annotated[
+        int, option("--evolution-seeds", "N", "Seeds of differential evolution per table; each takes seconds.", min=0)
+    ] = 1,
+    trials: Annotated[int, option("--trials", "N", "Simulated trials for the error on unseen points.", min=1)] = 60,
+) -> Outcome:
+    """Repeat the tablet paper: Tables 7 to 12, the sign of Eq. 20, and models with smaller prediction errors."""
+    folder = call.folder("reproduce", "tablet")
+    return (
+        run_study(call.seed, evolution_seeds, trials, call.progress, {"written_to": folder})
+        .measured({}, folder)
+        .outcome()
+    )
 
-    folder: Path
-    seed: int = 0
-    evolution_seeds: int = 1
-    trials: int = 60
+
+def run_study(seed: int, evolution_seeds: int, trials: int, progress: Progress, more: Figures) -> Study:
+    """The study with all that it computed; its JSON object ends with ``more``."""
+    start = time.monotonic()
+    touches = published_touches()
+    progress("tables 7, 8, 10, 11", 0.0)
+    stages, cost = reproduce_stages(touches, tuple(range(seed + 1, seed + 1 + evolution_seeds)))
+    progress("signs and chains", 0.5)
+    dh, signs = dh_by_eq_20(touches), compare_signs(touches)
+    progress("one landmark left out", 0.55)
+    models = compare_models(touches)
+    progress("simulated trials", 0.7)
+    unseen = held_out(seed, trials, min(trials, PUBLISHED_TRIALS))
+    left_out = next(m.left_out_mm for m in models if m.name == CLOSED_FORM)
+    targets = (
+        *(
+            Target(
+                f"Table {TABLE_NUMBER[r.model, r.stage]}: F of stage {r.stage}, {r.model.upper()}, mm",
+                "",
+                r.ours.fitness.F,
+                FITNESS_TARGETS[r.model, r.stage],
+                "±",
+                FITNESS_TOLERANCE,
+            )
+            for r in stages
+        ),
+        Target("all four together, s", "", cost.four_fits, FOUR_FITS_S, "<", decides=False),
+        Target("leave one landmark out, published data, mm", "", left_out, LEFT_OUT_MM),
+        Target("unseen queries, simulated, mm", "", next(u.mean_mm for u in unseen if u.name == BEST), HELD_OUT_MM),
+    )
+    named = {(r.model, r.stage): r.ours for r in stages}
+    figures: dict[str, Any] = {
+        "met": all_met(targets),
+        "F1": named["htm", 1].fitness.F,
+        "F2": named["htm", 2].fitness.F,
+        "parameters": dict(zip(STAGE_1["htm"].names, named["htm", 1].parameters, strict=True)),
+        "leave_one_out_mm": left_out,
+        "seconds": cost.four_fits,
+        "tables": {str(TABLE_NUMBER[r.model, r.stage]): _table(r) for r in stages},
+        "touching_error_printed_mm": TOUCHING_MM,
+        "targets": [{"what": t.what, "reached": t.value, "limit": limit_words(t), "met": t.met} for t in targets],
+        "cost": {
+            **asdict(cost),
+            "published_extrapolated": PUBLISHED_EVALUATIONS * cost.one_evaluation,
+            "published_in_crowds_extrapolated": PUBLISHED_EVALUATIONS * cost.crowd_evaluation,
+        },
+        "dh_by_eq_20": dh,
+        "signs": signs,
+        "models": models,
+        "unseen": unseen,
+        "wall_seconds": time.monotonic() - start,
+    }
+    return Study(
+        name="tablet",
+        what="The tablet paper repeated: its tables, the sign of Eq. 20, and models with smaller prediction errors.",
+        figures=lambda results: {**figures, **more},
+        header=("published data", "unknowns", "in sample mm", "held out mm", "largest mm"),
+        rows=lambda found: [
+            (m.name, str(m.unknowns), fixed(m.in_sample_mm, 3), fixed(m.left_out_mm, 3), fixed(m.worst_mm))
+            for m in models
+        ],
+        numbers=4,
+        others=lambda found: _tables(found, stages),
+        targets=lambda found: targets,
+        plots={"figures/residuals.svg": lambda results: sign_residuals(touches)},
+        group="reproduce",
+    )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class TabletStudy:
-    """Everything that the study computed."""
-
-    options: TabletOptions
-    stages: tuple[Reproduced, ...]
-    cost: Cost
-    dh: dict[str, Fitness]
-    signs: tuple[SignRow, ...]
-    models: tuple[ModelRow, ...]
-    unseen: tuple[HeldOutRow, ...]
-    linear: LinearFit
-    wall_seconds: float
-
-    @property
-    def leave_one_out_mm(self) -> float:
-        """Error of the closed form on the published data, one landmark left out."""
-        return next(m.left_out_mm for m in self.models if m.name == CLOSED_FORM)
-
-    @property
-    def targets(self) -> tuple[Target, ...]:
-        """Each target with the value reached; the wall time does not decide."""
-        unseen = next(u.mean_mm for u in self.unseen if u.name == BEST)
-        return (
-            *(
-                Target(
-                    f"Table {TABLE_NUMBER[r.model, r.stage]}: F of stage {r.stage}, {r.model.upper()}, mm",
-                    "",
-                    r.ours.fitness.F,
-                    FITNESS_TARGETS[r.model, r.stage],
-                    "±",
-                    FITNESS_TOLERANCE,
-                )
-                for r in self.stages
-            ),
-            Target("all four together, s", "", self.cost.four_fits, FOUR_FITS_S, "<", decides=False),
-            Target("leave one landmark out, published data, mm", "", self.leave_one_out_mm, LEFT_OUT_MM),
-            Target("unseen queries, simulated, mm", "", unseen, HELD_OUT_MM),
-        )
-
-    @property
-    def met(self) -> bool:
-        """Whether every target that decides is met."""
-        return all_met(self.targets)
-
-    def summary(self) -> dict[str, object]:
-        """The result for JSON: lengths in mm, angles in degrees."""
-        named = {(r.model, r.stage): r.ours for r in self.stages}
-        return {
-            "state": "done",
-            "met": self.met,
-            "F1": named["htm", 1].fitness.F,
-            "F2": named["htm", 2].fitness.F,
-            "parameters": dict(zip(STAGE_1["htm"].names, named["htm", 1].parameters, strict=True)),
-            "leave_one_out_mm": self.leave_one_out_mm,
-            "seconds": self.cost.four_fits,
-            "tables": {str(TABLE_NUMBER[r.model, r.stage]): _table(r) for r in self.stages},
-            "touching_error_printed_mm": TOUCHING_MM,
-            "targets": [
-                {"what": t.what, "reached": t.value, "limit": limit_words(t), "met": t.met} for t in self.targets
-            ],
-            "cost": {
-                **asdict(self.cost),
-                "published_extrapolated": self.cost.published,
-                "published_in_crowds_extrapolated": self.cost.published_in_crowds,
-            },
-            "dh_by_eq_20": self.dh,
-            "signs": self.signs,
-            "models": self.models,
-            "unseen": self.unseen,
-            "wall_seconds": self.wall_seconds,
-            "written_to": self.options.folder,
-        }
+def _tables(figures: Figures, stages: Iterable[Reproduced]) -> Iterable[Table]:
+    unseen = [(u.name, str(u.trials), fixed(u.mean_mm, 3)) for u in figures["unseen"]]
+    yield "Unseen queries", ("simulated", "trials", "unseen mm"), unseen
+    yield (
+        "The sign of Eq. 20, without a camera: the tablet's points against the hand",
+        ("touching error", "rigid, mm per axis", "with scale, mm per axis", "held out mm"),
+        [
+            (SIGN_WORDS[s.sign], fixed(s.rigid_mm, 3), fixed(s.scaled_mm, 3), fixed(s.left_out_mm, 2))
+            for s in figures["signs"]
+        ],
+    )
+    for r in sorted(stages, key=lambda r: TABLE_NUMBER[r.model, r.stage]):
+        title = f"Table {TABLE_NUMBER[r.model, r.stage]}: {_TITLES[r.model, r.stage]}"
+        yield title, ("", "printed", "ours", "differential evolution"), table_rows(r)
+    dh = [(name, fixed(f.F, 4), fixed(f.f1, 4), fixed(f.f2, 4)) for name, f in figures["dh_by_eq_20"].items()]
+    yield "The error in Table 8", ("", "F, mm", "f1, mm", "f2, mm"), dh
+    touching = [(f"Table {n}", *(fixed(v) for v in values)) for n, values in TOUCHING_MM.items()]
+    yield "Touched again by the paper's robot, printed, mm", ("", "1", "2", "3", "4", "5"), touching
+    minutes = f"{figures['cost']['published_extrapolated'] / 60.0:.0f} min, extrapolated from one"
+    yield "Cost", ("", ""), [("the paper's 1e8 evaluations", minutes)]
 
 
 def limit_words(target: Target) -> str:
@@ -153,45 +171,6 @@ def _table(r: Reproduced) -> dict[str, object]:
         "differential_evolution": [one(e) for e in r.evolved],
         "differential_evolution_seconds": r.evolved_seconds,
     }
-
-
-@command("reproduce tablet", short_help="Repeat the tablet paper: Tables 7 to 12.")
-def tablet(
-    call: Call,
-    evolution_seeds: Annotated[
-        int, option("--evolution-seeds", "N", "Seeds of differential evolution per table; each takes seconds.", min=0)
-    ] = 1,
-    trials: Annotated[int, option("--trials", "N", "Simulated trials for the error on unseen points.", min=1)] = 60,
-) -> Outcome:
-    """Repeat the tablet paper: Tables 7 to 12, the sign of Eq. 20, and models with smaller prediction errors."""
-    folder = call.folder("reproduce", "tablet")
-    study = run_tablet_study(TabletOptions(folder, call.seed, evolution_seeds, trials), call.progress)
-    rows = {t.what: f"{t.value:.4f}  ({limit_words(t)}: {t.verdict})" for t in study.targets}
-    rows["the paper's 1e8 evaluations"] = f"{study.cost.published / 60.0:.0f} min, extrapolated from one"
-    return Outcome(study.summary(), values={}, rows=rows, problem="" if study.met else MISSED)
-
-
-def run_tablet_study(options: TabletOptions, progress: Progress) -> TabletStudy:
-    """Run the study and write table.json and report.html."""
-    start = time.monotonic()
-    touches = published_touches()
-    progress("tables 7, 8, 10, 11", 0.0)
-    seeds = tuple(range(options.seed + 1, options.seed + 1 + options.evolution_seeds))
-    stages, cost = reproduce_stages(touches, seeds)
-    progress("signs and chains", 0.5)
-    dh, signs = dh_by_eq_20(touches), compare_signs(touches)
-    progress("one landmark left out", 0.55)
-    models = compare_models(touches)
-    progress("simulated trials", 0.7)
-    unseen = held_out(options.seed, options.trials, min(options.trials, PUBLISHED_TRIALS))
-    study = TabletStudy(
-        options=options, stages=stages, cost=cost, dh=dh, signs=signs, models=models, unseen=unseen,
-        linear=fit_linear(touches), wall_seconds=time.monotonic() - start,
-    )  # fmt: skip
-    progress("report", 0.99)
-    write_json(options.folder / "table.json", study.summary())
-    write_atomic(options.folder / "report.html", tablet_report(study))
-    return study
 
 
 def sign_residuals(touches: TabletTouches) -> bytes:
@@ -217,48 +196,11 @@ def sign_residuals(touches: TabletTouches) -> bytes:
     return svg(picture)
 
 
-def unseen_errors(models: tuple[ModelRow, ...], unseen: tuple[HeldOutRow, ...]) -> bytes:
-    """Bars: left-out and in-sample error on the published data; error on simulated queries."""
-    picture = Figure(figsize=(9.0, 0.42 * (len(models) + len(unseen)) + 1.6), layout="constrained")
-    left, queries = picture.subplots(2, 1, height_ratios=[len(models), len(unseen)], sharex=True)
-    y = np.arange(len(models))
-    left.barh(y, [m.left_out_mm for m in models], 0.6, color=[_colour(m.name) for m in models])
-    left.plot([m.in_sample_mm for m in models], y, "|", color="black", ms=14, mew=2, label="in sample")
-    _label(left, y, [f"{m.name} ({m.unknowns})" for m in models], [m.left_out_mm for m in models])
-    left.set_title("published data, one landmark left out (unknowns)", fontsize=10, loc="left")
-    left.legend(frameon=False, fontsize=8, loc="lower right")
-    y = np.arange(len(unseen))
-    queries.barh(y, [u.mean_mm for u in unseen], 0.6, color=[_colour(u.name) for u in unseen])
-    _label(queries, y, [u.name for u in unseen], [u.mean_mm for u in unseen])
-    queries.axvline(0.222, color=TRUTH, lw=1.0, ls=":")
-    queries.set_title("simulated trials, queries that no fit saw (dotted: target)", fontsize=10, loc="left")
-    queries.set_xlabel("mean error of the hand, mm")
-    return svg(picture)
-
-
-def _colour(name: str) -> str:
-    return THEIRS if name.startswith("paper") else OURS
-
-
-def _label(axes: Axes, y: np.ndarray, names: list[str], values: list[float]) -> None:
-    axes.set_yticks(y, names, fontsize=9)
-    axes.invert_yaxis()
-    for at, value in zip(y, values, strict=True):
-        axes.text(value + 0.01, at, f"{value:.3f}", va="center", fontsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-_TITLES = {
-    ("htm", 1): "six-parameter transforms, stage 1", ("dh", 1): "Denavit-Hartenberg, stage 1",
-    ("htm", 2): "affine pair on the transforms", ("dh", 2): "affine pair on Denavit-Hartenberg",
-}  # fmt: skip
-
-
-def table_rows(r: Reproduced) -> list[tuple[str, ...]]:
+def table_rows(r: Reproduced) -> list[Row]:
     """One of the paper's tables: name, printed, ours, by differential evolution (first seed)."""
     printed = printed_stage(r.model, r.stage)
     ours, evolved = r.ours, r.evolved[0] if r.evolved else None
-    rows: list[tuple[str, ...]] = []
+    rows: list[Row] = []
 
     def row(name: str, digits: int, printed_value: float, our_value: float, evolved_value: float | None) -> None:
         rows.append((name, fixed(printed_value), fixed(our_value, digits), fixed(evolved_value, digits)))
@@ -269,36 +211,3 @@ def table_rows(r: Reproduced) -> list[tuple[str, ...]]:
     for k, name in enumerate(printed.names):
         row(name, 2, printed.parameters[k], ours.parameters[k], evolved.parameters[k] if evolved else None)
     return rows
-
-
-def tablet_report(study: TabletStudy) -> str:
-    """The whole report as one self-contained HTML text."""
-    touches = published_touches()
-    tables = [
-        {
-            "title": f"Table {TABLE_NUMBER[r.model, r.stage]}: {_TITLES[r.model, r.stage]}",
-            "rows": table_rows(r),
-            "run": r,
-        }
-        for r in sorted(study.stages, key=lambda r: TABLE_NUMBER[r.model, r.stage])
-    ]
-    return render(
-        "tablet_study.html.j2",
-        study=study,
-        tables=tables,
-        targets=[(t.what, fixed(t.value, 4), limit_words(t), t.verdict) for t in study.targets],
-        missed=sum(not t.met for t in study.targets),
-        signs=[
-            (SIGN_WORDS[s.sign], fixed(s.rigid_mm, 3), fixed(s.scaled_mm, 3), fixed(s.left_out_mm, 2))
-            for s in study.signs
-        ],
-        dh=[(name, fixed(f.F, 4), fixed(f.f1, 4), fixed(f.f2, 4)) for name, f in study.dh.items()],
-        models=[
-            (m.name, m.unknowns, fixed(m.in_sample_mm, 3), fixed(m.left_out_mm, 3), fixed(m.worst_mm))
-            for m in study.models
-        ],
-        unseen=[(u.name, u.trials, fixed(u.mean_mm, 3)) for u in study.unseen],
-        touching=[(f"Table {n}", *(fixed(v) for v in values)) for n, values in TOUCHING_MM.items()],
-        residuals=sign_residuals(touches),
-        errors=unseen_errors(study.models, study.unseen),
-    )

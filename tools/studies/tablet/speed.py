@@ -1,7 +1,6 @@
 """Times each tablet calibration: closed form, PnP, the paper's stages, and the published search."""
 
 from collections.abc import Mapping
-from pathlib import Path
 
 from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar
 from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
@@ -16,11 +15,14 @@ from weldcal.tools.worlds.tablet import published_touches, simulate_trial
 @command("benchmark tablet", short_help="Time the tablet calibrations and the published search.")
 def tablet(call: Call) -> Mapping[str, object]:
     """Time each tablet calibration and compare it with the published search."""
-    return run_tablet_benchmark(call.folder("benchmark", "tablet"), call.seed, call.progress)
+    folder = call.folder("benchmark", "tablet")
+    found = times(call.seed, call.progress)
+    write_json(folder / "benchmark.json", found)
+    return found
 
 
-def run_tablet_benchmark(folder: Path, seed: int, progress: Progress) -> dict[str, object]:
-    """Time every calibration on the published data (closed form also on a simulated trial); write benchmark.json."""
+def times(seed: int, progress: Progress) -> dict[str, object]:
+    """Time every calibration on the published data (closed form also on a simulated trial)."""
     touches = published_touches()
     progress("closed form", 0.0)
     rays, hand, theta = touched_rays(touches).T.copy(), touches.hand_m.T.copy(), touches.theta_rad
@@ -37,7 +39,7 @@ def run_tablet_benchmark(folder: Path, seed: int, progress: Progress) -> dict[st
     two_stages = median_seconds(lambda: tablet_stage2(touches, tablet_stage1(touches).parameters), 3)
     alone, crowd = evaluation_seconds(touches)
     published = PUBLISHED_EVALUATIONS * alone
-    summary = {
+    return {
         "state": "done",
         "closed_form_us": 1e6 * closed,
         "closed_form_simulated_us": 1e6 * simulated,
@@ -53,5 +55,3 @@ def run_tablet_benchmark(folder: Path, seed: int, progress: Progress) -> dict[st
         "two_stages_times_faster": 2.0 * published / two_stages,
         "closed_form_in_evaluations": closed / alone,
     }
-    write_json(folder / "benchmark.json", summary)
-    return summary

@@ -42,21 +42,11 @@ class Reproduced:
 
 @dataclass(frozen=True)
 class Cost:
-    """Seconds: the four fits together, one evaluation of the objective alone and in a crowd, and what 1e8 would take."""
+    """Seconds: the four fits together, and one evaluation of the objective, alone and in a crowd."""
 
     four_fits: float
     one_evaluation: float
     crowd_evaluation: float
-
-    @property
-    def published(self) -> float:
-        """The paper's evaluations one by one, extrapolated."""
-        return PUBLISHED_EVALUATIONS * self.one_evaluation
-
-    @property
-    def published_in_crowds(self) -> float:
-        """The same, whole generations at a time, extrapolated."""
-        return PUBLISHED_EVALUATIONS * self.crowd_evaluation
 
 
 @dataclass(frozen=True)

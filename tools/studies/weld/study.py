@@ -1,10 +1,9 @@
-"""Runs the weld study and writes its tables, CSV files, pictures and report page."""
+"""Runs the weld study: its target table, the turns, the comparison of the laws, and one pictured run of each seam."""
 
 import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, astuple, dataclass, fields
-from functools import partial
+from dataclasses import asdict, astuple, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +11,11 @@ import numpy as np
 
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
-from weldcal.tools.report.files import csv_text, write_json
+from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, paths
-from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.studies.harness import MISSED
-from weldcal.tools.studies.output import print_note, print_table
-from weldcal.tools.studies.targets import verdict
+from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.studies.harness import RUNS, Figures, Measured, Study
+from weldcal.tools.studies.targets import Target, verdict
 from weldcal.tools.studies.weld.rows import (
     CHORDS,
     COMPARED,
@@ -38,50 +36,94 @@ from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase
 
-
-@dataclass(frozen=True)
-class StudyOptions:
-    """Output folder, rows (all when none), how many seeds, the first of them, and whether in short form."""
-
-    folder: Path
-    rows: tuple[str, ...] = ()
-    seeds: int = 10
-    first_seed: int = 0
-    quick: bool = False
+COMPARED_SEEDS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
-    """All runs of a study, by row, by turn and by law, and one pictured run of each seam."""
+@command("reproduce weld", short_help="Run the weld law in a small kinematic world.")
+def weld(
+    call: Call,
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each weld.", min=1)] = 10,
+    rows: Annotated[str, option("--rows", "NAMES", "Only these rows, separated by commas.", show_default="all")] = "",
+    quick: Annotated[
+        bool, switch("--quick", "Two seeds of each weld, and two for the comparison of the laws.")
+    ] = False,
+) -> Outcome:
+    """Run the weld law in a small kinematic world: every target, the published law for comparison, figures."""
+    folder, number = call.folder("reproduce", "weld"), min(seeds, 2) if quick else seeds
+    names = tuple(name.strip() for name in rows.split(",") if name.strip())
+    return run_study(folder, names, number, call.seed, quick, call.progress).outcome()
 
-    options: StudyOptions
-    rows: tuple[RowResult, ...]
-    turns: tuple[TurnResult, ...]
-    compared: tuple[CaseResult, ...]
-    pictured: tuple[tuple[Case, StudyRun, RunMetrics], ...]
-    wall_seconds: float
 
-    @property
-    def met(self) -> bool:
-        """Whether every weld was completed, every target met, and every impossible turn refused."""
-        return all(r.met for r in self.rows) and all(t.named and not t.stalled for t in self.turns)
+def run_study(
+    folder: Path, names: tuple[str, ...], count: int, first: int, quick: bool, progress: Progress
+) -> Measured:
+    """Run the rows of those names (all when none) with ``count`` seeds from ``first`` on; write the tables, runs.csv, and one CSV and two
+    pictures per pictured run."""
+    start = time.monotonic()
+    everything = not names
+    rows = get_rows(names)
+    wanted = [case for row in rows for case in row.cases]
+    seeds = tuple(range(first, first + count))
+    pictured: dict[str, tuple[Case, StudyRun]] = {}
 
-    def summary(self) -> dict[str, object]:
-        """The result for JSON; what could not be measured is null."""
-        return {
-            "state": "done",
-            "met": self.met,
-            "seeds": self.options.seeds,
-            "first_seed": self.options.first_seed,
-            "rows": {r.row.key: _row_summary(r) for r in self.rows},
-            "turns": [asdict(t) | {"named": t.named, "stalled": t.stalled} for t in self.turns],
-            "laws": [
-                {"case": c.case.name, "law": c.case.law, "completed": c.completed, "runs": c.metrics}
-                for c in self.compared
-            ],
-            "wall_seconds": self.wall_seconds,
-            "written_to": self.options.folder,
-        }
+    def keep(case: Case, seed: int, run: StudyRun, figures: RunMetrics) -> None:
+        # One run of each seam is drawn: the first seed, ours, nominal, as far as there is one.
+        if seed == first and case.law == "guarded" and case.seam not in pictured:
+            pictured[case.seam] = (case, run)
+
+    results = run_cases(wanted, seeds, keep, lambda name, share: progress(name, 0.7 * share))
+    turns: list[TurnResult] = []
+    if everything or "turns" in names:
+        chords = CHORDS[1:2] if quick else CHORDS
+        pairs = [(name, chord) for name in TURNS for chord in chords]
+        for k, (name, chord) in enumerate(pairs):
+            progress(name, 0.7 + 0.05 * k / len(pairs))
+            turns.append(run_turn(name, chord, first))
+    compared: dict[Case, CaseResult] = {}
+    if everything or "laws" in names:
+        few = seeds[: 1 if quick else COMPARED_SEEDS]
+        compared = run_cases(COMPARED, few, keep, lambda name, share: progress(name, 0.75 + 0.25 * share), results)
+    measured = [measure_row(row, results) for row in rows] if results else []
+    write_atomic(folder / RUNS, runs_csv([*results.values(), *compared.values()]))
+    for case, run in pictured.values():
+        trace = weld_trace(run, study_config(case))
+        write_atomic(folder / "runs" / f"{case.name}.csv", run_csv(run))
+        write_atomic(folder / "figures" / f"{case.name}_paths.svg", paths(trace))
+        write_atomic(folder / "figures" / f"{case.name}_along.svg", along_the_weld(trace))
+    figures = {
+        "met": all(r.met for r in measured) and all(t.named and not t.stalled for t in turns),
+        "seeds": count,
+        "first_seed": first,
+        "rows": {r.row.key: _row_summary(r) for r in measured},
+        "turns": [asdict(t) | {"named": t.named, "stalled": t.stalled} for t in turns],
+        "laws": [
+            {"case": c.case.name, "law": c.case.law, "completed": c.completed, "runs": c.metrics}
+            for c in compared.values()
+        ],
+        "wall_seconds": time.monotonic() - start,
+        "written_to": folder,
+    }
+    study = Study(
+        name="weld",
+        what="The weld law in a small kinematic world: every target, turns, and the published law for comparison.",
+        figures=lambda results: figures,
+        header=("what", "figure", "target", "mean", "worst", "", "worst run"),
+        rows=lambda figures: table_lines(measured),
+        others=lambda figures: (
+            ("Turns, U-turns and cusps", TURN_HEADER, turn_lines(turns)),
+            ("Comparison of the laws", LAW_HEADER, compared_lines(compared.values())),
+        ),
+        targets=_missed,
+        group="reproduce",
+    )
+    return study.measured({}, folder)
+
+
+def _missed(figures: Figures) -> list[Target]:
+    """Every weld is to be completed, every target met, and every impossible turn refused."""
+    bad = [row for row in figures["rows"].values() if not row["met"]]
+    bad += [turn for turn in figures["turns"] if not turn["named"] or turn["stalled"]]
+    return [Target("rows and turns that missed", "", len(bad), 0.0)]
 
 
 def _row_summary(row: RowResult) -> dict[str, object]:
@@ -164,71 +206,6 @@ def turn_lines(turns: Iterable[TurnResult]) -> list[tuple[str, ...]]:
     ]  # fmt: skip
 
 
-def print_study(study: Study) -> None:
-    """Write the tables on stdout."""
-    lines = table_lines(study.rows)
-    if lines:
-        header = ("what", "figure", "target", "mean", "worst", "")
-        print_table("Reached against targets", header, [line[:6] for line in lines], text=(0, 1, 2, 5))
-        for line in lines:
-            if line[5] == "MISSED":
-                print_note(f"missed: {line[1]}, target {line[2]}: {line[6]}")
-    if study.turns:
-        print_table("Turns, U-turns and cusps", TURN_HEADER, turn_lines(study.turns), text=(0, 4, 5))
-    if study.compared:
-        print_table("Comparison of the laws", LAW_HEADER, compared_lines(study.compared), text=(0, 1, 6))
-    print_note(f"written to {study.options.folder}")
-
-
-TITLES = {
-    "straight": "Straight", "s_r60": "S of radius 60 mm", "l_r20_convex": "Corner of 20 mm, convex",
-    "l_r20_concave": "Corner of 20 mm, concave", "l_r5_convex": "Corner of 5 mm, convex", "l_r5_concave": "Corner of 5 mm, concave",
-    "l_r1_convex": "Corner of 1 mm, convex", "l_r1_concave": "Corner of 1 mm, concave", "arc_r60_end": "Ending on an arc of 60 mm",
-}  # fmt: skip
-_CARDS = (
-    ("imperfect", "mean_mm"),
-    ("imperfect", "max_mm"),
-    ("imperfect", "height_mm"),
-    ("imperfect_corners", "max_mm"),
-)
-
-
-def study_report(study: Study) -> str:
-    """The whole report as one self-contained HTML text."""
-    lines = table_lines(study.rows)
-    missed = sum(line[5] != "met" for line in lines) + sum(not t.named or t.stalled for t in study.turns)
-    total = len(lines) + len(study.turns)
-    seams = [
-        {
-            "title": TITLES.get(case.seam, case.seam.replace("_", " ")),
-            "sentence": f"{case.name}, seed {study.options.first_seed}: mean {fixed(m.mean_mm, 3)} mm, largest "
-            f"{fixed(m.max_mm, 3)} mm, torch speed CV {fixed(m.cv_percent, 1)} %, turning rate up to {fixed(m.omega_rad_s, 2)} rad/s.",
-            "paths": paths(trace),
-            "along": along_the_weld(trace),
-            "bent": trace.work is not None,
-        }
-        for case, trace, m in ((case, weld_trace(run, study_config(case)), m) for case, run, m in study.pictured)
-    ]
-    usual = any(row.row.key == key for row in study.rows for key, _ in _CARDS)
-    cards = [
-        (row.row.label, FIGURE_NAMES[r.target.figure], r)
-        for row in study.rows
-        for r in row.reached
-        if ((row.row.key, r.target.figure) in _CARDS if usual else r == row.reached[0])
-    ]
-    return render(
-        "weld_study.html.j2",
-        cards=cards,
-        study=study,
-        lines=lines,
-        missed=missed,
-        total=total,
-        seams=seams,
-        turns=turn_lines(study.turns),
-        compared=compared_lines(study.compared),
-    )
-
-
 _EVERY = 4  # ticks per plotted point: 0.26 mm at 8 mm/s
 _BENT_RAD = math.radians(1.0)  # a surface whose normal turns by less is flat
 
@@ -281,52 +258,6 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
     )
 
 
-COMPARED_SEEDS = 3
-
-
-def run_study(options: StudyOptions, progress: Progress) -> Study:
-    """Run what is asked for and write table.json, runs.csv, one CSV per pictured run, and report.html."""
-    start = time.monotonic()
-    everything = not options.rows
-    rows = get_rows(options.rows)
-    wanted = [case for row in rows for case in row.cases]
-    seeds = tuple(range(options.first_seed, options.first_seed + options.seeds))
-    pictured: dict[str, tuple[Case, StudyRun, RunMetrics]] = {}
-
-    def keep(case: Case, seed: int, run: StudyRun, figures: RunMetrics) -> None:
-        # One run of each seam is drawn: the first seed, ours, nominal, as far as there is one.
-        if seed == options.first_seed and case.law == "guarded" and case.seam not in pictured:
-            pictured[case.seam] = (case, run, figures)
-
-    results = run_cases(wanted, seeds, keep, lambda name, share: progress(name, 0.7 * share))
-    turns: list[TurnResult] = []
-    if everything or "turns" in options.rows:
-        chords = CHORDS[1:2] if options.quick else CHORDS
-        pairs = [(name, chord) for name in TURNS for chord in chords]
-        for k, (name, chord) in enumerate(pairs):
-            progress(name, 0.7 + 0.05 * k / len(pairs))
-            turns.append(run_turn(name, chord, options.first_seed))
-    compared: dict[Case, CaseResult] = {}
-    if everything or "laws" in options.rows:
-        few = seeds[: 1 if options.quick else COMPARED_SEEDS]
-        compared = run_cases(COMPARED, few, keep, lambda name, share: progress(name, 0.75 + 0.25 * share), results)
-    study = Study(
-        options,
-        tuple(measure_row(row, results) for row in rows) if results else (),
-        tuple(turns),
-        tuple(compared.values()),
-        tuple(pictured.values()),
-        time.monotonic() - start,
-    )
-    folder = options.folder
-    write_json(folder / "table.json", study.summary())
-    write_atomic(folder / "runs.csv", runs_csv([*results.values(), *compared.values()]))
-    for case, run, _ in study.pictured:
-        write_atomic(folder / "runs" / f"{case.name}.csv", run_csv(run))
-    write_atomic(folder / "report.html", study_report(study))
-    return study
-
-
 def runs_csv(results: Iterable[CaseResult]) -> str:
     """One line per run: case, seed and every figure."""
     header = ["case", "seam", "budget", "chord_mm", "speed_mm_s", "law", "seed", *(f.name for f in fields(RunMetrics))]
@@ -345,19 +276,3 @@ def run_csv(run: StudyRun) -> str:
     for line, phase in zip(lines, run.column("phase"), strict=True):
         line[k] = PHASES[int(phase)].value
     return csv_text(COLUMNS, lines)
-
-
-@command("reproduce weld", short_help="Run the weld law in a small kinematic world.")
-def weld(
-    call: Call,
-    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each weld.", min=1)] = 10,
-    rows: Annotated[str, option("--rows", "NAMES", "Only these rows, separated by commas.", show_default="all")] = "",
-    quick: Annotated[
-        bool, switch("--quick", "Two seeds of each weld, and two for the comparison of the laws.")
-    ] = False,
-) -> Outcome:
-    """Run the weld law in a small kinematic world: every target, the published law for comparison, figures, a report."""
-    folder, number = call.folder("reproduce", "weld"), min(seeds, 2) if quick else seeds
-    names = tuple(name.strip() for name in rows.split(",") if name.strip())
-    study = run_study(StudyOptions(folder, names, number, call.seed, quick), call.progress)
-    return Outcome(study.summary(), {}, text=partial(print_study, study), problem="" if study.met else MISSED)

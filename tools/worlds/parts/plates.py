@@ -1,7 +1,7 @@
 """Simulated scans of workpieces: a part on a table with other objects, ray-cast for any scanner preset."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +10,9 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.spatial import cKDTree
 
 from weldcal.models.mesh import TriMesh, extrude
-from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
-from weldcal.models.workpieces.plate import Workpiece
+from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
+from weldcal.models.workpieces.part import bend
+from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 from weldcal.welding.locate.planes import Floats, into
 
 TABLE_M = 1.4
@@ -115,3 +116,107 @@ def sideways(points_B: Floats, part: Workpiece, X_BP: RigidTransform) -> tuple[F
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     gap = p - part.seam_P[nearest]
     return np.sum(gap * left, axis=1), np.sum(gap * up, axis=1)
+
+
+WIDEST_PX = 824
+CORNER_M, BEND_M = 0.004, 0.200
+
+
+def part_for(preset: str, shape: str) -> Workpiece:
+    """A workpiece that the preset's field of view holds in any turn."""
+    scanner = get_scanner(preset)
+    small = min(scanner.footprint_m(min(0.93, 0.97 * scanner.far_m))) < 0.35
+    kind = {"corner": "l", "bent": "s"}.get(shape, shape)
+    radius = CORNER_M if shape == "corner" else None
+    if small:
+        part = make_workpiece(kind, length_m=0.200, width_m=0.130 if kind != "l" else 0.150, radius_m=radius)
+    else:
+        part = make_workpiece(kind, length_m=0.200 if shape == "bent" else 0.300, radius_m=radius)
+    return bend(part, BEND_M) if shape == "bent" else part
+
+
+def scan(preset: str, shape: str, seed: int, widest_px: int | None = WIDEST_PX) -> Scene:
+    """A part under that preset, at most `widest_px` wide (None: as the scanner has it), in a random pose tilted by up to 5 deg."""
+    scanner = get_scanner(preset)
+    scanner = scanner.resized(widest_px) if widest_px is not None and scanner.width > widest_px else scanner
+    part = part_for(preset, shape)
+    return scan_part(part, scanner, seed, tilt_rad=math.radians(5.0), spread_m=0.0 if part.size_m[1] < 0.16 else 0.05)
+
+
+def barred(width_m: float) -> Callable[[np.random.Generator], list[TriMesh]]:
+    """A bar 60 mm over the part, across its middle."""
+
+    def made(rng: np.random.Generator) -> list[TriMesh]:
+        turn = RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi))
+        p = [0.6 + rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), 0.11]
+        return [box(0.6, width_m, 0.01).transformed(RigidTransform(turn, p))]
+
+    return made
+
+
+def cluttered(rng: np.random.Generator) -> list[TriMesh]:
+    """Boxes around the part, some as high as it, and one on its edge."""
+    meshes = []
+    for _ in range(8):
+        angle, far = rng.uniform(-math.pi, math.pi), rng.uniform(0.16, 0.32)
+        X = RigidTransform(
+            RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi)),
+            [0.6 + far * math.cos(angle), far * math.sin(angle), 0.0],
+        )
+        size = rng.uniform([0.03, 0.03, 0.01], [0.12, 0.08, 0.08])
+        meshes.append(box(*(float(v) for v in size)).transformed(X))
+    return meshes
+
+
+PLANNED, REFUSED = "planned", "refused"
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """A kind of scene. others: objects beside the part; drawing: what is looked for, None: the part itself; must: what the
+    answer has to be, empty where a plan with an honest sigma and a refusal are both right.
+    """
+
+    name: str
+    part: Callable[[], Workpiece]
+    must: str
+    method: str
+    others: Callable[[np.random.Generator], list[TriMesh]] = lambda rng: []
+    drawing: Callable[[], Workpiece] | None = None
+
+
+def _s() -> Workpiece:
+    return make_workpiece("s", length_m=0.250)
+
+
+def _flat() -> Workpiece:
+    return make_workpiece("s", length_m=0.200)
+
+
+def _bent(radius_m: float) -> Callable[[], Workpiece]:
+    return lambda: bend(_flat(), radius_m)
+
+
+TROUBLES = (
+    *(
+        Trouble(name, part, must, method, others)
+        for name, part, must, others in (
+            ("bar of 12 mm across", _s, PLANNED, barred(0.012)),
+            ("bar of 30 mm across", _s, "", barred(0.030)),
+            ("clutter around", _s, PLANNED, cluttered),
+            ("bent, bar of 12 mm across", _bent(BEND_M), PLANNED, barred(0.012)),
+        )
+        for method in ("cad", "cloud")
+    ),
+    *(
+        Trouble(f"wrong: {name}", part, REFUSED, "cad", drawing=drawing)
+        for name, part, drawing in (
+            ("6 mm wider", lambda: make_workpiece("s", length_m=0.250, width_m=0.206), _s),
+            ("5 mm longer", lambda: make_workpiece("s", length_m=0.255), _s),
+            ("another groove", lambda: make_workpiece("straight", length_m=_s().size_m[0]), _s),
+            ("bent, drawn flat", _bent(BEND_M), _flat),
+            ("flat, drawn bent", _flat, _bent(BEND_M)),
+            ("bent over 230 mm, drawn 200", _bent(0.230), _bent(BEND_M)),
+        )
+    ),
+)

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.models.mesh import TriMesh, merge
+from weldcal.models.errors import WeldcalError
+from weldcal.models.mesh import TriMesh, merge, revolve
 from weldcal.models.scanners import ScannerPreset
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.tools.worlds.parts.plates import box, cast, looking_at, table
 from weldcal.tools.worlds.parts.step_parts import PARTS
+from weldcal.welding.locate.part.result import AmbiguousPart, PartNotFound
 
 Floats = NDArray[np.float64]
 MIDDLE = np.array([0.6, 0.0, 0.0])
@@ -202,3 +206,65 @@ def block() -> TriMesh:
         box(0.02, 0.02, 0.032).transformed(RigidTransform([0.005, -0.03, 0.0])),
     ]
     return merge(*parts)
+
+
+MESH_NOISE_M, MESH_WAVE_M, MESH_TRIANGLES = 1e-4, 0.015, 15_000
+
+
+def scanned_mesh(mesh: TriMesh, rng: np.random.Generator) -> TriMesh:
+    """The part as a mesh file made from a scan: small triangles, its surface off by 0.1 mm in waves of MESH_WAVE_M."""
+    import open3d
+
+    fine: Any = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(mesh.vertices.copy()), open3d.utility.Vector3iVector(mesh.triangles.copy())
+    )
+    fine.merge_close_vertices(1e-7)
+    while len(fine.triangles) < MESH_TRIANGLES:
+        fine = fine.subdivide_midpoint(1)
+    corners = np.asarray(fine.vertices)
+    # The triangles are slivers in places: an error of each corner by itself would fold the surface.
+    waves = rng.normal(size=(3, 3, 60)) * (2.0 * math.pi / MESH_WAVE_M / math.sqrt(3.0))
+    phase = rng.uniform(0.0, 2.0 * math.pi, size=(3, 1, 60))
+    error = MESH_NOISE_M * math.sqrt(2.0 / 60.0) * np.cos(corners @ waves + phase).sum(axis=2).T
+    return TriMesh(corners + error, np.asarray(fine.triangles, dtype=np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """What lies in the scene, what is looked for, and the error with the words that must name why."""
+
+    there: TriMesh
+    looked_for: TriMesh
+    error: type[WeldcalError]
+    words: str
+    twice: bool = False
+
+
+def sphere(radius: float) -> TriMesh:
+    """A ball that rests on z = 0, m."""
+    a = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 33)
+    return revolve(np.column_stack([radius * np.cos(a) * (np.abs(a) < 1.57), radius * (1.0 + np.sin(a))]), 64)
+
+
+def pipe(radius: float, wall: float, height: float) -> TriMesh:
+    """A pipe that rests on z = 0, m."""
+    inner = radius - wall
+    return revolve(np.array([[inner, 0.0], [radius, 0.0], [radius, height], [inner, height], [inner, 0.0]]), 72)
+
+
+def _scaled(mesh: TriMesh, factor: float) -> TriMesh:
+    return TriMesh(mesh.vertices * factor, mesh.triangles)
+
+
+REFUSALS: dict[str, Callable[[], Refusal]] = {
+    "plain plate": lambda: Refusal(box(0.2, 0.12, 0.012), box(0.2, 0.12, 0.012), AmbiguousPart, "turning it about its"),
+    "plain pipe": lambda: Refusal(
+        pipe(0.05, 0.005, 0.09), pipe(0.05, 0.005, 0.09), AmbiguousPart, "free to turn about its z axis|looks the same"
+    ),
+    "sphere": lambda: Refusal(sphere(0.05), sphere(0.05), AmbiguousPart, "free to turn about its|looks the same"),
+    "two alike": lambda: Refusal(block(), block(), AmbiguousPart, "Two places in the scan", twice=True),
+    "another part": lambda: Refusal(block(), subject("lap").mesh, PartNotFound, "part"),
+    "another length": lambda: Refusal(box(0.2, 0.12, 0.03), box(0.26, 0.12, 0.03), PartNotFound, "part"),
+    "wrong unit": lambda: Refusal(block(), _scaled(block(), 25.4), PartNotFound, "part"),
+    "not there": lambda: Refusal(box(0.03, 0.03, 0.02), block(), PartNotFound, "part"),
+}

@@ -12,7 +12,6 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
-from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome, study_clouds
 from weldcal.tools.studies.flange.published.pairs import (
     KinectOutcome,
@@ -22,8 +21,7 @@ from weldcal.tools.studies.flange.published.pairs import (
     study_pairs,
 )
 from weldcal.tools.studies.flange.published.report import COST_HEADER, cost_rows, pictures, tables
-from weldcal.tools.studies.flange.published.results import Study as Found
-from weldcal.tools.studies.flange.published.results import StudyOptions
+from weldcal.tools.studies.flange.published.results import Found
 from weldcal.tools.studies.flange.published.simulation import simulate
 from weldcal.tools.studies.flange.published.sphere import run_sphere_study, sphere_rows
 from weldcal.tools.studies.harness import Study
@@ -37,15 +35,13 @@ _LEAST_CLOUDS = 10
 _USUAL_CLOUDS = 18  # more scans make each run of Algorithm 1 longer: fewer runs then, and the same time
 
 
-def run_study(options: StudyOptions, progress: Progress) -> Found:
-    """Run it, and draw figures/*.svg in the folder.
+def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> Found:
+    """Everything, or the simulated parts where no folder of datasets is given.
 
     Raises:
         InputError: the data folder does not exist or holds no dataset, before any work.
     """
-    start = time.monotonic()
-    found = find_datasets(options.data) if options.data is not None else []
-    quick, seed = options.quick, options.seed
+    found = find_datasets(data) if data is not None else []
     levels, realisations = (5, 40) if quick else (50, 100)
     share = _SHARE_SIMULATION if found else 1.0
     simulation = simulate(
@@ -55,27 +51,29 @@ def run_study(options: StudyOptions, progress: Progress) -> Found:
     clouds: list[CloudsOutcome] = []
     kinect: list[KinectOutcome] = []
     notes: list[str] = [] if found else [NO_DATA]
-    for k, data in enumerate(found):
-        name = data.folder.name
+    for k, dataset in enumerate(found):
+        name = dataset.folder.name
         begin, width = share + (1.0 - share) * k / len(found), (1.0 - share) / len(found)
         progress(name, begin)
-        if data.pairs:
-            observations = [Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs]
-            if "kinect" in data.header.scanner:
+        if dataset.pairs:
+            observations = [Observation(p.id, p.X_BR, p.p_CR) for p in dataset.pairs]
+            if "kinect" in dataset.header.scanner:
                 kinect.append(study_kinect(name, observations, repeats=2 if quick else 10, seed=seed))
             else:
-                runs = load_runs(data.folder)
-                pairs.append(study_pairs(name, title(data), observations, runs, repeats=2 if quick else 10, seed=seed))
-        elif len(data.clouds) < _LEAST_CLOUDS:
-            scans = "1 scan" if len(data.clouds) == 1 else f"{len(data.clouds)} scans"
+                runs = load_runs(dataset.folder)
+                pairs.append(
+                    study_pairs(name, title(dataset), observations, runs, repeats=2 if quick else 10, seed=seed)
+                )
+        elif len(dataset.clouds) < _LEAST_CLOUDS:
+            scans = "1 scan" if len(dataset.clouds) == 1 else f"{len(dataset.clouds)} scans"
             notes.append(f"{name} holds {scans}, too few to hold any out: it is not used.")
         else:
-            effort = min(1.0, (_USUAL_CLOUDS - 5) / (len(data.clouds) - 5))
+            effort = min(1.0, (_USUAL_CLOUDS - 5) / (len(dataset.clouds) - 5))
             outcome = study_clouds(
                 name,
-                title(data),
-                data,
-                get_flange(data.header.flange),
+                title(dataset),
+                dataset,
+                get_flange(dataset.header.flange),
                 orders=2 if quick else max(5, round(50 * effort)),
                 splits=3 if quick else max(5, round(60 * effort)),
                 circles=4 if quick else None,
@@ -83,18 +81,9 @@ def run_study(options: StudyOptions, progress: Progress) -> Found:
                 progress=lambda what, done, at=begin, part=width: progress(what, at + part * done),  # type: ignore[misc]
             )
             clouds.append(outcome)
-    study = Found(
-        options=options,
-        simulation=simulation,
-        pairs=tuple(pairs),
-        clouds=tuple(clouds),
-        kinect=tuple(kinect),
-        notes=tuple(notes),
-        wall_seconds=time.monotonic() - start,
+    return Found(
+        simulation=simulation, pairs=tuple(pairs), clouds=tuple(clouds), kinect=tuple(kinect), notes=tuple(notes)
     )
-    for name, picture in pictures(study).items():
-        write_atomic(options.folder / "figures" / f"{name}.svg", picture)
-    return study
 
 
 def find_datasets(folder: Path) -> list[Dataset]:
@@ -131,18 +120,21 @@ def flange(
 ) -> Outcome:
     """Repeat the flange paper: Table 1, Fig. 9, 10 and 11, the Kinect data, and the effect of Algorithm 1's cost."""
     folder = call.folder("reproduce", "flange")
-    found = run_study(StudyOptions(folder, data, call.seed, quick), call.progress)
+    start = time.monotonic()
+    found = compute(data, call.seed, quick, call.progress)
+    more = {"quick": quick, "seed": call.seed, "wall_seconds": time.monotonic() - start, "written_to": folder}
     paper = Study(
         name="flange",
         what="The flange paper repeated: the effect of Algorithm 1's cost (simulated, 1 mm of noise), and its data.",
         group="reproduce",
-        figures=lambda results: results["all"],
+        figures=lambda results: {**found.summary(), **more},
         header=COST_HEADER,
         rows=lambda figures: cost_rows(found),
         others=lambda figures: tables(found),
         numbers=len(COST_HEADER) - 1,
+        plots=pictures(found),
     )
-    return paper.measured({"all": found.summary()}, folder).outcome()
+    return paper.measured({}, folder).outcome()
 
 
 @command("reproduce flange-sphere", short_help="Repeat Table 2 of the flange paper with a sphere.")
@@ -154,7 +146,7 @@ def flange_sphere(
     """Repeat Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same scans; and the false
     segmentations of Table 1."""
     folder = call.folder("reproduce", "flange-sphere")
-    summary = run_sphere_study(folder, scans, draws, call.seed, call.progress)
+    summary = run_sphere_study(scans, draws, call.seed, call.progress)
     sphere = Study(
         name="flange-sphere",
         what="Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same scans.",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from weldcal.models.arrays import Array
 from weldcal.tools.report.pictures import OURS, PLANNED, THEIRS, TRUTH, plain, svg
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
-from weldcal.tools.studies.flange.published.pairs import KinectOutcome, PairsOutcome
+from weldcal.tools.studies.flange.published.pairs import PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import Simulation
 
 # the paper's order and grouping: x, y, z above roll, pitch, yaw
@@ -137,20 +137,6 @@ def circles(c: CloudsOutcome) -> bytes:
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     axes.set_aspect("equal")
     _plain(axes, "x of the flange, mm", "y of the flange, mm")
-    return svg(picture)
-
-
-def kinect(k: KinectOutcome) -> bytes:
-    """Errors at the wrist ring before and after the paper's compensation."""
-    picture = Figure(figsize=(7.6, 2.2), layout="constrained")
-    axes = picture.subplots()
-    rows = [
-        ("all pairs, SVD", 1e3 * k.residual, PLANNED),
-        ("the same, held out", 1e3 * k.held_out, PLANNED),
-        ("weldcal, held out", 1e3 * k.ours, OURS),
-        ("compensated (Eq. 21)", 1e3 * k.compensated, TRUTH),
-    ]
-    _boxes(axes, rows)
     return svg(picture)
 
 

@@ -1,6 +1,7 @@
 """Tables and pictures of the flange study: the paper's numbers, ours, and the true errors."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 
@@ -8,9 +9,9 @@ from weldcal.models.arrays import Array
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.flange.published import plots
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
-from weldcal.tools.studies.flange.published.results import TABLE1, Study, statistics
+from weldcal.tools.studies.flange.published.results import TABLE1, Found, in_mm
 from weldcal.tools.studies.flange.published.simulation import COSTS
-from weldcal.tools.studies.harness import Row, Table
+from weldcal.tools.studies.harness import Results, Row, Table
 
 _SIX = ("x mm", "y mm", "z mm", "roll °", "pitch °", "yaw °")
 TABLE1_HEADER = ("robot and scanner", *_SIX)
@@ -25,7 +26,7 @@ SHORT = {
 }
 
 
-def table1_rows(study: Study) -> list[Row]:
+def table1_rows(study: Found) -> list[Row]:
     """Table 1: the paper's row, then ours where there are data."""
     rows: list[Row] = []
     for name, numbers in TABLE1.items():
@@ -43,7 +44,7 @@ def table1_rows(study: Study) -> list[Row]:
     return rows
 
 
-def cost_rows(study: Study) -> list[Row]:
+def cost_rows(study: Found) -> list[Row]:
     """Section 3.1 at 1 mm: spread of the error at the camera, and the true error at the 75 flange centres."""
     rows: list[Row] = []
     for name, e in study.simulation.costs.items():
@@ -63,7 +64,7 @@ def held_out_rows(outcome: CloudsOutcome) -> list[Row]:
     return rows
 
 
-def pairs_rows(study: Study) -> list[Row]:
+def pairs_rows(study: Found) -> list[Row]:
     """Per robot known by pairs: the paper's 50 runs, all pairs, ours; held-out errors."""
     rows: list[Row] = []
     for p in study.pairs:
@@ -84,10 +85,10 @@ def sight_rows(outcome: CloudsOutcome) -> list[Row]:
     return rows
 
 
-def kinect_rows(study: Study) -> list[Row]:
+def kinect_rows(study: Found) -> list[Row]:
     """The all-pairs SVD, held out, ours, and the compensated one, errors at the wrist ring."""
     return [
-        (what, *_numbers(statistics(errors).values(), 2))
+        (what, *_numbers(in_mm(errors).values(), 2))
         for k in study.kinect
         for what, errors in (
             (f"all {k.n} pairs, SVD, on the same pairs", k.residual),
@@ -98,7 +99,7 @@ def kinect_rows(study: Study) -> list[Row]:
     ]
 
 
-def tables(study: Study) -> list[Table]:
+def tables(study: Found) -> list[Table]:
     """Every table of the study that has lines."""
     found: list[Table] = []
     if study.pairs or study.clouds:
@@ -123,25 +124,22 @@ def _six(e: Array, degree_digits: int) -> tuple[str, ...]:
 
 def _held_out(name: str, reported_mm: float | None, errors_m: Array, digits: int) -> tuple[str, ...]:
     """A calibration's own figure, the true errors and their ratio."""
-    true = statistics(errors_m)
+    true = in_mm(errors_m)
     ratio = f"{true['median'] / reported_mm:.1f}×" if reported_mm else "–"
     return (name, fixed(reported_mm, digits), *_numbers(true.values(), digits), ratio)
 
 
-def pictures(study: Study) -> dict[str, bytes]:
-    """Every figure as SVG, by the name of its file."""
-    drawn = {
-        "fig9_noise": plots.fig9(study.simulation),
-        "fig10_steps": plots.fig10(study.simulation),
-        "costs": plots.costs(study.simulation),
+def pictures(study: Found) -> dict[str, Callable[[Results], bytes]]:
+    """What draws every figure, by the name of its file."""
+    sim = study.simulation
+    drawn: dict[str, Callable[[], bytes]] = {
+        "fig9_noise": lambda: plots.fig9(sim),
+        "fig10_steps": lambda: plots.fig10(sim),
+        "costs": lambda: plots.costs(sim),
     }
-    for p in study.pairs:
-        if p.runs is not None:
-            drawn[f"fig11_{p.name}"] = plots.fig11_stored(p)
+    drawn |= {f"fig11_{p.name}": partial(plots.fig11_stored, p) for p in study.pairs if p.runs is not None}
     for c in study.clouds:
-        drawn[f"fig11_{c.name}"] = plots.fig11_rerun(c)
-        drawn[f"held_out_{c.name}"] = plots.held_out(c)
-        drawn[f"circles_{c.name}"] = plots.circles(c)
-    for k in study.kinect:
-        drawn[f"kinect_{k.name}"] = plots.kinect(k)
-    return drawn
+        drawn[f"fig11_{c.name}"] = partial(plots.fig11_rerun, c)
+        drawn[f"held_out_{c.name}"] = partial(plots.held_out, c)
+        drawn[f"circles_{c.name}"] = partial(plots.circles, c)
+    return {f"figures/{name}.svg": lambda results, draw=draw: draw() for name, draw in drawn.items()}  # type: ignore[misc]

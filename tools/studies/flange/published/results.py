@@ -1,7 +1,6 @@
 """Results of the flange study and its JSON object."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -9,6 +8,7 @@ from weldcal.models.arrays import Array
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome
 from weldcal.tools.studies.flange.published.pairs import PAPER_E_RPY_DEG, PAPER_E_XYZ_MM, KinectOutcome, PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import Errors, Simulation
+from weldcal.tools.studies.harness import statistics
 
 TABLE1: dict[str, tuple[float, ...]] = {
     "UR5 & PhoXi M": (11.60, 2.81, 5.55, 0.49, -0.89, -0.47),
@@ -19,35 +19,20 @@ TABLE1: dict[str, tuple[float, ...]] = {
 """Table 1 of the paper: x, y, z in mm, roll, pitch, yaw in degrees."""
 
 
-@dataclass(frozen=True)
-class StudyOptions:
-    """Output folder, folder of datasets (None: only the simulated parts), seed, and whether in short form."""
-
-    folder: Path
-    data: Path | None = None
-    seed: int = 0
-    quick: bool = False
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Study:
+class Found:
     """All outcomes; ``notes`` are sentences about data that were missing or not usable."""
 
-    options: StudyOptions
     simulation: Simulation
     pairs: tuple[PairsOutcome, ...]
     clouds: tuple[CloudsOutcome, ...]
     kinect: tuple[KinectOutcome, ...]
     notes: tuple[str, ...]
-    wall_seconds: float
 
     def summary(self) -> dict[str, object]:
         """The result for JSON: millimetres and degrees where the key says so."""
         sim, axes = self.simulation, ("roll", "pitch", "yaw", "x", "y", "z")
         return {
-            "state": "done",
-            "quick": self.options.quick,
-            "seed": self.options.seed,
             "notes": self.notes,
             "simulation": {
                 "std_ratio_all_over_algorithm1": dict(zip(axes, sim.ratio, strict=True)),
@@ -61,26 +46,21 @@ class Study:
                 k.name: {
                     "n": k.n,
                     "paper_e": {"xyz_mm": PAPER_E_XYZ_MM, "rpy_deg": PAPER_E_RPY_DEG},
-                    "residual_mm": statistics(k.residual),
-                    "held_out_mm": statistics(k.held_out),
-                    "weldcal_held_out_mm": statistics(k.ours),
-                    "compensated_mm": statistics(k.compensated),
+                    "residual_mm": in_mm(k.residual),
+                    "held_out_mm": in_mm(k.held_out),
+                    "weldcal_held_out_mm": in_mm(k.ours),
+                    "compensated_mm": in_mm(k.compensated),
                     "e_at_camera_mm": 1e3 * k.at_camera_m,
                     "e_at_work_mm": 1e3 * k.shift_m,
                 }
                 for k in self.kinect
             },
-            "wall_seconds": self.wall_seconds,
-            "written_to": self.options.folder,
         }
 
 
-def statistics(errors_m: Array) -> dict[str, float]:
+def in_mm(errors_m: Array) -> dict[str, float]:
     """Median, mean and 95 % in mm, NaN left out."""
-    e = 1e3 * errors_m[np.isfinite(errors_m)]
-    if len(e) == 0:
-        return dict.fromkeys(("median", "mean", "p95"), float("nan"))
-    return {"median": float(np.median(e)), "mean": float(e.mean()), "p95": float(np.percentile(e, 95))}
+    return statistics(1e3 * errors_m, "median", "mean", "p95")
 
 
 def _errors(e: Errors) -> dict[str, object]:
@@ -99,10 +79,10 @@ def _pairs(p: PairsOutcome) -> dict[str, object]:
         "table1_xyz_mm": None if p.table1 is None else 1e3 * p.table1[3:],
         "table1_rpy_deg": None if p.table1 is None else np.degrees(p.table1[:3]),
         "algorithm1_reports_mm": None if p.runs is None else p.reported_mm,
-        "algorithm1_own_four_mm": statistics(p.own_pool),
-        "algorithm1_true_mm": statistics(p.true),
-        "svd_held_out_mm": statistics(p.svd),
-        "weldcal_held_out_mm": statistics(p.ours),
+        "algorithm1_own_four_mm": in_mm(p.own_pool),
+        "algorithm1_true_mm": in_mm(p.true),
+        "svd_held_out_mm": in_mm(p.svd),
+        "weldcal_held_out_mm": in_mm(p.ours),
     }
 
 
@@ -115,7 +95,7 @@ def _clouds(c: CloudsOutcome) -> dict[str, object]:
         "circle_bias_R_mm": c.circle_bias_R_mm,
         "circle_halves_mm": c.halves_mm("published"),
         "edges_halves_mm": c.halves_mm("ours"),
-        "held_out_mm": {s.name: statistics(s.held_out) for s in c.splits},
+        "held_out_mm": {s.name: in_mm(s.held_out) for s in c.splits},
         "reported_mm": {s.name: 1e3 * s.reported for s in c.splits},
         "sight": {r.title: {"share": r.share, "value": r.value, "blind": r.blind} for r in c.sights},
     }

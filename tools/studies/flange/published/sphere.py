@@ -1,111 +1,29 @@
 """Table 2 of the flange paper repeated in a simulated cell: a calibration sphere on the flange beside the flange, in the same scans."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
-from weldcal.calibration.flange.fit import FlangeFit, fit_flange
-from weldcal.calibration.flange.observation import Observation, observation_from_fit
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
-from weldcal.calibration.touch.table import around, fit_touched_sphere
-from weldcal.models.arms.inverse import nearest_solution
-from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.models.flanges import get_flange
-from weldcal.models.scanners import get_scanner
-from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.report.files import write_json
-from weldcal.tools.worlds.flange_frames import facing, sphere_frame
+from weldcal.tools.studies.harness import statistics
+from weldcal.tools.worlds.sphere_cell import P_FS, SphereScan, cell_scans
 
-SPHERE_RADIUS_M = 0.025
-P_FS = np.array([0.085, 0.0, 0.02])
-"""Centre of the sphere on the flange, as it was meant to be mounted, m."""
 TABLE2 = {4: (-1.94, -0.90, -0.86, -0.07, 0.04, -0.10), 16: (-0.98, -1.01, -0.83, -0.07, 0.09, -0.11)}
 """The paper's Table 2 by its number of pairs: x, y, z in mm, roll, pitch, yaw in degrees."""
 FALSE, OF = 3, 54
 """Table 1, UR5: false segmentations among the pairs."""
-_MOUNTED_M = 1e-3  # by which the sphere lies elsewhere than meant, per axis
-_REPEAT_M = 2e-5
-_ARM_MM = 0.4
-_HOME = np.radians([10.0, -80.0, 110.0, -120.0, -90.0, 0.0])
-
-
-@dataclass(frozen=True, eq=False)
-class SphereScan:
-    """One scan with both: the flange's observation, the sphere's centre (3,) m in the camera, and the stated X_BF."""
-
-    flange: Observation
-    sphere: Array
-    X_BF: RigidTransform
-
-
-def cell_scans(n: int, seed: int, progress: Progress = no_progress) -> list[SphereScan]:
-    """``n`` scans of a flange that carries a sphere, by one arm and one scanner whose errors no estimate is given: links 0.4 mm (rms at the
-    flange), repeatability 0.035 mm, scale 0.2 %, gradient 0.13 % per 100 mm, a warp of 0.1 mm."""
-    rng = np.random.default_rng(seed)
-    arm, standard = load_arm("ur10e"), get_flange("iso9409-1-50-4-m6")
-    true = draw_true_arm(arm, _ARM_MM, _HOME, rng)
-    scanner = get_scanner("phoxi_m", 824)
-    noise = replace(
-        scanner.noise, scale_error=-2e-3, gradient_per_m=(0.013, 0.0), warp_m=1e-4, device=int(rng.integers(2**31))
-    )
-    scanner = replace(scanner, noise=noise)
-    X_BC = RigidTransform(RollPitchYaw(np.radians([180.0, 0.0, -90.0])), [-0.65, 0.1, 1.25])
-    p_FS = P_FS + _MOUNTED_M * rng.normal(size=3)
-    scans: list[SphereScan] = []
-    for _ in range(6 * n):
-        if len(scans) == n:
-            break
-        z = rng.uniform(0.58, 0.85)
-        p = np.array([rng.uniform(-0.16, 0.16), rng.uniform(-0.12, 0.12), z])
-        X_CF = facing(p, np.radians(rng.uniform(0.0, 25.0)), *rng.uniform(0.0, 2.0 * np.pi, 2))
-        q = nearest_solution(arm, X_BC @ X_CF, _HOME)
-        if q is None:
-            continue
-        stated = forward_kinematics(arm, q)
-        real = forward_kinematics(true, q)
-        real = RigidTransform(real.rotation(), real.translation() + _REPEAT_M * rng.normal(size=3))
-        X_CF = X_BC.inverse() @ real
-        points = sphere_frame(scanner, standard, rng, X_CF, p_FS, SPHERE_RADIUS_M)
-        try:
-            fit = fit_flange(points, standard)
-            sphere = _sphere(points, fit)
-        except WeldcalError:
-            continue
-        scans.append(SphereScan(observation_from_fit(f"s{len(scans)}", stated, fit), sphere, stated))
-        progress("scans", len(scans) / n)
-    return scans
-
-
-def _sphere(points_C: Array, fit: FlangeFit) -> Array:
-    """Centre of the ball beside the fitted flange: what stands proud of the face, on the ring where the ball must lie."""
-    p = points_C.reshape(-1, 3)
-    p = p[np.isfinite(p).all(axis=1)]
-    away = p - fit.center_C
-    height = away @ fit.normal_C
-    aside = np.linalg.norm(away - height[:, None] * fit.normal_C, axis=1)
-    reach = float(np.hypot(P_FS[0], P_FS[1]))
-    seen = p[
-        (np.abs(aside - reach) < 0.8 * SPHERE_RADIUS_M)
-        & (height > P_FS[2])
-        & (height < P_FS[2] + 1.2 * SPHERE_RADIUS_M)
-    ]
-    middle = np.median(seen, axis=0) if len(seen) else fit.center_C
-    near = around(p, middle, 0.9 * SPHERE_RADIUS_M, "sphere")
-    first, _ = fit_touched_sphere(near, SPHERE_RADIUS_M)
-    cap = p[np.abs(np.linalg.norm(p - first, axis=1) - SPHERE_RADIUS_M) < 1e-3]
-    return fit_touched_sphere(around(cap, first, 1.1 * SPHERE_RADIUS_M, "sphere"), SPHERE_RADIUS_M)[0]
 
 
 def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
@@ -128,20 +46,9 @@ def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
     return X
 
 
-@dataclass(frozen=True)
-class SphereRow:
-    """One method with one number of pairs: errors at the flange (mm) over all draws and the scans that the draw did not use."""
-
-    method: str
-    pairs: int
-    median_mm: float
-    p95_mm: float
-    max_mm: float
-
-
 def compare_sphere(
     seed: int = 0, draws: int = 30, pool: int = 32, progress: Progress = no_progress
-) -> tuple[list[SphereRow], dict[str, object]]:
+) -> tuple[list[dict[str, object]], dict[str, object]]:
     """Sphere and flange in the same scans with 4 and with 16 pairs, judged at the flange on the others; and Table 1's false segmentations.
 
     Every judged scan is one that the calibration did not use. "flange, weldcal" corrects the scanner.
@@ -169,7 +76,8 @@ def compare_sphere(
             progress(f"{n} pairs", 0.8 + 0.1 * (k + 1) / draws)
         for method, found in errors.items():
             e = 1e3 * np.concatenate(found)
-            rows.append(SphereRow(method, n, float(np.median(e)), float(np.percentile(e, 95)), float(e.max())))
+            of = statistics(e, "median", "p95", "max")
+            rows.append({"method": method, "pairs": n, **{f"{name}_mm": v for name, v in of.items()}})
     return rows, false_segmentations([s.flange for s in scans], seed)
 
 
@@ -205,21 +113,16 @@ def false_segmentations(flanges: Sequence[Observation], seed: int = 0) -> dict[s
     }
 
 
-def run_sphere_study(
-    folder: Path, scans: int, draws: int, seed: int, progress: Progress = no_progress
-) -> dict[str, object]:
-    """The comparison as a JSON object, written to sphere.json in the folder, beside the paper's Table 2 (x, y, z mm; roll, pitch, yaw deg)."""
+def run_sphere_study(scans: int, draws: int, seed: int, progress: Progress = no_progress) -> dict[str, object]:
+    """The comparison as a JSON object, beside the paper's Table 2 (x, y, z mm; roll, pitch, yaw deg)."""
     rows, false = compare_sphere(seed, draws, scans, progress)
-    summary: dict[str, object] = {
-        "state": "done",
+    return {
         "scans": scans,
         "draws": draws,
-        "rows": [asdict(r) for r in rows],
+        "rows": rows,
         "paper_table2": {str(n): list(v) for n, v in TABLE2.items()},
         "false_segmentations": false,
     }
-    write_json(folder / "sphere.json", summary)
-    return summary
 
 
 def sphere_rows(summary: dict[str, Any]) -> dict[str, str]:
