@@ -22,7 +22,7 @@ from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import file_size
+from weldcal.models.files import file_size, read_text
 from weldcal.models.limits import LARGEST_NUMBER
 
 _MORE = {"robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL")}
@@ -257,7 +257,10 @@ def _no_lists(folder: Path) -> str:
 def _joint_columns(path: Path) -> dict[str, Any]:
     try:
         names, rows = read_rows(path)
-    except InputError:
+    except InputError as problem:
+        first = read_text(path).lstrip("\ufeff").split("\n", 1)[0].lower()
+        if sum(bool(re.search(rf"\b{name}\b", first)) for name in _JOINTS) >= 5:
+            raise DatasetError(str(problem)) from problem
         return {}
     joints = [name for name in _JOINTS if name in names]
     if len(joints) < 5:

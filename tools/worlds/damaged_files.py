@@ -27,7 +27,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.images import read_grey_image
 from weldcal.systems.scenario.loading import load_scenario, scenario_class
 from weldcal.tools.commands.profiler.files import read_profiler_file
-from weldcal.tools.worlds import binary_damage, text_damage
+from weldcal.tools.worlds import binary_damage, pose_examples, text_damage
 from weldcal.tools.worlds import file_examples as examples
 from weldcal.tools.worlds.file_examples import Files, Rng
 from weldcal.welding.record.weld_log import load_weld_log
@@ -158,6 +158,12 @@ READERS = (
     Reader("weld-table", "table", "weld.csv", examples.weld_log, _weld_log, finite=False),
     Reader("weld-header", "json", "weld.json", examples.weld_log, _weld_log, finite=False),
     Reader("image", "image", "a.png", examples.image, lambda f: [read_grey_image(f / "a.png")]),
+    Reader("hand-eye-program", "text", "set/robot.txt", pose_examples.program, _pairs("set")),
+    Reader("hand-eye-captions", "text", "poses.txt", pose_examples.captions, _pairs("poses.txt")),
+    Reader("hand-eye-documents", "text", "set/robot.yaml", pose_examples.documents, _pairs("set")),
+    Reader("hand-eye-nested", "json", "pairs.json", pose_examples.nested, _pairs("pairs.json")),
+    Reader("hand-eye-matlab", "bytes", "pairs.mat", pose_examples.matlab, _pairs("pairs.mat")),
+    Reader("hand-eye-folder", "json", "set/sample_3.json", pose_examples.folder, _pairs("set")),
 )
 
 

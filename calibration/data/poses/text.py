@@ -20,6 +20,7 @@ _KEYED = re.compile(rf"[\"']?\b([A-Za-z_][\w.]{{0,40}})[\"']?\s{{0,9}}[:=]\s{{0,
 _UNIT_CELL = re.compile(r"(?i)[\[(]?(mm|cm|m|in|inch|deg|rad|degrees?|radians?|°|-|s|ms)?[\])]?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _COMMENT = ("#", "%", "//", "!", ";")
+_BEYOND = 1e300  # a number of so many digits that it has no value
 _COSINE = 1.1  # no element of a rotation matrix exceeds it
 _NANOSECONDS = 1e14  # a time above it is in nanoseconds
 
@@ -67,7 +68,8 @@ class _Line:
 
 def _value(cell: str) -> float | None:
     if _CELL.fullmatch(cell):
-        return float(cell)
+        value = float(cell)
+        return value if np.isfinite(value) or not cell.lstrip("+-")[:1].isdigit() else _BEYOND
     return np.nan if cell == "" else None
 
 

@@ -12,6 +12,7 @@ from weldcal.calibration.data.poses.names import natural
 from weldcal.calibration.data.poses.text import table_lists
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
+from weldcal.models.documents import as_number
 
 _PARTNERS = {
     "rotations": "translations", "rotation": "translation", "rots": "trans", "rot": "trans", "rvecs": "tvecs", "rvec": "tvec",
@@ -87,13 +88,31 @@ def _of_samples(node: list[Mapping[Any, Any]], name: str, at: str, label: str) -
         values = [item.get(key) for item in node]
         if all(isinstance(v, Mapping) for v in values) and not _has_columns(values[0]):
             yield from _of_samples(values, name, f"{at}/{key}", f"{name}, {at.strip('/')}/{key}".replace(", /", ", "))  # type: ignore[arg-type]
-        elif all(isinstance(v, list | np.ndarray) for v in values) and not _NO_POSES.match(str(key)):
-            arrays = [_array(v) if isinstance(v, list) else v for v in values]
-            if all(a is not None and a.size in (12, 16) for a in arrays):
-                yield listing_of_array(f"{name}, {key}", np.stack([np.asarray(a).reshape(-1, 4) for a in arrays]))
-            elif all(a is not None and a.size in (6, 7) for a in arrays):
-                yield listing_of_array(f"{name}, {key}", np.stack([np.asarray(a).ravel() for a in arrays]))
+        elif not _NO_POSES.match(str(key)):
+            poses = _stack(values, f"{name}, {key}", label)
+            if poses is not None:
+                yield listing_of_array(f"{name}, {key}", poses)
     yield from _partners({k: [item.get(k) for item in node] for k in node[0]}, name, at)
+
+
+def _stack(values: list[Any], name: str, label: str) -> Array | None:
+    """The poses of samples, (n, 4, 4), (n, 3, 4), (n, 6) or (n, 7); NaN where a sample has none. None where most are no poses.
+
+    Raises:
+        DatasetError: a sample has other numbers than most.
+    """
+    arrays = [_array(v) if isinstance(v, list | np.ndarray) else None for v in values]
+    sizes = [a.size for a in arrays if a is not None and a.size in (6, 7, 12, 16)]
+    size = max(set(sizes), key=sizes.count) if sizes else 0
+    if not size or 2 * sizes.count(size) < len(values):
+        return None
+    for k, (value, array) in enumerate(zip(values, arrays, strict=True)):
+        if value is not None and (array is None or array.size != size):
+            raise DatasetError(
+                f"Sample {k + 1} of '{label}' is no pose of {size} numbers, as the others of '{name}' are; correct or remove it."
+            )
+    shape = (-1, 4) if size in (12, 16) else (-1,)
+    return np.stack([np.full(size, np.nan).reshape(shape) if a is None else a.reshape(shape) for a in arrays])
 
 
 def _has_columns(node: Any) -> bool:
@@ -248,7 +267,7 @@ def _flat(node: Mapping[Any, Any], at: str = "") -> dict[str, float]:
         elif isinstance(value, list) and len(value) == 1 and isinstance(value[0], Mapping):
             out |= _flat(value[0], path)  # a message with one detection or transform
         elif isinstance(value, int | float) and not isinstance(value, bool):
-            out[path] = float(value)
+            out[path] = as_number(value)
         elif isinstance(value, list | np.ndarray):
             numbers = value if isinstance(value, np.ndarray) else _array(value)
             if numbers is not None and numbers.dtype.kind in "fiu":
