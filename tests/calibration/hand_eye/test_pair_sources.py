@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.calibration.hand_eye.pair_sources import NAMED, READ, REFUSED
-from tests.calibration.hand_eye.pair_world import BASE, X, X_BASE
+from tests.calibration.hand_eye.pair_world import BASE, X_BASE, X
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.calibration.hand_eye.importing import StatedForms

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import PoseReading, readings
-from weldcal.calibration.geometry.quantiles import f_quantile
+from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.calibration.hand_eye.conventions import Decision, agreements, decide
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
