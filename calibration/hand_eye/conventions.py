@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
@@ -126,7 +127,8 @@ def _judge(tried: list[Agreement], count: int) -> Decision:
         if not _rejected(first, best, _limit(best.dof, count)):
             best, tried = first, plain
     limit = _limit(best.dof, count)
-    alive, dead = [], []
+    alive: list[Agreement] = []
+    dead: list[Agreement] = []
     for one in tried:
         if one is not best and (best.changed or not one.changed or one.cost < best.cost):
             (dead if _rejected(one, best, limit) else alive).append(one)
@@ -195,7 +197,7 @@ def _notations(robot: Sequence[PoseReading], camera: Sequence[PoseReading]) -> l
     )
 
 
-def _relative_angles(R: Array, i: Array, j: Array) -> Array:
+def _relative_angles(R: Array, i: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
     chord = np.linalg.norm(R[i] - R[j], axis=(1, 2)) / (2.0 * np.sqrt(2.0))
     return np.asarray(2.0 * np.arcsin(np.clip(chord, 0.0, 1.0)))
 
@@ -319,7 +321,7 @@ def _starts(F: Array, G: Array) -> list[Array]:
     return [nearest_rotation(linear), nearest_rotation(vectors_ + 1e-9 * np.eye(3))]
 
 
-def _pairs(n: int, most: int) -> tuple[Array, Array]:
+def _pairs(n: int, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices i < j of pairs of n poses, evenly chosen where there are more than ``most``."""
     i, j = np.triu_indices(n, 1)
     if len(i) > most:

@@ -313,12 +313,14 @@ def _stated_in(path: Path, raw: dict[str, Any], stated: StatedForms) -> StatedFo
             raise DatasetError(
                 f"'{path.name}/dataset.yaml': poses.{who} has no key '{str(wrong)[:40]}'; use {', '.join(known)}."
             )
-        words = {k: str(v) for k, v in given.items()}
+        words: dict[str, Any] = {k: str(v) for k, v in given.items()}
+        more: dict[str, Any] = {}
         own = getattr(stated, who)
         if own == PoseForm():
-            stated = replace(stated, **{who: PoseForm(**words)})
+            more[who] = PoseForm(**words)
         if words.get("file"):
-            stated = replace(stated, **{f"{who}_poses": words["file"]})
+            more[f"{who}_poses"] = words["file"]
+        stated = replace(stated, **more)
     return stated
 
 

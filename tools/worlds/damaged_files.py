@@ -38,6 +38,7 @@ GOOD = (ACCEPTED, REFUSED)
 GRAMMARS = text_damage.GRAMMARS | binary_damage.GRAMMARS
 _PLACES = ("a pipe", "a folder", "a device", "a loop of links", "nothing")
 _ODD_PLACE = 0.02  # share of the cases in which no regular file is there
+_FEWER = ("hand-eye-folder",)  # a folder without one of its samples is right
 _UNITS = 0.05  # and in which a dataset's unit is exchanged
 _EXAMPLES = 40  # different ones of each reader
 _LONGEST = 1010  # characters of a refusal
@@ -192,7 +193,7 @@ def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, s
     rng = np.random.default_rng((seed, number, case))
     files = _example(number, seed, case % _EXAMPLES)
     if rng.random() < _ODD_PLACE:
-        return files, files, True, str(rng.choice(_PLACES))
+        return files, files, reader.name not in _FEWER, str(rng.choice(_PLACES))
     content = files[reader.target]
     if reader.target == "dataset.yaml" and rng.random() < _UNITS:
         swapped = content.replace(

@@ -115,7 +115,7 @@ def matlab(rng: Rng) -> Files:
                 cells[0, k] = X
             arrays[name] = cells
     stream = io.BytesIO()
-    savemat(stream, arrays, do_compression=bool(rng.random() < 0.5))
+    savemat(stream, arrays, do_compression=bool(rng.random() < 0.5))  # type: ignore[arg-type]
     return {"pairs.mat": stream.getvalue()}
 
 

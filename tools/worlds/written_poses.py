@@ -112,5 +112,5 @@ def _angles(turn: Rotation, which: int) -> Array:
     axes = _NAMED[which - len(_AXES)] if named else _AXES[which]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # gimbal lock: one angle is chosen, and the rotation is right
-        found = np.asarray(turn.as_euler(axes))
+        found = np.asarray(turn.as_euler(axes))  # type: ignore[call-overload]
     return found[:, [axes.index(a) for a in "xyz"]] if named else found

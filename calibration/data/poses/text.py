@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 
@@ -328,7 +329,7 @@ def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...
         return table[:, [at[r] for r in roles]]
 
     grid = sorted(r for r in at if re.fullmatch(r"m\d\d", r))
-    more = {"ids": ids, "times": times, "unit": length}
+    more: dict[str, Any] = {"ids": ids, "times": times, "unit": length}
     if len(grid) in (12, 16):
         return listing_of_array(name, take(*grid), **more)
     if not {"x", "y", "z"} <= set(at):
