@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
@@ -24,6 +25,7 @@ _NEAR_UNIT = 0.08  # of the logarithm of a factor: attenuation by noise of short
 _MOST = 160  # pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
 _SURE_TURN = 2.8  # rad
 _STEPS = 6
+_TRIAL_STEPS = 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,19 +115,20 @@ def decide(
     """
     notations = _notations(robot, camera)
     tried = [pair for a, b in notations for pair in _variants(robot[a], camera[b], changes)]
-    return _judge(_agreements(tried, eye_in_hand))
+    return _judge(agreements(tried, eye_in_hand=eye_in_hand, all_of_them=False), len(tried))
 
 
-def _judge(tried: list[Agreement]) -> Decision:
+def _judge(tried: list[Agreement], count: int) -> Decision:
     best = min(tried, key=lambda t: t.cost)
     if best.changed:
         # a list that need not be changed is not changed
         plain = [t for t in tried if not t.changed]
         first = min(plain, key=lambda t: t.cost)
-        if not _rejected(first, best, _limit(best, len(tried))):
+        if not _rejected(first, best, _limit(best.dof, count)):
             best, tried = first, plain
-    limit = _limit(best, len(tried))
-    alive, dead = [], []
+    limit = _limit(best.dof, count)
+    alive: list[Agreement] = []
+    dead: list[Agreement] = []
     for one in tried:
         if one is not best and (best.changed or not one.changed or one.cost < best.cost):
             (dead if _rejected(one, best, limit) else alive).append(one)
@@ -136,9 +139,9 @@ def _judge(tried: list[Agreement]) -> Decision:
     return Decision(best, tuple(rivals), tuple(same), dead[0] if dead else None)
 
 
-def _limit(best: Agreement, tried: int) -> float:
+def _limit(dof: int, tried: int) -> float:
     """Ratio of residuals beyond which a reading is rejected."""
-    return float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * max(tried - 1, 1)), best.dof, best.dof)))
+    return float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * max(tried - 1, 1)), dof, dof)))
 
 
 def _rejected(one: Agreement, best: Agreement, limit: float) -> bool:
@@ -194,27 +197,39 @@ def _notations(robot: Sequence[PoseReading], camera: Sequence[PoseReading]) -> l
     )
 
 
-def _relative_angles(R: Array, i: Array, j: Array) -> Array:
+def _relative_angles(R: Array, i: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
     chord = np.linalg.norm(R[i] - R[j], axis=(1, 2)) / (2.0 * np.sqrt(2.0))
     return np.asarray(2.0 * np.arcsin(np.clip(chord, 0.0, 1.0)))
 
 
-def _agreements(variants: list[tuple[PoseReading, PoseReading, int]], eye_in_hand: bool) -> list[Agreement]:
-    """Solve F X G = Y for each pair of readings; all at once."""
+def agreements(
+    variants: list[tuple[PoseReading, PoseReading, int]], *, eye_in_hand: bool, all_of_them: bool = True
+) -> list[Agreement]:
+    """Solve F X G = Y for each pair of readings, all at once.
+
+    Without ``all_of_them``, readings that their rotations reject are left out, but the best of them and the best without a change.
+    """
     tried, changes = [(a, b) for a, b, _ in variants], [c for _, _, c in variants]
     F = np.stack([one.X if eye_in_hand else inverse(one.X) for one, _ in tried])
     G = np.stack([other.X for _, other in tried])
     n = F.shape[1]
     kept = max(int(np.ceil(_KEPT * n)), min(n, 5))
-    RX, RY, w = _rotation(F[..., :3, :3], G[..., :3, :3], kept)
+    dof = max(3 * kept - 6, 3)
+    RX, RY, angle = _rotation(F[..., :3, :3], G[..., :3, :3], kept)
+    turn = np.sqrt(_motion(F[..., :3, :3]) * _motion(G[..., :3, :3])) + _ROTATION_FLOOR
+    rotation = np.sqrt(_trimmed(angle, kept)) + _ROTATION_FLOOR
+    if not all_of_them:
+        some = _worth_solving(rotation / turn, np.array(changes), _limit(dof, len(tried)))
+        tried, changes = [tried[k] for k in some], [changes[k] for k in some]
+        F, G, RX, RY, turn, rotation = (one[some] for one in (F, G, RX, RY, turn, rotation))
     turned = (F[..., :3, :3] @ (G[..., :3, 3] @ np.swapaxes(RX, 1, 2))[..., None])[..., 0]
     tX, tY, scale, d, sigma = _translation(F, turned, kept, None)
     # a negative scale is no solution: without its sign the positions do not fit
     units = [_nearest_unit(abs(float(s))) for s in scale]
     fixed = np.array([abs(float(s)) if u is None else u for s, u in zip(scale, units, strict=True)])
     tX, tY, _, d, _ = _translation(F, turned, kept, fixed)
+    position = np.sqrt(_trimmed(np.linalg.norm(d, axis=2), kept))
     extent = np.sqrt(F[..., :3, 3].var(axis=1).sum(axis=1)) + 1e-12
-    turns = [_motion(one) for one in (F[..., :3, :3], G[..., :3, :3])]
     found = []
     for k, (one, other) in enumerate(tried):
         X, Y = np.eye(4), np.eye(4)
@@ -225,17 +240,26 @@ def _agreements(variants: list[tuple[PoseReading, PoseReading, int]], eye_in_han
             scale=max(abs(float(scale[k])), 1e-12),
             scale_sigma=float(sigma[k] / max(abs(float(scale[k])), 1e-12)),
             unit_scale=units[k],
-            rotation=_rms(w[k], kept) + _ROTATION_FLOOR,
-            turn=float(np.sqrt(turns[0][k] * turns[1][k])) + _ROTATION_FLOOR,
-            position=_rms(d[k], kept) + _POSITION_FLOOR * float(extent[k]),
+            rotation=float(rotation[k]),
+            turn=float(turn[k]),
+            position=float(position[k]) + _POSITION_FLOOR * float(extent[k]),
             extent=float(extent[k]),
             X=X,
             Y=Y,
             changes=changes[k],
-            dof=max(3 * kept - 6, 3),
+            dof=dof,
         )
         found.append(agreement)
     return found
+
+
+def _worth_solving(spread: Array, changes: Array, limit: float) -> Array:
+    """Indices of the readings whose rotations agree, of the best of the others, and of the best without a change."""
+    alive = spread <= limit * spread.min()
+    dead = np.flatnonzero(~alive)
+    plain = np.flatnonzero(changes == 0)
+    best = [one[np.argmin(spread[one])] for one in (dead, plain) if len(one)]
+    return np.union1d(np.flatnonzero(alive), np.array(best, dtype=int))
 
 
 def _motion(R: Array) -> Array:
@@ -245,11 +269,6 @@ def _motion(R: Array) -> Array:
     return np.asarray(np.sqrt(((2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))) ** 2).mean(axis=1)))
 
 
-def _rms(e: Array, kept: int) -> float:
-    """Root mean square of the least of the residuals' lengths."""
-    return float(np.sqrt(np.sort((e**2).sum(axis=1))[:kept].mean()))
-
-
 def _weights(size: Array, kept: int) -> Array:
     """Weights (m, n) that fall where a residual is far beyond those of the poses that agree."""
     cut = np.sort(size, axis=1)[:, kept - 1 : kept] + 1e-12
@@ -257,30 +276,33 @@ def _weights(size: Array, kept: int) -> Array:
 
 
 def _rotation(F: Array, G: Array, kept: int) -> tuple[Array, Array, Array]:
-    """R_X and R_Y of F R_X G = R_Y and the residuals rad, for (m, n, 3, 3): linear starts, then alternating robust means."""
-    m, n = F.shape[:2]
-    best: tuple[Array, Array, Array, Array] | None = None
-    for R in _starts(F, G):
-        weight = np.ones((m, n))
-        for _ in range(_STEPS):
-            moved = F @ R[:, None] @ G
-            RY = nearest_rotation((weight[..., None, None] * moved).sum(axis=1))
-            back = np.swapaxes(F, 2, 3) @ RY[:, None] @ np.swapaxes(G, 2, 3)
-            R = nearest_rotation((weight[..., None, None] * back).sum(axis=1))
-            off = np.swapaxes(RY, 1, 2)[:, None] @ F @ R[:, None] @ G
-            w = Rotation.from_matrix(off.reshape(-1, 3, 3)).as_rotvec().reshape(m, n, 3)
-            weight = _weights(np.linalg.norm(w, axis=2), kept)
-        value = np.sort((w**2).sum(axis=2), axis=1)[:, :kept].mean(axis=1)
-        if best is None:
-            best = value, R, RY, w
-        else:
-            better = value < best[0]
-            best = tuple(
-                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-                for new, old in zip((value, R, RY, w), best, strict=True)
-            )  # type: ignore[assignment]
-    assert best is not None
-    return best[1], best[2], best[3]
+    """R_X and R_Y of F R_X G = R_Y and the residual angles (m, n) rad, for (m, n, 3, 3): the better of two linear starts, then alternating
+    robust means."""
+    back = np.ascontiguousarray(np.swapaxes(F, 2, 3)), np.ascontiguousarray(np.swapaxes(G, 2, 3))
+    one, other = (_alternate(R, F, G, back, kept, _TRIAL_STEPS) for R in _starts(F, G))
+    better = _trimmed(other[2], kept) < _trimmed(one[2], kept)
+    return _alternate(np.where(better[:, None, None], other[0], one[0]), F, G, back, kept, _STEPS)
+
+
+def _alternate(
+    R: Array, F: Array, G: Array, back: tuple[Array, Array], kept: int, steps: int
+) -> tuple[Array, Array, Array]:
+    """R_X, R_Y and the residual angles (m, n) after some steps from a start; ``back``: the transposed F and G."""
+    weight = np.ones(F.shape[:2])
+    moved = F @ R[:, None] @ G
+    for _ in range(steps):
+        RY = nearest_rotation((weight[..., None, None] * moved).sum(axis=1))
+        R = nearest_rotation((weight[..., None, None] * (back[0] @ RY[:, None] @ back[1])).sum(axis=1))
+        moved = F @ R[:, None] @ G
+        chord = np.sqrt(((moved - RY[:, None]) ** 2).sum(axis=(2, 3))) / (2.0 * np.sqrt(2.0))
+        angle = 2.0 * np.arcsin(np.minimum(chord, 1.0))
+        weight = _weights(angle, kept)
+    return R, RY, angle
+
+
+def _trimmed(angle: Array, kept: int) -> Array:
+    """Mean square of the least residuals."""
+    return np.asarray(np.sort(angle**2, axis=1)[:, :kept].mean(axis=1))
 
 
 def _starts(F: Array, G: Array) -> list[Array]:
@@ -299,7 +321,7 @@ def _starts(F: Array, G: Array) -> list[Array]:
     return [nearest_rotation(linear), nearest_rotation(vectors_ + 1e-9 * np.eye(3))]
 
 
-def _pairs(n: int, most: int) -> tuple[Array, Array]:
+def _pairs(n: int, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices i < j of pairs of n poses, evenly chosen where there are more than ``most``."""
     i, j = np.triu_indices(n, 1)
     if len(i) > most:

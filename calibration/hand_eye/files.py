@@ -22,7 +22,7 @@ from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER, file_size
+from weldcal.models.files import LARGEST_NUMBER, file_size, read_text
 
 _MORE = {"robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL")}
 _EXTRAS = ("X_true", "img", "obj", "K", "dist", "q")
@@ -256,7 +256,10 @@ def _no_lists(folder: Path) -> str:
 def _joint_columns(path: Path) -> dict[str, Any]:
     try:
         names, rows = read_rows(path)
-    except InputError:
+    except InputError as problem:
+        first = read_text(path).lstrip("\ufeff").split("\n", 1)[0].lower()
+        if sum(bool(re.search(rf"\b{name}\b", first)) for name in _JOINTS) >= 5:
+            raise DatasetError(str(problem)) from problem
         return {}
     joints = [name for name in _JOINTS if name in names]
     if len(joints) < 5:
@@ -310,12 +313,14 @@ def _stated_in(path: Path, raw: dict[str, Any], stated: StatedForms) -> StatedFo
             raise DatasetError(
                 f"'{path.name}/dataset.yaml': poses.{who} has no key '{str(wrong)[:40]}'; use {', '.join(known)}."
             )
-        words = {k: str(v) for k, v in given.items()}
+        words: dict[str, Any] = {k: str(v) for k, v in given.items()}
+        more: dict[str, Any] = {}
         own = getattr(stated, who)
         if own == PoseForm():
-            stated = replace(stated, **{who: PoseForm(**words)})
+            more[who] = PoseForm(**words)
         if words.get("file"):
-            stated = replace(stated, **{f"{who}_poses": words["file"]})
+            more[f"{who}_poses"] = words["file"]
+        stated = replace(stated, **more)
     return stated
 
 

@@ -306,9 +306,7 @@ def _units(
         ratio = best.scale * unit_r  # metres per camera unit
     if not words[1]:
         words[1] = _camera_unit(ratio, words[0], B, source)
-    elif ratio is not None and abs(np.log(ratio / UNITS[words[1]])) > max(
-        _LEAST_SCALE, _SCALE_SIGMA * best.scale_sigma
-    ):  # type: ignore[union-attr]
+    elif ratio is not None and abs(np.log(ratio / UNITS[words[1]])) > _LEAST_SCALE:
         _refuse_scale(ratio, words[1], source)
     return (unit_r, words[0]), (UNITS[words[1]], words[1])
 

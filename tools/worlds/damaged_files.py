@@ -27,7 +27,7 @@ from weldcal.models.array_files import read_grey_image
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario, scenario_class
 from weldcal.tools.commands.profiler.files import read_profiler_file
-from weldcal.tools.worlds import binary_damage, text_damage
+from weldcal.tools.worlds import binary_damage, pose_examples, text_damage
 from weldcal.tools.worlds import file_examples as examples
 from weldcal.tools.worlds.file_examples import Files, Rng
 from weldcal.welding.record.weld_log import load_weld_log
@@ -38,6 +38,7 @@ GOOD = (ACCEPTED, REFUSED)
 GRAMMARS = text_damage.GRAMMARS | binary_damage.GRAMMARS
 _PLACES = ("a pipe", "a folder", "a device", "a loop of links", "nothing")
 _ODD_PLACE = 0.02  # share of the cases in which no regular file is there
+_FEWER = ("hand-eye-folder",)  # a folder without one of its samples is right
 _UNITS = 0.05  # and in which a dataset's unit is exchanged
 _EXAMPLES = 40  # different ones of each reader
 _LONGEST = 1010  # characters of a refusal
@@ -158,6 +159,12 @@ READERS = (
     Reader("weld-table", "table", "weld.csv", examples.weld_log, _weld_log, finite=False),
     Reader("weld-header", "json", "weld.json", examples.weld_log, _weld_log, finite=False),
     Reader("image", "image", "a.png", examples.image, lambda f: [read_grey_image(f / "a.png")]),
+    Reader("hand-eye-program", "text", "set/robot.txt", pose_examples.program, _pairs("set")),
+    Reader("hand-eye-captions", "text", "poses.txt", pose_examples.captions, _pairs("poses.txt")),
+    Reader("hand-eye-documents", "text", "set/robot.yaml", pose_examples.documents, _pairs("set")),
+    Reader("hand-eye-nested", "json", "pairs.json", pose_examples.nested, _pairs("pairs.json")),
+    Reader("hand-eye-matlab", "bytes", "pairs.mat", pose_examples.matlab, _pairs("pairs.mat")),
+    Reader("hand-eye-folder", "json", "set/sample_3.json", pose_examples.folder, _pairs("set")),
 )
 
 
@@ -186,7 +193,7 @@ def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, s
     rng = np.random.default_rng((seed, number, case))
     files = _example(number, seed, case % _EXAMPLES)
     if rng.random() < _ODD_PLACE:
-        return files, files, True, str(rng.choice(_PLACES))
+        return files, files, reader.name not in _FEWER, str(rng.choice(_PLACES))
     content = files[reader.target]
     if reader.target == "dataset.yaml" and rng.random() < _UNITS:
         swapped = content.replace(

@@ -241,7 +241,7 @@ def tablet_record(rng: Rng) -> Files:
     return _saved(lambda folder: save_tablet_result(result, folder), "tablet.yaml")
 
 
-def _hand_eye(rng: Rng) -> tuple[Array, Array]:
+def hand_eye_lists(rng: Rng) -> tuple[Array, Array]:
     F, X = _poses(rng, 8), pose(exp_rotation(rng.normal(size=3)), rng.normal(size=3) * 0.1)
     Y = F[0] @ X @ pose(np.eye(3), np.array([0.0, 0.0, 0.6]))
     return F, inverse(F @ X) @ Y
@@ -249,7 +249,7 @@ def _hand_eye(rng: Rng) -> tuple[Array, Array]:
 
 def hand_eye_npz(rng: Rng) -> Files:
     """A and B, with the mounting and the unit."""
-    F, G = _hand_eye(rng)
+    F, G = hand_eye_lists(rng)
     return {
         "pairs.npz": npz(
             {"A": F, "B": G, "mode": np.array("eye_in_hand"), "unit": np.array("m")}, bool(rng.random() < 0.5)
@@ -259,7 +259,7 @@ def hand_eye_npz(rng: Rng) -> Files:
 
 def hand_eye_csv(rng: Rng) -> Files:
     """Robot and camera poses by columns, with joints."""
-    F, G = _hand_eye(rng)
+    F, G = hand_eye_lists(rng)
     header = [f"{who}_{c}" for who in ("robot", "camera") for c in _POSE] + [f"q{k}" for k in range(1, 7)]
     rows = [
         [*_seven(a), *_seven(b), *(f"{v:.6f}" for v in rng.uniform(-2.0, 2.0, 6))] for a, b in zip(F, G, strict=True)
@@ -269,7 +269,7 @@ def hand_eye_csv(rng: Rng) -> Files:
 
 def hand_eye_json(rng: Rng) -> Files:
     """Matrices A and B, or samples as easy_handeye2 writes them."""
-    F, G = _hand_eye(rng)
+    F, G = hand_eye_lists(rng)
     if rng.random() < 0.5:
         return {
             "pairs.json": json.dumps({"A": F.tolist(), "B": G.tolist(), "mode": "eye_in_hand", "unit": "m"}).encode()
@@ -288,7 +288,7 @@ def hand_eye_json(rng: Rng) -> Files:
 
 def hand_eye_yaml(rng: Rng) -> Files:
     """MoveIt's samples."""
-    F, G = _hand_eye(rng)
+    F, G = hand_eye_lists(rng)
     samples = [
         {"effector_wrt_world": a.ravel().tolist(), "object_wrt_sensor": b.ravel().tolist()}
         for a, b in zip(F, G, strict=True)

@@ -166,6 +166,8 @@ def _roles(name: str) -> list[tuple[str, str]]:
     if not tokens:
         return []
     last, before = tokens[-1], tokens[:-1]
+    if last in ("a", "b", "c", "w", "p", "r", "o") and len(before) == 1 and before[0] in _OWNERS:
+        return [(before[0], last)]
     if short := re.fullmatch(r"([tpqr]|pos|rot|quat|rvec|tvec|rv)([wxyz])", last):
         before, last = [*before, short[1]], short[2]
     if (short := re.fullmatch(r"(.+?)([xyz]|q[wxyz]|r[xyz])", last)) and short[1] in _OWNERS:

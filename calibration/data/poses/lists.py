@@ -1,7 +1,9 @@
 """Read every list of poses of a file or folder, whatever its form, and find the robot's and the camera's among them."""
 
+import gzip
 import re
 import zipfile
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of_array
-from weldcal.calibration.data.poses.names import natural, number_of
-from weldcal.calibration.data.poses.storage import read_tree
+from weldcal.calibration.data.poses.names import last_key, natural, number_of, whose
+from weldcal.calibration.data.poses.storage import read_tree, tree_of_text
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.errors import InputError
-from weldcal.models.files import MOST_CELLS, file_size, read_text
+from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_text
 
 TEXT = (
     ".csv",
@@ -34,6 +36,17 @@ TEXT = (
     ".asc",
     ".urp",
     ".sys",
+    ".jbi",
+    ".dtx",
+    ".as",
+    ".py",
+    ".m",
+    ".drl",
+    ".lua",
+    ".pnt",
+    ".pos",
+    ".jsonl",
+    ".out",
 )
 TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib")
 ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
@@ -41,13 +54,12 @@ ENDINGS = (*TEXT, *TREES, *ARRAYS)
 """Endings of files that may hold poses."""
 _OWN = ("dataset.yaml", "readme.txt", "notes.txt", "requirements.txt")
 _CLOUDS = ("clouds", "pointclouds", "point_clouds", "scans", "ply", "pcd")
+_BEGINNING = 4000  # characters that show what a text is
+_TREE_TEXT = re.compile(
+    r"(?m)^\s*(position|translation|orientation|rotation|pose|transforms?):[ \t\r]*$|\A\s*\[?\s*\{\s*\""
+)
+_TABLE_TEXT = re.compile(r"(?m)^At time|Translation: \[")
 _INVERSE = re.compile(r"(?i)base2(gripper|ee|hand|tool|flange)|cam(era)?2(target|board|marker|object|chess\w*)")
-_CAMERA = re.compile(
-    r"(?i)(target|board|marker|object|chess|pattern|tag|camera|(^|[^a-z])cam([^a-z]|$)|cam\d|eye|optical|sensor|tracking|cpo|(^|[^a-z])b([^a-z]|$)|x_cm|aruco)"
-)
-_ROBOT = re.compile(
-    r"(?i)(robot|hand|gripper|(^|[^a-z])ee([^a-z]|$)|ee2|2ee|effector|flange|tcp|tool|arm|fpe|(^|[^a-z])a([^a-z]|$)|x_bf|base_t|t_base|o_t_ee|(^|[^a-z])pos(es?)?([^a-z]|$))"
-)
 
 
 def read_lists(path: Path) -> list[Listing]:
@@ -69,7 +81,13 @@ def read_lists(path: Path) -> list[Listing]:
             return _workbook(path)
         if ending in TREES:
             return lists_of_tree(read_tree(path), path.name)
-        return lists_of_text(read_text(path), path.name)
+        if ending == ".urp":
+            return lists_of_text(_unzipped(path), path.name)
+        text = read_text(path)
+        if _TREE_TEXT.search(text[:_BEGINNING]) and not _TABLE_TEXT.search(text[:_BEGINNING]):
+            kind = "JSON" if text.lstrip().startswith(("{", "[")) else "YAML"
+            return lists_of_tree(tree_of_text(text, path.name, kind), path.name)
+        return lists_of_text(text, path.name)
     except DatasetError:
         raise
     except InputError as problem:
@@ -83,10 +101,17 @@ def folder_lists(folder: Path) -> list[Listing]:
         DatasetError: a file that should hold poses cannot be read.
     """
     groups: dict[tuple[str, str], list[Path]] = {}
+    numbered = _numbered_folders(folder)
     for place in (folder, *sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith((".", "_")))):
         label = "" if place == folder else place.name
+        if place in numbered:
+            label = re.sub(r"\d+", "", label)
         for path in sorted((p for p in place.iterdir() if _may_hold_poses(p)), key=lambda p: natural(p.name)):
-            stem = re.sub(r"\d+$", "", path.stem) if number_of(path.stem) is not None else path.stem
+            stem = (
+                re.sub(r"\d+$", "", path.stem)
+                if number_of(path.stem) is not None and place not in numbered
+                else path.stem
+            )
             groups.setdefault((label, f"{stem}{path.suffix.lower()}"), []).append(path)
     found: list[Listing] = []
     problem: DatasetError | None = None
@@ -100,6 +125,15 @@ def folder_lists(folder: Path) -> list[Listing]:
     if len(found) < 2 and problem is not None:
         raise problem
     return found
+
+
+def _numbered_folders(folder: Path) -> frozenset[Path]:
+    """Folders of one pose each, such as pose_1, pose_2 ...: three or more that differ in a number."""
+    stems: dict[str, list[Path]] = {}
+    for place in folder.iterdir():
+        if place.is_dir() and number_of(place.name) is not None:
+            stems.setdefault(re.sub(r"\d+", "", place.name), []).append(place)
+    return frozenset(p for places in stems.values() if len(places) > 2 for p in places)
 
 
 def _may_hold_poses(path: Path) -> bool:
@@ -118,14 +152,31 @@ def _group(files: list[Path], label: str) -> list[Listing]:
         return [_renamed(one, prefix) for one in read_lists(files[0])]
     lists = [read_lists(path) for path in files]
     many = next((p for p, found in zip(files, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
+    alike = len({p.name for p in files}) == 1 and len(files) > 1  # the same file in each of several folders
+    ids = tuple((p.parent.name if alike else p.stem) for p in files)
+    order = sorted(range(len(files)), key=lambda k: natural(ids[k]))
     if many is not None:
         if all(len(found) == 1 for found in lists):
             return [_renamed(found[0], prefix) for found in lists]
+        each = len(lists[0])
+        if each > 1 and all(len(found) == each and all(len(one) == 1 for one in found) for found in lists):
+            return [
+                stacked(
+                    [lists[k][j] for k in order],
+                    f"{prefix}{files[0].name} ..., {_key_of(lists[0][j])}",
+                    tuple(ids[k] for k in order),
+                )
+                for j in range(each)
+            ]
         raise DatasetError(
             f"'{many.name}' does not hold one pose, as the {len(files) - 1} files beside it do; give one pose a file."
         )
-    name = f"{prefix}{files[0].name} ... {files[-1].name}"
-    return [stacked([found[0] for found in lists], name, tuple(p.stem for p in files))]
+    name = f"{prefix}{files[0].name}" if alike else f"{prefix}{files[0].name} ... {files[-1].name}"
+    return [stacked([lists[k][0] for k in order], name, tuple(ids[k] for k in order))]
+
+
+def _key_of(listing: Listing) -> str:
+    return listing.name.rpartition(", ")[2]
 
 
 def _renamed(listing: Listing, prefix: str) -> Listing:
@@ -148,7 +199,7 @@ def two_lists(
     for who, key in (("robot", robot), ("camera", camera)):
         if key is None:
             continue
-        match = [one for one in lists if _key(one.name) == key] or [one for one in lists if key in one.name]
+        match = [one for one in lists if last_key(one.name) == key] or [one for one in lists if key in one.name]
         if len(match) != 1:
             raise DatasetError(f"--{who}-poses {key} names {len(match)} of the lists of '{source}': {known}.")
         chosen[who] = match[0]
@@ -178,31 +229,9 @@ def two_lists(
     )
 
 
-def _key(name: str) -> str:
-    return re.split(r"[/,\s]+", name)[-1]
-
-
-def whose(name: str) -> str:
-    """Whose list a name says it is: the robot's, the camera's, or empty."""
-    for part in (_key(name), *reversed(re.split(r"[/,]+", name))):
-        plain = re.sub(r"(?i)^(r|rot|rotation|rvecs?|t|x|h)_", "", part.strip())
-        if re.search(r"(?i)wrt_world|wrt_base", plain):
-            return "robot"
-        if re.search(r"(?i)wrt_(sensor|camera)", plain):
-            return "camera"
-        robot, camera = bool(_ROBOT.search(plain)), bool(_CAMERA.search(plain))
-        if re.search(r"(?i)hand_?eye", plain):
-            continue
-        if robot != camera:
-            return "robot" if robot else "camera"
-        if robot and camera:
-            return "camera" if re.search(r"(?i)(target|board|marker|object|chess|pattern|tag)", plain) else ""
-    return ""
-
-
 def named_inverse(listing: Listing) -> bool:
     """Whether a list's name says that it holds the inverse poses, such as R_base2gripper."""
-    return _INVERSE.search(_key(listing.name)) is not None
+    return _INVERSE.search(last_key(listing.name)) is not None
 
 
 def together(robot: Listing, camera: Listing, near_s: float = 0.05) -> tuple[np.ndarray, np.ndarray, str]:
@@ -243,6 +272,20 @@ def together(robot: Listing, camera: Listing, near_s: float = 0.05) -> tuple[np.
     return nearest[keep], np.flatnonzero(keep), "by time"
 
 
+def _unzipped(path: Path) -> str:
+    """The text of a robot program that is stored compressed."""
+    try:
+        with gzip.open(path) as stream:
+            found = stream.read(LARGEST_DOCUMENT + 1)
+    except gzip.BadGzipFile:
+        return read_text(path)
+    except (OSError, EOFError, zlib.error) as problem:
+        raise DatasetError(f"'{path.name}' is damaged: its compressed text does not end.") from problem
+    if len(found) > LARGEST_DOCUMENT:
+        raise DatasetError(f"'{path.name}' holds more than {LARGEST_DOCUMENT // 2**20} MiB of text.")
+    return found.decode("utf-8", "replace")
+
+
 def _numbers(path: Path, value: Any) -> Any:
     if value.dtype.kind not in "fiu":
         raise DatasetError(f"'{path.name}' holds words, not numbers.")
@@ -258,7 +301,17 @@ def _matlab(path: Path) -> dict[str, Any]:
         raise DatasetError(f"'{path.name}' is a MATLAB 7.3 file: save it with save('{path.name}', '-v7').") from problem
     except Exception as problem:  # scipy raises many kinds for a damaged file
         raise DatasetError(f"'{path.name}' cannot be read as a MATLAB file ({type(problem).__name__}).") from problem
-    return {k: v for k, v in found.items() if not k.startswith("__")}
+    return {k: _cells(v) for k, v in found.items() if not k.startswith("__")}
+
+
+def _cells(value: Any) -> Any:
+    """Cell arrays of MATLAB as lists."""
+    if isinstance(value, dict):
+        return {str(k): _cells(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        items = [_cells(v) for v in value.ravel()]
+        return [v.tolist() if isinstance(v, np.ndarray) else v for v in items]
+    return value
 
 
 def _workbook(path: Path) -> list[Listing]:

@@ -3,8 +3,10 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.rotations import notation
@@ -78,7 +80,7 @@ class PoseReading:
         return PoseReading(f"{self.form},{change}", f"{self.words}, {words}", apply_change(self.X, change))
 
 
-def pick(listed: Sequence[PoseReading], rows: Array) -> list[PoseReading]:
+def pick(listed: Sequence[PoseReading], rows: NDArray[np.integer[Any]]) -> list[PoseReading]:
     """The readings of some rows."""
     return [replace(one, X=one.X[rows]) for one in listed]
 

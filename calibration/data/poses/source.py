@@ -10,8 +10,8 @@ from weldcal.calibration.data.poses.columns import columns_of
 from weldcal.calibration.data.poses.form import PoseList
 from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import ENDINGS as READ
-from weldcal.calibration.data.poses.lists import read_lists, whose
-from weldcal.calibration.data.poses.names import BASES, FLANGES, natural, number_of
+from weldcal.calibration.data.poses.lists import read_lists
+from weldcal.calibration.data.poses.names import BASES, FLANGES, natural, number_of, whose
 from weldcal.calibration.data.poses.readings import pick
 from weldcal.calibration.data.poses.trees import stacked
 from weldcal.calibration.data.tables import read_rows

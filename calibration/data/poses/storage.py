@@ -21,12 +21,26 @@ def read_tree(path: Path) -> Any:
         text = read_text(path, LARGEST_DOCUMENT)
         if path.suffix.lower() == ".xml":
             return _matrices(_from_xml(path, text))
-        text = re.sub(r"\A%YAML[:\s]\S*\s*?\n", "", text)  # FileStorage writes a directive that YAML does not know
-        return _matrices(parse_document(path.name, text, "JSON" if path.suffix.lower() == ".json" else "YAML"))
+        return tree_of_text(text, path.name, "JSON" if path.suffix.lower() == ".json" else "YAML")
     except DatasetError:
         raise
     except InputError as e:
         raise DatasetError(str(e)) from e
+
+
+def tree_of_text(text: str, name: str, kind: str = "YAML") -> Any:
+    """The contents of a text of YAML or JSON; several YAML documents, or a JSON object a line, are a list. Raises InputError."""
+    text = text.lstrip("\ufeff")
+    if kind == "JSON":
+        lines = [line for line in text.splitlines() if line.strip()]
+        if len(lines) > 1 and all(line.lstrip().startswith("{") and line.rstrip().endswith("}") for line in lines):
+            return [_matrices(parse_document(name, line, kind)) for line in lines[:MOST_NODES]]
+        return _matrices(parse_document(name, text, kind))
+    text = re.sub(r"\A%YAML[:\s]\S*\s*?\n", "", text)  # FileStorage writes a directive that YAML does not know
+    documents = [one for one in re.split(r"(?m)^(?:---|\.\.\.)[ \t]*\r?$", text) if one.strip()]
+    if len(documents) < 2:
+        return _matrices(parse_document(name, text, kind))
+    return [_matrices(parse_document(name, one, kind)) for one in documents]
 
 
 def _array(value: Any) -> Array | None:

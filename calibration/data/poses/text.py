@@ -5,30 +5,24 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 
 from weldcal.calibration.data.poses.columns import Column, columns_of
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
+from weldcal.calibration.data.poses.names import whose
+from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_CELL = re.compile(rf"{_NUMBER}|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
+_CELL = re.compile(rf"{NUMBER}|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
+_KEYED = re.compile(rf"[\"']?\b([A-Za-z_][\w.]{{0,40}})[\"']?\s{{0,9}}[:=]\s{{0,9}}[\"']?({NUMBER})(?![\w.])")
+_UNIT_CELL = re.compile(r"(?i)[\[(]?(mm|cm|m|in|inch|deg|rad|degrees?|radians?|°|-|s|ms)?[\])]?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _COMMENT = ("#", "%", "//", "!", ";")
-_UR = re.compile(rf"p\s*\[\s*({_NUMBER}(?:\s*,\s*{_NUMBER}){{5}})\s*\]")
-_UR_SETTINGS = re.compile(r"set_tcp\s*\(|set_payload\s*\(|set_gravity\s*\(|_tcp\s*=")
-_RAPID = re.compile(
-    rf"(?:(\w+)\s*:=\s*)?\[\s*\[({_NUMBER}(?:\s*,\s*{_NUMBER}){{2}})\]\s*,\s*\[({_NUMBER}(?:\s*,\s*{_NUMBER}){{3}})\]"
-)
-_KUKA = re.compile(r"(?:(\w+)\s*=\s*)?\{([^{}]*\bX\b[^{}]*\bA\b[^{}]*)\}", re.IGNORECASE)
-_KUKA_FIELD = re.compile(rf"\b([XYZABC])\s+({_NUMBER})", re.IGNORECASE)
-_FANUC_FIELD = re.compile(rf"\b([XYZWPR])\s*[=:]\s*({_NUMBER})\s*(mm|deg)?", re.IGNORECASE)
-_FANUC_POINT = re.compile(r"\bP\[\s*(\d+)[^\]]*\]\s*\{")
-_TF_P = re.compile(rf"Translation:\s*\[\s*({_NUMBER}(?:\s*,\s*{_NUMBER}){{2}})\s*\]")
-_TF_Q = re.compile(rf"in Quaternion(?:\s*\(xyzw\))?\s*\[\s*({_NUMBER}(?:\s*,\s*{_NUMBER}){{3}})\s*\]")
-_TF_TIME = re.compile(rf"At time\s+({_NUMBER})")
+_BEYOND = 1e300  # a number of so many digits that it has no value
+_COSINE = 1.1  # no element of a rotation matrix exceeds it
 _NANOSECONDS = 1e14  # a time above it is in nanoseconds
 
 
@@ -48,104 +42,17 @@ def lists_of_text(text: str, name: str) -> list[Listing]:
             f"'{name}' is COLMAP's images.txt: its poses lead from the world to the camera and have no unit of length. Write the inverse "
             "poses in metres, scaled by a known length, as a table x,y,z,qw,qx,qy,qz."
         )
-    for program in (_rapid, _kuka, _fanuc, _transforms, _ur):
-        found = program(text, name)
-        if found is not None:
-            return [found]
-    return _numbers(text, name)
+    found = list_of_program(text, name)
+    return [found] if found is not None else _keyed(text, name) or _numbers(text, name)
 
 
-def _floats(text: str) -> list[float]:
-    return [float(v) for v in re.findall(_NUMBER, text)]
-
-
-def _rapid(text: str, name: str) -> Listing | None:
-    found = _RAPID.findall(text)
-    if not found or "[[" not in text.replace(" ", ""):
-        return None
-    p, q = np.array([_floats(m[1]) for m in found]), np.array([_floats(m[2]) for m in found])
-    return listing_of(
-        name, p, q, rotation="quaternion_wxyz", ids=_unique([m[0] for m in found]), unit="mm", form="ABB robtargets"
-    )
-
-
-def _kuka(text: str, name: str) -> Listing | None:
-    rows, ids = [], []
-    for label, body in _KUKA.findall(text):
-        fields = {key.upper(): float(value) for key, value in _KUKA_FIELD.findall(body)}
-        if set("XYZABC") <= set(fields):
-            rows.append([fields[key] for key in "XYZABC"])
-            ids.append(re.sub(r"^X(?=\w)", "", label))
-    if not rows:
-        return None
-    table = np.array(rows)
-    return listing_of(
-        name,
-        table[:, :3],
-        table[:, 3:],
-        rotation="euler_ZYX",
-        angles="deg",
-        ids=_unique(ids),
-        unit="mm",
-        form="KUKA positions",
-    )
-
-
-def _fanuc(text: str, name: str) -> Listing | None:
-    if not re.search(r"\bW\s*[=:]\s*" + _NUMBER + r"\s*deg", text, re.IGNORECASE):
-        return None
-    rows: list[list[float]] = []
-    fields: dict[str, float] = {}
-    for key, value, _ in _FANUC_FIELD.findall(text):
-        fields[key.upper()] = float(value)
-        if set("XYZWPR") <= set(fields):
-            rows.append([fields[k] for k in "XYZWPR"])
-            fields = {}
-    if not rows:
-        return None
-    ids = [f"P{number}" for number in _FANUC_POINT.findall(text)]
-    table = np.array(rows)
-    return listing_of(
-        name, table[:, :3], table[:, 3:], rotation="euler_xyz", angles="deg", ids=_unique(ids) if len(ids) == len(rows) else (),
-        unit="mm", form="Fanuc positions",
-    )  # fmt: skip
-
-
-def _transforms(text: str, name: str) -> Listing | None:
-    p, q, times = _TF_P.findall(text), _TF_Q.findall(text), _TF_TIME.findall(text)
-    if not p or len(p) != len(q):
-        return None
-    at = np.array([float(t) for t in times]) if len(times) == len(p) else None
-    return listing_of(
-        name, np.array([_floats(v) for v in p]), np.array([_floats(v) for v in q]), rotation="quaternion_xyzw", times=at, unit="m",
-        form="transforms of tf2_echo",
-    )  # fmt: skip
-
-
-def _ur(text: str, name: str) -> Listing | None:
-    rows = [
-        _floats(pose)
-        for line in text.splitlines()
-        if not line.lstrip().startswith("#") and not _UR_SETTINGS.search(line)
-        for pose in _UR.findall(line)
-    ]
-    if not rows:
-        return None
-    table = np.array(rows)
-    return listing_of(
-        name,
-        table[:, :3],
-        table[:, 3:],
-        rotation="rotation_vector",
-        angles="rad",
-        unit="m",
-        form="UR poses (x, y, z, rotation vector)",
-    )
-
-
-def _unique(ids: Sequence[str]) -> tuple[str, ...]:
-    named = all(ids) and len(set(ids)) == len(ids)
-    return tuple(ids) if named else ()
+def _keyed(text: str, name: str) -> list[Listing]:
+    """The lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each; empty where it has none."""
+    rows = [found for line in text.splitlines() if len(found := _KEYED.findall(line)) >= 6]
+    names = [key for key, _ in rows[0]] if len(rows) > 1 else []
+    if not names or any([key for key, _ in row] != names for row in rows) or len(columns_of(names)[0]) < 6:
+        return []
+    return table_lists(names, np.array([[float(value) for _, value in row] for row in rows]), name)
 
 
 class _Line:
@@ -162,7 +69,8 @@ class _Line:
 
 def _value(cell: str) -> float | None:
     if _CELL.fullmatch(cell):
-        return float(cell)
+        value = float(cell)
+        return value if np.isfinite(value) or not cell.lstrip("+-")[:1].isdigit() else _BEYOND
     return np.nan if cell == "" else None
 
 
@@ -172,7 +80,7 @@ def _numbers(text: str, name: str) -> list[Listing]:
         raise DatasetError(f"'{name}' is empty.")
     header = next((k for k, line in enumerate(lines[:40]) if _is_header(line, lines[k + 1 :])), None)
     if header is not None:
-        return _table(lines[header].cells, lines[header + 1 :], name)
+        return _table(*_whole_header(lines, header), name)
     rows = [line for line in lines if line.numeric >= 3]
     if not rows:
         raise DatasetError(
@@ -184,13 +92,74 @@ def _numbers(text: str, name: str) -> list[Listing]:
     )
     if commented is not None and len(commented.cells) == len(rows[0].cells):
         return _table(commented.cells, rows, name)
+    captions = _captioned(lines)
+    if captions is not None:
+        return [_bare([_tail(r) for r in mine], f"{name}, {label}", ()) for label, mine in captions.items()]
     labelled: dict[str, list[_Line]] = defaultdict(list)
     for row in rows:
         labelled[str(row.cells[0]).lower() if row.values[0] is None else ""].append(row)
     if 2 <= len(labelled) <= 3 and "" not in labelled and min(map(len, labelled.values())) >= 3:
         return [_bare([_tail(r) for r in mine], f"{name}, {label}", ()) for label, mine in labelled.items()]
     ids = tuple(PurePath(str(r.cells[0])).stem for r in rows) if all(r.values[0] is None for r in rows) else ()
-    return [_bare([_tail(r) for r in rows], name, ids)]
+    plain = [_tail(r) for r in rows]
+    if _two_a_row(plain):
+        half = len(plain[0]) // 2  # two poses a row, the robot's first
+        return [
+            _bare([row[k : k + half] for row in plain], f"{name}, columns {k + 1} to {k + half}, {who}", ids)
+            for k, who in ((0, "robot"), (half, "camera"))
+        ]
+    return [_bare(plain, name, ids)]
+
+
+def _two_a_row(rows: list[list[float]]) -> bool:
+    """Whether rows hold two poses each: 14 numbers, or 12 of which those that would be cosines exceed 1."""
+    n = len(rows[0])
+    if len(rows) < 2 or any(len(row) != n for row in rows):
+        return False
+    return n == 14 or (n == 12 and float(np.nanmax(np.abs(np.array(rows)[:, [0, 1, 2, 4, 5, 6, 8]]))) > _COSINE)
+
+
+def _whole_header(lines: list[_Line], at: int) -> tuple[list[str], list[_Line]]:
+    """The names of a header of one or two lines with the units of a line below it, and the lines below."""
+    names, rest = list(lines[at].cells), lines[at + 1 :]
+    above = lines[at - 1].cells if at else []
+    if len({n.lower() for n in names}) < len(names) and 1 < len(above) <= len(names) and not _filled(lines[at - 1]):
+        owner, joined = "", []
+        for k, name in enumerate(names):
+            owner = above[k] if k < len(above) and above[k] else owner
+            joined.append(f"{owner} {name}".strip())
+        names = joined
+    if rest and not _filled(rest[0]) and all(_UNIT_CELL.fullmatch(c) for c in rest[0].cells):
+        units = [c.strip("[]() ") for c in rest[0].cells]
+        names = [
+            f"{n} [{u}]" if u and u != "-" else n for n, u in zip(names, [*units, *[""] * len(names)], strict=False)
+        ]
+        rest = rest[1:]
+    return names, rest
+
+
+def _filled(line: _Line) -> int:
+    """How many cells of a line are numbers that are there."""
+    return sum(v is not None and c != "" for v, c in zip(line.values, line.cells, strict=True))
+
+
+def _captioned(lines: Sequence[_Line]) -> dict[str, list[_Line]] | None:
+    """The rows of numbers below captions of two kinds, such as ``robot:`` and ``camera:``; None where the captions are not of two lists."""
+    groups: dict[str, list[_Line]] = defaultdict(list)
+    label = ""
+    for line in lines:
+        words = "".join(
+            re.findall(
+                r"[A-Za-z_]\w*|\s", " ".join(c for c, v in zip(line.cells, line.values, strict=True) if v is None)
+            )
+        )
+        if line.numeric >= 3 and line.values[0] is not None:
+            groups[label].append(line)
+        elif words.strip():
+            label = re.sub(r"\d+", "", " ".join(words.split())).lower()
+    if len(groups) != 2 or "" in groups or min(map(len, groups.values())) < 3:
+        return None
+    return groups if {whose(label) for label in groups} == {"robot", "camera"} else None
 
 
 def _tail(row: _Line) -> list[float]:
@@ -208,10 +177,11 @@ def _bare(rows: list[list[float]], name: str, ids: tuple[str, ...]) -> Listing:
         table = table.reshape(-1, 12)
     elif n == 9 and not ids:
         table = _stamped(table)
-    counted = n in (7, 8, 13, 17) and len(table) > 1 and bool((np.diff(table[:, 0]) == 1.0).all())
+    step = np.diff(table[:, 0])
+    counted = n in (7, 8, 13, 17) and len(table) > 1 and bool((step == step[0]).all()) and step[0] in (0.0, 1.0)
     if counted and (n != 7 or not _quaternion_rows(table)):
         found = listing_of_array(name, table[:, 1:])
-        return replace(found, ids=ids or tuple(str(int(v)) for v in table[:, 0]))
+        return replace(found, ids=ids or (tuple(str(int(v)) for v in table[:, 0]) if step[0] else ()))
     found = listing_of_array(name, table)
     return replace(found, ids=ids) if ids and len(ids) == len(found) else found
 
@@ -359,7 +329,7 @@ def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...
         return table[:, [at[r] for r in roles]]
 
     grid = sorted(r for r in at if re.fullmatch(r"m\d\d", r))
-    more = {"ids": ids, "times": times, "unit": length}
+    more: dict[str, Any] = {"ids": ids, "times": times, "unit": length}
     if len(grid) in (12, 16):
         return listing_of_array(name, take(*grid), **more)
     if not {"x", "y", "z"} <= set(at):
@@ -368,6 +338,10 @@ def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...
     if {"qw", "qx", "qy", "qz"} <= set(at):
         return listing_of(
             name, p, take("qw", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more
+        )
+    if {"q0", "qx", "qy", "qz"} <= set(at):
+        return listing_of(
+            name, p, take("q0", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more
         )
     for numbered in (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")):
         if set(numbered) <= set(at) and not {"rx", "ry", "rz"} <= set(at):

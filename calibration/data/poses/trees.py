@@ -12,16 +12,17 @@ from weldcal.calibration.data.poses.names import natural
 from weldcal.calibration.data.poses.text import table_lists
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
+from weldcal.models.documents import as_number
 
 _PARTNERS = {
     "rotations": "translations", "rotation": "translation", "rots": "trans", "rot": "trans", "rvecs": "tvecs", "rvec": "tvec",
     "orientations": "positions", "orientation": "position", "r": "t", "q": "t",
 }  # fmt: skip
 _NO_POSES = re.compile(
-    r"(?i)^(q|joints?|joint_.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(matrix|coeffs?|distortion)|covariance.*)$"
+    r"(?i)^(q|joints?|joint_.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(camera|intrinsic|projection|rectif)\w*matrix|.*(coeffs?|distortion)|covariance.*)$"
 )
 _VECTOR = re.compile(r"(?i)(rvec|rotvec|rotation_?vector|axis_?angle|rodrigues)")
-_QUATERNION = re.compile(r"(?i)(^q$|quat|rotation|orientation|wxyz|xyzw)")
+_QUATERNION = re.compile(r"(?i)(^q$|quat|rotation|^ori|wxyz|xyzw)")
 _POSITION = re.compile(r"(?i)^(.*_)?(position|translation|xyz|pos|trans|tvec|t|p|location)$")
 
 
@@ -87,13 +88,31 @@ def _of_samples(node: list[Mapping[Any, Any]], name: str, at: str, label: str) -
         values = [item.get(key) for item in node]
         if all(isinstance(v, Mapping) for v in values) and not _has_columns(values[0]):
             yield from _of_samples(values, name, f"{at}/{key}", f"{name}, {at.strip('/')}/{key}".replace(", /", ", "))  # type: ignore[arg-type]
-        elif all(isinstance(v, list | np.ndarray) for v in values) and not _NO_POSES.match(str(key)):
-            arrays = [_array(v) if isinstance(v, list) else v for v in values]
-            if all(a is not None and a.size in (12, 16) for a in arrays):
-                yield listing_of_array(f"{name}, {key}", np.stack([np.asarray(a).reshape(-1, 4) for a in arrays]))
-            elif all(a is not None and a.size in (6, 7) for a in arrays):
-                yield listing_of_array(f"{name}, {key}", np.stack([np.asarray(a).ravel() for a in arrays]))
+        elif not _NO_POSES.match(str(key)):
+            poses = _stack(values, f"{name}, {key}", label)
+            if poses is not None:
+                yield listing_of_array(f"{name}, {key}", poses)
     yield from _partners({k: [item.get(k) for item in node] for k in node[0]}, name, at)
+
+
+def _stack(values: list[Any], name: str, label: str) -> Array | None:
+    """The poses of samples, (n, 4, 4), (n, 3, 4), (n, 6) or (n, 7); NaN where a sample has none. None where most are no poses.
+
+    Raises:
+        DatasetError: a sample has other numbers than most.
+    """
+    arrays = [_array(v) if isinstance(v, list | np.ndarray) else None for v in values]
+    sizes = [a.size for a in arrays if a is not None and a.size in (6, 7, 12, 16)]
+    size = max(set(sizes), key=sizes.count) if sizes else 0
+    if not size or 2 * sizes.count(size) < len(values):
+        return None
+    for k, (value, array) in enumerate(zip(values, arrays, strict=True)):
+        if value is not None and (array is None or array.size != size):
+            raise DatasetError(
+                f"Sample {k + 1} of '{label}' is no pose of {size} numbers, as the others of '{name}' are; correct or remove it."
+            )
+    shape = (-1, 4) if size in (12, 16) else (-1,)
+    return np.stack([np.full(size, np.nan).reshape(shape) if a is None else a.reshape(shape) for a in arrays])
 
 
 def _has_columns(node: Any) -> bool:
@@ -101,12 +120,21 @@ def _has_columns(node: Any) -> bool:
 
 
 def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iterator[Listing]:
+    samples = _numbered(node)
+    if samples:
+        yield from _of_samples(samples, name, at, label)
+        return
     flat = _flat(node)
     columns, _ = columns_of(list(flat))
     direct = [n for n in flat if len({c.prefix for c in columns}) <= 1 or not columns]
     if len(columns) >= 6 and direct and len({c.prefix for c in columns}) == 1:
         yield from table_lists(list(flat), np.array([list(flat.values())]), label)
-        return
+        roots = {list(flat)[c.index].partition(".")[0] for c in columns}
+        node = {
+            k: v for k, v in node.items() if str(k).lower() not in roots and isinstance(v, Mapping | list | np.ndarray)
+        }
+        if len(roots) > 1:  # the whole mapping is the pose
+            return
     used = set()
     for listing, keys in _joined(node, name, at):
         used |= keys
@@ -123,11 +151,20 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
     yield from _together(singles, name, at)
 
 
+def _numbered(node: Mapping[Any, Any]) -> list[Mapping[Any, Any]]:
+    """The samples of a mapping with a numbered key each, such as 0, 1, 2 or frame_0, frame_1; empty where it has none."""
+    found = {str(k): v for k, v in node.items() if isinstance(v, Mapping) and re.search(r"\d", str(k))}
+    if len(found) < 3 or len({_stem(k) for k in found}) > 1 or len(found) < len(node) - 3:
+        return []
+    keys = sorted(found, key=natural)
+    return [found[k] for k in keys] if all(set(found[k]) == set(found[keys[0]]) for k in keys) else []
+
+
 def _together(singles: list[tuple[str, Listing]], name: str, at: str) -> Iterator[Listing]:
     """Single poses under numbered keys (pose_0, pose_1 ...) as one list each."""
     groups: dict[str, list[tuple[str, Listing]]] = {}
     for key, one in singles:
-        groups.setdefault(re.sub(r"\d+", "", key), []).append((key, one))
+        groups.setdefault(_stem(key), []).append((key, one))
     for stem, group in groups.items():
         if len(group) == 1 or not re.search(r"\d", group[0][0]):
             yield from (one for _, one in group)
@@ -135,9 +172,14 @@ def _together(singles: list[tuple[str, Listing]], name: str, at: str) -> Iterato
         group.sort(key=lambda g: natural(g[0]))
         yield stacked(
             [one for _, one in group],
-            f"{name}, {at.strip('/')} {stem}".replace(",  ", ", "),
+            f"{name}, {at.strip('/')} {stem.strip('_- ')}".replace(",  ", ", "),
             tuple(k for k, _ in group),
         )
+
+
+def _stem(key: str) -> str:
+    """A key without its last number."""
+    return re.sub(r"\d+(?=\D*$)", "", key)
 
 
 def stacked(lists: list[Listing], name: str, ids: tuple[str, ...] = ()) -> Listing:
@@ -221,9 +263,11 @@ def _flat(node: Mapping[Any, Any], at: str = "") -> dict[str, float]:
     for key, value in node.items():
         path = f"{at}.{key}".strip(".").lower()
         if isinstance(value, Mapping):
-            out |= _flat(value, path)
+            out |= _axis_angle(value, path) or _flat(value, path)
+        elif isinstance(value, list) and len(value) == 1 and isinstance(value[0], Mapping):
+            out |= _flat(value[0], path)  # a message with one detection or transform
         elif isinstance(value, int | float) and not isinstance(value, bool):
-            out[path] = float(value)
+            out[path] = as_number(value)
         elif isinstance(value, list | np.ndarray):
             numbers = value if isinstance(value, np.ndarray) else _array(value)
             if numbers is not None and numbers.dtype.kind in "fiu":
@@ -234,6 +278,17 @@ def _flat(node: Mapping[Any, Any], at: str = "") -> dict[str, float]:
             except ValueError:
                 continue
     return out
+
+
+def _axis_angle(value: Mapping[Any, Any], path: str) -> dict[str, float]:
+    """A rotation of an angle about an axis as a rotation vector; empty where the mapping is none."""
+    axis, angle = _array(value.get("axis")) if isinstance(value.get("axis"), list) else None, value.get("angle")
+    if axis is None or axis.shape != (3,) or not isinstance(angle, int | float):
+        return {}
+    size = float(np.linalg.norm(axis))
+    parent = f"{path.rpartition('.')[0]}."
+    vector = float(angle) * axis / (size if size > 0.0 else 1.0)
+    return dict(zip((f"{parent}rvec_{a}".lstrip(".") for a in "xyz"), map(float, vector), strict=True))
 
 
 def _spelled(path: str, key: str, numbers: Array) -> dict[str, float]:

@@ -30,6 +30,7 @@ from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, swit
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.hand_eye.cells import hand_eye_cells, mountings
+from weldcal.tools.studies.hand_eye.conventions import hand_eye_conventions
 from weldcal.tools.studies.harness import Figures, Row, Study, Table
 from weldcal.tools.worlds.hand_eye_mistakes import fuzz
 
@@ -394,7 +395,7 @@ def hand_eye_sets(
 
 
 @command("benchmark hand-eye", short_help="Compare the hand-eye solvers with OpenCV's.", options=FARM)
-@one_of("sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings)
+@one_of("sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings, conventions=hand_eye_conventions)
 def hand_eye(call: Call) -> None:
-    """Compare the hand-eye solvers with OpenCV's on public data (sets) and on imperfect cells (cells), test them in simulation, and
-    calibrate every mounting live (mountings)."""
+    """Compare the hand-eye solvers with OpenCV's on public data (sets) and on imperfect cells (cells), test them in simulation,
+    calibrate every mounting live (mountings), and read pose lists in random conventions (conventions)."""
