@@ -362,21 +362,8 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     mistake = likely_mistake(pairs, result, config)
     if mistake is not None:
         raise InconsistentPoses(mistake)
-    said = [w for w in (scale_warning(problem, result), _repeated(pairs)) if w is not None]
-    return replace(result, warnings=(*result.warnings, *said))
-
-
-def _repeated(pairs: PosePairs) -> str | None:
-    seen = np.hstack(
-        [X.reshape(len(X), -1) for X in (pairs.robot, pairs.camera, pairs.robot2, pairs.link) if X is not None]
-    )
-    again = len(seen) - len(np.unique(seen, axis=0))
-    if not again:
-        return None
-    return (
-        f"{again} of {len(seen)} samples are exact copies of others. They make uncertainty and held-out errors too small: "
-        "remove them."
-    )
+    scale = scale_warning(problem, result)
+    return result if scale is None else replace(result, warnings=(*result.warnings, scale))
 
 
 def problem_of_pairs(pairs: PosePairs) -> Problem:
