@@ -338,16 +338,25 @@ def as_poses(value: ArrayLike | Sequence[RigidTransform], name: str) -> Array:
     off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
     wrong = (off > _RIGID) | (np.linalg.det(R) < 0.0) | (np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > 1e-9)
     if wrong.any():
-        raise InputError(
-            f"Pose {int(np.argmax(wrong))} of '{name}' is not a rigid pose (rotation not orthonormal, mirrored, or last row not "
-            "0 0 0 1); check the order of rows and columns."
-        )
+        k = int(np.argmax(wrong))
+        raise InputError(f"Pose {k} of '{name}' is not a rigid pose: {_why_not_rigid(M[k])}")
     # printed matrices are rounded: take the rotation they stand for, but leave exact ones as they are
     rounded = off > 1e-12
     if rounded.any():
         U, _, Vt = np.linalg.svd(R[rounded])
         M[rounded, :3, :3] = U @ Vt
     return M
+
+
+def _why_not_rigid(M: Array) -> str:
+    R = M[:3, :3]
+    if float(np.abs(M[3] - [0.0, 0.0, 0.0, 1.0]).max()) > 1e-9:
+        if float(np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max()) < 1e-9:
+            return "its position is in the last row; exchange rows and columns of each matrix."
+        return "its last row is not 0 0 0 1."
+    if float(np.abs(R @ R.T - np.eye(3)).max()) <= _RIGID:
+        return "its rotation is mirrored (determinant -1); turn the sign of one axis of that frame in all poses."
+    return "the columns of its 3 x 3 part must have length 1 and be at right angles."
 
 
 def _problem(
