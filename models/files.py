@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from weldcal.models.errors import InputError
-from weldcal.models.limits import LARGEST_BYTES, LARGEST_TABLE
+from weldcal.models.limits import LARGEST_BYTES, LARGEST_TABLE, MOST_POSES
 
 _BLOCK = 1024**2
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
@@ -32,6 +32,20 @@ def file_size(path: Path, limit: int = LARGEST_BYTES) -> int:
     except (OSError, ValueError) as e:  # a loop of links, a name that is too long or holds a null character
         raise InputError(f"'{path}' cannot be opened: {_reason(e)}.") from None
     return _checked(path, status, limit)
+
+
+def require_few_lines(path: Path, most: int = MOST_POSES) -> None:
+    """Refuse a text with more lines than a list of poses may have, before it is parsed.
+
+    Raises:
+        InputError: as opened; it has more lines than ``most``.
+    """
+    with opened(path) as file:
+        lines = sum(block.count(b"\n") for block in iter(lambda: file.read(_BLOCK), b""))
+    if lines > most + 1:
+        raise InputError(
+            f"'{path.name}' holds {lines:,} lines, and at most {most:,} poses are read. Keep one row for each scan or picture: the pose at its time."
+        )
 
 
 @contextmanager

@@ -37,3 +37,7 @@ def expansion_limit(size: int) -> int:
     The largest of today's area scanners (8 megapixels) takes 190 MB; a file that is not compressed never exceeds ten times.
     """
     return max(_EXPANDED, _TIMES * size)
+
+
+MOST_POSES = 100_000
+"""Poses of one list, and lines of a text that holds them: more take minutes to read, and no set of scans has so many."""

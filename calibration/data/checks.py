@@ -17,7 +17,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text, sha256
+from weldcal.models.files import read_text, require_few_lines, sha256
 from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
 
 UNITS = {"m": 1.0, "mm": 1e-3}
@@ -140,6 +140,7 @@ def _check_poses(header: DatasetHeader, path: Path) -> None:
 def table_rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
     """Rows of a table with the column `id`, each id a plain name that occurs once. Raises DatasetError."""
     try:
+        require_few_lines(path)
         names, rows = read_rows(path)
     except InputError as e:
         raise DatasetError(str(e)) from e
