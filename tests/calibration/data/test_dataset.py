@@ -109,6 +109,8 @@ def test_feature_in_the_flange_frame_is_read(folder: Path) -> None:
         ("dataset.yaml", "note: test", "scanner_guess: {radius_m: .nan}", "radius_m must be a positive number"),
         ("dataset.yaml", "note: test", "scanner_guess: {radius_m: -0.1}", "radius_m must be a positive number"),
         ("dataset.yaml", "note: test", "scanner_guess: {radius_m: [1]}", "cannot be read as a dataset description"),
+        ("dataset.yaml", "note: test", "poses: {rotaton: matrix}", "no key 'poses.rotaton'; did you mean 'rotation'"),
+        ("dataset.yaml", "clouds: m,", "cloud: m,", "no key 'units.cloud'; did you mean 'clouds'"),
         ("dataset.yaml", "poses: m}", "poses: mm}", "look like m;"),
         ("poses.csv", "0.5,0.2,0.4", "0,5,0.2,0.4", "line 3: 9 cells, and the header names 8 columns"),
         ("poses.csv", "id,x,y,z,qw", "id,x,y,z,x,qw", "two columns 'x'"),
