@@ -18,7 +18,6 @@ from weldcal.tools import console
 from weldcal.tools.cli.result_folder import claimed
 
 if TYPE_CHECKING:
-    from weldcal.tools.farm.run import Farm
     from weldcal.tools.report.first_screen import FirstScreen
 
 
@@ -189,12 +188,6 @@ class Call:
         if self._page is not None:
             self._page[1]()
         self._page = None
-
-    def farm(self, folder: Path) -> "Farm":
-        """Where the tasks of a study run whose results are written to ``folder``."""
-        from weldcal.tools.farm.run import Farm
-
-        return Farm(folder, self.given.get("workers"), self.given.get("scheduler"), self.progress)
 
     def progress(self, stage: str, fraction: float) -> None:
         """Shows the stage and the completed fraction (0 to 1); the first call opens the progress bar."""
