@@ -34,6 +34,8 @@ LARGEST_IMAGE = 128 * 1024**2
 """Bytes of an image."""
 MOST_PIXELS = 100_000_000
 """Pixels of an image."""
+MOST_POSES = 100_000
+"""Poses of one list, and lines of a text that holds them: more take minutes to read, and no set of scans has so many."""
 LARGEST_NUMBER = 1e9
 """Size of any coordinate, in the unit of its file: squares and cubes of it are still far from overflow."""
 
@@ -70,6 +72,20 @@ def file_size(path: Path, limit: int = LARGEST_BYTES) -> int:
     except (OSError, ValueError) as e:  # a loop of links, a name that is too long or holds a null character
         raise InputError(f"'{path}' cannot be opened: {_reason(e)}.") from None
     return _checked(path, status, limit)
+
+
+def require_few_lines(path: Path, most: int = MOST_POSES) -> None:
+    """Refuse a text with more lines than a list of poses may have, before it is parsed.
+
+    Raises:
+        InputError: as opened; it has more lines than ``most``.
+    """
+    with opened(path) as file:
+        lines = sum(block.count(b"\n") for block in iter(lambda: file.read(_BLOCK), b""))
+    if lines > most + 1:
+        raise InputError(
+            f"'{path.name}' holds {lines:,} lines, and at most {most:,} poses are read. Keep one row for each scan or picture: the pose at its time."
+        )
 
 
 @contextmanager

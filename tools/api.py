@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.data import clouds
+from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.flange import fit as flange_fit
 from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.hand_eye.files import PosePairs
-from weldcal.calibration.hand_eye.solve import HandEyeResult
+from weldcal.calibration.hand_eye.solve import HandEyeResult, as_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.cell import Cell
@@ -22,7 +23,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import run_procedure
-from weldcal.tools.commands.hand_eye import solve_pairs
+from weldcal.tools.commands.hand_eye import solve_arrays
 from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.report.calibration import CalibrationReport
 from weldcal.tools.report.run import RunOptions
@@ -124,26 +125,35 @@ def fit_flange(points_C: Floats, flange: str = FLANGE) -> FlangeFit:
     return flange_fit.fit_flange(np.asarray(points_C), get_flange(flange))
 
 
-def hand_eye(robot: Floats, camera: Floats, mounting: str = "eye_in_hand") -> HandEyeResult:
+def hand_eye(
+    robot: Floats,
+    camera: Floats,
+    mounting: str = "eye_in_hand",
+    *,
+    robot_form: str | None = None,
+    camera_form: str | None = None,
+) -> HandEyeResult:
     """Calibrate a camera from pairs of poses (AX = XB, AX = YB).
 
     Args:
         robot: X_BF (n, 4, 4), the robot's flange in its base; camera: X_CM (n, 4, 4), the target in the camera; metres.
         mounting: eye_in_hand or eye_on_base, and others of `weldcal hand-eye`.
+        robot_form, camera_form: how the matrices are to be read, as --robot-form and --camera-form: matrix, or "matrix,inverse".
 
     Returns:
-        `.poses` by letter (X: the camera on what carries it, Y: the target), `.covariance`, `.held_out`, `.unobservable`.
+        `.poses` by letter (X: the camera on what carries it, Y: the target), `.covariance`, `.held_out`, `.unobservable`. `.warnings` name
+        another reading of the matrices than the usual one, and the rows that were left out.
 
     Raises:
-        InputError: poses that cannot be used, or do not determine the answer.
+        InputError: poses that cannot be used, contradict each other, or do not determine the answer.
     """
-    shapes = np.shape(robot), np.shape(camera)
-    if any(len(shape) != 3 or shape[1:] != (4, 4) for shape in shapes) or shapes[0] != shapes[1]:
-        raise InputError(f"robot and camera must both be (n, 4, 4) matrices; they are {shapes[0]} and {shapes[1]}.")
-    pairs = PosePairs(
-        source="the poses", robot=np.asarray(robot, dtype=float), camera=np.asarray(camera, dtype=float), mode=mounting
+    A, B = (
+        np.array([X.GetAsMatrix4() if isinstance(X, RigidTransform) else X for X in each]) for each in (robot, camera)
     )
-    return solve_pairs(pairs)
+    if any(each.ndim != 3 or each.shape[1:] != (4, 4) for each in (A, B)) or len(A) != len(B):
+        raise InputError(f"robot and camera must both be (n, 4, 4) matrices; they are {A.shape} and {B.shape}.")
+    A, B = as_poses(A, "robot"), as_poses(B, "camera")
+    return solve_arrays(A, B, mounting_name(mounting), robot_form, camera_form)
 
 
 def build_cell(scenario: Scenario | str, seed: int = 0, meshcat: Meshcat | None = None) -> Cell[Any]:

@@ -10,14 +10,14 @@ from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RotationMatrix
 
 from weldcal.calibration.data.clouds import CloudError, read_cloud
-from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.header import DatasetHeader, Feature, PoseForm, ScannerGuess, Units
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_DOCUMENT, LARGEST_NUMBER, read_text, sha256
+from weldcal.models.files import LARGEST_DOCUMENT, LARGEST_NUMBER, read_text, require_few_lines, sha256
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 AUTO = "auto"
@@ -80,15 +80,21 @@ def read_header(path: Path) -> DatasetHeader:
     return header
 
 
+_PARTS = {"units": Units, "feature_in_flange": Feature, "scanner_guess": ScannerGuess, "poses": PoseForm}
+"""The keys of dataset.yaml that hold keys of their own."""
+
+
 def _unread(name: str, given: object, problem: str) -> str:
     """Why a dataset.yaml cannot be read: the unknown key and the nearest known one, or the reader's words."""
-    known = {f.name for f in fields(DatasetHeader)}
-    wrong = next((str(key) for key in given if key not in known), None) if isinstance(given, dict) else None
-    if wrong is None:
-        return f"'{name}' cannot be read as a dataset description: {problem}"
-    near = get_close_matches(wrong, known, 1, 0.5)
-    hint = f"did you mean '{near[0]}'?" if near else f"use {', '.join(sorted(known))}."
-    return f"'{name}' has no key '{wrong[:40]}'; {hint}"
+    for part, kind in (("", DatasetHeader), *_PARTS.items()):
+        keys = given.get(part) if part and isinstance(given, dict) else given
+        known = {f.name for f in fields(kind)}
+        wrong = next((str(key) for key in keys if key not in known), None) if isinstance(keys, dict) else None
+        if wrong is not None:
+            near = get_close_matches(wrong, known, 1, 0.5)
+            hint = f"did you mean '{near[0]}'?" if near else f"use {', '.join(sorted(known))}."
+            return f"'{name}' has no key '{f'{part}.' if part else ''}{wrong[:40]}'; {hint}"
+    return f"'{name}' cannot be read as a dataset description: {problem}"
 
 
 def is_motion(folder: Path) -> bool:
@@ -148,6 +154,7 @@ def _check_poses(header: DatasetHeader, path: Path) -> None:
 def table_rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
     """Rows of a table with the column `id`, each id a plain name that occurs once. Raises DatasetError."""
     try:
+        require_few_lines(path)
         names, rows = read_rows(path)
     except InputError as e:
         raise DatasetError(str(e)) from e

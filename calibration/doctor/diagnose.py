@@ -428,4 +428,11 @@ def _weight(winner: Explained, models: list[Explained], null: Fit) -> float:
 
 
 def _residuals(null: Fit, best: Fit) -> dict[str, float]:
-    return {"without_mm": 1e3 * null.rms, "with_mm": 1e3 * best.rms}
+    """Medians of centres (mm) and, where normals were seen, of their angles (deg), without and with the cause."""
+    out = {"without_mm": 1e3 * null.rms, "with_mm": 1e3 * best.rms}
+    if np.isfinite(null.tilt).any() and np.isfinite(best.tilt).any():
+        out |= {
+            "without_deg": float(np.degrees(np.nanmedian(null.tilt))),
+            "with_deg": float(np.degrees(np.nanmedian(best.tilt))),
+        }
+    return out

@@ -73,8 +73,10 @@ class TcpOffset:
         tcp = ", ".join(f"{-1e3 * v:.1f}" if k else "?" for v, k in zip(self.offset_m, self.known, strict=True))
         cure = "or correct the positions in pairs.csv"
         if X_FR is not None:
-            at = X_FR.multiply(np.where(self.known, self.offset_m, 0.0))
-            cure = f"or write feature_in_flange: {{xyz: [{', '.join(f'{v:.5f}' for v in at)}]}} (m) in dataset.yaml"
+            # the flange lies at -t in the frame of a TCP t: X_FR moves with it
+            t = -X_FR.rotation().matrix() @ np.where(self.known, self.offset_m, 0.0)
+            numbers = ", ".join(f"{v + 0.0:.4f}" for v in np.round(t, 4))
+            cure = f"or write poses: {{tcp: [{numbers}, 0.0, 0.0, 0.0]}} (m, rad) in dataset.yaml"
         hidden = [a for a, k in zip("xyz", self.known, strict=True) if not k]
         open_axes = (
             f" Its {' and '.join(hidden)} cannot be seen in these poses: take it from the controller." if hidden else ""

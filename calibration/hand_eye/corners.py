@@ -73,7 +73,7 @@ def refine_with_corners(pairs: PosePairs, config: HandEyeConfig | None = None) -
     config = config or HandEyeConfig()
     quick = replace(config, folds=0, candidates=CANDIDATES[:1])
     plain = solve_problem(full_problem(pairs.F, poses_from_corners(pairs, np.zeros(2)), pairs.H), config=config)
-    n = 3.0 * int(plain.inliers.sum())
+    n = 3.0 * len(np.unique(plain.observation[plain.inliers]))
 
     def solved(shift: Array, how: HandEyeConfig = quick) -> HandEyeResult:
         return solve_problem(full_problem(pairs.F, poses_from_corners(pairs, shift), pairs.H), config=how)

@@ -18,7 +18,9 @@ _FEWEST = 4  # with fewer pairs the data decide nothing
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 _DISTINCT = 1e-7  # of a rotation matrix, and of the extent of positions
 _MILLIMETRES_FROM, _METRES_TO = 80.0, 10.0  # median distances of a robot's poses from its base, in mm and m
-_NEAREST_M, _FARTHEST_M = 0.02, 20.0
+_NEAREST_M = 0.02
+FARTHEST_M = 20.0
+"""Median distance of a robot's poses from its base beyond which the unit is wrong."""
 _SCALE_SIGMA = 4.0
 _LEAST_SCALE = 0.1  # of the logarithm: a factor that is nearer to a unit is a matter of the result, which names it
 
@@ -297,7 +299,7 @@ def _units(
                 "arm. State the unit with --unit m, mm, cm or inch."
             )
     unit_r = UNITS[words[0]]
-    if median * unit_r > _FARTHEST_M or (words[0] != "m" and median * unit_r < _NEAREST_M):
+    if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < _NEAREST_M):
         raise DatasetError(
             f"The robot positions of '{source}' have a median of {median * unit_r:.3g} m from the base, in {words[0]}; correct --unit."
         )
@@ -323,6 +325,12 @@ def _camera_unit(ratio: float | None, robot: str, B: PoseReading, source: str) -
 
 def _refuse_scale(ratio: float, unit: str, source: str) -> None:
     factor = ratio / UNITS[unit]
+    near = min(UNITS, key=lambda u: abs(np.log(ratio / UNITS[u])))
+    if near != unit and abs(np.log(ratio / UNITS[near])) < _LEAST_SCALE:
+        raise InconsistentPoses(
+            f"The camera positions of '{source}' are in {near} by the robot's motion, and in {unit} as stated. Correct the unit, or multiply the "
+            f"positions by {UNITS[near] / UNITS[unit]:g}."
+        )
     squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
     raise InconsistentPoses(
         f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g} (from {unit} to the right length): "

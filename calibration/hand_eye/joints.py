@@ -143,7 +143,8 @@ def refine_joints(
     state = _state_of(plain)
     try:
         found = _fit(robot.pick(keep), state, k, plain.noise_centre)
-        errors = {m: _held_out(robot, state, keep, m, plain.noise_centre, config.folds or 5) for m in (0, k)}
+        label = fold_labels(int(plain.observation.max()) + 1, config.folds or 5)[plain.observation]
+        errors = {m: _held_out(robot, state, keep, m, centre=plain.noise_centre, label=label) for m in (0, k)}
     except (WeldcalError, np.linalg.LinAlgError):
         return refused("no calibration agrees with them")
     sigma = np.sqrt(np.diag(found.V)[-k:])
@@ -302,12 +303,11 @@ def _by_errors(robot: _Robot, state: State, k: int, centre: Array, u: Array) -> 
 
 
 def _held_out(
-    robot: _Robot, state: State, keep: NDArray[np.bool_], k: int, centre: Array, folds: int
+    robot: _Robot, state: State, keep: NDArray[np.bool_], k: int, *, centre: Array, label: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """Errors (n,), (n,) of every pose under a fit with ``k`` robot errors that never saw its fold."""
-    label = fold_labels(len(keep), folds)
+    """Errors (n,), (n,) of every pose under a fit with ``k`` robot errors that never saw its fold; ``label`` (n,): the folds."""
     w, d = np.full(len(keep), np.nan), np.full(len(keep), np.nan)
-    for fold in range(folds):
+    for fold in range(int(label.max()) + 1):
         test = label == fold
         if not test.any():
             continue

@@ -14,6 +14,7 @@ from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.fit import descend
 from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, residuals
+from weldcal.calibration.hand_eye.repeats import one_per_pose
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.hand_eye.starts import grid, kronecker, with_positions
 from weldcal.models.arrays import Array
@@ -72,7 +73,8 @@ def likely_mistake(pairs: PosePairs, given: HandEyeResult | None, config: HandEy
 def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
     """A sentence where the robot's motion says that all camera distances are too long or too short by one factor (a target of
     another size, a wrong focal length): such an error shifts the answer without showing in any reprojection."""
-    used = problem.pick(result.inliers)
+    # repeats say nothing more about the scale than one sample does
+    used = one_per_pose(problem).problem.pick(np.unique(result.observation[result.inliers]))
     if problem.tied or not used.all_full or 6 * len(used) < problem.size + 12 or result.unobservable:
         return None
     X, Y = (np.asarray(result.poses[k].GetAsMatrix4()) if k in result.poses else IDENTITY for k in "XY")

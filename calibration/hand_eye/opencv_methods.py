@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, nearest_rotation, pose
-from weldcal.calibration.hand_eye.problem import Problem, residuals
+from weldcal.calibration.hand_eye.problem import Problem, full_problem, residuals
+from weldcal.calibration.hand_eye.repeats import one_per_pose
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, fold_labels
 from weldcal.models.arrays import Array
 
@@ -63,8 +64,9 @@ def opencv_held_out(method: str, F: Array, G: Array, folds: int = 5, most: int |
 
     ``most``: fit each fold to so many of its poses at most, evenly spaced; calibrateHandEye holds all pairs of poses in memory.
     """
-    label = fold_labels(len(F), folds)
     n = len(F)
+    observation = one_per_pose(full_problem(F, G)).observation
+    label = fold_labels(int(observation.max()) + 1, folds)[observation]
     out = HandEyeHeldOut(np.full(n, np.nan), np.full(n, np.nan))
     for k in range(folds):
         train, test = np.flatnonzero(label != k), label == k

@@ -19,6 +19,7 @@ from weldcal.calibration.hand_eye.determinacy import (
     without_drift,
 )
 from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, residuals
+from weldcal.calibration.hand_eye.repeats import one_per_pose
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 
@@ -71,7 +72,8 @@ class HandEyeResult:
     ``joint_covariance`` (m, m): all of them, in the order of ``poses``. ``rotation_rad`` (n,) (NaN where none was seen)
     and ``translation`` (n,): residuals of all observations at the origin of the target. ``sigma_rotation_rad``,
     ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target where it
-    holds. Lengths are in the unit of the data.
+    holds. ``observation`` (n,): the observation that each sample belongs to; repeats of a pose are one. Lengths are in the unit of
+    the data.
     """
 
     equation: str
@@ -94,6 +96,7 @@ class HandEyeResult:
     scores: dict[str, tuple[float, float]]
     diversity: Diversity
     extent: float
+    observation: NDArray[np.int64]
     labels: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -192,6 +195,8 @@ def solve_problem(
 ) -> HandEyeResult:
     """Solve F_i X G_i = Y H_i Z for the free poses; ``known`` holds the others (Y and Z may carry a known feature).
 
+    Repeats of a robot pose are one observation; residuals and held-out errors are of every sample.
+
     Raises TooFewPoses, RepeatedPoses, PureTranslation, CoplanarPoses before any work, InconsistentPoses where no rigid
     poses explain the observations, and UndeterminedPoses where more than one translation or any rotation of the camera
     stays open (unless ``config.allow_open``).
@@ -199,6 +204,8 @@ def solve_problem(
     config = config or HandEyeConfig()
     labels = labels or {}
     diverse = check_poses(problem, allow_coplanar=config.allow_coplanar)
+    samples, repeats = problem, one_per_pose(problem)
+    problem, observation = repeats.problem, repeats.observation
     choice = solve(
         problem,
         known,
@@ -220,8 +227,9 @@ def solve_problem(
     _refuse_open(problem, found.directions, found.names, config)
     state = without_drift(used, choice.state, found)
     covariance = with_open_directions(choice.covariance, found, length)
-    w, d = residuals(problem, state)
-    seen = problem.full | problem.normal
+    w, d = residuals(samples, state)
+    seen = samples.full | samples.normal
+    inliers = keep[observation] & repeats.agrees
     warnings = list(found.warnings)
     numbers = float(used.numbers_w.sum()) + 3.0 * len(used)
     if numbers < _SPARE * problem.size:
@@ -229,10 +237,10 @@ def solve_problem(
             f"{len(used)} {'motions' if problem.tied else 'poses'} are {numbers:.0f} numbers for {problem.size} unknowns: "
             "a wrong sample or convention is hard to detect; add samples before you rely on the result."
         )
-    if not keep.all():
-        names = ", ".join(str(i) for i in np.nonzero(~keep)[0])
+    if not inliers.all():
+        names = ", ".join(str(i) for i in np.nonzero(~inliers)[0])
         warnings.insert(
-            0, f"{int((~keep).sum())} of {len(keep)} poses disagree with the rest and were excluded: {names}."
+            0, f"{int((~inliers).sum())} of {len(inliers)} poses disagree with the rest and were excluded: {names}."
         )
     blocks = {NAMES[k]: slice(6 * row, 6 * row + 6) for row, k in enumerate(problem.blocks)}
     return HandEyeResult(
@@ -243,8 +251,10 @@ def solve_problem(
         degrees_of_freedom=min(s.free_w, s.free_d) if s.total_w else s.free_d,
         rotation_rad=np.where(seen, np.linalg.norm(w, axis=1), np.nan),
         translation=np.linalg.norm(d, axis=1),
-        inliers=keep,
-        held_out=_held_out(problem, known, config, starts) if config.folds else _nothing(len(problem)),
+        inliers=inliers,
+        held_out=_held_out(samples, problem, observation, known, config=config, starts=starts)
+        if config.folds
+        else _nothing(len(samples)),
         sigma_rotation_rad=float(np.sqrt(noise.rotation)) if s.total_w else float("nan"),
         sigma_translation=float(np.sqrt(noise.translation)),
         noise_centre=choice.fit.centre,
@@ -256,6 +266,7 @@ def solve_problem(
         scores=choice.scores,
         diversity=diverse,
         extent=length,
+        observation=observation,
         labels=labels,
     )
 
@@ -278,11 +289,19 @@ def fold_labels(n: int, folds: int = 5) -> NDArray[np.int64]:
     return np.asarray(np.random.default_rng(0).permutation(n) % folds)
 
 
-def _held_out(problem: Problem, known: State, config: HandEyeConfig, starts: tuple[State, ...]) -> HandEyeHeldOut:
+def _held_out(
+    samples: Problem,
+    problem: Problem,
+    observation: NDArray[np.int64],
+    known: State,
+    *,
+    config: HandEyeConfig,
+    starts: tuple[State, ...],
+) -> HandEyeHeldOut:
     label = fold_labels(len(problem), config.folds)
-    out = _nothing(len(problem))
+    out = _nothing(len(samples))
     for k in range(config.folds):
-        train, test = label != k, label == k
+        train, test = label != k, (label == k)[observation]
         if not test.any():
             continue
         try:
@@ -298,7 +317,7 @@ def _held_out(problem: Problem, known: State, config: HandEyeConfig, starts: tup
             )
         except WeldcalError:
             continue
-        rest = problem.pick(test)
+        rest = samples.pick(test)
         w, d = residuals(rest, choice.state)
         out.rotation_rad[test] = np.where(rest.full | rest.normal, np.linalg.norm(w, axis=1), np.nan)
         out.translation[test] = np.linalg.norm(d, axis=1)
@@ -319,16 +338,25 @@ def as_poses(value: ArrayLike | Sequence[RigidTransform], name: str) -> Array:
     off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
     wrong = (off > _RIGID) | (np.linalg.det(R) < 0.0) | (np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > 1e-9)
     if wrong.any():
-        raise InputError(
-            f"Pose {int(np.argmax(wrong))} of '{name}' is not a rigid pose (rotation not orthonormal, mirrored, or last row not "
-            "0 0 0 1); check the order of rows and columns."
-        )
+        k = int(np.argmax(wrong))
+        raise InputError(f"Pose {k} of '{name}' is not a rigid pose: {_why_not_rigid(M[k])}")
     # printed matrices are rounded: take the rotation they stand for, but leave exact ones as they are
     rounded = off > 1e-12
     if rounded.any():
         U, _, Vt = np.linalg.svd(R[rounded])
         M[rounded, :3, :3] = U @ Vt
     return M
+
+
+def _why_not_rigid(M: Array) -> str:
+    R = M[:3, :3]
+    if float(np.abs(M[3] - [0.0, 0.0, 0.0, 1.0]).max()) > 1e-9:
+        if float(np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max()) < 1e-9:
+            return "its position is in the last row; exchange rows and columns of each matrix."
+        return "its last row is not 0 0 0 1."
+    if float(np.abs(R @ R.T - np.eye(3)).max()) <= _RIGID:
+        return "its rotation is mirrored (determinant -1); turn the sign of one axis of that frame in all poses."
+    return "the columns of its 3 x 3 part must have length 1 and be at right angles."
 
 
 def _problem(

@@ -142,8 +142,10 @@ def next_pose(
     camera. None where no candidate is left. For a scanner that watches a flange, pose_planning plans with the arm's bodies too.
     """
     state = _state(result, known, problem)
-    used = problem.pick(result.inliers)
-    taken = np.nonzero(result.inliers)[0]
+    # one sample of each observation: repeats add nothing
+    kept = np.nonzero(result.inliers)[0]
+    taken = kept[np.unique(result.observation[kept], return_index=True)[1]]
+    used = problem.pick(taken)
     noise = Noise(
         max(float(np.nan_to_num(result.sigma_rotation_rad)) ** 2, 1e-12), max(result.sigma_translation**2, 1e-14)
     )

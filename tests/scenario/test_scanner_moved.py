@@ -44,7 +44,8 @@ def test_the_change_is_named_and_both_parts_can_be_calibrated(tmp_path: Path) ->
     assert [part["n"] for part in answer["change_point"]["parts"]] == [11, 9]
     assert [path.name for path in out.iterdir()] == ["observations.csv"], "a wrong calibration is not exported"
     for option, part in zip((":p10", "p11:"), answer["change_point"]["parts"], strict=True):
-        done = CliRunner().invoke(app, ["calibrate", str(folder), "--out", str(out), "--poses", option, "--json"])
+        words = ["calibrate", str(folder), "--out", str(out), "--overwrite", "--poses", option, "--json"]
+        done = CliRunner().invoke(app, words)
         assert done.exit_code == 0, done.output
         X = np.array(json.loads(done.stdout.splitlines()[-1])["X_BC"])
         assert pytest.approx(np.array(part["X_BC"]), abs=1e-4) == X

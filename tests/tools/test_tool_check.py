@@ -29,7 +29,7 @@ def test_a_tool_is_told_and_drawn(tmp_path: Path) -> None:
     page = (tmp_path / "out/tool.html").read_text()
     assert "70.7 mm behind the tip" in page
     assert "data:image/png" in page
-    shown = CliRunner().invoke(app, ["tool", "check", str(file), "--out", str(tmp_path / "out")])
+    shown = CliRunner().invoke(app, ["tool", "check", str(file), "--out", str(tmp_path / "out"), "--overwrite"])
     assert "wire point at (-70, 10, 171.5) mm, 70.7 mm behind the tip" in " ".join(shown.output.split())
 
 

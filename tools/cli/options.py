@@ -15,6 +15,7 @@ import typer
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import whole_result
 from weldcal.tools import console
+from weldcal.tools.cli.result_folder import claimed
 
 if TYPE_CHECKING:
     from weldcal.tools.report.first_screen import FirstScreen
@@ -85,6 +86,10 @@ COMMON: dict[str, tuple[Any, object]] = {
     ),
     "scheduler": (Annotated[str | None, option("--scheduler", "ADDRESS", _SCHEDULER)], None),
     "out": (Annotated[Path | None, option("--out", "FOLDER", _OUT)], None),
+    "overwrite": (
+        Annotated[bool, switch("--overwrite", "Write over an earlier result in the folder of --out.")],
+        False,
+    ),
     "seed": (Annotated[int, option("--seed", "N", "Seed of all random numbers; the first of several.", min=0)], 0),
     "json": (Annotated[bool, switch("--json", "Print the result as one JSON object, the last line of stdout.")], False),
     "debug": (Annotated[bool, switch("--debug", "Show the traceback of an internal error.")], False),
@@ -94,7 +99,7 @@ COMMON: dict[str, tuple[Any, object]] = {
 MOTION = ("dry_run", "pace", "speed_factor")
 LIVE = ("browser", "share", "realtime", "robot", *MOTION)
 FARM = ("workers", "scheduler")
-RESULT = ("out", "seed", "json", "debug")
+RESULT = ("out", "overwrite", "seed", "json", "debug")
 LOOK = ("json", "debug")
 """Groups of common options: of arm motion, of a live run, of a study of many tasks, of a command that writes a result, of one that only reads."""
 
@@ -129,6 +134,7 @@ class Call:
         self.json: bool = given.get("json", False)
         self.given = given
         self.written: Path | None = None
+        self._kept: list[Path] = []
         self._title, self._stack = title, stack
         self._report: console.Progress | None = None
         self._page: tuple[Callable[[FirstScreen | None, Path | None], None], Callable[[], None]] | None = None
@@ -150,9 +156,22 @@ class Call:
             InputError: nothing can be written there. Nothing is created.
         """
         self.written = self.out or fresh_folder(command, name, self.seed)
-        check_writable(self.written)
-        self._stack.enter_context(whole_result(self.written))
+        self.keep(self.written)
         return self.written
+
+    def keep(self, folder: Path) -> None:
+        """Keeps a folder for the result of this call.
+
+        Raises:
+            InputError: nothing can be written there, it holds an earlier result, or another command writes there.
+        """
+        if folder in self._kept:
+            return
+        check_writable(folder)
+        overwrite, resumes = bool(self.given.get("overwrite")), "workers" in self.given
+        self._stack.enter_context(claimed(folder, overwrite=overwrite, resumes=resumes))
+        self._stack.enter_context(whole_result(folder))
+        self._kept.append(folder)
 
     def keep_page(self, show: "Callable[[FirstScreen | None, Path | None], None]", close: Callable[[], None]) -> None:
         """Keeps the dashboard of a run open until its result is printed; one of an earlier run closes."""
@@ -235,8 +254,7 @@ def command(
                     call = Call(title, shared, stack)
                     pages.callback(call.close_page)
                     if call.out is not None:
-                        check_writable(call.out)
-                        stack.enter_context(whole_result(call.out))
+                        call.keep(call.out)
                     outcome = body(call, **given)
                 if outcome is not None:
                     report(title, outcome if isinstance(outcome, Outcome) else Outcome(outcome), call)

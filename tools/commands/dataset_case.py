@@ -9,6 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.calibration.doctor.readings import FEWEST
 from weldcal.calibration.doctor.record import NAME, case_of, case_text
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
@@ -16,6 +17,9 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.result_files import write_apart
 from weldcal.models.scanners import get_scanner
+
+_NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "too few scans")
+"""Causes that the solver names itself, or that are none."""
 
 
 def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> Case:
@@ -50,16 +54,32 @@ def write_case(folder: Path, case: Case) -> None:
 def examined_where_refused(
     out: Path, data: Dataset, seen: FlangeObservations, standard: FlangeStandard, seed: int
 ) -> Iterator[None]:
-    """Writes the case to ``out`` where the block refuses five scans or more, and lets the error go on.
+    """Writes the case to ``out`` where the block refuses five scans or more, and lets the error go on, with the doctor's first cause.
 
     Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be wrong.
     """
     try:
         yield
-    except WeldcalError:
+    except WeldcalError as problem:
         if len(seen.observations) < FEWEST and data.header.scanner_guess is not None:
             anywhere = replace(data, header=replace(data.header, scanner_guess=None))
             seen = see_flanges(anywhere, standard, holes=False, seed=seed)
         if len(seen.observations) >= FEWEST:
-            write_case(out, dataset_case(data, seen, standard, standard))
+            case = dataset_case(data, seen, standard, standard)
+            write_case(out, case)
+            _name_cause(problem, case)
         raise
+
+
+def _name_cause(problem: WeldcalError, case: Case) -> None:
+    """Adds the doctor's first cause to the sentence, with its evidence and remedy, unless the sentence names it."""
+    from weldcal.tools.commands.doctor import worded  # it imports this module
+
+    causes = worded("", diagnose(case), most=1).causes
+    if not causes or causes[0].name in _NAMED_ALREADY:
+        return
+    cause = causes[0]
+    problem.args = (
+        f"{problem} The likely cause is: {cause.name} ({100.0 * cause.confidence:.0f} %). {cause.evidence} {cause.next}",
+        *problem.args[1:],
+    )

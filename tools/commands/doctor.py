@@ -58,6 +58,10 @@ class NamedCause:
         return {"name": self.name, "confidence": self.confidence, "evidence": self.evidence, "next": self.next}
 
 
+_CENTRES_SAY = 1.5
+"""How much better the centres fit with a cause before they are its evidence; else the normals are."""
+
+
 @dataclass(frozen=True)
 class DoctorReport:
     """The named causes, the likeliest first; what was examined, its number of scans and the spread that remains (mm, None: unknown)."""
@@ -114,6 +118,12 @@ def _names(c: Cause, most: int = 5) -> str:
 
 
 def _fits(c: Cause) -> str:
+    n = c.numbers
+    if "without_deg" in n and n["without_mm"] < _CENTRES_SAY * n["with_mm"] and n["without_deg"] > n["with_deg"]:
+        return (
+            f"with it the faces look along the poses' z axes to {n['with_deg']:.2f} degrees, without it to {n['without_deg']:.1f} (median); the "
+            f"centres fit to {n['with_mm']:.2f} mm either way"
+        )
     return f"with it the centres fit to {c.numbers['with_mm']:.2f} mm, without it to {c.numbers['without_mm']:.2f} mm (median)"
 
 
@@ -127,15 +137,18 @@ def _moved(c: Cause) -> tuple[str, str]:
 
 def _tcp(c: Cause) -> tuple[str, str]:
     t = ", ".join(f"{c.numbers[f'tcp_{a}_mm']:.1f}" for a in "xyz")
+    metres = ", ".join(f"{1e-3 * c.numbers[f'tcp_{a}_mm']:.4f}" for a in "xyz")
     return (
         f"The poses stand off the flange by a constant ({t}) mm in their own frame; {_fits(c)}.",
-        "Set the TCP to zero at the controller and record again, or state it in dataset.yaml: 'poses: {tcp: [x, y, z, rx, ry, rz]}'.",
+        f"Set the TCP to zero at the controller and record again, or write poses: {{tcp: [{metres}, 0.0, 0.0, 0.0]}} (m, rad) in dataset.yaml; "
+        "if the TCP is turned too, with the rotation that the controller shows.",
     )
 
 
 def _misread(c: Cause) -> tuple[str, str]:
+    order = "quaternion_wxyz" if c.words.startswith("the quaternions' order is (w") else "quaternion_xyzw"
     cure = {
-        "wrong quaternion order": "Swap the columns, or set 'poses: {rotation: quaternion_xyzw}' (or quaternion_wxyz) in dataset.yaml.",
+        "wrong quaternion order": f"Swap the columns, or set 'poses: {{rotation: {order}}}' in dataset.yaml.",
         "poses inverted": "Set 'poses: {frame: base_in_flange}' in dataset.yaml, or invert the poses.",
         "wrong rotation convention": "Set 'poses: {rotation: ...}' in dataset.yaml to what the robot writes.",
         "scanner axes mirrored": "Export the clouds in a right-handed frame: x right, y down, z out of the scanner.",

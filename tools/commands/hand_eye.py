@@ -11,13 +11,14 @@ import numpy as np
 import typer
 
 from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.listing import listing_of_array
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_corners, refine_with_corners
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
-from weldcal.calibration.hand_eye.importing import StatedForms
+from weldcal.calibration.hand_eye.importing import FARTHEST_M, StatedForms, import_pairs
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
@@ -27,6 +28,7 @@ from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, sol
 from weldcal.calibration.motion.pose_streams import is_stream_file
 from weldcal.calibration.planning.next_pose import View, next_pose, view_of
 from weldcal.models.arms.chain import Chain, load_chain
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option, switch
@@ -361,21 +363,31 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     mistake = likely_mistake(pairs, result, config)
     if mistake is not None:
         raise InconsistentPoses(mistake)
-    said = [w for w in (scale_warning(problem, result), _repeated(pairs)) if w is not None]
-    return replace(result, warnings=(*result.warnings, *said))
+    scale = scale_warning(problem, result)
+    return result if scale is None else replace(result, warnings=(*result.warnings, scale))
 
 
-def _repeated(pairs: PosePairs) -> str | None:
-    seen = np.hstack(
-        [X.reshape(len(X), -1) for X in (pairs.robot, pairs.camera, pairs.robot2, pairs.link) if X is not None]
-    )
-    again = len(seen) - len(np.unique(seen, axis=0))
-    if not again:
-        return None
-    return (
-        f"{again} of {len(seen)} samples are exact copies of others. They make uncertainty and held-out errors too small: "
-        "remove them."
-    )
+def solve_arrays(
+    robot: Array, camera: Array, mounting: str, robot_form: str | None = None, camera_form: str | None = None
+) -> HandEyeResult:
+    """Solve pairs of poses (n, 4, 4) in metres; the data choose how the matrices are read, as for a file.
+
+    Raises:
+        InputError: as read_pairs and solve_pairs.
+    """
+    far = float(np.median(np.linalg.norm(robot[:, :3, 3], axis=1)))
+    if far > FARTHEST_M:
+        raise InputError(
+            f"The robot's positions have a median of {far:.4g} from the base: they must be metres. Divide millimetres by 1000."
+        )
+    stated = replace(stated_forms(None, None, robot_form, camera_form), unit="m")
+    lists = [listing_of_array(name, X) for name, X in (("robot", robot), ("camera", camera))]
+    found = import_pairs(lists, "the poses", mounting, stated)
+    usual = len(found.robot) == len(robot) and all(one["reading"] == "matrix" for one in found.reading.values())
+    if not usual:
+        robot, camera = found.robot, found.camera
+    result = solve_pairs(PosePairs(source="the poses", robot=robot, camera=camera, mode=mounting))
+    return replace(result, warnings=(*found.notes, *result.warnings))
 
 
 def problem_of_pairs(pairs: PosePairs) -> Problem:

@@ -59,9 +59,10 @@ class HandEyeReport:
         notes = (
             [f"{outliers} of {len(r.inliers)} poses disagree with the others and were not used."] if outliers else []
         )
-        notes += self.read_notes
-        concerns = [*(f"Not observable: {text}" for text in r.unobservable), *r.warnings]
-        found = Findings(tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
+        notes += [*repeat_note(r), *self.read_notes]
+        found = Findings(
+            against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
+        )
         after = Next(f"To know it better, add a pose. {self.advice}") if self.advice else Next(
             "Compare with poses that were not in the file: the target must stay where the result puts it."
         )  # fmt: skip
@@ -69,7 +70,7 @@ class HandEyeReport:
 
     def summary(self) -> dict[str, object]:
         """The JSON object of the command."""
-        r = self.result
+        r, used = self.result, held_out_used(self.result)
         out: dict[str, object] = {"state": "done", "configuration": self.mounting.name}
         for k, X in r.poses.items():
             out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": r.covariance[k]}
@@ -79,8 +80,9 @@ class HandEyeReport:
                 "clock_offset_sigma_ms": 1e3 * self.streams.sigma_s,
             }
         return out | {
-            "held_out_deg": r.held_out.rms_deg,
-            "held_out_mm": 1e3 * r.held_out.rms_translation,
+            "held_out_deg": used.rms_deg,
+            "held_out_mm": 1e3 * used.rms_translation,
+            "held_out_of": held_out_set(r),
             "residual_deg": np.degrees(r.rotation_rad),
             "residual_mm": 1e3 * r.translation,
             "inliers": r.inliers,
@@ -109,8 +111,7 @@ class HandEyeReport:
             lines.append(f"one sigma    {m.unknowns[k].symbol}  {mm} mm   {deg} deg")
         lines += [f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
         if not r.inliers.all():
-            kept = HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
-            lines += [f"             {_held_out(kept, 'without outliers, ')}"]
+            lines += [f"             {_held_out(held_out_used(r), 'without outliers, ')}"]
         lines += [f"weighting    {r.method}"]
         if self.corners:
             lines += ["", self.corners]
@@ -137,20 +138,51 @@ def _sigmas(values: Array, certain: float) -> str:
     return "  ".join("open" if v > certain else f"{v:.3f}" for v in values)
 
 
+def held_out_used(r: HandEyeResult) -> HandEyeHeldOut:
+    """The held-out errors of the samples that were used."""
+    return HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
+
+
+def held_out_set(r: HandEyeResult) -> str:
+    """What the held-out errors are of, in words: the samples and poses that were used and left out in turn."""
+    seen = r.inliers & np.isfinite(r.held_out.translation)
+    samples, poses = int(seen.sum()), len(np.unique(r.observation[seen]))
+    repeated = f" ({samples} samples)" if samples > poses else ""
+    out = int((~r.inliers).sum())
+    return f"{poses} pose{'s' if poses != 1 else ''}{repeated}" + (f", without {out} excluded" if out else "")
+
+
+def repeat_note(r: HandEyeResult) -> list[str]:
+    """A sentence where samples repeat poses."""
+    n, poses = len(r.observation), int(r.observation.max()) + 1
+    if n == poses:
+        return []
+    return [f"The {n} samples repeat {poses} poses: the repeats of a pose are averaged and count once."]
+
+
+def undetermined(r: HandEyeResult, *, everything: bool = False) -> list[str]:
+    """Sentences on what the poses do not determine of the camera's pose, or of ``everything`` that was solved for."""
+    sigma = np.sqrt(np.diag(r.covariance["X"]))
+    if not everything and sigma[:3].max() < 1.0 and sigma[3:].max() < r.extent:
+        return []
+    return [f"Not observable: {text}. Add poses that turn the hand about other axes." for text in r.unobservable]
+
+
 def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
-    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and their number."""
-    held = 1e3 * r.held_out.translation[r.inliers]
-    held = held[np.isfinite(held)]
+    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and the number of poses."""
+    used = held_out_used(r)
+    seen = np.isfinite(used.translation)
+    held = 1e3 * used.translation[seen]
     what = "held-out error at the target, 95 %"
     if not len(held):
         return (
-            Expected(what, "not known", "too few poses to leave any out; it stands in place of a work point"),
+            Expected(what, "not known", "too few poses to leave any out; it takes the place of a work point"),
             float("nan"),
             0,
         )
     p95 = float(np.percentile(held, 95))
-    backing = f"of {len(held)} poses, each unseen by its calibration; rms {r.held_out.rms_deg:.3f} degrees; in place of a work point"
-    return Expected(what, f"{p95:.3f} mm", backing), p95, len(held)
+    backing = f"of {held_out_set(r)}, each unseen by its calibration; rms {used.rms_deg:.3f} degrees; in place of a work point"
+    return Expected(what, f"{p95:.3f} mm", backing), p95, len(np.unique(r.observation[r.inliers][seen]))
 
 
 def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:
@@ -187,8 +219,9 @@ def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:
         judged=judged,
         n=len(r.inliers),
         diversity=r.diversity.sentence(),
-        held_mm=1e3 * r.held_out.rms_translation,
-        held_deg=r.held_out.rms_deg,
+        held_mm=1e3 * held_out_used(r).rms_translation,
+        held_deg=held_out_used(r).rms_deg,
+        held_of=held_out_set(r),
         unknowns=unknown_tables(r, m, {}),
         bars=error_bars(names, held, r.inliers, "held-out error, mm") if judged else None,
         tilts=error_bars(names, turned, r.inliers, "held-out rotation, deg") if np.isfinite(turned).any() else None,

@@ -39,7 +39,14 @@ from weldcal.tools.report.first_screen import (
     radius_95,
     refused_note,
 )
-from weldcal.tools.report.hand_eye import HandEyeReport, held_out_error, shown_poses, unknown_tables
+from weldcal.tools.report.hand_eye import (
+    HandEyeReport,
+    held_out_error,
+    held_out_used,
+    shown_poses,
+    undetermined,
+    unknown_tables,
+)
 from weldcal.tools.report.pictures import OURS, error_bars, millimetres, svg
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.run import robot_timing
@@ -118,7 +125,12 @@ class MountingReport:
             "the expected error, one sigma,", 1e3 * status.sigma_work_m, scenario.calibration.required_error_mm,
             "calibration.required_error_mm",
         )  # fmt: skip
-        concerns = [*(f"Not observable: {text}" for text in result.unobservable), *result.warnings]
+        open_directions = undetermined(result)
+        against += open_directions
+        concerns = [
+            *(f"Not observable: {text}" for text in result.unobservable if not open_directions),
+            *result.warnings,
+        ]
         notes = refused_note(status.refused, status.sequence)
         found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
         if status.next_best is not None:
@@ -170,8 +182,8 @@ class MountingReport:
             for k, X in result.poses.items():
                 out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": result.covariance[k]}
             out |= {
-                "held_out_deg": result.held_out.rms_deg,
-                "held_out_mm": 1e3 * result.held_out.rms_translation,
+                "held_out_deg": held_out_used(result).rms_deg,
+                "held_out_mm": 1e3 * held_out_used(result).rms_translation,
                 "kept_aside_mm": [1e3 * k.error_m for k in status.held_out],
                 "kept_aside_deg": [float(np.degrees(k.tilt_rad)) for k in status.held_out],
                 "expected_error_mm": 1e3 * status.sigma_work_m,

@@ -10,7 +10,7 @@ from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.readings import PoseNumbers, PoseReading, parse_form, readings
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
-from weldcal.models.files import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER, MOST_POSES
 
 _ORTHONORMAL = 0.05  # rotations with two decimals deviate by 0.02 at most
 _UNIT_LENGTH = 0.05  # of quaternions with two decimals
@@ -231,8 +231,12 @@ def _listing(
     vector: bool,
     **more: object,
 ) -> Listing:
-    left_out = _without_pose(meanings)
     n = len(meanings[0][0])
+    if n > MOST_POSES:
+        raise DatasetError(
+            f"'{name}' holds {n:,} poses, and at most {MOST_POSES:,} are read. Keep one for each scan or picture: the pose at its time."
+        )
+    left_out = _without_pose(meanings)
     if len(left_out) == n:
         raise DatasetError(f"'{name}' holds no pose: {left_out[0][1]}")
     rows = [row for row, _ in left_out]

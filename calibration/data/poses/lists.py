@@ -18,7 +18,7 @@ from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_text
+from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_text, require_few_lines
 
 TEXT = (
     ".csv",
@@ -83,6 +83,7 @@ def read_lists(path: Path) -> list[Listing]:
             return lists_of_tree(read_tree(path), path.name)
         if ending == ".urp":
             return lists_of_text(_unzipped(path), path.name)
+        require_few_lines(path)
         text = read_text(path)
         if _TREE_TEXT.search(text[:_BEGINNING]) and not _TABLE_TEXT.search(text[:_BEGINNING]):
             kind = "JSON" if text.lstrip().startswith(("{", "[")) else "YAML"
@@ -253,7 +254,8 @@ def together(robot: Listing, camera: Listing, near_s: float = 0.05) -> tuple[np.
                 f"The poses {', '.join(map(str, alone))} have no partner of the same number; add or remove them."
             )
         if common:
-            rows = [np.array([one.index(k) for k in common]) for one in numbers]
+            places = [{k: row for row, k in enumerate(one)} for one in numbers]
+            rows = [np.array([one[k] for k in common]) for one in places]
             return rows[0], rows[1], "by the numbers in their names"
     if len(robot) == len(camera):
         return np.arange(len(robot)), np.arange(len(camera)), "in order"
@@ -262,9 +264,11 @@ def together(robot: Listing, camera: Listing, near_s: float = 0.05) -> tuple[np.
             f"'{robot.name}' holds {len(robot)} poses and '{camera.name}' holds {len(camera)}; without times or numbers they pair in order, "
             "one for one: remove what has no partner."
         )
-    gap = np.abs(camera.times[:, None] - robot.times[None, :])
-    nearest = gap.argmin(axis=1)
-    keep = gap.min(axis=1) <= near_s
+    order = np.argsort(robot.times, kind="stable")
+    after = np.clip(np.searchsorted(robot.times[order], camera.times), 0, len(order) - 1)
+    either = np.stack([order[np.maximum(after - 1, 0)], order[after]])
+    gap = np.abs(camera.times - robot.times[either])
+    nearest, keep = either[gap.argmin(axis=0), np.arange(len(camera))], gap.min(axis=0) <= near_s
     if not keep.any():
         raise DatasetError(
             f"No pose of '{robot.name}' is within {near_s:g} s of a pose of '{camera.name}'; bring both to one clock."

@@ -19,6 +19,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.files import require_few_lines
 
 _STEMS = (
     "poses",
@@ -66,6 +67,7 @@ def is_plain(path: Path) -> bool:
     if path.suffix.lower() != ".csv":
         return False
     try:
+        require_few_lines(path)
         names, _ = read_rows(path)
     except InputError:
         return True  # its reader says what is wrong, and where

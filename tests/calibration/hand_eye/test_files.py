@@ -222,11 +222,11 @@ def test_a_word_of_an_npz_may_be_bytes_or_an_array(tmp_path: Path, poses: tuple[
         assert read_pairs(tmp_path / "a.npz").mode == "eye_in_hand"
 
 
-def test_samples_that_repeat_others_are_said(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+def test_samples_that_repeat_others_are_named(tmp_path: Path, poses: tuple[Array, Array]) -> None:
     F, G = poses
     path = write("npz", tmp_path, np.concatenate([F, F[:3]]), np.concatenate([G, G[:3]]))
     report = run_hand_eye("ax-yb", path, tmp_path / "out")
-    assert any(w.startswith("3 of 15 samples are exact copies") for w in report.result.warnings)
+    assert any(text.startswith("The 15 samples repeat 12 poses") for text in report.first.notes)
 
 
 def test_corners_that_are_of_no_use_leave_the_poses_as_given(tmp_path: Path, poses: tuple[Array, Array]) -> None:
