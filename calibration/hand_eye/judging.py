@@ -10,7 +10,7 @@ from scipy.special import fdtrc, ncfdtr
 
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import IDENTITY, difference, inverse, log_rotation, nearest_rotation, skew
-from weldcal.calibration.hand_eye.problem import Problem, residuals
+from weldcal.calibration.hand_eye.problem import Flags, Problem, residuals
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, fold_labels, solve_problem
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
@@ -55,7 +55,7 @@ class Judgement:
     translation_m: Array
     held_rotation_rad: Array
     held_translation_m: Array
-    used: Array
+    used: Flags
     new: HandEyeResult | None = None
     missing: str = ""
     off_mm: float = float("nan")
@@ -243,7 +243,7 @@ def _noncentrality(critical: float, freedom: float) -> float:
     return float(brentq(lacking, 0.0, high)) if high < 1e9 else float("inf")
 
 
-def _target(problem: Problem, X: Array, rows: Array) -> Array:
+def _target(problem: Problem, X: Array, rows: Flags) -> Array:
     """The best Y (4, 4) for X: the mean of F X G."""
     P = (problem.F @ X @ problem.G)[rows]
     Y = np.eye(4)
@@ -258,7 +258,7 @@ def _spread(problem: Problem, X: Array) -> float:
     return float((w**2).mean() + (d**2).mean() / problem.extent**2)
 
 
-def _residuals_only(problem: Problem, X: Array, used: Array, missing: str) -> Judgement:
+def _residuals_only(problem: Problem, X: Array, used: Flags, missing: str) -> Judgement:
     n = len(problem)
     w, d = residuals(problem, (X, _target(problem, X, used), IDENTITY))
     held_w, held_d = w.copy(), d.copy()

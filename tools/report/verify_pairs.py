@@ -170,7 +170,7 @@ class PairsReport:
         columns = (
             np.degrees(j.rotation_rad), 1e3 * j.translation_m, np.degrees(j.held_rotation_rad), 1e3 * j.held_translation_m
         )  # fmt: skip
-        return [(i, bool(u), *map(float, row)) for i, u, *row in zip(self.ids, j.used, *columns, strict=True)]  # type: ignore[misc]
+        return [(i, bool(u), *map(float, row)) for i, u, *row in zip(self.ids, j.used, *columns, strict=True)]
 
     def rows(self) -> dict[str, str]:
         """Rows for the terminal: the residuals of every pair, the largest first where there are many."""
