@@ -158,6 +158,10 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "three_scans": lambda path: write_scans(path, 3, 2),
     "one_scan": lambda path: write_scans(path, 1, 5),
     "pairs.npz": lambda path: _hand_eye(path, "eye_in_hand"),
+    "eMc.yaml": lambda path: path.write_text(
+        "rows: 6\ncols: 1\ndata:\n  - [0.05]\n  - [-0.03]\n  - [0.08]\n  - [0.1]\n  - [-0.2]\n  - [1.5]\n",
+        encoding="utf-8",
+    ),
     "samples.npz": lambda path: _hand_eye(path, "eye_in_hand"),
     "fixed_camera.npz": lambda path: _hand_eye(path, "eye_on_base"),
     "two_robots.npz": _two_robots,

@@ -78,7 +78,7 @@ def test_a_result_two_millimetres_off_is_not_accepted_in_any_form(form: str, tmp
 
 
 def test_both_sides_of_the_rule_hold_over_seeds(tmp_path: Path) -> None:
-    runs, accepted, refused = 120, 0, 0
+    runs, accepted, refused = 60, 0, 0
     for seed in range(runs):
         X = truth(seed)
         A, B, _ = pairs(16, 1000 + seed, X)
@@ -88,8 +88,8 @@ def test_both_sides_of_the_rule_hold_over_seeds(tmp_path: Path) -> None:
         _, wrong = judge_pose(problem, [moved(X, 2.0, seed)], None, config)
         accepted += not right.rejected
         refused += wrong.rejected
-    # 1 % false alarms; 120 runs have five or fewer of them with 99.9 %
-    assert accepted >= runs - 5
+    # 1 % false alarms: 60 runs have three or fewer of them with 99.7 %
+    assert accepted >= runs - 3
     assert refused >= 0.95 * runs
 
 
@@ -151,14 +151,14 @@ def test_the_other_mounting_is_named(tmp_path: Path) -> None:
 
 def test_a_result_of_the_same_pairs_is_no_verification(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    saved(tmp_path, 14, 11, truth(10))
+    saved(tmp_path, 24, 11, truth(10))
     run = CliRunner().invoke(app, ["hand-eye", "ax-yb", "pairs.npz", "--out", "own"])
     assert run.exit_code == 0, run.output
     for result in ("own", "own/hand_eye.json"):
         run = CliRunner().invoke(app, ["verify", result, "pairs.npz", "--json", "--out", f"v{len(result)}"])
         assert run.exit_code == 0
         assert json.loads(run.stdout.splitlines()[-1])["verdict"] == "not a verification"
-    np.savez("pairs.npz", **dict(zip("AB", pairs(14, 12, truth(10))[:2], strict=True)))
+    np.savez("pairs.npz", **dict(zip("AB", pairs(24, 12, truth(10))[:2], strict=True)))
     run = CliRunner().invoke(app, ["verify", "own", "pairs.npz", "--json", "--out", "new"])
     assert json.loads(run.stdout.splitlines()[-1])["verdict"] == "use it"
     assert (tmp_path / "new" / "report.html").is_file()
@@ -176,25 +176,23 @@ def test_the_exit_code_is_one_for_do_not_use_only(tmp_path: Path, monkeypatch: p
     assert "do not use" in run.stderr
 
 
-def test_verify_from_python_takes_pairs_and_knows_the_flange(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verify_from_python_takes_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     X = truth(14)
     found = weldcal.verify(write("URDF", X, tmp_path), saved(tmp_path, 14, 15, X))
     assert found.verdict.verdict == "use it"
-    write_scans(tmp_path / "scans", 8, 0)
-    write_scans(tmp_path / "others", 8, 1)
-    weldcal.calibrate("scans", out="result", correct_scanner=False)
-    (tmp_path / "others" / "dataset.yaml").unlink()
-    report = weldcal.verify("result", "others", out="verified")
-    assert report.verdict.verdict in ("use it", "use with care")
 
 
-def test_a_report_without_names_has_no_empty_commas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_flange_and_the_names_of_a_result_without_dataset_yaml(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    write_scans(tmp_path / "scans", 8, 0)
-    (tmp_path / "scans" / "dataset.yaml").unlink()
+    for name, seed in (("scans", 0), ("others", 1)):
+        write_scans(tmp_path / name, 5, seed)
+        (tmp_path / name / "dataset.yaml").unlink()
     weldcal.calibrate("scans", out="result", flange="iso9409-1-50-4-m6", correct_scanner=False)
-    weldcal.verify("result", "scans", out="verified")
+    report = weldcal.verify("result", "others", out="verified")  # the result knows the flange
+    assert report.verdict.verdict in ("use it", "use with care")
     for name in ("result", "verified"):
         page = (tmp_path / name / "report.html").read_text()
         assert ", , flange" not in page
