@@ -91,6 +91,15 @@ def _unread(name: str, given: object, problem: str) -> str:
     return f"'{name}' has no key '{wrong[:40]}'; {hint}"
 
 
+def is_motion(folder: Path) -> bool:
+    """Whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
+    path = Path(folder) / "dataset.yaml"
+    try:
+        return path.is_file() and read_header(path).mode == "motion"
+    except DatasetError:
+        return False
+
+
 def metric_cloud(path: Path, unit: str) -> Array:
     """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
     points = read_cloud(path)
