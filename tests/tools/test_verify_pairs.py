@@ -197,3 +197,19 @@ def test_the_flange_and_the_names_of_a_result_without_dataset_yaml(
         page = (tmp_path / name / "report.html").read_text()
         assert ", , flange" not in page
         assert ">flange iso9409-1-50-4-m6" in page
+
+
+def test_a_camera_beside_the_robot_is_judged_too(tmp_path: Path) -> None:
+    X, (_, B, Y) = truth(16), pairs(16, 17, truth(16))
+    robot = X @ B @ np.linalg.inv(Y)  # X_BF of a target on the flange at Y
+    np.savez(tmp_path / "pairs.npz", A=robot, B=B, mode="eye_on_base")
+    right, wrong = write("matrix txt", X, tmp_path), write("quaternion", moved(X, 2.0, 2), tmp_path)
+    assert verdict(right, tmp_path / "pairs.npz").verdict.verdict == "use it"
+    assert verdict(wrong, tmp_path / "pairs.npz").verdict.verdict == "do not use"
+
+
+def test_kalibr_states_the_body_in_the_camera_and_the_inverse_is_named(tmp_path: Path) -> None:
+    X = truth(18)
+    found = verdict(write("Kalibr", np.linalg.inv(X), tmp_path), saved(tmp_path, 16, 19, X)).verdict
+    assert found.verdict == "do not use"
+    assert found.reason.startswith("The inverse of RESULT fits: 0.")

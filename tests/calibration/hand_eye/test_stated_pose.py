@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.calibration.hand_eye.stated_forms import FORMS, truth, write
+from weldcal.calibration.data.stated_pose import read_stated_pose
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.hand_eye.stated_pose import read_stated_pose
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -12,19 +12,20 @@ import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
 from weldcal.calibration.data.poses.lists import ARRAYS, TREES, read_lists
-from weldcal.calibration.data.poses.names import mounting_name
+from weldcal.calibration.data.poses.names import MOUNTINGS, mounting_name
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.data.results import RESULT_FILE as CALIBRATION_FILE
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.hand_eye.exports import RESULT_FILE as HAND_EYE_FILE
-from weldcal.calibration.hand_eye.mountings import MOUNTINGS, get_mounting
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
+HAND_EYE_FILE = "hand_eye.yaml"
+SYMBOLS = {"eye_in_hand": "X_FC", "eye_on_base": "X_BC"}
+"""The camera's pose by the mounting."""
 UNITS = {"m": 1.0, "mm": 1e-3}
 _MILLIMETRES_FROM = 10.0  # no camera is 10 m from the flange or the base that carries it
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -187,7 +188,7 @@ def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own
     sha: list[Any] = []
     found: Any = None
     if mounting is not None and isinstance(poses, Mapping):
-        symbol = get_mounting(mounting).unknowns["X"].symbol
+        symbol = SYMBOLS[mounting]
         found = poses.get(symbol)
         data = tree.get("data")
         sha = [data.get("sha256")] if isinstance(data, Mapping) else []
@@ -196,7 +197,7 @@ def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own
         found = tree.get(symbol)
         hashes = tree.get("data_sha256")
         sha = list(hashes.values()) if isinstance(hashes, Mapping) else []
-        mounting = mounting or {"X_BC": "eye_on_base", "X_FC": "eye_in_hand"}.get(symbol)
+        mounting = mounting or {symbol: name for name, symbol in SYMBOLS.items()}.get(symbol)
     covariance = tree.get("covariance", tree.get("covariance_X", tree.get("covariance_rotation_translation")))
     if isinstance(found, Mapping):
         covariance = found.get("covariance", covariance)
