@@ -25,9 +25,11 @@ from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import run_procedure
 from weldcal.tools.commands.hand_eye import solve_arrays
 from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.commands.verify_pairs import holds_scans, verify_on_pairs
 from weldcal.tools.report.calibration import CalibrationReport
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.verify import VerifyReport
+from weldcal.tools.report.verify_pairs import PairsReport
 
 Floats = npt.NDArray[np.floating[Any]]
 FLANGE = "iso9409-1-50-4-m6"
@@ -68,22 +70,35 @@ def calibrate(
 
 
 def verify(
-    result: str | Path, folder: str | Path, out: str | Path | None = None, *, limit_mm: float | None = None
-) -> VerifyReport:
-    """Verify a calibration (its folder, or calibration.yaml) on scans that it has not seen.
+    result: str | Path,
+    folder: str | Path,
+    out: str | Path | None = None,
+    *,
+    limit_mm: float | None = None,
+    flange: str | None = None,
+    mounting: str | None = None,
+) -> VerifyReport | PairsReport:
+    """Verify a calibration on scans, or any file with a camera's pose on pairs of poses, that it did not use.
 
     Args:
-        result: what `calibrate` wrote; folder: a dataset.
+        result: what `calibrate` wrote (its folder, or calibration.yaml); for pairs any file with a pose.
+        folder: a dataset with scans of the flange, or a file or folder with pairs as `weldcal hand-eye` reads.
         out: folder for verification.json and report.html; None: nothing is kept.
-        limit_mm: largest acceptable median error; None: the calibration's own statement decides.
+        limit_mm: largest acceptable error; None: what the calibration states, or the pairs show, decides.
+        flange: of the scans; None: as the dataset or the result names it.
+        mounting: of the pairs, where neither they nor the result name it.
 
     Raises:
         InputError: the result or the data cannot be used.
     """
+    if not holds_scans(Path(folder)):
+        return verify_on_pairs(
+            Path(result), Path(folder), None if out is None else Path(out), mounting=mounting, limit_mm=limit_mm
+        )
     if out is not None:
-        return verify_dataset(Path(result), Path(folder), Path(out), limit_mm=limit_mm)
+        return verify_dataset(Path(result), Path(folder), Path(out), limit_mm=limit_mm, flange=flange)
     with tempfile.TemporaryDirectory() as kept_for_now:
-        return verify_dataset(Path(result), Path(folder), Path(kept_for_now), limit_mm=limit_mm)
+        return verify_dataset(Path(result), Path(folder), Path(kept_for_now), limit_mm=limit_mm, flange=flange)
 
 
 def read_cloud(file: str | Path, unit: str = "m") -> Floats:

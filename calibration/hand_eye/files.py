@@ -106,8 +106,27 @@ def read_pairs(
         raise DatasetError(f"'{path.name}' needs more memory than there is: give fewer pairs.") from None
 
 
+def pairs_of_lists(
+    lists: list[Listing], names: str, *, mounting: str | None, length: str | None, stated: StatedForms
+) -> PosePairs:
+    """The pairs of lists from several files, as `read_pairs`; ``names`` of the files go into messages."""
+    mounting = None if mounting is None else mounting_name(mounting)
+    return _pairs(Path(names), lists, {}, mounting, length, stated)
+
+
 def _read(path: Path, mounting: str | None, length: str | None, stated: StatedForms) -> PosePairs:
     lists, raw = _contents(path)
+    return _pairs(path, lists, raw, mounting, length, stated)
+
+
+def _pairs(
+    path: Path,
+    lists: list[Listing],
+    raw: dict[str, Any],
+    mounting: str | None,
+    length: str | None,
+    stated: StatedForms,
+) -> PosePairs:
     more: dict[str, Listing] = {}
     for who, names in _MORE.items():
         found = next((one for one in lists if re.split(r"[/,\s]+", one.name)[-1] in names), None)

@@ -18,6 +18,7 @@ from tests.documents.scans import write_scans
 from tests.places import ROOT, SHARED_DATA
 from tests.short_job import SHORT_JOB
 from weldcal.calibration.data.results import save_result
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.calibration.touch.table import touches_text
 from weldcal.models.arms import ur10e
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
@@ -57,6 +58,13 @@ def _hand_eye(path: Path, mounting: str) -> None:
     camera = [(F @ X).InvertAndCompose(Y) if in_hand else X.InvertAndCompose(F @ Y) for F in robot]
     noisy = [G @ RigidTransform(RollPitchYaw(rng.normal(size=3) * 2e-4), rng.normal(size=3) * 1e-4) for G in camera]
     np.savez(path, A=matrices(robot), B=matrices(noisy), q=q, mode=mounting)
+
+
+def _camera_pose(path: Path) -> None:
+    """The camera's true pose of `_hand_eye` as a pose vector: position and rotation vector."""
+    X = random_poses(2, np.random.default_rng(3))[0]
+    vector = (*X.translation(), *rotation_vector(X.rotation()))
+    path.write_text("rows: 6\ncols: 1\ndata:\n" + "".join(f"  - [{v:.9f}]\n" for v in vector), encoding="utf-8")
 
 
 def _two_robots(path: Path) -> None:
@@ -158,6 +166,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "three_scans": lambda path: write_scans(path, 3, 2),
     "one_scan": lambda path: write_scans(path, 1, 5),
     "pairs.npz": lambda path: _hand_eye(path, "eye_in_hand"),
+    "eMc.yaml": _camera_pose,
     "samples.npz": lambda path: _hand_eye(path, "eye_in_hand"),
     "fixed_camera.npz": lambda path: _hand_eye(path, "eye_on_base"),
     "two_robots.npz": _two_robots,

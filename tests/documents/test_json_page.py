@@ -20,6 +20,8 @@ EVERYWHERE = {"state", "first_screen"}
 COMMANDS = {
     "calibrate": ("`calibrate FOLDER`", "calibrate three_scans --out my-calibration"),
     "verify": ("`verify RESULT FOLDER`", "verify my-calibration other_scans"),
+    "verify pairs": ("`verify RESULT PAIRS`", "verify eMc.yaml pairs.npz"),
+    "import": ("`import`", "import samples.npz"),
     "hand-eye": ("`hand-eye`", "hand-eye ax-yb samples.npz"),
     "two robots": ("`hand-eye`", "hand-eye axb-ycz two_robots.npz"),
 }

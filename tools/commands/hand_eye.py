@@ -273,7 +273,7 @@ def run_hand_eye(
         view = view_of(problem.G, pairs.K if pairs.has_corners else None, scanner)
         advice = next_pose(problem, result, found, (IDENTITY,) * 3, arm=arm, view=view)
         advised = advice.sentence() if advice is not None else _no_advice(view, arm)
-    provenance = Provenance(file.name, _digest(file))
+    provenance = Provenance(file.name, digest(file))
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
     report = HandEyeReport(
@@ -313,7 +313,7 @@ def _no_advice(view: View, arm: Chain | None) -> str:
     return f"No further pose near those so far is visible{reach} (view: {view.source}). Move to a region with a better view."
 
 
-def _digest(path: Path) -> str:
+def digest(path: Path) -> str:
     """SHA-256 of a file, or of the files of a folder in the order of their names."""
     if path.is_file():
         return sha256(path.read_bytes()).hexdigest()

@@ -24,6 +24,16 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outcome, command, option
+from weldcal.tools.commands.hand_eye import (
+    CameraFormOption,
+    CameraPosesOption,
+    MountingOption,
+    RobotFormOption,
+    RobotPosesOption,
+    UnitOption,
+    stated_forms,
+)
+from weldcal.tools.commands.verify_pairs import holds_scans, verify_on_pairs
 from weldcal.tools.console import Progress
 from weldcal.tools.report.first_screen import CARE, DO_NOT, USE
 from weldcal.tools.report.render import write_atomic
@@ -51,9 +61,17 @@ _UNCORRECTED = (
 )
 def verify(
     call: Call,
-    result: Annotated[Path, typer.Argument(help="A result folder, or its calibration.yaml.")],
+    result: Annotated[
+        Path,
+        typer.Argument(
+            help="A result folder, or its calibration.yaml; for pairs any file with a pose (docs/hand_eye.md)."
+        ),
+    ],
     dataset: Annotated[
-        Path | None, typer.Argument(help="A folder with poses and clouds, or pairs.csv (docs/datasets.md).")
+        Path | None,
+        typer.Argument(
+            help="Scans: a folder with poses and clouds, or pairs.csv. Or pairs of poses, as hand-eye reads (docs/datasets.md)."
+        ),
     ] = None,
     touch: Annotated[
         Path | None,
@@ -86,9 +104,19 @@ def verify(
             show_default="from what the calibration states; 1 % false alarms",
         ),
     ] = None,
+    pose: Annotated[
+        str | None, option("--pose", "NAME", "With pairs: the key of the pose, where the file of RESULT holds several.")
+    ] = None,
+    mounting: MountingOption = None,
+    unit: UnitOption = None,
+    robot_poses: RobotPosesOption = None,
+    camera_poses: CameraPosesOption = None,
+    robot_form: RobotFormOption = None,
+    camera_form: CameraFormOption = None,
 ) -> Outcome:
-    """Verify a calibration on scans that it did not use: a verdict, position error and tilt per pose, at the flange.
+    """Verify a calibration on scans or pairs of poses that it did not use: a verdict, and the error of each.
 
+    Scans of the flange give position error and tilt at the flange. Pairs of robot and camera poses give the error of any stated pose of a camera.
     With --touch or --scenario: by points that the tip touched, each against the stated 95 % region. The exit code is 1 where the verdict is "do not use".
     """
     if sum(given is not None for given in (dataset, touch, scenario)) != 1:
@@ -100,8 +128,23 @@ def verify(
     if touch is not None or dataset is None:
         assert touch is not None
         return _by_touch(call, result, touch)
-    from weldcal.tools.report.first_screen import DO_NOT
-
+    of_pairs = {
+        "--pose": pose, "--mounting": mounting, "--unit": unit, "--robot-poses": robot_poses, "--camera-poses": camera_poses,
+        "--robot-form": robot_form, "--camera-form": camera_form,
+    }  # fmt: skip
+    if not holds_scans(dataset):
+        paired = verify_on_pairs(
+            result, dataset, call.folder("verify", dataset.resolve().stem), mounting=mounting, unit=unit, pose=pose, limit_mm=limit_mm,
+            stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form), seed=call.seed,
+        )  # fmt: skip
+        settled = paired.verdict
+        return Outcome(
+            paired.summary(), values={}, rows=paired.rows(), first=paired.first,
+            problem=f"The verdict is: {settled.verdict}. {settled.reason}" if settled.verdict == DO_NOT else "",
+        )  # fmt: skip
+    surplus = next((name for name, value in of_pairs.items() if value is not None), None)
+    if surplus is not None:
+        raise typer.BadParameter(f"{surplus} is for pairs of poses, and '{dataset.name}' holds scans of a flange")
     report = verify_dataset(
         result,
         dataset,
@@ -124,7 +167,6 @@ def verify(
 
 def _by_touch(call: Call, result: Path, touches: Path) -> Outcome:
     from weldcal.tools.commands.touch import verify_touches
-    from weldcal.tools.report.first_screen import DO_NOT
 
     report = verify_touches(result, touches, call.folder("verify", touches.resolve().stem))
     verdict = report.verdict
@@ -139,7 +181,6 @@ def _by_touch(call: Call, result: Path, touches: Path) -> Outcome:
 
 def _touched_live(call: Call, result: Path, scenario: str, robot: str, points: int) -> Outcome:
     from weldcal.tools.commands.touch import run_touches, touching
-    from weldcal.tools.report.first_screen import DO_NOT
     from weldcal.tools.report.run import RunOptions
 
     options = RunOptions(
@@ -188,7 +229,7 @@ def verify_dataset(
     calibration = load_result(Path(result))
     correction = correction_from_document(calibration.scanner_correction) if correct_scanner else None
     data = load_dataset(Path(dataset), robot=calibration.robot)
-    standard = get_flange(flange or data.header.flange)
+    standard = get_flange(flange or data.header.flange or calibration.flange)
     seen = see_flanges(
         data,
         standard,

@@ -1,0 +1,210 @@
+"""The result of `weldcal verify RESULT PAIRS` and its page: the rule of the verdict, residuals and held-out errors of every pair."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from weldcal.calibration.hand_eye.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL, Judgement
+from weldcal.calibration.hand_eye.mountings import Mounting
+from weldcal.calibration.hand_eye.solve import as_transform
+from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, Expected, Findings, FirstScreen, Next, ShownPose
+from weldcal.tools.report.pictures import error_bars
+from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.verify import NONE, Verdict
+
+CANNOT_TELL = "cannot tell"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsReport:
+    """A stated pose judged on pairs.
+
+    Attributes:
+        judgement: the figures.
+        mounting: that of the pairs.
+        result, pairs: names of the two sources.
+        read_as: how the pose was read, a phrase.
+        ids: names of the pairs (n).
+        same_data: whether the result was computed from these pairs.
+        limit_mm: the error that the job allows, or None.
+        reading, notes: how the pairs were understood.
+        mounting_stated: the mounting that the result names, or None.
+    """
+
+    judgement: Judgement
+    mounting: Mounting
+    result: str
+    pairs: str
+    read_as: str
+    ids: tuple[str, ...]
+    same_data: bool = False
+    limit_mm: float | None = None
+    reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    mounting_stated: str | None = None
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the result.
+
+        1. The result was computed from these pairs: no verification.
+        2. It names another mounting: do not use.
+        3. The pairs have no solution of their own: cannot tell; do not use where the residuals alone are above a stated limit.
+        4. The new solution is better than chance: do not use where the error is above the limit. Without a limit: above its own uncertainty
+           and above SMALL of the held-out error of one pose. Else use with care.
+        5. It is not: use, if the pairs show an error of the limit (SHOWN_MM without one) with the probability POWER; else cannot tell.
+        """
+        j, limit = self.judgement, self.limit_mm
+        held = f"The held-out error of {int(j.used.sum())} pairs with it is {j.held_out_mm:.3f} mm and {j.held_out_deg:.3f} degrees (rms)"
+        if self.same_data:
+            return Verdict(NONE, limit, f"RESULT was computed from these pairs. {held}. Record new pairs to verify it.")
+        if self.mounting_stated not in (None, self.mounting.name):
+            text = (
+                f"RESULT is for the mounting {self.mounting_stated}, and the pairs are {self.mounting.name}. {held}. "
+            )
+            return Verdict(DO_NOT, limit, text + "Give the result of this camera, or correct --mounting.")
+        if j.new is None:
+            if limit is not None and j.held_out_mm > limit:
+                return Verdict(DO_NOT, limit, f"The pairs contradict RESULT. {held}, above the limit of {limit:g} mm.")
+            return Verdict(
+                CANNOT_TELL, limit, f"The pairs have no solution of their own to compare with: {j.missing} {held}."
+            )
+        off = f"RESULT is off by {j.off_mm:.3f} mm at the target (+- {j.uncertain_mm:.3f}) and {j.off_deg:.3f} degrees"
+        if np.isfinite(j.new_held_out_mm):
+            held += f"; with a new solution it is {j.new_held_out_mm:.3f} mm"
+        if j.rejected:
+            chance = f"By chance alone a right pose differs as much with a probability of {_small(j.chance)}."
+            if j.other is not None:
+                return Verdict(
+                    DO_NOT, limit, f"{_upper(j.other[0])} fits: {j.other[1]:.1f} mm. As it is, {off}. {held}."
+                )
+            if limit is not None:
+                small, why = j.off_mm <= limit, f"The error is within the limit of {limit:g} mm."
+            else:
+                small = j.off_mm <= max(SMALL * j.new_held_out_mm, j.uncertain_mm)
+                why = "The error is small beside that of one pair, or beside the uncertainty of the new solution."
+            if small:
+                return Verdict(CARE, limit, f"{off}. {held}. {chance} {why}")
+            return Verdict(DO_NOT, limit, f"{off}. {held}. {chance} Use the new solution, or calibrate again.")
+        need, source = (SHOWN_MM, "which is needed without --limit-mm") if limit is None else (limit, "the limit")
+        text = f"{off}, no more than chance explains. {held}. The pairs show errors from {j.shown_mm:.3g} mm on with {100 * POWER:.0f} %"
+        if j.shown_mm > need:
+            return Verdict(CANNOT_TELL, limit, f"{text}, and not of {need:g} mm, {source}. Add pairs.")
+        return Verdict(USE, limit, f"{text}.")
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen; its verdict is this command's own."""
+        v, j = self.verdict, self.judgement
+        lead = {NONE: "This is no verification. ", CANNOT_TELL: "These pairs cannot tell. "}.get(v.verdict, "")
+        settled = (v.verdict if v.verdict in (USE, CARE, DO_NOT) else CARE, lead + v.reason)
+        expected = Expected(
+            "held-out error at the target, 95 %", f"{1e3 * np.percentile(j.held_translation_m[j.used], 95):.3f} mm",
+            f"of {int(j.used.sum())} pairs, with RESULT's pose and the target's pose from the other pairs",
+        )  # fmt: skip
+        unknown = self.mounting.unknowns["X"]
+        words = f"pose of the {unknown.child_words} in the {unknown.parent_words} frame"
+        poses = [ShownPose(unknown.symbol, f"{words}, as RESULT states it", as_transform(j.X))]
+        if j.new is not None:
+            poses.append(ShownPose(unknown.symbol, f"{words}, from these pairs alone", j.new.X))
+        return FirstScreen(
+            Findings(settled=settled, notes=self.notes, concerns=self.warnings), expected, self._next(), tuple(poses)
+        )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the new solution warns of, and directions that these pairs do not show."""
+        new = self.judgement.new
+        return () if new is None else (*(f"Not observable: {text}" for text in new.unobservable), *new.warnings)
+
+    def _next(self) -> Next:
+        v = self.verdict.verdict
+        solve = f"weldcal hand-eye ax-yb {self.pairs} --mounting {self.mounting.name}"
+        if v == USE:
+            return Next("Use RESULT. Verify again after work at the robot or the camera.")
+        if v == DO_NOT and self.judgement.other is not None:
+            return Next("Correct RESULT as the verdict says, and verify it again.")
+        if v in (DO_NOT, CARE):
+            return Next("Solve from these pairs, and verify the new result on pairs that it did not use.", solve)
+        return Next("Record pairs with larger and more varied turns of the robot, and verify with them.")
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of the command."""
+        j = self.judgement
+        return {
+            "state": "done",
+            "verdict": self.verdict.verdict,
+            "limit_mm": self.limit_mm,
+            "reason": self.verdict.reason,
+            "configuration": self.mounting.name,
+            "X": as_transform(j.X),
+            "read_as": self.read_as,
+            "held_out_mm": j.held_out_mm,
+            "held_out_deg": j.held_out_deg,
+            "off_mm": _known(j.off_mm),
+            "off_deg": _known(j.off_deg),
+            "off_uncertainty_mm": _known(j.uncertain_mm),
+            "shown_mm": _known(j.shown_mm),
+            "chance": _known(j.chance),
+            "false_alarm": FALSE_ALARM,
+            "fits": None if j.other is None else {"form": j.other[0], "off_mm": j.other[1]},
+            "new": None
+            if j.new is None
+            else {
+                "X": j.new.X,
+                "held_out_mm": _known(j.new_held_out_mm),
+                "held_out_deg": _known(j.new.held_out.rms_deg),
+            },
+            "per_pose": [
+                {"id": i, "used": bool(u), "residual_deg": a, "residual_mm": b, "held_out_deg": c, "held_out_mm": d}
+                for i, u, a, b, c, d in self._columns()
+            ],
+            "reading": {who: dict(found) for who, found in self.reading.items()},
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
+
+    def _columns(self) -> list[tuple[str, bool, float, float, float, float]]:
+        j = self.judgement
+        columns = (
+            np.degrees(j.rotation_rad), 1e3 * j.translation_m, np.degrees(j.held_rotation_rad), 1e3 * j.held_translation_m
+        )  # fmt: skip
+        return [(i, bool(u), *map(float, row)) for i, u, *row in zip(self.ids, j.used, *columns, strict=True)]
+
+    def rows(self) -> dict[str, str]:
+        """Rows for the terminal: the residuals of every pair, the largest first where there are many."""
+        worst = sorted(self._columns(), key=lambda row: -row[5])
+        some = self._columns() if len(worst) <= 12 else worst[:8]
+        title = "held out" if len(worst) <= 12 else "held out, worst"
+        text = "\n".join(f"{i}  {d:.3f} mm  {c:.3f} deg{'' if u else '  (outlier)'}" for i, u, _, _, c, d in some)
+        return {"result": f"{self.result}, {self.read_as}", "mounting": self.mounting.name, title: text}
+
+
+def verify_pairs_report(report: PairsReport) -> str:
+    """The whole report as one self-contained HTML text."""
+    j = report.judgement
+    rows = [(i, "used" if u else "outlier", *(fixed(v, 4) for v in row)) for i, u, *row in report._columns()]
+    return render(
+        "verify_pairs.html.j2",
+        first=report.first,
+        r=report,
+        j=j,
+        v=report.verdict,
+        n=len(rows),
+        rows=rows,
+        bars=error_bars(list(report.ids), 1e3 * j.held_translation_m, j.used, "held-out error, mm"),
+        tilts=error_bars(list(report.ids), np.degrees(j.held_rotation_rad), j.used, "held-out rotation, deg"),
+    )
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _small(chance: float) -> str:
+    return f"{chance:.2g}" if chance >= 1e-6 else "less than 1e-6"
+
+
+def _upper(text: str) -> str:
+    return text[0].upper() + text[1:]
