@@ -76,6 +76,19 @@ def read_npy(path: Path) -> AnyArray:
         ) from e
 
 
+def npy_shape(path: Path) -> tuple[int, ...]:
+    """The shape that the header of an npy file states. Raises InputError as read_npz."""
+    try:
+        with opened(path) as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            return _header(path.name, stream, size)[0]
+    except InputError:
+        raise
+    except _DAMAGED as e:
+        raise InputError(f"The file {path.name} cannot be read as NPY ({type(e).__name__}).") from e
+
+
 def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     """The arrays that the central directory lists, by name."""
     listed = [m for m in archive.infolist() if m.filename.endswith(".npy")]

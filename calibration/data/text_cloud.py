@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.cloud_body import CloudError
+from weldcal.calibration.data.cloud_body import CloudError, cloud_stream
 from weldcal.models.arrays import Array
-from weldcal.models.files import read_text
+from weldcal.models.files import decoded, read_text
 from weldcal.models.limits import LARGEST_TEXT
 
 _ROWS = 50_000  # converted at a time
@@ -21,12 +21,17 @@ _LONGEST_NUMBER = 100  # characters
 def read_text_cloud(path: Path) -> Array:
     """Points (N, 3): the columns that the header names x, y and z, else the first three; # and // begin comments.
 
-    All rows have as many cells. Decimal commas are read where semicolons, tabs or blanks separate the cells. Raises CloudError
-    for anything else, with the line's number; InputError: the file cannot be opened, or is not UTF-8.
+    A first line with one whole number is the number of points, as in .pts files. All rows have as many cells. Decimal commas are
+    read where semicolons, tabs or blanks separate the cells.
+
+    Raises:
+        CloudError: anything else, with the line's number. InputError: the file cannot be opened, or is not UTF-8.
     """
-    text = read_text(path, LARGEST_TEXT)
-    rows = _rows(text)
+    rows = _rows(_text(path))
     first = next(rows, None)
+    promised = None
+    if first is not None and _WHOLE.fullmatch(first[1]) and len(first[1]) < 16:
+        promised, first = int(first[1]), next(rows, None)
     if first is None:
         raise CloudError(f"The cloud {path.name} is empty; scan again.")
     line, row = first
@@ -72,7 +77,19 @@ def read_text_cloud(path: Path) -> Array:
         raise CloudError(
             f"The commas of {path.name} could be separators or decimal commas; write decimal points, or semicolons between the cells."
         )
-    return np.concatenate([*blocks, np.array(block, dtype=float).reshape(-1, 3)])
+    points = np.concatenate([*blocks, np.array(block, dtype=float).reshape(-1, 3)])
+    if promised is not None and promised != len(points):
+        raise CloudError(
+            f"The first line of {path.name} promises {promised} points, and {len(points)} are there; export it again."
+        )
+    return points
+
+
+def _text(path: Path) -> str:
+    if path.suffix.lower() != ".gz":
+        return read_text(path, LARGEST_TEXT)
+    with cloud_stream(path) as (stream, _):
+        return decoded(path, stream.read())
 
 
 def _rows(text: str) -> Iterator[tuple[int, str]]:
