@@ -83,9 +83,8 @@ def column_values(path: Path, content: bytes, n: int, record: int, columns: list
             f"The file {path.name} is truncated: {n} points are promised and {len(content) // record} are there."
         )
     out = np.empty((n, len(columns)))
-    raw = np.frombuffer(content, np.uint8, n * record).reshape(n, record)
     for k, (at, kind) in enumerate(columns):
-        out[:, k] = np.ascontiguousarray(raw[:, at : at + np.dtype(kind).itemsize]).view(kind)[:, 0]
+        out[:, k] = np.ndarray(n, kind, content, at, strides=(record,))
     return out
 
 

@@ -103,9 +103,12 @@ def read_cloud(path: Path, form: CloudForm | None = None) -> Array:
     flat = points.reshape(-1, 3)
     if len(flat) == 0:
         raise CloudError(f"The cloud {path.name} is empty; scan again.")
-    if np.isinf(flat).any():
+    largest = max(
+        float(np.fmax.reduce(flat, axis=None)), -float(np.fmin.reduce(flat, axis=None))
+    )  # of all that are no NaN
+    if np.isinf(largest):
         raise CloudError(f"The cloud {path.name} holds infinite coordinates; export it again.")
-    if max(float(np.nanmax(flat, initial=0.0)), -float(np.nanmin(flat, initial=0.0))) > LARGEST_NUMBER:
+    if largest > LARGEST_NUMBER:
         raise CloudError(f"The cloud {path.name} holds coordinates beyond {LARGEST_NUMBER:g}; it is damaged.")
     points = measured(points, path.name)
     valid = points.size // 3 if points.ndim == 2 else int(np.count_nonzero(~np.isnan(points[:, :, 2])))

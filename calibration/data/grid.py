@@ -8,6 +8,7 @@ from weldcal.models.arrays import Array
 
 _SAMPLE = 4000  # pairs of neighbours that are compared
 _SIDE = 8  # points of the shortest side of a grid, and the largest ratio of its sides
+_FAR = 0.25  # largest distance of neighbours, in distances of any two points
 _NEAR = 4.0  # distance of neighbours in a column, in distances of neighbours in a row
 _SHARE = 0.9  # of the pairs that must be so near
 _CLEAR = 1.25  # by which the next best width must be worse
@@ -27,7 +28,12 @@ def measured(points: Array, name: str) -> Array:
         CloudError: nothing was measured.
     """
     flat = points.reshape(-1, 3)
-    missing = np.isnan(flat).any(axis=1) | ~flat.any(axis=1)
+    x, y, z = flat.T  # whole columns: reductions over three numbers take several times as long
+    sums = x + y
+    sums += z
+    missing = np.isnan(sums)
+    nothing = np.flatnonzero(sums == 0.0)
+    missing[nothing] = ~flat[nothing].any(axis=1)
     if missing.all():
         raise CloudError(f"Every point of {name} is missing (NaN or 0 0 0): nothing was measured; scan again.")
     if not missing.any():
@@ -43,7 +49,8 @@ def measured(points: Array, name: str) -> Array:
 def sensor_width(points: Array, valid: NDArray[np.bool_], widths: tuple[int, ...] = ()) -> int | None:
     """Width of the grid in which points (N, 3) follow each other row by row; None where they do not.
 
-    In a grid the point one row below is as near as the next one. That tells the width among the divisors of N.
+    In a grid the point one row below is about as near as the next one, and both are much nearer than any two points. That
+    tells the width among the divisors of N.
 
     Args:
         valid: which points were measured (N).
@@ -56,7 +63,9 @@ def sensor_width(points: Array, valid: NDArray[np.bool_], widths: tuple[int, ...
     if len(starts) < _SIDE or not tried:
         return None
     pitch = float(np.median(np.linalg.norm(points[starts + 1] - points[starts], axis=1)))
-    if not pitch > 0.0:
+    others = points[np.roll(starts, len(starts) // 2)]
+    spread = float(np.median(np.linalg.norm(points[starts] - others, axis=1)))
+    if not 0.0 < pitch < _FAR * spread:
         return None
     found: list[tuple[float, float, int]] = []
     for width in tried:
@@ -67,7 +76,12 @@ def sensor_width(points: Array, valid: NDArray[np.bool_], widths: tuple[int, ...
         steps = np.linalg.norm(points[below + width] - points[below], axis=1) / pitch
         found.append((float(np.median(steps)), float(np.mean(steps < _NEAR)), width))
     found.sort()
-    if not found or found[0][1] < _SHARE or (len(found) > 1 and found[1][0] < _CLEAR * found[0][0]):
+    if (
+        not found
+        or found[0][1] < _SHARE
+        or found[0][0] * pitch > _FAR * spread
+        or (len(found) > 1 and found[1][0] < _CLEAR * found[0][0])
+    ):
         return None
     return found[0][2]
 

@@ -48,6 +48,11 @@ class Intrinsics:
     straight: bool = True
 
 
+def is_camera_file(path: Path) -> bool:
+    """Whether a file's name says that it holds a camera's intrinsics."""
+    return path.stem.lower() in _STEMS and path.suffix.lower() in (*_TREES, *_TEXTS)
+
+
 def find_intrinsics(*folders: Path) -> Intrinsics | None:
     """The camera of the first of these folders that holds a file of one; None where none does.
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES, cloud_id, ending_of
 from weldcal.calibration.data.depth import IMAGES, may_be_depth
+from weldcal.calibration.data.intrinsics import is_camera_file
 from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.errors import DatasetError
 
@@ -48,7 +49,10 @@ def _points(files: list[Path]) -> list[Path]:
     return ours or [
         p
         for p in files
-        if ending_of(p) in SUFFIXES and ending_of(p) not in IMAGES and cloud_id(p).lower() not in _NOTES
+        if ending_of(p) in SUFFIXES
+        and ending_of(p) not in IMAGES
+        and cloud_id(p).lower() not in _NOTES
+        and not is_camera_file(p)
     ]
 
 
