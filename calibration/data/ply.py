@@ -84,8 +84,8 @@ def read_ply(path: Path) -> Array:
     cols, rows = h.sides
     if min(cols, rows) > 1 and cols * rows == len(points):
         # some programs exchange rows and columns: neighbours tell which is which
-        valid = np.isfinite(points).all(axis=1) & points.any(axis=1)
-        width = sensor_width(points, valid, tuple({cols, rows}))
+        sums = points.sum(axis=1)
+        width = sensor_width(points, np.isfinite(sums) & (sums != 0.0), tuple({cols, rows}))
         return points if width is None else points.reshape(-1, width, 3)
     return points
 

@@ -27,7 +27,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.images import read_grey_image
 from weldcal.systems.scenario.loading import load_scenario, scenario_class
 from weldcal.tools.commands.profiler.files import read_profiler_file
-from weldcal.tools.worlds import binary_damage, text_damage
+from weldcal.tools.worlds import binary_damage, cloud_examples, text_damage
 from weldcal.tools.worlds import file_examples as examples
 from weldcal.tools.worlds.file_examples import Files, Rng
 from weldcal.welding.record.weld_log import load_weld_log
@@ -158,6 +158,15 @@ READERS = (
     Reader("weld-table", "table", "weld.csv", examples.weld_log, _weld_log, finite=False),
     Reader("weld-header", "json", "weld.json", examples.weld_log, _weld_log, finite=False),
     Reader("image", "image", "a.png", examples.image, lambda f: [read_grey_image(f / "a.png")]),
+    Reader("ply-grid", "cloud", "a.ply", cloud_examples.ply_grid, _cloud("a.ply"), finite=False),
+    Reader("ply-lists", "cloud", "a.ply", cloud_examples.ply_lists, _cloud("a.ply"), finite=False),
+    Reader("ply-gz", "bytes", "a.ply.gz", cloud_examples.ply_gz, _cloud("a.ply.gz"), finite=False),
+    Reader("pcd-stored", "cloud", "a.pcd", cloud_examples.pcd_stored, _cloud("a.pcd"), finite=False),
+    Reader("pts", "table", "a.pts", cloud_examples.pts, _cloud("a.pts"), finite=False),
+    Reader("depth-png", "image", "clouds/s0.png", cloud_examples.depth_png, _dataset, finite=False),
+    Reader("depth-tiff", "bytes", "clouds/s0.tif", cloud_examples.depth_tiff, _dataset, finite=False),
+    Reader("depth-npy", "npy", "clouds/s0.npy", cloud_examples.depth_npy, _dataset, finite=False),
+    Reader("intrinsics", "yaml", "camera_info.yaml", cloud_examples.depth_npy, _dataset, finite=False),
 )
 
 
