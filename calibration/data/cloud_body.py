@@ -11,8 +11,7 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import opened, read_bytes
-from weldcal.models.limits import MOST_POINTS, expansion_limit
+from weldcal.models.files import MOST_POINTS, expansion_limit, opened, read_bytes
 
 _ROWS = 50_000  # of text, converted at a time
 _LONGEST_LINE = 1_000_000

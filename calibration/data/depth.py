@@ -8,12 +8,10 @@ import numpy as np
 from weldcal.calibration.data.cloud_body import CloudError
 from weldcal.calibration.data.cloud_form import CloudForm
 from weldcal.calibration.data.intrinsics import Intrinsics, checked_intrinsics, find_intrinsics, intrinsics_of
-from weldcal.models.array_files import npy_shape
+from weldcal.models.array_files import npy_shape, png_depth, read_raw_image
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import file_size
-from weldcal.models.images import png_depth, read_raw_image
-from weldcal.models.limits import MOST_POINTS, expansion_limit
+from weldcal.models.files import MOST_POINTS, expansion_limit, file_size
 
 IMAGES = (".png", ".tif", ".tiff")
 """Endings of depth images."""

@@ -11,8 +11,7 @@ from weldcal.calibration.data.cloud_body import CloudError
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text
-from weldcal.models.limits import LARGEST_DOCUMENT
+from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
 _STEMS = (
     "camera_info", "depth_camera_info", "depth_intrinsics", "intrinsics", "intrinsic", "camera_intrinsics", "camera_intrinsic",

@@ -13,7 +13,7 @@ from pydrake.math import RotationMatrix
 from weldcal.calibration.data.cloud_body import CloudError, check_points, cloud_stream, column_values, text_columns
 from weldcal.calibration.data.cloud_form import CloudForm
 from weldcal.models.arrays import Array
-from weldcal.models.limits import expansion_limit
+from weldcal.models.files import expansion_limit
 
 _SIZES = {"I": (1, 2, 4, 8), "U": (1, 2, 4, 8), "F": (4, 8)}
 _KINDS = {"I": "i", "U": "u", "F": "f"}
