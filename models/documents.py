@@ -281,9 +281,9 @@ def nearest(word: str, known: Iterable[str], likeness: float = LIKENESS) -> str 
 
 
 def did_you_mean(word: str, known: Iterable[str], otherwise: str, likeness: float = LIKENESS) -> str:
-    """The end of a sentence about an unknown word: the nearest known one, or ``otherwise``."""
+    """The end of a sentence about an unknown word: the nearest known one, where there is one, and ``otherwise``."""
     near = nearest(word, known, likeness)
-    return otherwise if near is None else f"did you mean '{near}'?"
+    return otherwise if near is None else f"did you mean '{near}'? {otherwise[:1].upper()}{otherwise[1:]}"
 
 
 def read_part(kind: type[Part], document: Any, file: str, place: str = "") -> Part:

@@ -106,6 +106,15 @@ def cloud_form(header: DatasetHeader, folder: Path) -> CloudForm:
     )
 
 
+def is_motion(folder: Path) -> bool:
+    """Whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
+    path = Path(folder) / "dataset.yaml"
+    try:
+        return path.is_file() and read_header(path).mode == "motion"
+    except DatasetError:
+        return False
+
+
 def metric_cloud(path: Path, header: DatasetHeader, folder: Path) -> Array:
     """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
     points = read_cloud(path, cloud_form(header, folder))

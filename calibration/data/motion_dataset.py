@@ -100,15 +100,6 @@ class MotionDataset:
         return metric_cloud(self.clouds[id], self.header, self.folder)
 
 
-def is_motion(folder: Path) -> bool:
-    """Whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
-    path = Path(folder) / "dataset.yaml"
-    try:
-        return path.is_file() and read_header(path).mode == "motion"
-    except DatasetError:
-        return False
-
-
 def load_motion_dataset(folder: Path, *, robot: str | None = None) -> MotionDataset:
     """Read and check a recording in motion: dataset.yaml (`mode: motion`), stream.csv, frames.csv and clouds/.
 

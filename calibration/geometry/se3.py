@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.math import RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array
 
 IDENTITY: Array = np.eye(4)
@@ -137,3 +138,13 @@ def mean_of(poses: list[Array]) -> Array:
             break
         before = size
     return M
+
+
+def flange_poses(arm: Chain, q: Array, errors: Array) -> Array:
+    """Flange poses (m, 4, 4) at joint angles q (m, n) rad; ``errors`` (n, 6) [rotation; translation] of each joint in its own
+    frame before it turns: the third is the joint's offset."""
+    X = np.broadcast_to(IDENTITY, (len(q), 4, 4))
+    for i in range(arm.n):
+        turn = exp_rotation(q[:, i : i + 1] * [0.0, 0.0, 1.0])
+        X = X @ (arm.stack[i] @ pose(exp_rotation(errors[i, :3]), errors[i, 3:])) @ pose(turn, np.zeros(3))
+    return np.asarray(X @ arm.X_LF)

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, log_rotation, mean_pose, pose
+from weldcal.calibration.geometry.se3 import (
+    IDENTITY,
+    flange_poses,
+    inverse,
+    log_rotation,
+    mean_pose,
+)
 from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.linearisation import TINY, inverse_information
 from weldcal.calibration.hand_eye.mountings import chain as mounted
@@ -98,16 +104,6 @@ class _Found:
     V: Array
     slope: Array
     noise: tuple[float, float]
-
-
-def flange_poses(arm: Chain, q: Array, errors: Array) -> Array:
-    """Flange poses (m, 4, 4) at joint angles q (m, n) rad; ``errors`` (n, 6) [rotation; translation] of each joint in its own
-    frame before it turns: the third is the joint's offset."""
-    X = np.broadcast_to(IDENTITY, (len(q), 4, 4))
-    for i in range(arm.n):
-        turn = exp_rotation(q[:, i : i + 1] * [0.0, 0.0, 1.0])
-        X = X @ (arm.stack[i] @ pose(exp_rotation(errors[i, :3]), errors[i, 3:])) @ pose(turn, np.zeros(3))
-    return np.asarray(X @ arm.X_LF)
 
 
 def refine_joints(

@@ -6,8 +6,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import inverse
-from weldcal.calibration.hand_eye.joints import flange_poses
+from weldcal.calibration.geometry.se3 import flange_poses, inverse
 from weldcal.calibration.refinement.kinematics_fit import KinematicsFit, arm_errors
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array

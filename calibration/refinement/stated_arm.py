@@ -14,8 +14,7 @@ from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import log_rotation
-from weldcal.calibration.hand_eye.joints import flange_poses
+from weldcal.calibration.geometry.se3 import flange_poses, log_rotation
 from weldcal.calibration.refinement.kinematics_fit import ArmErrors, KinematicsFit
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arrays import Array

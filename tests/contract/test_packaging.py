@@ -94,15 +94,15 @@ def test_each_folder_with_python_files_is_a_package() -> None:
 def test_the_wheel_holds_every_file_and_nothing_at_the_top(built: Built) -> None:
     with zipfile.ZipFile(built.wheel) as wheel:
         names = {name for name in wheel.namelist() if not name.endswith("/")}
-    assert {name.split("/")[0] for name in names} == {"weldcal", "weldcal-0.1.0.dist-info"}
+    assert {name.split("/")[0] for name in names} == {"weldcal", "weldcal-0.2.0.dist-info"}
     packaged = {name.removeprefix("weldcal/") for name in names if name.startswith("weldcal/")}
     assert packaged == source_files()
 
 
 def test_the_wheel_has_its_command_and_its_licences(built: Built) -> None:
     with zipfile.ZipFile(built.wheel) as wheel:
-        commands = wheel.read("weldcal-0.1.0.dist-info/entry_points.txt").decode()
-        metadata = wheel.read("weldcal-0.1.0.dist-info/METADATA").decode()
+        commands = wheel.read("weldcal-0.2.0.dist-info/entry_points.txt").decode()
+        metadata = wheel.read("weldcal-0.2.0.dist-info/METADATA").decode()
         licences = {name.rsplit("/", 1)[-1] for name in wheel.namelist() if "/licenses/" in name}
     assert "weldcal = weldcal.tools.cli.app:main" in commands
     assert "License-Expression: BSD-3-Clause" in metadata

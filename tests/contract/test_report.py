@@ -35,7 +35,7 @@ EXAMPLE = """{% extends "base.html.j2" %}
          header=["Pose", "Error (mm)", "Tilt (deg)", "Remark"], caption="Every scan", text=(0, 3)) }}
 {% endblock %}
 {% block provenance %}
-{{ facts([("weldcal", "0.1.0"), ("dataset", "sha256 " + "0123456789abcdef" * 4), ("seed", 0)]) }}
+{{ facts([("weldcal", "0.2.0"), ("dataset", "sha256 " + "0123456789abcdef" * 4), ("seed", 0)]) }}
 {% endblock %}
 """
 

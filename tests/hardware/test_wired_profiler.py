@@ -150,7 +150,7 @@ def test_a_probe_that_is_closed_or_chatters_holds_the_job_before_it_scans(
         (found,) = preflight(UrTouchProbe(wired.host, 16)).checks
     assert live.run.held
     assert sentence in live.state.reason
-    assert live.state.sequence == 0, "no profile was asked for"
+    assert live.state.trigger == 0, "no profile was asked for"
     assert not found.ok or how != "stuck", "check-cell finds a closed probe"
     assert preflight(UrTouchProbe(wired.host, 16)).checks[0].ok
 

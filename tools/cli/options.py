@@ -17,7 +17,6 @@ from weldcal.models.result_files import whole_result
 from weldcal.tools import console
 
 if TYPE_CHECKING:
-    from weldcal.tools.farm.run import Farm
     from weldcal.tools.report.first_screen import FirstScreen
 
 
@@ -170,12 +169,6 @@ class Call:
         if self._page is not None:
             self._page[1]()
         self._page = None
-
-    def farm(self, folder: Path) -> "Farm":
-        """Where the tasks of a study run whose results are written to ``folder``."""
-        from weldcal.tools.farm.run import Farm
-
-        return Farm(folder, self.given.get("workers"), self.given.get("scheduler"), self.progress)
 
     def progress(self, stage: str, fraction: float) -> None:
         """Shows the stage and the completed fraction (0 to 1); the first call opens the progress bar."""

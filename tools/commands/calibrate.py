@@ -10,8 +10,8 @@ import numpy as np
 import typer
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.data.checks import is_motion
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.data.motion_dataset import is_motion
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice

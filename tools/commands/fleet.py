@@ -44,7 +44,7 @@ def fleet(
     drift, and which need a visit."""
     find_cells(folder)
     out = call.folder("fleet", folder.resolve().name)
-    report = run_fleet(folder, call.farm(out), limit_mm=limit_mm, seed=call.seed)
+    report = run_fleet(folder, Farm.of(out, call.given, call.progress), limit_mm=limit_mm, seed=call.seed)
     summary = report.summary()
     shown = {
         cell.name: f"{cell.state}: {cell.reason} {cell.next}" for cell in report.cells if cell.state in (VISIT, LOOK)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from weldcal.calibration.data.results import software_version
 from weldcal.tools.console import Progress
@@ -26,6 +26,11 @@ class Farm:
     workers: int | None = None
     scheduler: str | None = None
     progress: Progress = field(default=lambda stage, share: None, compare=False)
+
+    @classmethod
+    def of(cls, folder: Path, given: Mapping[str, Any], progress: Progress) -> Self:
+        """The farm of a command's options --workers and --scheduler."""
+        return cls(folder, given.get("workers"), given.get("scheduler"), progress)
 
     def run(
         self,

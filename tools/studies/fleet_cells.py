@@ -42,7 +42,7 @@ def fleet(
     """Write made cells, some of which move, drift or break, and count what `weldcal fleet` says of them."""
     folder = call.folder("benchmark", "fleet")
     faults = write_fleet(folder / "cells", cells, datasets, call.seed)
-    farm = call.farm(folder)
+    farm = Farm.of(folder, call.given, call.progress)
     report = run_fleet(
         folder / "cells", Farm(folder / "page", farm.workers, farm.scheduler, farm.progress), seed=call.seed
     )

@@ -90,7 +90,7 @@ class Study:
         Raises:
             InputError: the folder holds another study, or no case could be done. WorkerLost: a process has ended.
         """
-        farm = call.farm(folder or self.folder(call))
+        farm = Farm.of(folder or self.folder(call), call.given, call.progress)
         return self.run(farm if "workers" in call.given else replace(farm, workers=0), cases).outcome()
 
     def folder(self, call: Call) -> Path:

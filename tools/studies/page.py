@@ -49,7 +49,7 @@ def _section(study: dict[str, Any]) -> str:
     lines = [
         f"## {study['command'].split()[1]} {study['study']}\n",
         f"{study['what']}\n",
-        f"    {study['command']}\n",
+        f"Command: `{study['command']}`\n",
         f"Measured on {study['measured_on']} with {study['software']}.\n",
     ]
     for k, table in enumerate(study["tables"]):

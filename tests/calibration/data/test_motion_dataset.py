@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from weldcal.calibration.data.checks import is_motion
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.header import DatasetHeader, ScannerGuess
 from weldcal.calibration.data.motion_dataset import (
     FrameTime,
     RobotStream,
-    is_motion,
     load_motion_dataset,
     save_motion_dataset,
 )

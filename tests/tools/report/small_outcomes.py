@@ -283,7 +283,7 @@ def mounting() -> Made:
 
 def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
     sequencer = SimpleNamespace(
-        GetMyContextFromRoot=lambda root: root, job_state=lambda context: SimpleNamespace(warnings=("A remark.",))
+        GetMyContextFromRoot=lambda root: root, state_in=lambda context: SimpleNamespace(warnings=("A remark.",))
     )
     run = _run(
         "calibrate_only",

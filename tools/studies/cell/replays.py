@@ -25,6 +25,7 @@ from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.emulators.cell.process import X_BC, wired_world
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
+from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
@@ -289,7 +290,7 @@ def replays(
 ) -> Outcome:
     """Record runs of every kind (simulated, on an emulated controller, by wire, with faults), and replay each bit for bit."""
     folder = call.folder("benchmark", "replay")
-    found = REPLAYS.run(call.farm(folder), replay_cases(folder, runs, call.seed))
+    found = REPLAYS.run(Farm.of(folder, call.given, call.progress), replay_cases(folder, runs, call.seed))
     return Outcome(found.figures, text=found.markdown())
 
 

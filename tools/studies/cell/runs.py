@@ -167,7 +167,9 @@ def seeds(
 ) -> Outcome:
     """Run the demo over many seeds: completed runs, and the largest errors of calibration and torch."""
     folder = call.folder("benchmark", f"seeds-{scenario}")
-    found = SEEDS.run(call.farm(folder), seed_cases(scenario, folder, range(call.seed, call.seed + runs)))
+    found = SEEDS.run(
+        Farm.of(folder, call.given, call.progress), seed_cases(scenario, folder, range(call.seed, call.seed + runs))
+    )
     return Outcome(found.figures, text=found.show)
 
 
@@ -182,7 +184,9 @@ def arms(
 ) -> Outcome:
     """Run the demo, scaled to the reach, on UR3e, UR5e, UR10e, UR16e, UR20 and UR30; the scenarios are written too."""
     chosen = [get_robot(name).name for name in names] if names else list(ARMS)
-    found = run_arms(call.farm(call.folder("benchmark", "arms")), chosen, call.seed, seam, robot)
+    found = run_arms(
+        Farm.of(call.folder("benchmark", "arms"), call.given, call.progress), chosen, call.seed, seam, robot
+    )
     return Outcome(found.figures, text=found.show)
 
 

@@ -17,6 +17,7 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
+from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
@@ -314,7 +315,9 @@ def wired_faults(
 ) -> Outcome:
     """Kill, freeze and delay each device by wire, and let it send garbage, in each phase: the arm must stop, and the job say why."""
     folder = call.folder("benchmark", "wired-faults")
-    found = WIRED_FAULTS.run(call.farm(folder), fault_cases(folder, call.seed, devices or (), phases or ()))
+    found = WIRED_FAULTS.run(
+        Farm.of(folder, call.given, call.progress), fault_cases(folder, call.seed, devices or (), phases or ())
+    )
     write_atomic(
         folder / "faults.csv",
         csv_text(FAULT_COLUMNS, ([r.get(n, "") for n in FAULT_COLUMNS] for r in found.figures["rows"])),
