@@ -16,6 +16,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_IMAGE, MOST_ARRAYS, MOST_PIXELS, expansion_limit, opened, read_bytes
 
 _PNG = b"\x89PNG\r\n\x1a\n"
+_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG's markers that are followed by a height and width
 
 
@@ -25,6 +26,27 @@ def read_grey_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         InputError: no regular file, no image, or more pixels than the bound in limits.
     """
+    return np.asarray(_decoded(path, grey=True), dtype=np.uint8)
+
+
+def read_raw_image(path: Path) -> NDArray[Any]:
+    """The pixels (height, width) or (height, width, channels) of a file as they are stored. Raises InputError as read_grey_image."""
+    return _decoded(path, grey=False)
+
+
+def png_depth(path: Path) -> tuple[int, int]:
+    """Bits and channels of a PNG, of which only the header is read; zeros where the file is none."""
+    try:
+        with opened(path, LARGEST_IMAGE) as stream:
+            begin = stream.read(26)
+    except InputError:
+        return 0, 0
+    if not begin.startswith(_PNG) or len(begin) < 26:
+        return 0, 0
+    return begin[24], {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(begin[25], 0)
+
+
+def _decoded(path: Path, *, grey: bool) -> NDArray[Any]:
     import cv2  # slow to import
 
     content = read_bytes(path, LARGEST_IMAGE)
@@ -33,23 +55,26 @@ def read_grey_image(path: Path) -> NDArray[np.uint8]:
         raise InputError(
             f"'{path.name}' has {width} by {height} pixels, more than {MOST_PIXELS}, the most that are read."
         )
+    flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_UNCHANGED
     try:
-        picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flag) if content else None
     except (cv2.error, MemoryError):
         picture = None
     if picture is None:
         raise InputError(f"'{path.name}' is not a readable image.")
-    return np.asarray(picture, dtype=np.uint8)
+    return np.asarray(picture)
 
 
 def _size(content: bytes) -> tuple[int, int]:
-    """Width and height that a PNG, JPEG or BMP states; 0 for other formats, which OpenCV bounds itself."""
+    """Width and height that a PNG, JPEG, BMP or TIFF states; 0 for other formats, which OpenCV bounds itself."""
     if content.startswith(_PNG) and len(content) >= 24:
         width, height = struct.unpack(">II", content[16:24])
         return width, height
     if content.startswith(b"BM") and len(content) >= 26:
         width, height = struct.unpack("<ii", content[18:26])
         return abs(width), abs(height)
+    if content[:4] in _TIFF:
+        return _tiff_size(content)
     at = 2 if content.startswith(b"\xff\xd8") else len(content)
     while at + 9 <= len(content) and content[at] == 0xFF:
         marker, length = content[at + 1], struct.unpack(">H", content[at + 2 : at + 4])[0]
@@ -58,6 +83,23 @@ def _size(content: bytes) -> tuple[int, int]:
             return width, height
         at += 2 + length
     return 0, 0
+
+
+def _tiff_size(content: bytes) -> tuple[int, int]:
+    """The largest width and height among the entries of a TIFF's first directory."""
+    order = _TIFF[content[:4]]
+    sides = {256: 0, 257: 0}
+    at = struct.unpack_from(f"{order}I", content, 4)[0] if len(content) >= 8 else len(content)
+    if at + 2 <= len(content):
+        for entry in range(struct.unpack_from(f"{order}H", content, at)[0]):
+            place = at + 2 + 12 * entry
+            if place + 12 > len(content):
+                break
+            tag, kind = struct.unpack_from(f"{order}HH", content, place)
+            if tag in sides:
+                value = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", content, place + 8)[0]
+                sides[tag] = max(sides[tag], value)
+    return sides[256], sides[257]
 
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -118,6 +160,19 @@ def read_npy(path: Path) -> AnyArray:
         raise InputError(
             f"The file {path.name} cannot be read as NPY: it is not an npy file, or damaged ({type(e).__name__})."
         ) from e
+
+
+def npy_shape(path: Path) -> tuple[int, ...]:
+    """The shape that the header of an npy file states. Raises InputError as read_npz."""
+    try:
+        with opened(path) as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            return _header(path.name, stream, size)[0]
+    except InputError:
+        raise
+    except _DAMAGED as e:
+        raise InputError(f"The file {path.name} cannot be read as NPY ({type(e).__name__}).") from e
 
 
 def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:

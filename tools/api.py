@@ -102,7 +102,8 @@ def verify(
 
 
 def read_cloud(file: str | Path, unit: str = "m") -> Floats:
-    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in metres, of a PLY, PCD, NPZ, NPY or text file.
+    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in metres, of a PLY, PCD, NPZ, NPY or text
+    file or a depth image beside a file of its camera.
 
     Args:
         unit: of the file's numbers, m or mm.

@@ -9,8 +9,11 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RotationMatrix
 
-from weldcal.calibration.data.clouds import CloudError, read_cloud
+from weldcal.calibration.data.cloud_form import VIEWPOINTS
+from weldcal.calibration.data.clouds import CloudError, CloudForm, read_cloud
+from weldcal.calibration.data.grid import measured
 from weldcal.calibration.data.header import DatasetHeader, Feature, PoseForm, ScannerGuess, Units
+from weldcal.calibration.data.intrinsics import checked_intrinsics
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
@@ -77,6 +80,7 @@ def read_header(path: Path) -> DatasetHeader:
             "poses, and 'weldcal hand-eye live eye_in_hand' scans the foot of the robot."
         )
     _check_poses(header, path)
+    _check_clouds(header, path)
     return header
 
 
@@ -97,6 +101,17 @@ def _unread(name: str, given: object, problem: str) -> str:
     return f"'{name}' cannot be read as a dataset description: {problem}"
 
 
+def cloud_form(header: DatasetHeader, folder: Path) -> CloudForm:
+    """What dataset.yaml states of the clouds in the dataset's folder."""
+    c = header.intrinsics
+    return CloudForm(
+        intrinsics=None if c is None else (c.fx, c.fy, c.cx, c.cy),
+        depth_scale=header.depth_scale / UNITS.get(header.units.clouds, 1.0),
+        viewpoint=header.viewpoint,
+        folder=folder,
+    )
+
+
 def is_motion(folder: Path) -> bool:
     """Whether a folder's dataset.yaml says `mode: motion`. False where it cannot be read."""
     path = Path(folder) / "dataset.yaml"
@@ -106,16 +121,20 @@ def is_motion(folder: Path) -> bool:
         return False
 
 
-def metric_cloud(path: Path, unit: str) -> Array:
+def metric_cloud(path: Path, header: DatasetHeader, folder: Path) -> Array:
     """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
-    points = read_cloud(path)
-    return to_metres(points, unit, path.name)
+    points = read_cloud(path, cloud_form(header, folder))
+    return to_metres(points, header.units.clouds, path.name)
 
 
 def to_metres(points: Array, unit: str, name: str) -> Array:
-    """The points, in place, in metres; the unit is m, mm or auto (by their distance). Raises CloudError."""
-    seen = points[np.isfinite(points[..., 2])]
-    distance = float(np.median(np.linalg.norm(seen[:: 1 + len(seen) // _SAMPLE], axis=1)))
+    """The measured points, in place where none is left out, in metres; the unit is m, mm or auto (by their distance).
+
+    Raises CloudError.
+    """
+    points = measured(points, name)
+    finite = points[np.isfinite(points[..., 2])]
+    distance = float(np.median(np.linalg.norm(finite[:: 1 + len(finite) // _SAMPLE], axis=1)))
     if unit == AUTO:
         unit = "mm" if distance > REACH_M[1] else "m"
     points *= UNITS[unit]
@@ -127,6 +146,24 @@ def to_metres(points: Array, unit: str, name: str) -> Array:
             "units in dataset.yaml."
         )
     return points
+
+
+def _check_clouds(header: DatasetHeader, path: Path) -> None:
+    """The header's keys of depth images and VIEWPOINT."""
+    if header.viewpoint not in ("", *VIEWPOINTS):
+        raise DatasetError(
+            f"'{path.name}' gives the viewpoint '{header.viewpoint[:40]}'; write {' or '.join(VIEWPOINTS)}."
+        )
+    if not 0.0 <= header.depth_scale <= 1.0:
+        raise DatasetError(
+            f"'{path.name}': depth_scale {header.depth_scale:g} must be the metres of one unit of a depth image, such as 0.001 for "
+            "millimetres or 0.0002 for 5000 units a metre."
+        )
+    if (c := header.intrinsics) is not None:
+        try:
+            checked_intrinsics((c.fx, c.fy, c.cx, c.cy), path.name)
+        except CloudError as e:
+            raise DatasetError(e.reason) from None
 
 
 def _check_poses(header: DatasetHeader, path: Path) -> None:

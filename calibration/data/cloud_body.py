@@ -1,6 +1,9 @@
 """Takes x, y, z out of the body of a cloud's file, as bytes or as text, and bounds the number of points."""
 
+import io
+import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -8,7 +11,7 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import MOST_POINTS, expansion_limit
+from weldcal.models.files import MOST_POINTS, expansion_limit, opened, read_bytes
 
 _ROWS = 50_000  # of text, converted at a time
 _LONGEST_LINE = 1_000_000
@@ -21,6 +24,44 @@ class CloudError(InputError):
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = str(self)
+
+
+@contextmanager
+def cloud_stream(path: Path) -> Iterator[tuple[BinaryIO, int]]:
+    """The file, open for reading bytes, and its length in bytes; a .gz file expanded, within expansion_limit.
+
+    Raises:
+        CloudError: a .gz file that is damaged, truncated or expands too far. InputError: the file cannot be opened.
+    """
+    if path.suffix.lower() != ".gz":
+        with opened(path) as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            yield stream, size
+        return
+    content = _expanded(path, read_bytes(path))
+    yield io.BytesIO(content), len(content)
+
+
+def _expanded(path: Path, packed: bytes) -> bytes:
+    limit = expansion_limit(len(packed))
+    parts: list[bytes] = []
+    left = limit
+    try:
+        while packed:
+            inflate = zlib.decompressobj(31)
+            parts.append(inflate.decompress(packed, left + 1))
+            left -= len(parts[-1])
+            if left < 0:
+                raise CloudError(
+                    f"The file {path.name} would expand to more than {1e-6 * limit:.0f} MB, too much for its size."
+                )
+            if not inflate.eof:
+                raise CloudError(f"The file {path.name} is truncated: its compressed body has no end.")
+            packed = inflate.unused_data.lstrip(b"\0")
+    except zlib.error as e:
+        raise CloudError(f"The file {path.name} is damaged: it cannot be expanded as gzip ({e}).") from None
+    return b"".join(parts)
 
 
 def check_points(path: Path, points: int, size: int) -> None:
@@ -41,38 +82,40 @@ def column_values(path: Path, content: bytes, n: int, record: int, columns: list
             f"The file {path.name} is truncated: {n} points are promised and {len(content) // record} are there."
         )
     out = np.empty((n, len(columns)))
-    raw = np.frombuffer(content, np.uint8, n * record).reshape(n, record)
     for k, (at, kind) in enumerate(columns):
-        out[:, k] = np.ascontiguousarray(raw[:, at : at + np.dtype(kind).itemsize]).view(kind)[:, 0]
+        out[:, k] = np.ndarray(n, kind, content, at, strides=(record,))
     return out
 
 
 def text_columns(
-    path: Path, stream: BinaryIO, columns: list[int], numbers: int, skip: int, rows: int, lines: int
+    path: Path, stream: BinaryIO, columns: list[int], numbers: int | None, skip: int, rows: int, lines: int
 ) -> Array:
-    """Columns (rows, k) of the text that follows in the stream: ``rows`` lines of ``numbers`` numbers after ``skip`` lines.
+    """Columns (rows, k) of the text that follows in the stream: ``rows`` lines of ``numbers`` numbers (None:
+    any) after ``skip`` lines.
 
     Raises CloudError where there are more or fewer than ``lines`` lines, or a line is not as promised.
     """
     out = np.empty((min(rows, MOST_POINTS), len(columns)))
     found = 0
     block: list[list[bytes]] = []
-    for line in _lines(path, stream):
+    for line in text_lines(path, stream):
         k, found = found - skip, found + 1
         if found > lines:
             continue
         if 0 <= k < rows:
             words = line.split()
-            if len(words) < numbers and not line.endswith(b"\n"):
+            if numbers is not None and len(words) < numbers and not line.endswith(b"\n"):
                 found -= 1  # the end of a file that was cut off
                 continue
-            if len(words) != numbers:
+            if numbers is not None and len(words) != numbers:
                 raise CloudError(
                     f"The file {path.name} is damaged: point {k + 1} has {len(words)} numbers instead of the {numbers} of its header."
                 )
+            if not columns:
+                continue
             block.append([words[c] for c in columns])
             if len(block) == _ROWS or k + 1 == rows:
-                out[k + 1 - len(block) : k + 1] = _converted(path, block)
+                out[k + 1 - len(block) : k + 1] = converted(path, block)
                 block = []
     if found < lines:
         raise CloudError(
@@ -85,8 +128,8 @@ def text_columns(
     return out
 
 
-def _lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
-    """The lines that are not blank."""
+def text_lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
+    """The lines that are not blank. Raises CloudError for one of extreme length."""
     while line := stream.readline(_LONGEST_LINE):
         if len(line) == _LONGEST_LINE:
             raise CloudError(f"The file {path.name} is damaged: a line is longer than {_LONGEST_LINE} characters.")
@@ -94,7 +137,8 @@ def _lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
             yield line
 
 
-def _converted(path: Path, block: list[list[bytes]]) -> Array:
+def converted(path: Path, block: list[list[bytes]]) -> Array:
+    """Rows of words as numbers. Raises CloudError for a word that is none."""
     bad = next((w for row in block for w in row if len(w) > _LONGEST_NUMBER), None)
     if bad is None:
         try:

@@ -1,4 +1,4 @@
-"""Reads point clouds from PLY, PCD, NPZ, NPY and text files; refuses damaged ones with a reason."""
+"""Reads point clouds from PLY, PCD, NPZ, NPY and text files and depth images; refuses damaged ones with a reason."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -7,15 +7,48 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.cloud_body import CloudError
+from weldcal.calibration.data.cloud_body import CloudError, cloud_stream
+from weldcal.calibration.data.cloud_form import CloudForm
+from weldcal.calibration.data.depth import (
+    IMAGES,
+    back_projected,
+    camera_of,
+    check_pixels,
+    depth_points,
+    is_depth_array,
+    read_depth_image,
+)
+from weldcal.calibration.data.grid import measured
+from weldcal.calibration.data.intrinsics import checked_intrinsics, intrinsics_of
 from weldcal.calibration.data.pcd import read_pcd
 from weldcal.calibration.data.ply import read_ply
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER, LARGEST_TEXT, MOST_POINTS, expansion_limit, file_size, read_text
+from weldcal.models.files import LARGEST_NUMBER, LARGEST_TEXT, decoded, read_text
 from weldcal.models.result_files import write_npz
 
+__all__ = [
+    "NO_NOTES",
+    "SUFFIXES",
+    "CloudError",
+    "CloudForm",
+    "cloud_id",
+    "ending_of",
+    "find_cloud",
+    "read_cloud",
+    "save_cloud",
+]
+
+_TEXT = (".csv", ".txt", ".xyz", ".pts", ".asc")
+_PLAIN = (".ply", ".pcd", ".npz", ".npy", *_TEXT)
+_PACKED = (".ply.gz", ".pcd.gz", *(f"{s}.gz" for s in _TEXT))
+SUFFIXES = (*_PLAIN, *_PACKED, *IMAGES)
+_NOTES = (".csv", ".txt", ".csv.gz", ".txt.gz", *IMAGES)
+NO_NOTES = tuple(
+    s for s in SUFFIXES if s not in _NOTES
+)  # such a file beside the clouds is a cloud, not somebody's notes or pictures
+_MIN_POINTS = 30
 _ROWS = 50_000  # converted at a time
 _LINE = re.compile(r"[^\r\n]+")
 _COMMA_DECIMAL = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
@@ -23,15 +56,140 @@ _WHOLE = re.compile(r"[+-]?\d+")
 _LONGEST_NUMBER = 100  # characters
 
 
+def ending_of(path: Path) -> str:
+    """The ending of a cloud's file, one of SUFFIXES; the name's last one for another file."""
+    name = path.name.lower()
+    return next((s for s in _PACKED if name.endswith(s)), path.suffix.lower())
+
+
+def cloud_id(path: Path) -> str:
+    """The name of a cloud's file without its ending."""
+    return path.name[: len(path.name) - len(ending_of(path))]
+
+
+def find_cloud(folder: Path, id: str) -> Path:
+    """The one cloud file of an id. Raises CloudError when there is none or more than one."""
+    found = sorted(p for p in folder.iterdir() if ending_of(p) in SUFFIXES and cloud_id(p) == id)
+    found = [p for p in found if ending_of(p) in NO_NOTES] or [p for p in found if ending_of(p) not in IMAGES] or found
+    if not found:
+        raise CloudError(f"There is no cloud for this pose; add clouds/{id}.pcd, .ply, .npz, .npy or .csv.")
+    if len(found) > 1:
+        raise CloudError(f"There is more than one cloud for this pose ({', '.join(p.name for p in found)}); keep one.")
+    return found[0]
+
+
+def read_cloud(path: Path, form: CloudForm | None = None) -> Array:
+    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit.
+
+    NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
+    centres at whole numbers; zero or NaN depth is invalid. NPY: such points alone, or a depth image. Text: x, y, z are the first
+    three columns, below a header or none. Points with NaN or at 0 0 0 were not measured: they are NaN in organised clouds and
+    left out of lists. A list in the sensor's order that keeps them becomes organised.
+
+    Args:
+        form: what is known of the files beyond their contents.
+
+    Raises:
+        CloudError: not a regular file, unreadable, truncated, larger than the bounds in models/files.py, empty, infinite
+            coordinates, a depth image without intrinsics, a PCD whose VIEWPOINT has no stated meaning.
+    """
+    form = form or CloudForm()
+    reader = _READERS.get(ending_of(path))
+    if reader is None:
+        raise CloudError(f"The file {path.name} is no cloud: give {', '.join(SUFFIXES)}.")
+    try:
+        points = reader(path, form)
+    except CloudError:
+        raise
+    except InputError as e:
+        raise CloudError(str(e)) from e
+    except MemoryError:
+        raise CloudError(f"The cloud {path.name} needs more memory than there is: give a smaller one.") from None
+    flat = points.reshape(-1, 3)
+    if len(flat) == 0:
+        raise CloudError(f"The cloud {path.name} is empty; scan again.")
+    largest = max(
+        float(np.fmax.reduce(flat, axis=None)), -float(np.fmin.reduce(flat, axis=None))
+    )  # of all that are no NaN
+    if np.isinf(largest):
+        raise CloudError(f"The cloud {path.name} holds infinite coordinates; export it again.")
+    if largest > LARGEST_NUMBER:
+        raise CloudError(f"The cloud {path.name} holds coordinates beyond {LARGEST_NUMBER:g}; it is damaged.")
+    points = measured(points, path.name)
+    valid = points.size // 3 if points.ndim == 2 else int(np.count_nonzero(~np.isnan(points[:, :, 2])))
+    if valid < _MIN_POINTS:
+        raise CloudError(f"The cloud {path.name} has only {valid} valid points; scan again.")
+    return points
+
+
+def save_cloud(path: Path, points_C: Array, intrinsics: tuple[float, float, float, float] | None = None) -> None:
+    """Write an (N, 3) or (H, W, 3) cloud as NPZ, single precision, metres: what read_cloud reads back.
+
+    With ``intrinsics`` (fx, fy, cx, cy) an organised cloud is written as its depth map, a third of the size.
+    """
+    if intrinsics is not None and np.ndim(points_C) == 3:
+        write_npz(path, depth=np.asarray(points_C[:, :, 2], dtype=np.float32), intrinsics=np.array(intrinsics))
+        return
+    write_npz(path, points=np.asarray(points_C, dtype=np.float32))
+
+
+def _read_npy(path: Path, form: CloudForm) -> Array:
+    array = read_npy(path)
+    return depth_points(path, array, form) if is_depth_array(array) else _points(path, "The array", array)
+
+
+def _points(path: Path, name: str, value: Any) -> Array:
+    points = _numbers(path, name, value)
+    if points.ndim not in (2, 3) or points.shape[-1] != 3:
+        raise CloudError(f"{name} in {path.name} has the shape {points.shape}; (N, 3) or (H, W, 3) is needed.")
+    return points
+
+
+def _numbers(path: Path, name: str, value: Any) -> Array:
+    try:
+        return np.asarray(value, dtype=float)
+    except ValueError:
+        raise CloudError(f"{name} in {path.name} holds words, not numbers.") from None
+
+
+def _read_npz(path: Path, form: CloudForm) -> Array:
+    data = read_npz(path, ("points", "depth", "K", "intrinsics"))
+    if "points" in data:
+        return _points(path, "'points'", data["points"])
+    if "depth" not in data:
+        raise CloudError(f"{path.name} holds neither 'points' nor 'depth'.")
+    depth = _numbers(path, "'depth'", data["depth"])
+    if depth.ndim != 2:
+        raise CloudError(f"'depth' in {path.name} has the shape {depth.shape}; (H, W) is needed.")
+    check_pixels(path, depth.size)
+    if "K" in data:
+        K = _numbers(path, "'K'", data["K"])
+        if K.shape != (3, 3):
+            raise CloudError(f"'K' in {path.name} has the shape {K.shape}; (3, 3) is needed.")
+        values = checked_intrinsics((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), path.name)
+    elif "intrinsics" in data and np.size(data["intrinsics"]) == 4:
+        values = checked_intrinsics(
+            tuple(float(v) for v in np.ravel(_numbers(path, "'intrinsics'", data["intrinsics"]))), path.name
+        )
+    else:
+        values = intrinsics_of(camera_of(path, form), depth.shape, path.name)
+    return back_projected(depth, values)
+
+
 def read_text_cloud(path: Path) -> Array:
     """Points (N, 3): the columns that the header names x, y and z, else the first three; # and // begin comments.
 
-    All rows have as many cells. Decimal commas are read where semicolons, tabs or blanks separate the cells. Raises CloudError
-    for anything else, with the line's number; InputError: the file cannot be opened, or is not UTF-8.
+    A first line with one whole number is the number of points, as in .pts files. All rows have as many cells. Decimal commas are
+    read where semicolons, tabs or blanks separate the cells.
+
+    Raises:
+        CloudError: anything else, with the line's number. InputError: the file cannot be opened, or is not UTF-8.
     """
-    text = read_text(path, LARGEST_TEXT)
-    rows = _rows(text)
+    rows = _rows(_text(path))
     first = next(rows, None)
+    promised = None
+    if first is not None and _WHOLE.fullmatch(first[1]) and len(first[1]) < 16:
+        promised, first = int(first[1]), next(rows, None)
     if first is None:
         raise CloudError(f"The cloud {path.name} is empty; scan again.")
     line, row = first
@@ -77,7 +235,19 @@ def read_text_cloud(path: Path) -> Array:
         raise CloudError(
             f"The commas of {path.name} could be separators or decimal commas; write decimal points, or semicolons between the cells."
         )
-    return np.concatenate([*blocks, np.array(block, dtype=float).reshape(-1, 3)])
+    points = np.concatenate([*blocks, np.array(block, dtype=float).reshape(-1, 3)])
+    if promised is not None and promised != len(points):
+        raise CloudError(
+            f"The first line of {path.name} promises {promised} points, and {len(points)} are there; export it again."
+        )
+    return points
+
+
+def _text(path: Path) -> str:
+    if path.suffix.lower() != ".gz":
+        return read_text(path, LARGEST_TEXT)
+    with cloud_stream(path) as (stream, _):
+        return decoded(path, stream.read())
 
 
 def _rows(text: str) -> Iterator[tuple[int, str]]:
@@ -140,133 +310,8 @@ def _surplus(path: Path, line: int, n: int, width: int) -> str:
     )
 
 
-__all__ = ["NO_NOTES", "SUFFIXES", "CloudError", "find_cloud", "read_cloud", "save_cloud"]
-
-_TEXT = (".csv", ".txt", ".xyz")
-SUFFIXES = (".ply", ".pcd", ".npz", ".npy", *_TEXT)
-NO_NOTES = tuple(
-    s for s in SUFFIXES if s not in (".csv", ".txt")
-)  # such a file beside the clouds is a cloud, not somebody's notes
-_MIN_POINTS = 30
-
-
-def find_cloud(folder: Path, id: str) -> Path:
-    """The one cloud file of an id. Raises CloudError when there is none or more than one."""
-    found = sorted(p for p in folder.iterdir() if p.stem == id and p.suffix.lower() in SUFFIXES)
-    found = [p for p in found if p.suffix.lower() in NO_NOTES] or found
-    if not found:
-        raise CloudError(f"There is no cloud for this pose; add clouds/{id}.pcd, .ply, .npz, .npy or .csv.")
-    if len(found) > 1:
-        raise CloudError(f"There is more than one cloud for this pose ({', '.join(p.name for p in found)}); keep one.")
-    return found[0]
-
-
-def read_cloud(path: Path) -> Array:
-    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit.
-
-    NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
-    centres at whole numbers; zero or NaN depth is invalid. NPY: such points alone. Text: x, y, z are the first three columns,
-    below a header or none. NaN stands for a missing pixel in organised files.
-    Raises CloudError: not a regular file, unreadable, truncated, larger than the bounds in models/files.py, empty, NaN in a
-    list of points, infinite coordinates.
-    """
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise CloudError(f"The file {path.name} is no cloud: give {', '.join(SUFFIXES)}.")
-    try:
-        points = reader(path)
-    except CloudError:
-        raise
-    except InputError as e:
-        raise CloudError(str(e)) from e
-    except MemoryError:
-        raise CloudError(f"The cloud {path.name} needs more memory than there is: give a smaller one.") from None
-    flat = points.reshape(-1, 3)
-    if len(flat) == 0:
-        raise CloudError(f"The cloud {path.name} is empty; scan again.")
-    if np.isinf(flat).any():
-        raise CloudError(f"The cloud {path.name} holds infinite coordinates; export it again.")
-    if max(float(np.nanmax(flat, initial=0.0)), -float(np.nanmin(flat, initial=0.0))) > LARGEST_NUMBER:
-        raise CloudError(f"The cloud {path.name} holds coordinates beyond {LARGEST_NUMBER:g}; it is damaged.")
-    bad = np.isnan(flat).any(axis=1)
-    n_bad = int(bad.sum())
-    if n_bad == len(flat):
-        raise CloudError(f"Every point of {path.name} is NaN: nothing was measured; scan again.")
-    if len(flat) - n_bad < _MIN_POINTS:
-        raise CloudError(f"The cloud {path.name} has only {len(flat) - n_bad} valid points; scan again.")
-    if points.ndim == 3:
-        out = points.copy()
-        out[bad.reshape(points.shape[:2])] = np.nan
-        return out
-    if n_bad:
-        raise CloudError(
-            f"{n_bad} of the {len(flat)} points of {path.name} are NaN; export the cloud without invalid points, or organised."
-        )
-    return flat
-
-
-def save_cloud(path: Path, points_C: Array, intrinsics: tuple[float, float, float, float] | None = None) -> None:
-    """Write an (N, 3) or (H, W, 3) cloud as NPZ, single precision, metres: what read_cloud reads back.
-
-    With ``intrinsics`` (fx, fy, cx, cy) an organised cloud is written as its depth map, a third of the size.
-    """
-    if intrinsics is not None and np.ndim(points_C) == 3:
-        write_npz(path, depth=np.asarray(points_C[:, :, 2], dtype=np.float32), intrinsics=np.array(intrinsics))
-        return
-    write_npz(path, points=np.asarray(points_C, dtype=np.float32))
-
-
-def _read_npy(path: Path) -> Array:
-    return _points(path, "The array", read_npy(path))
-
-
-def _points(path: Path, name: str, value: Any) -> Array:
-    points = _numbers(path, name, value)
-    if points.ndim not in (2, 3) or points.shape[-1] != 3:
-        raise CloudError(f"{name} in {path.name} has the shape {points.shape}; (N, 3) or (H, W, 3) is needed.")
-    return points
-
-
-def _numbers(path: Path, name: str, value: Any) -> Array:
-    try:
-        return np.asarray(value, dtype=float)
-    except ValueError:
-        raise CloudError(f"{name} in {path.name} holds words, not numbers.") from None
-
-
-def _read_npz(path: Path) -> Array:
-    data = read_npz(path, ("points", "depth", "K", "intrinsics"))
-    if "points" in data:
-        return _points(path, "'points'", data["points"])
-    if "depth" not in data:
-        raise CloudError(f"{path.name} holds neither 'points' nor 'depth'.")
-    depth = _numbers(path, "'depth'", data["depth"])
-    if depth.ndim != 2:
-        raise CloudError(f"'depth' in {path.name} has the shape {depth.shape}; (H, W) is needed.")
-    if depth.size > MOST_POINTS or 24 * depth.size > expansion_limit(file_size(path)):
-        raise CloudError(f"The depth map in {path.name} has {depth.size} pixels, too many for a file of its size.")
-    if "K" in data:
-        K = _numbers(path, "'K'", data["K"])
-        fx, fy, cx, cy = (
-            (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])) if K.shape == (3, 3) else (0.0,) * 4
-        )
-    elif "intrinsics" in data and np.size(data["intrinsics"]) == 4:
-        fx, fy, cx, cy = (float(v) for v in np.ravel(_numbers(path, "'intrinsics'", data["intrinsics"])))
-    else:
-        raise CloudError(
-            f"{path.name} holds a depth map without intrinsics; add 'intrinsics' (fx, fy, cx, cy) or 'K' (3, 3)."
-        )
-    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
-        raise CloudError(f"The intrinsics in {path.name} are not usable; focal lengths must be positive.")
-    points = np.empty((*depth.shape, 3))
-    z = points[:, :, 2]
-    z[:] = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
-    # in place: an image of the largest scanner must not be in memory many times over
-    np.divide(np.multiply(z, np.arange(depth.shape[1]) - cx, out=points[:, :, 0]), fx, out=points[:, :, 0])
-    np.divide(np.multiply(z, (np.arange(depth.shape[0]) - cy)[:, None], out=points[:, :, 1]), fy, out=points[:, :, 1])
-    return points
-
-
-_READERS: dict[str, Callable[[Path], Array]] = {
-    ".npz": _read_npz, ".npy": _read_npy, ".ply": read_ply, ".pcd": read_pcd, **dict.fromkeys(_TEXT, read_text_cloud)
+_READERS: dict[str, Callable[[Path, CloudForm], Array]] = {
+    ".npz": _read_npz, ".npy": _read_npy, **dict.fromkeys((".ply", ".ply.gz"), lambda path, form: read_ply(path)),
+    **dict.fromkeys((".pcd", ".pcd.gz"), read_pcd), **dict.fromkeys(IMAGES, read_depth_image),
+    **dict.fromkeys((*_TEXT, *(f"{s}.gz" for s in _TEXT)), lambda path, form: read_text_cloud(path)),
 }  # fmt: skip

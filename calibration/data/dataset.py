@@ -4,7 +4,7 @@ import csv
 import hashlib
 import io
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -17,6 +17,7 @@ from weldcal.calibration.data.checks import (
     REACH_M,
     UNITS,
     check_reach,
+    cloud_form,
     digest,
     metric_cloud,
     read_header,
@@ -25,8 +26,9 @@ from weldcal.calibration.data.checks import (
     to_metres,
     unit_quaternion,
 )
-from weldcal.calibration.data.clouds import NO_NOTES, CloudError, find_cloud, save_cloud
-from weldcal.calibration.data.header import DatasetHeader, PoseForm, Units
+from weldcal.calibration.data.clouds import NO_NOTES, CloudError, cloud_id, ending_of, find_cloud, save_cloud
+from weldcal.calibration.data.depth import camera_of, is_depth
+from weldcal.calibration.data.header import DatasetHeader, PoseForm, Units, without_cloud_form
 from weldcal.calibration.data.poses.bag import ENDINGS as RECORDINGS
 from weldcal.calibration.data.poses.bag import find_bag, read_bag
 from weldcal.calibration.data.poses.form import PoseList
@@ -119,7 +121,7 @@ class Dataset:
         """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
         if id in self.recorded:
             return to_metres(self.recorded[id].astype(float), self.header.units.clouds, id)
-        return metric_cloud(self.clouds[id], self.header.units.clouds)
+        return metric_cloud(self.clouds[id], self.header, self.folder)
 
 
 def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
@@ -162,7 +164,7 @@ def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
         source = _stated(folder, header.poses.file)
         bag = None if source is not None else find_bag(folder / header.poses.file)
     table = folder / "poses.csv"
-    if source == table and header.poses is None and is_plain(table):
+    if source == table and header.poses is None and is_plain(table) and (folder / "clouds").is_dir():
         return _plain(folder, header, hashes)
     if source is None and (folder / "pairs.csv").is_file():
         hashes["pairs.csv"] = digest(folder / "pairs.csv")
@@ -277,6 +279,7 @@ def _finished(
             f"example {next(iter(poses), 'pose01')}.pcd."
         )
     hashes.update({f"clouds/{path.name}": content[id] for id, path in clouds.items()})
+    notes += _camera_note(folder, header, next(iter(clouds.values())), hashes)
     return Dataset(
         folder=folder,
         header=header,
@@ -286,6 +289,24 @@ def _finished(
         refused=refused + again,
         hashes=hashes,
         notes=notes,
+    )
+
+
+def _camera_note(folder: Path, header: DatasetHeader, cloud: Path, hashes: dict[str, str]) -> tuple[str, ...]:
+    """Where the intrinsics of depth images come from, a sentence; the file is hashed. The cloud's reader says what is wrong."""
+    if not is_depth(cloud):
+        return ()
+    try:
+        camera = camera_of(cloud, cloud_form(header, folder))
+    except CloudError:
+        return ()
+    if camera is None:
+        return ()
+    if camera.source.is_file():
+        hashes[camera.source.relative_to(folder).as_posix()] = digest(camera.source)
+    fx, fy, cx, cy = camera.values
+    return (
+        f"Depth images with the intrinsics of {camera.source.name}: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} pixels.",
     )
 
 
@@ -309,7 +330,7 @@ def save_dataset(
     """
     if set(poses) != set(clouds):
         raise DatasetError("A recording needs one cloud for each pose; the ids of poses and clouds differ.")
-    document = {**asdict(header), "schema": 1, "units": {"clouds": "m", "poses": "m"}}
+    document = {**without_cloud_form(header), "schema": 1, "units": {"clouds": "m", "poses": "m"}}
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", *(["time"] if times else [])])
@@ -385,7 +406,7 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
     orphans = [
         p
         for p in sorted(folder.iterdir())
-        if p.suffix.lower() in NO_NOTES and p.stem not in poses and not p.name.startswith(".")
+        if ending_of(p) in NO_NOTES and cloud_id(p) not in poses and not p.name.startswith(".")
     ]
     if orphans:
         names = ", ".join(p.name for p in orphans[:5])

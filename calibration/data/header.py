@@ -2,7 +2,8 @@
 
 # no `from __future__ import annotations` here: pydrake's YAML reader needs the field types themselves, not their names
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 
 @dataclass
@@ -31,6 +32,16 @@ class ScannerGuess:
     radius_m: float = 0.06
 
 
+@dataclass
+class DepthCamera:
+    """Intrinsics of depth images, pixels; the centre of the first pixel is 0, 0."""
+
+    fx: float = 0.0
+    fy: float = 0.0
+    cx: float = 0.0
+    cy: float = 0.0
+
+
 @dataclass(kw_only=True)
 class PoseForm:
     """How the poses are written, where it is not x,y,z,qw,qx,qy,qz: ``file`` (a file or folder beside dataset.yaml), ``rotation`` (a
@@ -51,7 +62,8 @@ class PoseForm:
 
 @dataclass(kw_only=True)
 class DatasetHeader:
-    """Contents of dataset.yaml. ``mode``: static (a scan at each pose) or motion (scans while the arm moves)."""
+    """Contents of dataset.yaml. ``mode``: static (a scan at each pose) or motion (scans while the arm moves). ``intrinsics`` and
+    ``depth_scale`` (metres of one unit) of depth images; ``viewpoint``: what VIEWPOINT of PCD files means."""
 
     schema: int = 0
     robot: str = ""
@@ -64,3 +76,11 @@ class DatasetHeader:
     scanner_guess: ScannerGuess | None = None
     mode: str = "static"
     poses: PoseForm | None = None
+    intrinsics: DepthCamera | None = None
+    depth_scale: float = 0.0
+    viewpoint: str = ""
+
+
+def without_cloud_form(header: DatasetHeader) -> dict[str, Any]:
+    """The header as a document of plain values for clouds that are written in metres, in the sensor's frame."""
+    return {k: v for k, v in asdict(header).items() if k not in ("intrinsics", "depth_scale", "viewpoint")}

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +20,8 @@ from weldcal.calibration.data.checks import (
     table_rows,
     unit_quaternion,
 )
-from weldcal.calibration.data.clouds import NO_NOTES, CloudError, find_cloud, save_cloud
-from weldcal.calibration.data.header import DatasetHeader, Units
+from weldcal.calibration.data.clouds import NO_NOTES, CloudError, cloud_id, ending_of, find_cloud, save_cloud
+from weldcal.calibration.data.header import DatasetHeader, Units, without_cloud_form
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import pose
@@ -97,7 +97,7 @@ class MotionDataset:
 
     def cloud(self, id: str) -> Array:
         """Points of one frame in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
-        return metric_cloud(self.clouds[id], self.header.units.clouds)
+        return metric_cloud(self.clouds[id], self.header, self.folder)
 
 
 def load_motion_dataset(folder: Path, *, robot: str | None = None) -> MotionDataset:
@@ -123,7 +123,7 @@ def load_motion_dataset(folder: Path, *, robot: str | None = None) -> MotionData
     frames, refused = _read_frames(folder / "frames.csv", stream)
     files = _files(folder / "clouds")
     known = {f.id for f in frames} | {id for id, _ in refused}
-    surplus = sum(path.suffix.lower() in NO_NOTES for id, paths in files.items() if id not in known for path in paths)
+    surplus = sum(ending_of(path) in NO_NOTES for id, paths in files.items() if id not in known for path in paths)
     if surplus:
         said.append(f"{surplus} clouds have no row in frames.csv; they are not used.")
     hashes = {name: digest(folder / name) for name in ("dataset.yaml", "stream.csv", "frames.csv")}
@@ -175,7 +175,7 @@ def save_motion_dataset(
 
     The stream is written as joints where it has them. ``header.mode`` and ``header.units`` are written as motion and metres.
     """
-    document = {**asdict(header), "schema": 1, "mode": "motion", "units": {"clouds": "m", "poses": "m"}}
+    document = {**without_cloud_form(header), "schema": 1, "mode": "motion", "units": {"clouds": "m", "poses": "m"}}
     if header.scanner_guess is None:
         del document["scanner_guess"]
     if stream.joints is None:
@@ -354,6 +354,6 @@ def _files(folder: Path) -> dict[str, list[Path]]:
     """Cloud files by id: one listing, since a lookup of each frame would list the folder each time."""
     found: dict[str, list[Path]] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in NO_NOTES and not path.name.startswith("."):
-            found.setdefault(path.stem, []).append(path)
+        if ending_of(path) in NO_NOTES and not path.name.startswith("."):
+            found.setdefault(cloud_id(path), []).append(path)
     return found

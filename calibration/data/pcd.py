@@ -1,15 +1,19 @@
 """Reads the points of a PCD file after its header has been checked against the length of its body."""
 
 import struct
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RotationMatrix
 
-from weldcal.calibration.data.cloud_body import CloudError, check_points, column_values, text_columns
+from weldcal.calibration.data.cloud_body import CloudError, check_points, cloud_stream, column_values, text_columns
+from weldcal.calibration.data.cloud_form import CloudForm
 from weldcal.models.arrays import Array
-from weldcal.models.files import expansion_limit, opened
+from weldcal.models.files import expansion_limit
 
 _SIZES = {"I": (1, 2, 4, 8), "U": (1, 2, 4, 8), "F": (4, 8)}
 _KINDS = {"I": "i", "U": "u", "F": "f"}
@@ -25,6 +29,7 @@ class _Header:
     fields: tuple[tuple[int, str], ...]
     record: int
     numbers: int
+    viewpoint: tuple[float, ...]
     width: int
     height: int
     data: str
@@ -36,16 +41,19 @@ class _Header:
         return self.width * self.height
 
 
-def read_pcd(path: Path) -> Array:
+def read_pcd(path: Path, form: CloudForm | None = None) -> Array:
     """Points (N, 3), or (H, W, 3) where the header has more than one row, in the file's unit.
 
+    VIEWPOINT is the pose of the sensor when it took the scan. PCL's documentation does not state the frame of the points, and
+    programs differ: PCL's viewer and `transform_from_viewpoint` apply VIEWPOINT to points in the sensor's frame; PCL's estimation
+    of normals takes it as the sensor's place among points that were moved already. So VIEWPOINT other than identity is refused
+    until ``form.viewpoint`` says which: ``sensor`` (it is not applied) or ``world`` (it is undone).
+
     Raises:
-        CloudError: no PCD, a header that contradicts itself or the body's length, coordinates that are missing.
+        CloudError: no PCD, a header that contradicts itself or the body's length, coordinates that are missing, VIEWPOINT.
         InputError: the file cannot be opened.
     """
-    with opened(path) as stream:
-        size = stream.seek(0, 2)
-        stream.seek(0)
+    with cloud_stream(path) as (stream, size):
         h = _header(path, stream.read(min(size, _LONGEST_HEADER)))
         check_points(path, h.points, size)
         stream.seek(h.begin)
@@ -55,13 +63,30 @@ def read_pcd(path: Path) -> Array:
             _check_length(path, h, size - h.begin)
             points = column_values(path, stream.read(h.points * h.record), h.points, h.record, list(h.fields))
         else:
-            _check_compressed(path, h, stream, size)
-            points = _decompressed(path)
+            points = _compressed(path, h, stream, size)
     if len(points) != h.points:
         raise CloudError(
             f"The file {path.name} is damaged: its header promises {h.points} points and {len(points)} are there."
         )
+    points = _in_sensor_frame(path, points, h.viewpoint, form or CloudForm())
     return points.reshape(h.height, h.width, 3) if h.height > 1 else points
+
+
+def _in_sensor_frame(path: Path, points: Array, viewpoint: tuple[float, ...], form: CloudForm) -> Array:
+    """The points in the frame of the sensor, by VIEWPOINT (tx, ty, tz, qw, qx, qy, qz; empty: identity) and what is stated of it."""
+    if not viewpoint or form.viewpoint == "sensor":
+        return points
+    if form.viewpoint != "world":
+        raise CloudError(
+            f"{path.name} has the VIEWPOINT {' '.join(f'{v:g}' for v in viewpoint)}, and programs differ in what that means: write "
+            "'viewpoint: sensor' into dataset.yaml where the points are in the sensor's frame, 'viewpoint: world' where they were moved "
+            "by VIEWPOINT."
+        )
+    missing = ~points.any(axis=1)
+    wxyz = np.array(viewpoint[3:])
+    moved: Array = (points - np.array(viewpoint[:3])) @ RotationMatrix(Quaternion(wxyz / np.linalg.norm(wxyz))).matrix()
+    moved[missing] = np.nan
+    return moved
 
 
 def _header(path: Path, begin: bytes) -> _Header:
@@ -111,11 +136,30 @@ def _header(path: Path, begin: bytes) -> _Header:
         fields=tuple(fields),
         record=record,
         numbers=sum(counts),
+        viewpoint=_viewpoint(path, found.get("VIEWPOINT", [])),
         width=width,
         height=height,
         data=data,
         begin=at,
     )
+
+
+def _viewpoint(path: Path, words: list[str]) -> tuple[float, ...]:
+    """The seven numbers of VIEWPOINT; empty where it is the identity or not stated."""
+    if not words:
+        return ()
+    try:
+        values = tuple(float(w) for w in words)
+    except ValueError:
+        values = ()
+    if len(values) != 7 or not np.isfinite(values).all():
+        raise CloudError(f"The file {path.name} is damaged: its VIEWPOINT is no position and quaternion (7 numbers).")
+    length = float(np.linalg.norm(values[3:]))
+    if not any(values[:3]) and (length == 0.0 or not any(values[4:])):
+        return ()
+    if abs(length - 1.0) > 1e-3:
+        raise CloudError(f"The quaternion of VIEWPOINT in {path.name} has the length {length:.4f}; a rotation needs 1.")
+    return values
 
 
 def _extent(path: Path, found: dict[str, list[str]]) -> tuple[int, int]:
@@ -152,8 +196,11 @@ def _check_length(path: Path, h: _Header, there: int) -> None:
         )
 
 
-def _check_compressed(path: Path, h: _Header, stream: BinaryIO, size: int) -> None:
-    """The two lengths before the compressed body must fit the header and the file."""
+def _compressed(path: Path, h: _Header, stream: BinaryIO, size: int) -> Array:
+    """The points of a compressed body, field by field; where both lengths before it are equal, it is stored as it is.
+
+    The two lengths must fit the header and the file.
+    """
     lengths = stream.read(8)
     if len(lengths) < 8:
         raise CloudError(f"The file {path.name} is truncated: its body is missing.")
@@ -169,6 +216,21 @@ def _check_compressed(path: Path, h: _Header, stream: BinaryIO, size: int) -> No
         raise CloudError(
             f"The file {path.name} would expand to {1e-6 * unpacked:.0f} MB, too much for a file of its size."
         )
+
+    if packed == unpacked:
+        body = np.frombuffer(stream.read(unpacked), np.uint8)
+        out = np.empty((h.points, 3))
+        for k, (at, kind) in enumerate(h.fields):  # all x, then all y ...
+            begin = h.points * at
+            out[:, k] = body[begin : begin + h.points * np.dtype(kind).itemsize].view(kind)
+        return out
+    if path.suffix.lower() != ".gz":
+        return _decompressed(path)
+    with tempfile.NamedTemporaryFile(suffix=".pcd") as plain:
+        stream.seek(0)
+        plain.write(stream.read())
+        plain.flush()
+        return _decompressed(Path(plain.name))
 
 
 def _decompressed(path: Path) -> Array:

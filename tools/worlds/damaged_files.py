@@ -27,7 +27,7 @@ from weldcal.models.array_files import read_grey_image
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario, scenario_class
 from weldcal.tools.commands.profiler.files import read_profiler_file
-from weldcal.tools.worlds import binary_damage, pose_examples, text_damage
+from weldcal.tools.worlds import binary_damage, cloud_examples, pose_examples, text_damage
 from weldcal.tools.worlds import file_examples as examples
 from weldcal.tools.worlds.file_examples import Files, Rng
 from weldcal.welding.record.weld_log import load_weld_log
@@ -165,6 +165,15 @@ READERS = (
     Reader("hand-eye-nested", "json", "pairs.json", pose_examples.nested, _pairs("pairs.json")),
     Reader("hand-eye-matlab", "bytes", "pairs.mat", pose_examples.matlab, _pairs("pairs.mat")),
     Reader("hand-eye-folder", "json", "set/sample_3.json", pose_examples.folder, _pairs("set")),
+    Reader("ply-grid", "cloud", "a.ply", cloud_examples.ply_grid, _cloud("a.ply"), finite=False),
+    Reader("ply-lists", "cloud", "a.ply", cloud_examples.ply_lists, _cloud("a.ply"), finite=False),
+    Reader("ply-gz", "bytes", "a.ply.gz", cloud_examples.ply_gz, _cloud("a.ply.gz"), finite=False),
+    Reader("pcd-stored", "cloud", "a.pcd", cloud_examples.pcd_stored, _cloud("a.pcd"), finite=False),
+    Reader("pts", "table", "a.pts", cloud_examples.pts, _cloud("a.pts"), finite=False),
+    Reader("depth-png", "image", "clouds/s0.png", cloud_examples.depth_png, _dataset, finite=False),
+    Reader("depth-tiff", "bytes", "clouds/s0.tif", cloud_examples.depth_tiff, _dataset, finite=False),
+    Reader("depth-npy", "npy", "clouds/s0.npy", cloud_examples.depth_npy, _dataset, finite=False),
+    Reader("intrinsics", "yaml", "camera_info.yaml", cloud_examples.depth_npy, _dataset, finite=False),
 )
 
 

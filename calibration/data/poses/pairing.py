@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES
+from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES, cloud_id, ending_of
+from weldcal.calibration.data.depth import IMAGES, may_be_depth
+from weldcal.calibration.data.intrinsics import is_camera_file
 from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.errors import DatasetError
 
-FOLDERS = ("clouds", "pointclouds", "point_clouds", "scans", "ply", "pcd", "points", "images")
+FOLDERS = ("clouds", "pointclouds", "point_clouds", "scans", "ply", "pcd", "points", "depth", "depth_images", "images")
+_NOTES = ("readme", "notes")
 _CLOSED = {".zdf": "Zivid", ".praw": "Photoneo", ".pmraw": "Photoneo", ".dat": "the scanner's maker"}
 
 
@@ -19,14 +22,14 @@ def find_clouds(folder: Path, poses: Path | tuple[Path, ...]) -> list[Path]:
     """
     taken = set(poses) if isinstance(poses, tuple) else {poses}
     places = [folder / name for name in FOLDERS if (folder / name).is_dir()] + [folder]
-    for place in places:
-        files = [p for p in place.iterdir() if not p.name.startswith((".", "_")) and p not in taken]
-        ours = [p for p in files if p.suffix.lower() in NO_NOTES]
-        ours = ours or [p for p in files if p.suffix.lower() in SUFFIXES and p.stem.lower() not in ("readme", "notes")]
-        if ours:
-            # a folder that was copied twice: one ending is enough
-            first = next(e for e in SUFFIXES if any(p.suffix.lower() == e for p in ours))
-            return sorted((p for p in ours if p.suffix.lower() == first), key=lambda p: natural(p.name))
+    for of_place in (_points, _depths):  # depth images only where no place holds points
+        for place in places:
+            files = [p for p in place.iterdir() if not p.name.startswith((".", "_")) and p not in taken]
+            ours = of_place(files)
+            if ours:
+                # a folder that was copied twice: one ending is enough
+                first = next(e for e in SUFFIXES if any(ending_of(p) == e for p in ours))
+                return sorted((p for p in ours if ending_of(p) == first), key=lambda p: natural(p.name))
     for place in places:
         closed = sorted(p.name for p in place.iterdir() if p.suffix.lower() in _CLOSED)
         if closed:
@@ -36,8 +39,25 @@ def find_clouds(folder: Path, poses: Path | tuple[Path, ...]) -> list[Path]:
                 f"reads: export each as .ply or .pcd, or its points as .npy, beside the poses."
             )
     raise DatasetError(
-        f"'{folder.name}' has poses but no clouds; put one for each pose into clouds/: .ply, .pcd, .npy, .npz, .xyz or .csv."
+        f"'{folder.name}' has poses but no clouds; put one for each pose into clouds/: .ply, .pcd, .npy, .npz, .xyz, .pts or .csv, or "
+        "depth images (.png of 16 bits, .tif, .npy)."
     )
+
+
+def _points(files: list[Path]) -> list[Path]:
+    ours = [p for p in files if ending_of(p) in NO_NOTES]
+    return ours or [
+        p
+        for p in files
+        if ending_of(p) in SUFFIXES
+        and ending_of(p) not in IMAGES
+        and cloud_id(p).lower() not in _NOTES
+        and not is_camera_file(p)
+    ]
+
+
+def _depths(files: list[Path]) -> list[Path]:
+    return [p for p in files if may_be_depth(p)]
 
 
 def pair(ids: Sequence[str], n: int, clouds: Sequence[Path], source: str) -> tuple[list[str], list[Path | None], str]:
@@ -48,16 +68,16 @@ def pair(ids: Sequence[str], n: int, clouds: Sequence[Path], source: str) -> tup
     Raises:
         DatasetError: names or counts do not go together; the sentence names those without a partner.
     """
-    stems = {p.stem: p for p in clouds}
+    stems = {cloud_id(p): p for p in clouds}
     if len(stems) < len(clouds):
-        again = next(p for p in clouds if stems[p.stem] is not p)
-        raise DatasetError(f"Two clouds are called '{again.stem}'; keep one.")
+        again = next(p for p in clouds if stems[cloud_id(p)] is not p)
+        raise DatasetError(f"Two clouds are called '{cloud_id(again)}'; keep one.")
     if ids and set(ids) & set(stems):
-        _no_orphans([p.name for p in clouds if p.stem not in ids], source)
+        _no_orphans([p.name for p in clouds if cloud_id(p) not in ids], source)
         return list(ids), [stems.get(i) for i in ids], "paired by name"
     if ids:
         numbers = [number_of(i) for i in ids]
-        of = [number_of(p.stem) for p in clouds]
+        of = [number_of(cloud_id(p)) for p in clouds]
         if None not in numbers and None not in of and len(set(numbers)) == n and len(set(of)) == len(of):
             by_number = dict(zip(of, clouds, strict=True))
             same = set(numbers) == set(of)
@@ -70,7 +90,7 @@ def pair(ids: Sequence[str], n: int, clouds: Sequence[Path], source: str) -> tup
             f"'{source}' holds {n} poses, and there are {len(clouds)} clouds ({clouds[0].name} to {clouds[-1].name}); without names each "
             "pose needs its cloud, in the same order: remove what has no partner, or add a column id with the clouds' names."
         )
-    return [p.stem for p in clouds], list(clouds), f"paired in order, {clouds[0].name} with the first pose"
+    return [cloud_id(p) for p in clouds], list(clouds), f"paired in order, {clouds[0].name} with the first pose"
 
 
 def _no_orphans(orphans: list[str], source: str) -> None:

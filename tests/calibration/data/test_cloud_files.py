@@ -77,7 +77,7 @@ TWO = b"\x03" + b"\1" * 12
         ("a.ply", ply(n=1_000_000), "truncated"),
         ("a.ply", ply(n=39), "does not end where its header with 39 points says"),
         ("a.ply", ply(n=41, after=FACES) + TWO * 2, "1 entries"),
-        ("a.ply", ply().replace(b"property float y", b"property list uchar float y"), "lists before the end"),
+        ("a.ply", ply().replace(b"property float y", b"property list uchar float y"), "no coordinate y"),
         ("a.ply", ply().replace(b"float y", b"float x"), "twice"),
         ("a.ply", ply().replace(b"vertex 40", b"vertex -4"), "is no line of a PLY header"),
         ("a.pcd", pcd()[:-100], "header promises 40 points and 31 are there"),
