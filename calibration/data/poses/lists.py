@@ -35,7 +35,7 @@ TEXT = (
     ".urp",
     ".sys",
 )
-TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib")
+TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib", ".rob")
 ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
 ENDINGS = (*TEXT, *TREES, *ARRAYS)
 """Endings of files that may hold poses."""
