@@ -18,7 +18,9 @@ CHANCE = 1e-6
 """Chance that the right reading is rejected in favour of a wrong one."""
 _KEPT = 0.7  # share of the scans that must agree: the others may be outliers
 _FLOOR_M = 2e-6  # printed digits
-_WIDE_M = 0.5e-3  # sigmas of the comparison: wrong readings are to be measured, not refused
+_WIDE_M = 0.5e-3  # sigmas with which readings are measured that the usual ones refuse
+_SIGMAS_M = (0.06e-3, _WIDE_M)
+_LARGEST_M = 1e-3  # residual of a reading that may be used
 _POINTS = 16  # points of a profile of the sphere that are compared
 _SAME_M, _SAME_RAD = 0.1e-3, 1e-3
 
@@ -83,6 +85,11 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
         return 0, ""
     order = sorted(fits, key=lambda k: fits[k].rms_m)
     best = fits[order[0]]
+    if best.rms_m > _LARGEST_M:
+        raise InconsistentData(
+            f"No reading of the poses fits the profiles: the best of {len(readings)}, {readings[order[0]].words}, leaves {_mm(best)} of one {what}. "
+            "Check that each profile has its own pose and shows the target, or state the form with --robot-form."
+        )
     limit = float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * (len(readings) - 1)), best.dof, best.dof)))
     alive = [k for k in order if fits[k].rms_m <= limit * best.rms_m]
     rivals = [k for k in alive[1:] if not _same(fits[k], best)]
@@ -100,6 +107,8 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
         text += f"; the next best reading leaves {_mm(fits[dead[0]])}"
     elif len(alive) > 1:
         text += "; another reading gives the same result"
+    else:
+        text += f"; the other {len(readings) - 1} readings fit no {what}"
     return chosen, text + "."
 
 
@@ -119,10 +128,13 @@ def sphere_fit(profiles: Sequence[Floats], radius_m: float) -> Fit:
     for p in profiles:
         p = p[np.isfinite(p).all(axis=1)]
         thin.append(p[np.unique(np.linspace(0, len(p) - 1, _POINTS).round().astype(int))])
-    sigmas = SphereSigmas(sensor_m=_WIDE_M, robot_m=_WIDE_M)
 
     def fit(poses: FlangePoses) -> ReadingFit:
-        e = sphere_joint(SphereData(poses=poses, profiles=thin, radius_m=radius_m), "rigid", sigmas)
+        data = SphereData(poses=poses, profiles=thin, radius_m=radius_m)
+        try:
+            e = sphere_joint(data, "rigid")
+        except InconsistentData:
+            e = sphere_joint(data, "rigid", SphereSigmas(sensor_m=_WIDE_M, robot_m=_WIDE_M))
         square = []
         for k, p in enumerate(thin):
             at = e.points_F(p) @ poses.rotation[k].T + poses.translation[k]
@@ -136,7 +148,15 @@ def edge_fit(points: Floats) -> Fit:
     """The comparison of readings by points (n, 2) m of one edge, one for each pose."""
 
     def fit(poses: FlangePoses) -> ReadingFit:
-        e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=_WIDE_M, sigma_xz_m=np.full(2, _WIDE_M))
+        for sigma in _SIGMAS_M:
+            try:
+                e = edge_joint(
+                    poses.rotation, poses.translation, points, sigma_robot_m=sigma, sigma_xz_m=np.full(2, sigma)
+                )
+                break
+            except InconsistentData:
+                if sigma == _SIGMAS_M[-1]:
+                    raise
         p_S = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
         p_F = p_S @ e.rotation.T + e.translation
         away = np.einsum("nij,nj->ni", poses.rotation, p_F) + poses.translation - e.point
