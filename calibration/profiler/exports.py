@@ -153,9 +153,7 @@ def _with_header(blocks: list[Block], name: str) -> Profiles:
     poses = None
     if posed:
         poses = _one_list(
-            table_lists(
-                [header[k].lower() for k in rest], table[np.ix_(first, rest)], name, ids if len(ids) == n else ()
-            ),
+            table_lists([header[k].lower() for k in rest], table[first][:, rest], name, ids if len(ids) == n else ()),
             name,
         )
     return Profiles(

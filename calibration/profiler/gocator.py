@@ -124,7 +124,7 @@ def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
             raise InputError(
                 f"Frame {frame[:20]} of '{name}' has the rows {', '.join(rows_of)}; a profile needs {'X and Z' if shared is None else 'Z'}."
             )
-        at = shared if x is None else _values(x, axis, last, name)
+        at = _values(x, axis, last, name) if x is not None else np.zeros(last) if shared is None else shared
         points.append(np.column_stack([at, _values(z, axis, last, name)]))
         times.append(_number(z[place["time"]], name) if "time" in place else np.nan)
     t = np.array(times)

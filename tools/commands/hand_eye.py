@@ -228,12 +228,9 @@ def run_hand_eye(
         streams = _trajectories(file, mounting, stated)
         if streams is not None:
             say(streams.sentence)
-    if streams is None:
-        pairs = read_pairs(file, mounting=mounting, length=unit, stated=stated)
-        for sentence in understood(pairs):
-            say(sentence)
-    else:
-        pairs = streams.pairs
+    pairs = read_pairs(file, mounting=mounting, length=unit, stated=stated) if streams is None else streams.pairs
+    for sentence in understood(pairs):
+        say(sentence)
     found = get_mounting(pairs.mode)
     if kinematics is not None and arm is not None:
         pairs = poses_of_arm(pairs, arm)
