@@ -282,10 +282,6 @@ def _bare(blocks: list[Block], name: str, pitch_mm: float | None) -> Profiles:
     if width == 1:
         heights = [b.table[:, 0] for b in blocks]
         return _of_heights(heights, name, pitch_mm, "heights, a line each")
-    if width < _FEWEST_COLUMNS:
-        raise InputError(
-            f"'{name}' has {width} numbers a row and no header: name its columns in a first row, for example {EXAMPLE}."
-        )
     table = np.vstack([b.table for b in blocks])
     for grid, what in ((table, "row"), (table.T, "column")):
         if len(grid) > 1 and _even(grid[0]):
@@ -296,6 +292,10 @@ def _bare(blocks: list[Block], name: str, pitch_mm: float | None) -> Profiles:
                 source=name, points=points, unit="mm" if raw else "", form=f"heights, a {what} a profile, x in the first {what}",
                 columns=tuple(f"x = {v:g}" for v in x[:3]),
             )  # fmt: skip
+    if width < _FEWEST_COLUMNS:
+        raise InputError(
+            f"'{name}' has {width} numbers a row and no header: name its columns in a first row, for example {EXAMPLE}."
+        )
     return _of_heights(list(table), name, pitch_mm, "heights, a row a profile")
 
 

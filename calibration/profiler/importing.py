@@ -16,7 +16,9 @@ from weldcal.calibration.data.poses.source import robot_list
 from weldcal.calibration.data.poses.trees import stacked
 from weldcal.calibration.profiler.exports import TABLES, TREES, UNITS, Profiles, joined, listed_columns, read_profiles
 from weldcal.calibration.profiler.motion import Floats
+from weldcal.calibration.profiler.text_blocks import blocks_of
 from weldcal.models.errors import InputError
+from weldcal.models.files import read_text
 
 _POSE_NAME = re.compile(r"(?i)(^|[^a-z])(pos|rob)\d*($|[^a-z])|pose|robot|flange|tcp|tool")
 _POSE_ENDINGS = (*ENDINGS, ".rob")
@@ -92,7 +94,10 @@ def import_profiles(
 
 
 def _poses_only(path: Path) -> Listing | None:
+    """The poses of a file without profiles; None where it holds none, or numbers without names, which may be heights."""
     try:
+        if path.suffix.lower() in TABLES and any(not b.header for b in blocks_of(read_text(path), path.name)):
+            return None
         lists = read_lists(path)
         return robot_list(lists, path.name, PoseForm()) if lists else None
     except InputError:
