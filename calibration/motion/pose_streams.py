@@ -5,6 +5,7 @@ camera in the target's frame on its own clock, and d the camera's stamps less th
 searched by correlating the angular speeds, which no unknown pose changes (Furrer et al. 2017), then estimated together with X and Y.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,16 +15,18 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from weldcal.calibration.data.motion_dataset import RobotStream
+from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.errors import DatasetError, UndeterminedPoses
 from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, pose
+from weldcal.calibration.hand_eye.conventions import UNITS
 from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import solve_problem
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
+from weldcal.models.errors import InputError, WeldcalError
 
 
 def is_stream_file(path: Path) -> bool:
@@ -42,6 +45,11 @@ _MOST_FRAMES, _MOST_PAIRS = 2000, 300
 _FEWEST = 20
 _BLOCK_S = 1.0  # within which errors of the streams may be correlated
 _SOFT = 2.0  # residuals, in sigmas, from which on they count less
+_MARGIN_S = 0.1  # by which the refined offset may differ from the first
+_SHORTEST_S, _SLOWEST_S = 3.0, 0.25  # a trajectory: its length, and the step between its poses
+_MILLIMETRES_FROM = 10.0  # a median distance above it is in millimetres
+_MOST_READINGS = 4
+_FAR_BETTER = 3.0  # ratio of residuals beyond which the better reading of two trajectories is the right one
 _LEAST_TURN = 0.02  # rad/s (rms): slower motion shows no offset by its speed
 
 
@@ -108,6 +116,95 @@ def read_streams(path: Path) -> PoseStreams:
     return PoseStreams(*parts)
 
 
+def are_trajectories(robot: Listing, camera: Listing) -> bool:
+    """Whether two lists of poses with times are recordings in motion, of different lengths: they pair by interpolation."""
+    if len(robot) == len(camera):
+        return False
+    for one in (robot, camera):
+        t = one.times
+        if t is None or len(t) < _FEWEST or not (np.diff(t) > 0.0).all():
+            return False
+        if t[-1] - t[0] < _SHORTEST_S or float(np.median(np.diff(t))) > _SLOWEST_S:
+            return False
+    return True
+
+
+def synchronise_lists(
+    robot: Listing, camera: Listing, *, mounting: str = "eye_in_hand", source: str = "trajectories"
+) -> Synchronised:
+    """Clock offset, both poses and pairs of two trajectories, the camera's as X_CM or as the camera in the target's or the world's frame.
+
+    Orders of quaternions and the direction of the camera's poses follow from the residuals where nobody states them.
+
+    Raises:
+        DatasetError: too many readings are possible, no reading fits, or two fit alike.
+        UndeterminedPoses: the hand hardly turns.
+    """
+    a, b = robot.readings, camera.readings
+    if len(a) * len(b) > _MOST_READINGS:
+        who = "robot" if len(a) >= len(b) else "camera"
+        raise DatasetError(
+            f"The rotations of '{(robot if who == 'robot' else camera).name}' can be read in {max(len(a), len(b))} ways. State how they are written, "
+            f"for example --{who}-form {(a if who == 'robot' else b)[0].form}."
+        )
+    tried: list[tuple[float, Synchronised, str, str]] = []
+    problem: WeldcalError | None = None
+    for one, other in itertools.product(a, b):
+        for inverted in (False, True):
+            eye = _metres(other.X, camera.unit)
+            streams = PoseStreams(
+                _good(robot.times, robot), _metres(one.X, robot.unit)[robot.good], _good(camera.times, camera),
+                (eye if inverted else inverse(eye))[camera.good],
+            )  # fmt: skip
+            try:
+                found = synchronise(streams, mounting=mounting, source=source)
+            except WeldcalError as why:
+                problem = problem or why
+                continue
+            tried.append(
+                (found.rms_deg * found.rms_m, found, one.form, f"{other.form},inverse" if inverted else other.form)
+            )
+    if not tried:
+        assert problem is not None
+        raise problem
+    tried.sort(key=lambda t: t[0])
+    if len(tried) > 1 and tried[1][0] < _FAR_BETTER**2 * tried[0][0]:
+        raise DatasetError(
+            f"Two readings of the trajectories fit alike: {tried[0][2]} with {tried[0][3]}, and {tried[1][2]} with {tried[1][3]}. State one with "
+            "--robot-form and --camera-form."
+        )
+    _, found, form, other_form = tried[0]
+    reading = {
+        who: {
+            "file": one.name,
+            "form": one.form,
+            "unit": _unit(one),
+            "reading": written,
+            "rows": len(one),
+            "left_out": [],
+        }
+        for who, one, written in (("robot", robot, form), ("camera", camera, other_form))
+    }
+    return replace(found, pairs=replace(found.pairs, reading=reading))
+
+
+def _good(times: Array | None, listing: Listing) -> Array:
+    assert times is not None
+    return np.asarray(times[listing.good])
+
+
+def _unit(listing: Listing) -> str:
+    far = float(np.median(np.linalg.norm(listing.numbers[0].p, axis=1)))
+    return listing.unit or ("mm" if far > _MILLIMETRES_FROM else "m")
+
+
+def _metres(X: Array, unit: str) -> Array:
+    out = X.copy()
+    far = float(np.median(np.linalg.norm(X[:, :3, 3], axis=1)))
+    out[:, :3, 3] *= UNITS[unit or ("mm" if far > _MILLIMETRES_FROM else "m")]
+    return out
+
+
 def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: str = "streams") -> Synchronised:
     """Clock offset and both poses from two streams, and pairs at the offset for the solvers of hand-eye calibration.
 
@@ -122,7 +219,9 @@ def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: 
     start = _correlated(streams, hand)
     t = streams.eye_time[:: max(1, len(streams.eye_time) // _MOST_FRAMES)]
     E = streams.eye[:: max(1, len(streams.eye_time) // _MOST_FRAMES)]
-    inside = hand.known(t - start - 0.1) & hand.known(t - start + 0.1)
+    inside = hand.known(t - start - _MARGIN_S) & hand.known(t - start + _MARGIN_S)
+    for end, begin in hand.gaps:  # a shorter gap lies between both ends of the margin
+        inside &= (t - start + _MARGIN_S < end) | (t - start - _MARGIN_S > begin)
     t, E = t[inside], E[inside]
     if len(t) < _FEWEST:
         raise DatasetError("The two streams overlap in fewer than 20 frames; record them at the same time.")

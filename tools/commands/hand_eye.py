@@ -12,6 +12,8 @@ import typer
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import listing_of_array
+from weldcal.calibration.data.poses.lists import folder_lists, two_lists
+from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_corners, refine_with_corners
@@ -25,7 +27,7 @@ from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.motion.pose_streams import is_stream_file
+from weldcal.calibration.motion.pose_streams import Synchronised, are_trajectories, is_stream_file, synchronise_lists
 from weldcal.calibration.planning.next_pose import View, next_pose, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arrays import Array
@@ -223,13 +225,14 @@ def run_hand_eye(
 
         streams = synchronise(read_streams(file), mounting=mounting or "eye_in_hand", source=file.name)
         say(streams.sentence)
-    if streams is None:
-        stated = replace(stated or StatedForms(), decide=not motions)
-        pairs = read_pairs(file, mounting=mounting, length=unit, stated=stated)
-        for sentence in understood(pairs):
-            say(sentence)
-    else:
-        pairs = streams.pairs
+    stated = replace(stated or StatedForms(), decide=not motions)
+    if streams is None and not motions:
+        streams = _trajectories(file, mounting, stated)
+        if streams is not None:
+            say(streams.sentence)
+    pairs = read_pairs(file, mounting=mounting, length=unit, stated=stated) if streams is None else streams.pairs
+    for sentence in understood(pairs):
+        say(sentence)
     found = get_mounting(pairs.mode)
     if kinematics is not None and arm is not None:
         pairs = poses_of_arm(pairs, arm)
@@ -293,6 +296,23 @@ def run_hand_eye(
     )
     write_atomic(out / "report.html", hand_eye_report(report, file.name, provenance.sha256))
     return report
+
+
+def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Synchronised | None:
+    """The pairs of two recordings in motion of a folder; None where it holds none."""
+    if not path.is_dir() or (path / "pairs.npz").exists():
+        return None
+    try:
+        lists = two_lists(folder_lists(path), path.name, stated.robot_poses, stated.camera_poses)
+    except InputError:
+        return None  # the reader of pairs says what is wrong
+    if not are_trajectories(*lists):
+        return None
+    forms = (stated.robot, stated.camera)
+    robot, camera = (
+        one.stated(form, f"--{who}-form") for one, form, who in zip(lists, forms, ("robot", "camera"), strict=True)
+    )
+    return synchronise_lists(robot, camera, mounting=mounting_name(mounting or "eye_in_hand"), source=path.name)
 
 
 def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, optional: bool) -> CornerRefinement | None:

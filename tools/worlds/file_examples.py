@@ -324,6 +324,59 @@ def profiler_csv(rng: Rng) -> Files:
     return {"a.csv": _table(header, rows, str(rng.choice([",", ";", "\t"])))}
 
 
+def profiler_poses(rng: Rng) -> Files:
+    """Flange poses of six profiles: quaternions, or A, B, C of a KUKA."""
+    F = _poses(rng, 6)
+    if rng.random() < 0.5:
+        turn, header = Rotation.from_matrix(F[:, :3, :3]).as_euler("ZYX", degrees=True), ["a_deg", "b_deg", "c_deg"]
+    else:
+        turn, header = Rotation.from_matrix(F[:, :3, :3]).as_quat(), ["qx", "qy", "qz", "qw"]
+    rows = [[*(f"{1e3 * v:.4f}" for v in X[:3, 3]), *(f"{v:.6f}" for v in r)] for X, r in zip(F, turn, strict=True)]
+    return {"poses.csv": _table(["x_mm", "y_mm", "z_mm", *header], rows)}
+
+
+def profiler_gocator(rng: Rng) -> Files:
+    """Sections with raw or uniform profiles of six frames, and their poses."""
+    x, raw = np.linspace(-20.0, 20.0, 12), rng.random() < 0.5
+    lead = "Frame,Source,Time,Encoder,Z Encoder,Inputs,Exposure,Y,Axis"
+    lines = [
+        "Info",
+        "CSV Version,Sensor Count",
+        "2,1",
+        "End",
+        "RawProfile" if raw else "Profile",
+        "Frame Count,Column Count",
+        "6,12",
+    ]
+    lines.append(f"{lead}," + ",".join(str(k) if raw else f"{v:.3f}" for k, v in enumerate(x)))
+    for k in range(6):
+        z = ",".join("" if rng.random() < 0.1 else f"{v:.4f}" for v in rng.uniform(80.0, 120.0, 12))
+        lines += [f"{k},0,{k},0,0,0,300,0,X," + ",".join(f"{v:.4f}" for v in x)] * raw + [
+            f"{k},0,{k},0,0,0,300,0,Z,{z}"
+        ]
+    return {"a.csv": ("\n".join([*lines, "End"]) + "\n").encode(), **profiler_poses(rng)}
+
+
+def profiler_blocks(rng: Rng) -> Files:
+    """Profiles with decimal commas: numbered rows, or a block with a caption each; and their poses."""
+    numbered = rng.random() < 0.5
+    lines = ["scanner 2900-50", "Profile;X [mm];Z [mm]"] if numbered else []
+    for k in range(6):
+        points = [
+            ";".join(f"{v:.3f}".replace(".", ",") for v in p) for p in rng.uniform([-20.0, 80.0], [20.0, 120.0], (8, 2))
+        ]
+        lines += [f"{k};{p}" for p in points] if numbered else ["", f"Profile {k + 1}", "X [mm];Z [mm]", *points]
+    return {"a.csv": ("\n".join(lines) + "\n").encode(), **profiler_poses(rng)}
+
+
+def profiler_heights(rng: Rng) -> Files:
+    """A grid of heights with the x of its columns in the first row, or of its rows in the first column; and their poses."""
+    grid = np.vstack([np.linspace(-20.0, 20.0, 12), rng.uniform(80.0, 120.0, (6, 12))])
+    grid[3, 4] = -99999.9999
+    rows = grid if rng.random() < 0.5 else grid.T
+    return {"a.csv": "".join(",".join(f"{v:.4f}" for v in r) + "\n" for r in rows).encode(), **profiler_poses(rng)}
+
+
 def tablet(rng: Rng) -> Files:
     """Touches, poses, intrinsics and positions in the image of one visit."""
     shown = np.array([[400.0 * i, 250.0 * j] for j in range(3) for i in range(3)])

@@ -48,7 +48,7 @@ TEXT = (
     ".jsonl",
     ".out",
 )
-TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib")
+TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib", ".rob")
 ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
 ENDINGS = (*TEXT, *TREES, *ARRAYS)
 """Endings of files that may hold poses."""

@@ -103,7 +103,7 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
         found = stacked([one[0] for one in lists], name, tuple(p.stem for p in source))
         found = replace(found, form=f"one file per pose, {found.form}")
     else:
-        found = _robots(read_lists(source), source.name, form)
+        found = robot_list(read_lists(source), source.name, form)
     found = found.stated(replace(form, frame="flange_in_base"), "dataset.yaml: poses.rotation")
     good = found.good
     readings = tuple(pick(found.readings, np.flatnonzero(good)))
@@ -120,7 +120,7 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
     )
 
 
-def _robots(lists: list[Listing], name: str, form: PoseForm) -> Listing:
+def robot_list(lists: list[Listing], name: str, form: PoseForm) -> Listing:
     """The list of the flange's poses among those of a file: the only one, the one of the flange's frame, or the one that names the robot."""
     if len(lists) == 1:
         return lists[0]

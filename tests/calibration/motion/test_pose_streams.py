@@ -94,3 +94,27 @@ def test_what_cannot_be_used(tmp_path: Path) -> None:
     np.savez(tmp_path / "b.npz", hand=np.zeros((30, 7)), eye=np.zeros((30, 8)))
     with pytest.raises(DatasetError, match=r"\(n, 8\)"):
         read_streams(tmp_path / "b.npz")
+
+
+def test_a_short_hole_in_a_stream_is_left_out(tmp_path: Path) -> None:
+    s = streams(0.0371)
+    keep = (s.hand_time < 8.0) | (s.hand_time > 8.12)
+    file = written(tmp_path, PoseStreams(s.hand_time[keep], s.hand[keep], s.eye_time, s.eye))
+    report = run_hand_eye("ax-yb", file, tmp_path / "out", mounting="eye_in_hand")
+    assert report.streams is not None
+    assert abs(report.streams.offset_s - 0.0371) < 4.0 * report.streams.sigma_s
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_trajectories_of_other_length_and_clock(tmp_path: Path, inverted: bool) -> None:
+    s = streams(-0.213, epoch_s=1.6e9)
+    folder = tmp_path / "set"
+    folder.mkdir()
+    for name, t, P in (("robot", s.hand_time, s.hand), ("camera", s.eye_time, inverse(s.eye) if inverted else s.eye)):
+        q = Rotation.from_matrix(P[:, :3, :3]).as_quat()
+        rows = [f"{a:.6f} " + " ".join(f"{v:.7f}" for v in (*p, *r)) for a, p, r in zip(t, P[:, :3, 3], q, strict=True)]
+        (folder / f"{name}.tum").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n")
+    report = run_hand_eye("ax-yb", folder, tmp_path / "out", mounting="eye_in_hand")
+    assert report.streams is not None
+    assert abs(report.streams.offset_s + 0.213) < 4.0 * report.streams.sigma_s
+    assert np.abs(report.streams.X - X).max() < 2e-3

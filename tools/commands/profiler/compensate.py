@@ -13,9 +13,12 @@ from weldcal.calibration.profiler.sphere.radius import check_radius
 from weldcal.models.errors import InputError
 from weldcal.tools import console
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, switch
-from weldcal.tools.commands.profiler.files import Measurements
+from weldcal.tools.commands.profiler.files import Measurements, PosesStated
 from weldcal.tools.commands.profiler.result import (
     FileArgument,
+    FormOption,
+    PitchOption,
+    PosesOption,
     RadiusOption,
     SetOption,
     TipOption,
@@ -37,6 +40,9 @@ def compensate(
     unit: UnitOption = None,
     dataset: SetOption = "",
     trial: TrialOption = None,
+    poses: PosesOption = None,
+    robot_form: FormOption = "",
+    pitch: PitchOption = None,
     radius: RadiusOption = None,
     touches: TouchesOption = None,
     tip: TipOption = "",
@@ -47,7 +53,8 @@ def compensate(
 ) -> Outcome:
     """Calibrate by the sphere paper's two linear steps and its compensation. 'sphere' is more accurate on the same file."""
     check_limit(limit_mm)
-    data, measured = read_sphere(call, file, unit, dataset, trial, radius, touches, tip)
+    stated = PosesStated(poses, robot_form, pitch)
+    data, measured = read_sphere(call, file, unit, dataset, trial, radius, touches, tip, stated=stated)
     record, found = calibrate_compensate(data, measured, solve_tip=solve_tip)
     if found["wrong_sides"]:
         console.emit_warning(

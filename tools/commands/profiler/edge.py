@@ -17,16 +17,20 @@ from weldcal.calibration.profiler.plan import (
     plan_edge_poses,
     sample_edge_poses,
 )
+from weldcal.calibration.profiler.reading_choice import edge_fit
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.profiler.files import Measurements, read_profiler_file
+from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
 from weldcal.tools.commands.profiler.result import (
     CANDIDATES,
     ROBOT_SIGMA,
     Z_SIGMA,
     FileArgument,
+    FormOption,
+    PitchOption,
     PlanOption,
+    PosesOption,
     SetOption,
     Sigmas,
     TrialOption,
@@ -59,6 +63,9 @@ def edge(
     unit: UnitOption = None,
     dataset: SetOption = "",
     trial: TrialOption = None,
+    poses: PosesOption = None,
+    robot_form: FormOption = "",
+    pitch: PitchOption = None,
     method: Annotated[str, option("--method", "M", "joint, or paper (the published linear method).")] = "joint",
     feature: Annotated[str, option("--feature", "KIND", "For raw profiles: bar, step or apex.")] = "",
     side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
@@ -83,12 +90,27 @@ def edge(
     given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
     robot, x, z = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
     sigmas = Sigmas(robot, x, z, stated=any(v is not None for v in given))
-    data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
+    data = read_profiler_file(
+        file, unit=unit, dataset=dataset, trial=trial, stated=PosesStated(poses, robot_form, pitch)
+    )
+    data = _decided(data, feature, side)
     record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan, seed=call.seed)
     made, summary = finish_edge(
         data, feature, side, record, with_warnings(data, found), file.name, call.folder("profiler", file.stem), limit_mm
     )
     return outcome_of(call, summary, made)
+
+
+def _decided(data: Measurements, feature: str, side: str) -> Measurements:
+    """The measurements with the reading of the poses that the edge selects."""
+    if len(data.readings) < 2:
+        return data
+    points, _ = edge_points(data, feature, side)
+    keep = np.asarray(np.isfinite(points).all(axis=1), bool)
+    if points.shape != (len(data.readings[0].X), 2):
+        return data
+    fit = edge_fit(points[keep])
+    return data.decided(lambda poses: fit(poses[keep]), "edge")
 
 
 def calibrate_edge(

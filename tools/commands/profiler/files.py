@@ -1,18 +1,24 @@
-"""Reads measurements of a profiler from NPZ or CSV into SI units and one set of names (layouts: docs/profiler.md)."""
+"""Read measurements of a profiler from NPZ, tables, exports and folders into SI units and one set of names (layouts: docs/profiler.md)."""
 
-from dataclasses import dataclass
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.data.tables import cut_off, read_rows
 from weldcal.calibration.profiler.arm_errors import DhArm
+from weldcal.calibration.profiler.importing import import_profiles
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.reading_choice import Fit, choose_reading, flange_poses
 from weldcal.models.array_files import AnyArray, read_npz
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER, sha256
+from weldcal.models.files import LARGEST_NUMBER, read_text, sha256
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 NEAR_M = 0.02  # nor always this near
@@ -31,14 +37,63 @@ DIMENSIONS = {
 LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 
 
+@dataclass(frozen=True)
+class PosesStated:
+    """What the user states of an export's poses: their file, their form, and the distance of points (mm) where it holds heights only."""
+
+    poses: Path | None = None
+    form: str = ""
+    pitch_mm: float | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """The contents of a file, in m and rad; `digest` is its SHA-256; `warnings` about it are sentences."""
+    """The contents of a file, in m and rad.
+
+    Attributes:
+        arrays: by the names of docs/profiler.md.
+        profiles: raw profiles [x, z] (m, 2), or None.
+        digest: SHA-256 of the file or of the files of the folder.
+        warnings: sentences about the file.
+        readings: the readings that the numbers of the poses allow, the used one first; empty where the file's form fixes one.
+        reading: how the profiles and the poses were understood; empty for this package's own forms.
+        notes: sentences about the reading that was chosen.
+    """
 
     arrays: dict[str, Floats]
     profiles: tuple[Floats, ...] | None
     digest: str
     warnings: tuple[str, ...] = ()
+    readings: tuple[PoseReading, ...] = ()
+    reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def decided(self, fit: Fit, what: str) -> "Measurements":
+        """The same with the reading of the poses that the profiles select. Raises InconsistentData where they select none."""
+        if len(self.readings) < 2:
+            return self
+        k, sentence = choose_reading(self.readings, fit, what)
+        return self.read_as(k, sentence)
+
+    def read_as(self, k: int, sentence: str = "") -> "Measurements":
+        """The same with one of the readings."""
+        poses, one = flange_poses(self.readings[k]), self.readings[k]
+        arrays = {**self.arrays, "rotation": poses.rotation, "translation": poses.translation}
+        reading = {**self.reading, "robot": {**self.reading.get("robot", {}), "reading": one.form}}
+        return replace(
+            self,
+            arrays=arrays,
+            readings=(one,),
+            reading=reading,
+            notes=(*self.notes, *([sentence] if sentence else [])),
+        )
+
+    def with_form(self, form: str) -> "Measurements":
+        """The same with the reading of this form where the numbers allow several and it is one of them."""
+        k = next((k for k, one in enumerate(self.readings) if one.form == form), None)
+        return (
+            self if k is None or len(self.readings) < 2 else self.read_as(k, f"Poses read as {self.readings[k].words}.")
+        )
 
     def poses(self, of: str = "") -> FlangePoses | None:
         """Flange poses of the scans, or of="touch_"; None where there are none."""
@@ -71,30 +126,38 @@ class Measurements:
 
 
 def read_profiler_file(
-    path: Path, *, unit: str | None = None, dataset: str = "", trial: int | None = None
+    path: Path,
+    *,
+    unit: str | None = None,
+    dataset: str = "",
+    trial: int | None = None,
+    stated: PosesStated | None = None,
 ) -> Measurements:
-    """Read an NPZ or a CSV.
+    """Read an NPZ, a CSV, an export of a profiler or a folder with one file per profile.
 
     Args:
         unit: m or mm, of all lengths, where the file does not say; a CSV says it in its header.
         dataset: of an NPZ with several sets, the one whose names begin so; trial: which of its trials or worlds.
+        stated: what the user states of an export's poses.
 
     Raises:
         InputError: missing or unreadable file, missing or implausible unit, no such set or trial.
     """
     if unit is not None and unit not in UNITS:
         raise InputError(f"The unit is m or mm, not '{unit}'.")
-    digest = sha256(path)
-    told: str | None = None
-    if path.suffix.lower() == ".csv":
+    stated = stated or PosesStated()
+    if path.suffix.lower() == ".npz" and not path.is_dir():
+        if stated != PosesStated():
+            raise InputError("An NPZ holds its poses as T. Omit --poses, --robot-form and --pitch.")
+        arrays, profiles = _from_npz(path, unit, dataset, trial)
+        file = Measurements(arrays, profiles, sha256(path))
+    elif stated == PosesStated() and _is_own_table(path):
         arrays, profiles = _from_csv(path)
         told = cut_off(path)
-    elif path.suffix.lower() == ".npz":
-        arrays, profiles = _from_npz(path, unit, dataset, trial)
+        file = Measurements(arrays, profiles, sha256(path), () if told is None else (told,))
     else:
-        raise InputError(f"'{path.name}' is neither .npz nor .csv. Give one of these.")
-    _check_numbers(path, arrays, profiles)
-    file = Measurements(arrays, profiles, digest, () if told is None else (told,))
+        file = _imported(path, unit, stated)
+    _check_numbers(path, file.arrays, file.profiles)
     X = file.poses()
     if X is None:
         raise InputError("The file has no flange poses. Give 'T', or 'rotation' and 'translation'.")
@@ -107,6 +170,42 @@ def read_profiler_file(
             f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base. Give --unit m if the lengths are in m."
         )
     return file
+
+
+def _is_own_table(path: Path) -> bool:
+    """Whether a table is in this package's own form: a flange position and a rotation vector in every row."""
+    if path.suffix.lower() != ".csv" or path.is_dir():
+        return False
+    first = next(
+        (s for s in read_text(path).lstrip("\ufeff").splitlines() if s.strip() and not s.lstrip().startswith("#")), ""
+    )
+    return {"rx_rad", "ry_rad", "rz_rad"} <= set(re.split(r"[\s,;]+", first.lower()))
+
+
+def _imported(path: Path, unit: str | None, stated: PosesStated) -> Measurements:
+    """An export, a table with poses in another form, or a folder."""
+    found = import_profiles(path, poses=stated.poses, form=stated.form, unit=unit, pitch_mm=stated.pitch_mm)
+    poses = flange_poses(found.readings[0])
+    arrays = {"rotation": poses.rotation, "translation": poses.translation}
+    if found.profiles is not None and all(len(p) == 1 for p in found.profiles):
+        arrays["points"] = np.vstack(found.profiles)
+    told = cut_off(path) if found.single and path.suffix.lower() == ".csv" else None
+    return Measurements(
+        arrays, None if found.single else found.profiles, digest_of(path, stated.poses), () if told is None else (told,),
+        found.readings, found.reading,
+    )  # fmt: skip
+
+
+def digest_of(path: Path, poses: Path | None = None) -> str:
+    """SHA-256 of a file, or of the files of a folder in the order of their names, and of the file of the poses."""
+    if path.is_file() and poses is None:
+        return sha256(path)
+    whole = hashlib.sha256()
+    for place in (path, *([] if poses is None else [poses])):
+        files = [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.is_file())
+        for one in files:
+            whole.update(sha256(one).encode())
+    return whole.hexdigest()
 
 
 def _check_numbers(path: Path, arrays: dict[str, Floats], profiles: tuple[Floats, ...] | None) -> None:

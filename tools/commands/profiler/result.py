@@ -27,8 +27,20 @@ CANDIDATES = 300
 Estimate = TypeVar("Estimate", EdgeEstimate, SphereEstimate)
 _MANY = 2000  # points of a report's picture
 
-FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Measurements, .npz or .csv (docs/profiler.md).")]
-UnitOption = Annotated[str | None, option("--unit", "U", "m or mm, for an NPZ that does not state its unit.")]
+FileArgument = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Measurements, a profiler's export or a folder (docs/profiler.md).")
+]
+UnitOption = Annotated[str | None, option("--unit", "U", "m or mm, where the file does not state its unit.")]
+PosesOption = Annotated[
+    Path | None, option("--poses", "FILE", "The flange's pose of each profile, where the export has none.")
+]
+FormOption = Annotated[
+    str,
+    option("--robot-form", "FORM", "How the poses are written, such as euler_ZYX,deg. Without it the profiles choose."),
+]
+PitchOption = Annotated[
+    float | None, option("--pitch", "MM", "Distance of the points, where the export holds heights only.")
+]
 SetOption = Annotated[str, option("--set", "NAME", "Which set of an NPZ with several.")]
 TrialOption = Annotated[int | None, option("--trial", "K", "Which trial or world of an NPZ with several.")]
 ROBOT_SIGMA, Z_SIGMA = "Standard deviation of the robot's position per axis.", "Standard deviation of a point in depth."
@@ -40,7 +52,24 @@ TipOption = Annotated[str, option("--tip", "X,Y,Z", "The torch's tip in the flan
 
 def with_warnings(data: Measurements, found: Mapping[str, Any]) -> dict[str, Any]:
     """What was found, with the warnings about the file first."""
-    return {**found, **({"warnings": [*data.warnings, *found.get("warnings", [])]} if data.warnings else {})}
+    whole = {**found, **({"warnings": [*data.warnings, *found.get("warnings", [])]} if data.warnings else {})}
+    if data.reading:
+        whole["reading"] = {who: dict(words) for who, words in data.reading.items()}
+        whole["read_as"] = " ".join(understood(data))
+    return whole
+
+
+def understood(data: Measurements) -> list[str]:
+    """How the profiles and the poses were understood, a sentence each."""
+    lines = []
+    for who, words in data.reading.items():
+        out = len(left) if isinstance(left := words.get("left_out"), list) else 0
+        rest = f", {out} rows left out" if out else ""
+        form = f" as {words['form']}" if words.get("form") else ""
+        lines.append(
+            f"{'Profiles' if who == 'profiles' else 'Poses'} of '{words['file']}'{form} in {words['unit']}{rest}."
+        )
+    return [*lines, *data.notes]
 
 
 def outcome_of(call: Call, found: Mapping[str, object], made: ProfilerFile | ProfilerSeam) -> Outcome:
@@ -61,7 +90,7 @@ def outcome_of(call: Call, found: Mapping[str, object], made: ProfilerFile | Pro
             turn = ", ".join(f"{v:.4f}" for v in pose[3:])
             left = after["rms_before_and_after_each_mm"]
             rows[f"add pose {k + 1}"] = f"{place} mm, {turn} rad: {left[k]:.3f} to {left[k + 1]:.3f} mm in the field"
-    values = {k: v for k, v in found.items() if v != [] and k != "warnings"}
+    values = {k: v for k, v in found.items() if v != [] and k not in ("warnings", "reading")}
     return Outcome({"state": "done", **found, "written_to": str(made.out)}, values, rows, first=made.first)
 
 
@@ -131,7 +160,10 @@ def finish(
     record: ProfilerRecord, found: dict[str, Any], points: Floats, held_mm: Floats, source: str, out: Path,
     limit_mm: float | None,
 ) -> tuple[ProfilerFile, dict[str, Any]]:  # fmt: skip
+    """Write a calibration and its report; the result, and its JSON object without the folder."""
     points = points[np.isfinite(points).all(axis=1)]
+    if "reading" in found:
+        record = replace(record, figures={**record.figures, "robot_form": found["reading"]["robot"]["reading"]})
     made = ProfilerFile(
         record=record,
         found=found,

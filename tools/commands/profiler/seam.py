@@ -11,9 +11,12 @@ from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.record import load_record
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.profiler.files import Measurements, read_profiler_file
+from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
 from weldcal.tools.commands.profiler.result import (
     FileArgument,
+    FormOption,
+    PitchOption,
+    PosesOption,
     TrialOption,
     UnitOption,
     check_number,
@@ -33,14 +36,31 @@ def seam(
     calibration: Annotated[Path, option("--calibration", "FOLDER", "Result folder of edge, sphere or compensate.")],
     unit: UnitOption = None,
     trial: TrialOption = None,
+    poses: PosesOption = None,
+    robot_form: FormOption = "",
+    pitch: PitchOption = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Map both edges and the root of a V-groove from raw profiles into the base frame, as seam.csv."""
     check_limit(limit_mm)
     folder = call.folder("profiler", file.stem)
-    data = read_profiler_file(file, unit=unit, trial=trial)
+    data = read_profiler_file(file, unit=unit, trial=trial, stated=PosesStated(poses, robot_form, pitch))
+    data = _as_calibrated(data, calibration)
     found = with_warnings(data, map_seam(data, calibration, folder))
     return outcome_of(call, found, finish_seam(found, calibration, file.name, folder, limit_mm))
+
+
+def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
+    """The measurements with their poses read as those of the calibration were. Raises InputError where several readings are left."""
+    if len(data.readings) > 1:
+        data = data.with_form(str(load_record(calibration).figures.get("robot_form", "")))
+    if len(data.readings) > 1:
+        one, other = data.readings[:2]
+        raise InputError(
+            f"A seam does not show how its poses are written: as {one.words}, or as {other.words} ({len(data.readings)} readings). State it, for "
+            f"example with --robot-form {one.form} or --robot-form {other.form}."
+        )
+    return data
 
 
 def map_seam(file: Measurements, calibration: Path, folder: Path) -> dict[str, Any]:

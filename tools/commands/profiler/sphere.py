@@ -14,6 +14,7 @@ from weldcal.calibration.profiler.plan import (
     plan_sphere_poses,
     sample_sphere_poses,
 )
+from weldcal.calibration.profiler.reading_choice import sphere_fit
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, choose_model, leave_one_out_m, sphere_joint
@@ -22,13 +23,16 @@ from weldcal.calibration.profiler.sphere.radius import SCALE_SIGMAS, check_radiu
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.profiler.files import Measurements, read_profiler_file
+from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
 from weldcal.tools.commands.profiler.result import (
     CANDIDATES,
     ROBOT_SIGMA,
     Z_SIGMA,
     FileArgument,
+    FormOption,
+    PitchOption,
     PlanOption,
+    PosesOption,
     RadiusOption,
     SetOption,
     Sigmas,
@@ -61,6 +65,9 @@ def sphere(
     unit: UnitOption = None,
     dataset: SetOption = "",
     trial: TrialOption = None,
+    poses: PosesOption = None,
+    robot_form: FormOption = "",
+    pitch: PitchOption = None,
     radius: RadiusOption = None,
     model: Annotated[str, option("--model", "M", "auto, rigid, affine or affine+joints.")] = "auto",
     arm: Annotated[str, option("--arm", "NAME", "Arm whose kinematic table is used, for example ur10e.")] = "",
@@ -76,7 +83,9 @@ def sphere(
     check_limit(limit_mm)
     sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
     lost: list[int] = []
-    data, measured = read_sphere(call, file, unit, dataset, trial, radius, touches, tip, arm, lost)
+    data, measured = read_sphere(
+        call, file, unit, dataset, trial, radius, touches, tip, arm, lost, PosesStated(poses, robot_form, pitch)
+    )
     record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=call.seed)
     made, summary = finish_sphere(
         measured, SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m), record,
@@ -96,13 +105,32 @@ def read_sphere(
     tip: str,
     arm: str = "",
     lost: list[int] | None = None,
+    stated: PosesStated | None = None,
 ) -> tuple[Measurements, SphereData]:
-
+    """The measurements of a sphere and its touches, with the reading of the poses that the arcs select."""
     tip_m = parse_tip(tip)
-    data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
-    felt = None if touches is None else read_profiler_file(touches, unit=unit)
+    stated = stated or PosesStated()
+    data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial, stated=stated)
+    felt = None if touches is None else read_profiler_file(touches, unit=unit, stated=PosesStated(form=stated.form))
     radius_m = None if radius is None else 1e-3 * radius
-    return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=call.seed)
+    lost = [] if lost is None and len(data.readings) > 1 else lost
+
+    def of(file: Measurements, felt: Measurements | None, lost: list[int] | None) -> SphereData:
+        return sphere_data(file, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=call.seed)
+
+    found = of(data, felt, lost)
+    if len(data.readings) > 1:
+        kept = np.setdiff1d(np.arange(len(data.readings[0].X)), lost or [])
+        fit = sphere_fit(found.profiles, found.radius_m)
+        data = data.decided(lambda poses: fit(poses[kept]), "sphere")
+        if felt is not None:
+            felt = felt.with_form(data.readings[0].form)
+        found = replace(
+            found,
+            poses=cast(FlangePoses, data.poses())[kept],
+            touches=None if found.touches is None or felt is None else felt.poses(),
+        )
+    return data, found
 
 
 def sphere_data(

@@ -1,0 +1,162 @@
+"""Read the CSV export of LMI Gocator profilers: sections that begin with their name and end with the line End."""
+
+import csv
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from weldcal.calibration.profiler.motion import Floats
+from weldcal.calibration.profiler.text_blocks import number_in
+from weldcal.models.errors import InputError
+from weldcal.models.files import MOST_CELLS
+
+SECTIONS = ("RawProfile", "Profile", "Surface", "Part", "SurfaceSection")
+"""Sections that hold profiles, in the order in which they are used."""
+_START = re.compile(r"\A\ufeff?\s*Info\b[ ,]*\r?\n", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class GocatorProfiles:
+    """Profiles of one section: points [x, z] (m, 2) mm each, NaN where nothing was measured; names of the columns before the points."""
+
+    section: str
+    points: tuple[Floats, ...]
+    ids: tuple[str, ...]
+    times: Floats | None
+    columns: tuple[str, ...]
+
+
+def is_gocator(text: str) -> bool:
+    """Whether a text begins as the export of a Gocator does."""
+    return _START.match(text[:200]) is not None
+
+
+def gocator_profiles(text: str, name: str) -> GocatorProfiles:
+    """The profiles of an export.
+
+    Raises:
+        InputError: no section with profiles, or one that is damaged; the sentence names the sections.
+    """
+    sections = _sections(text, name)
+    known = {re.sub(r"\s", "", key).lower(): key for key in sections}
+    for section in SECTIONS:
+        key = known.get(section.lower())
+        if key is not None:
+            rows = sections[key]
+            return _frames(rows, key, name) if "profile" in section.lower() else _surface(rows, key, name)
+    raise InputError(
+        f"'{name}' is a Gocator export with the sections {', '.join(list(sections)[:10])}, none of {', '.join(SECTIONS)}. Record in the mode "
+        "Profile, and export the profiles as CSV."
+    )
+
+
+def _sections(text: str, name: str) -> dict[str, list[list[str]]]:
+    found: dict[str, list[list[str]]] = {}
+    rows: list[list[str]] | None = None
+    cells = 0
+    try:
+        for row in csv.reader(re.split(r"\r\n|\n|\r", text.lstrip("\ufeff"))):
+            row = [c.strip() for c in row]
+            while row and row[-1] == "":
+                row.pop()
+            if not row:
+                continue
+            if rows is None:
+                rows = found.setdefault(row[0], [])
+            elif len(row) == 1 and row[0].lower() == "end":
+                rows = None
+            else:
+                rows.append(row)
+                cells += len(row)
+                if cells > MOST_CELLS:
+                    raise InputError(f"'{name}' has more than {MOST_CELLS} cells, the most that are read.")
+    except csv.Error as e:
+        raise InputError(f"'{name}' cannot be read as CSV ({e}).") from e
+    return found
+
+
+def _data(rows: list[list[str]], first: str) -> tuple[list[str], list[list[str]]]:
+    """The header that begins with a word, and the rows below it."""
+    for k, row in enumerate(rows):
+        if row[0].lower() == first and "axis" in (c.lower() for c in row):
+            return row, rows[k + 1 :]
+    return [], []
+
+
+def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
+    header, data = _data(rows, "frame")
+    lower = [h.lower() for h in header]
+    if not header or not data:
+        raise InputError(
+            f"The section {section} of '{name}' has no table with the columns Frame and Axis; export it again."
+        )
+    axis = lower.index("axis")
+    last = len(header) - axis - 1
+    place = {word: lower.index(word) for word in ("source", "time") if word in lower}
+    frames: dict[str, dict[str, list[str]]] = {}
+    order: list[str] = []
+    for row in data:
+        if len(row) <= axis:
+            raise InputError(
+                f"A row of the section {section} of '{name}' ends before its column Axis: the file is cut off there."
+            )
+        frame = row[0]
+        if frame not in frames:
+            frames[frame] = {}
+            order.append(frame)
+        mark = row[axis].upper()[:1]
+        if mark in frames[frame]:
+            sources = sorted({r[place["source"]] for r in data if len(r) > axis}) if "source" in place else []
+            if len(sources) > 1:
+                raise InputError(
+                    f"'{name}' holds the profiles of the sources {', '.join(sources[:6])}; export one of them."
+                )
+            raise InputError(f"Frame {frame[:20]} of '{name}' has two rows {mark}; keep one.")
+        frames[frame][mark] = row
+    shared = np.array([_number(c, name) for c in header[axis + 1 :]]) if section.lower() == "profile" else None
+    points, times = [], []
+    for frame in order:
+        rows_of = frames[frame]
+        z = rows_of.get("Z")
+        x = rows_of.get("X")
+        if z is None or (x is None and shared is None):
+            raise InputError(
+                f"Frame {frame[:20]} of '{name}' has the rows {', '.join(rows_of)}; a profile needs {'X and Z' if shared is None else 'Z'}."
+            )
+        at = _values(x, axis, last, name) if x is not None else np.zeros(last) if shared is None else shared
+        points.append(np.column_stack([at, _values(z, axis, last, name)]))
+        times.append(_number(z[place["time"]], name) if "time" in place else np.nan)
+    t = np.array(times)
+    return GocatorProfiles(
+        section, tuple(points), tuple(order), t if np.isfinite(t).all() else None, tuple(header[: axis + 1])
+    )
+
+
+def _surface(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
+    """A surface of one frame: x in the first row, y in the first column, heights within."""
+    widest = max((len(r) for r in rows), default=0)
+    begin = next((k for k, r in enumerate(rows) if len(r) == widest and k > 1 and number_in(r[-1]) is not None), None)
+    if begin is None or widest < 6 or len(rows) < begin + 2:
+        raise InputError(f"The section {section} of '{name}' has no table of heights; export it again.")
+    x = np.array([_number(c, name) for c in rows[begin][1:]])
+    points = []
+    for row in rows[begin + 1 :]:
+        z = _values(row, 0, len(x), name)
+        points.append(np.column_stack([x, z]))
+    ids = tuple(row[0] for row in rows[begin + 1 :])
+    return GocatorProfiles(section, tuple(points), ids, None, tuple(rows[0][:9]))
+
+
+def _values(row: list[str], axis: int, count: int, name: str) -> Floats:
+    out = np.full(count, np.nan)
+    cells = row[axis + 1 : axis + 1 + count]
+    out[: len(cells)] = [_number(c, name) for c in cells]
+    return out
+
+
+def _number(cell: str, name: str) -> float:
+    value = number_in(cell)
+    if value is None:
+        raise InputError(f"'{name}' has a cell that is not a number: '{cell[:20]}'.")
+    return value
