@@ -105,7 +105,7 @@ class Board:
         """Orders (m,) of the points that look alike in a picture; the first is the identity."""
         n = self.columns * self.rows
         grid = np.arange(n).reshape(self.rows, self.columns)
-        found = [grid]
+        found: list[NDArray[Any]] = [grid]
         if self.kind == "chessboard":
             if (self.columns + self.rows) % 2 == 0:
                 found.append(np.rot90(grid, 2))
@@ -134,7 +134,8 @@ class Board:
 def dictionary(name: str) -> Any:
     """OpenCV's dictionary of markers by its name, such as 5X5_100 or APRILTAG_36h11. Raises DatasetError for another."""
     plain = re.sub(r"^DICT_", "", name.strip(), flags=re.IGNORECASE).lower()
-    plain = {"36h11": "apriltag_36h11", "tag36h11": "apriltag_36h11", "25h9": "apriltag_25h9", "tag25h9": "apriltag_25h9", "16h5": "apriltag_16h5", "tag16h5": "apriltag_16h5"}.get(plain, plain)  # fmt: skip
+    family = re.fullmatch(r"(tag)?(16h5|25h9|36h10|36h11)", plain)
+    plain = f"apriltag_{family[2]}" if family else plain
     found = next((key for key in _DICTIONARIES if key.lower() == plain), None)
     if found is None:
         raise DatasetError(f"There is no dictionary of markers '{name[:30]}'; use {', '.join(sorted(_DICTIONARIES))}.")
@@ -239,7 +240,7 @@ def _off_plane(points: Array | None, board: Board) -> float | None:
     seen = np.zeros(0, dtype=bool) if points is None else np.isfinite(points[:, 0])
     if points is None or int(seen.sum()) < 8:
         return None
-    H, _ = cv2.findHomography(board.points[seen, :2], points[seen])
+    H: Any = cv2.findHomography(board.points[seen, :2], points[seen])[0]
     if H is None:
         return None
     back = cv2.perspectiveTransform(board.points[seen, None, :2], H)[:, 0]
@@ -258,8 +259,7 @@ def _chessboard(grey: Grey, board: Board) -> Array | None:
     scale = min(1.0, _DETECT_PX / max(grey.shape))
     points: Array | None = None
     if scale < 0.8:
-        small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        points = _search(small, size)
+        points = _search(_smaller(grey, scale), size)
         if points is not None:
             points = (points + 0.5) / scale - 0.5
             gap = float(np.linalg.norm(np.diff(points.reshape(board.rows, board.columns, 2), axis=1), axis=2).min())
@@ -278,6 +278,12 @@ def _chessboard(grey: Grey, board: Board) -> Array | None:
     elif board.columns == board.rows and board.columns % 2 and not _dark(grey, grid):
         grid = np.rot90(grid)
     return np.asarray(grid.reshape(-1, 2))
+
+
+def _smaller(grey: Grey, scale: float) -> Grey:
+    if scale >= 1.0:
+        return grey
+    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _search(grey: Grey, size: tuple[int, int]) -> Array | None:
@@ -348,7 +354,7 @@ def _circles(grey: Grey, board: Board) -> Array | None:
     for colour in (0, 255):
         points = None
         for scale in (min(1.0, 1000.0 / max(grey.shape)), 1.0):
-            small = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            small = _smaller(grey, scale)
             detector = _blobs(small, colour)
             for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
                 found, points = cv2.findCirclesGrid(small, size, flags=flags, blobDetector=detector)
@@ -363,7 +369,8 @@ def _circles(grey: Grey, board: Board) -> Array | None:
 
 
 def _blobs(grey: Grey, colour: int) -> Any:
-    settings = cv2.SimpleBlobDetector_Params()
+    opencv: Any = cv2  # its types lack the blob detector
+    settings = opencv.SimpleBlobDetector_Params()
     settings.filterByColor, settings.blobColor = True, colour
     settings.filterByArea, settings.minArea, settings.maxArea = True, 20.0, 0.02 * grey.size
     settings.filterByCircularity = False
@@ -371,7 +378,7 @@ def _blobs(grey: Grey, colour: int) -> Any:
     settings.filterByConvexity, settings.minConvexity = True, 0.85
     settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 20.0, 230.0, 15.0
     settings.minDistBetweenBlobs = 4.0
-    return cv2.SimpleBlobDetector_create(settings)
+    return opencv.SimpleBlobDetector_create(settings)
 
 
 def _centres(grey: Grey, points: Array, colour: int) -> Array:
@@ -428,7 +435,7 @@ def what_is_there(greys: Sequence[Grey], board: Board) -> str:
                     ids = ", ".join(str(k) for k in sorted(markers)[:12])
                     return f"markers of {name} were found ({ids}), none of {board.dictionary}"
         scale = min(1.0, _DETECT_PX / max(grey.shape))
-        small = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = _smaller(grey, scale)
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
         found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
         if found and meta is not None:

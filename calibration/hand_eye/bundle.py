@@ -137,9 +137,9 @@ class _Adjustment:
 
     def normal(self, s: _State, px: float, prior: Array) -> _Normal:
         """Normal equations at a state; ``prior`` (6,): precisions of each picture's error."""
-        r, G, O = self.project(s, slopes=True)
+        r, G, own = self.project(s, slopes=True)
         w = np.minimum(1.0, _HUBER * px / np.maximum(np.linalg.norm(r, axis=1), 1e-12)) / px**2
-        GW, OW = G * w[:, None, None], O * w[:, None, None]
+        GW, OW = G * w[:, None, None], own * w[:, None, None]
         A = np.einsum("nki,nkj->ij", GW, G, optimize=True)
         a = np.einsum("nki,nk->i", GW, r)
         g = G.shape[2]
@@ -148,7 +148,7 @@ class _Adjustment:
             rows = slice(self.bounds[i], self.bounds[i + 1])
             o = OW[rows].reshape(-1, 6)
             B[i] = G[rows].reshape(-1, g).T @ o
-            C[i] = o.T @ O[rows].reshape(-1, 6)
+            C[i] = o.T @ own[rows].reshape(-1, 6)
             c[i] = o.T @ r[rows].ravel()
         C += np.diag(prior)
         c += s.off * prior

@@ -21,7 +21,7 @@ from weldcal.calibration.hand_eye.boards import EXAMPLES, Board, find_board, wha
 from weldcal.calibration.hand_eye.bundle import Bundle, Corners, adjust
 from weldcal.calibration.hand_eye.conventions import UNITS
 from weldcal.calibration.hand_eye.files import PosePairs
-from weldcal.calibration.hand_eye.importing import ImportedPairs, StatedForms, import_pairs
+from weldcal.calibration.hand_eye.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
 from weldcal.calibration.hand_eye.picture_files import camera_in, load_grey, picture_files
 from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.models.arrays import Array
@@ -283,7 +283,7 @@ def _camera(
         for k, e in zip(np.array(kept)[bad], error[bad], strict=True):
             pictures[k] = replace(pictures[k], why=f"Its points do not fit the camera of the others ({e:.1f} px).")
     K, dist = np.asarray(found[1], dtype=float), np.ravel(np.asarray(found[2], dtype=float))[:5]
-    free = np.array([0, 1, 4] if few else [0, 1, 2, 3, 4, 5, 6, 7])
+    free = np.array([0, 1, 2, 3, 4, 5] if few else [0, 1, 2, 3, 4, 5, 6, 7])
     if not few:
         more = cv2.calibrateCamera(obj, img, size, K.copy(), dist.copy(), flags=cv2.CALIB_USE_INTRINSIC_GUESS)
         numbers = 2.0 * sum(len(o) for o in obj)
@@ -364,7 +364,7 @@ def _paired(
                 pictures[k] = replace(picture, why="Its points give no pose of the board.")
     name = f"{files[0].name} ... {files[-1].name}"
     labels = np.zeros(len(pictures), dtype=np.int64)
-    stated = replace(stated, robot_poses=robot.name, camera_poses=name, unit=None)
+    stated = replace(stated, robot_poses=robot.name, camera_poses=name, unit=None, camera_known=True)
     problem: InconsistentPoses | DatasetError | None = None
     for numbered in _numbered(robot, pictures):
         choices: list[NDArray[np.int64]] = [labels]
@@ -374,6 +374,13 @@ def _paired(
             listing = _listing(name, pictures, _flipped(C, choice, board))
             try:
                 found_pairs = import_pairs([numbered, listing], source, mode, stated)
+            except WrongScale as why:
+                size = 1e3 * board.size * why.factor
+                problem = InconsistentPoses(
+                    f"The board in the pictures of '{source}' fits the robot's motion with its lengths multiplied by {why.factor:.4g}: a size of "
+                    f"{size:.4g} mm in place of {1e3 * board.size:g} mm. Measure the board and correct --board, or correct --unit of the robot."
+                )
+                break
             except (InconsistentPoses, DatasetError) as why:
                 problem = problem or why
                 continue
@@ -452,7 +459,7 @@ def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: 
     rows_r, rows_c = rows_r[good], rows_c[good]
     turns = np.stack([_turn(board, order)[:3, :3] for order in board.symmetries])
     C = camera.readings[0].X[rows_c, :3, :3]
-    n, s = len(C), len(turns)
+    n = len(C)
     tried: dict[bytes, tuple[float, NDArray[np.int64]]] = {}
     for shift in _TRIED_SHIFTS:
         m = n - abs(shift)
@@ -539,7 +546,8 @@ def solve_pictures(
         if keep[k]:
             pictures[row] = replace(pictures[row], rms_px=float(errors[k]))
         else:
-            why = f"Board and robot pose disagree with the other pictures by {np.degrees(result.rotation_rad[k]):.2f} degrees and {1e3 * result.translation[k]:.1f} mm."
+            deg, mm = np.degrees(result.rotation_rad[k]), 1e3 * result.translation[k]
+            why = f"Board and robot pose disagree with the other pictures by {deg:.2f} degrees and {mm:.1f} mm."
             pictures[row] = replace(pictures[row], why=why)
     weight = np.isfinite(pairs.img[keep][..., 0]).sum(axis=1) if pairs.img is not None else np.ones(int(keep.sum()))
     total = float(np.sqrt((weight * bundle.rms_px**2).sum() / weight.sum()))
@@ -567,7 +575,9 @@ def _transform(X: Array) -> RigidTransform:
 
 
 def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], data: PictureSet) -> Bundle:
-    assert pairs.img is not None and pairs.K is not None and pairs.dist is not None
+    assert pairs.img is not None
+    assert pairs.K is not None
+    assert pairs.dist is not None
     return adjust(
         Corners(
             robot=pairs.robot[keep], img=pairs.img[keep], obj=data.board.points, eye_in_hand=pairs.mode == "eye_in_hand"
@@ -585,7 +595,9 @@ def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], 
 
 def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[PosePairs, bool]:
     """The pairs with, for each picture, the solution that lies nearest to what the result predicts: a plane and a symmetric board have several."""
-    assert pairs.img is not None and pairs.K is not None and pairs.dist is not None
+    assert pairs.img is not None
+    assert pairs.K is not None
+    assert pairs.dist is not None
     X, Y = np.asarray(result.X.GetAsMatrix4()), np.asarray(result.Y.GetAsMatrix4())
     predicted = inverse(pairs.F @ X) @ Y
     camera, img, changed = pairs.camera.copy(), pairs.img.copy(), False
@@ -606,7 +618,9 @@ def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[Pos
 
 def _reprojected(pairs: PosePairs, board: Board) -> PosePairs:
     """The pairs with the boards' poses under their camera, each the solution nearest to the present one."""
-    assert pairs.img is not None and pairs.K is not None and pairs.dist is not None
+    assert pairs.img is not None
+    assert pairs.K is not None
+    assert pairs.dist is not None
     camera = pairs.camera.copy()
     for i, picture in enumerate(pairs.img):
         seen = np.isfinite(picture[:, 0])

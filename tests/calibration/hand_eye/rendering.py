@@ -90,7 +90,7 @@ def draw_circles(columns: int, rows: int, pitch: float, asymmetric: bool = False
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     for u, v in (grid + margin) * PX_PER_MM - 0.5:
         image[(x - u) ** 2 + (y - v) ** 2 < (radius * PX_PER_MM) ** 2] = 15
-    return Drawing(260 - image if inverse else image, np.array([margin, margin]), grid)
+    return Drawing(255 - image if inverse else image, np.array([margin, margin]), grid)
 
 
 def draw_tags(columns: int, rows: int, size: float, gap: float, dictionary: str, first: int = 0, upward: bool = False, border: int = 1) -> Drawing:  # fmt: skip
