@@ -264,7 +264,8 @@ def _chessboard(grey: Grey, board: Board) -> Array | None:
             points = (points + 0.5) / scale - 0.5
             gap = float(np.linalg.norm(np.diff(points.reshape(board.rows, board.columns, 2), axis=1), axis=2).min())
             half = int(np.clip(0.3 * gap, 3, 15))
-            fine = cv2.cornerSubPix(grey, points.astype(np.float32)[:, None], (half, half), (-1, -1), _SHARPEN)
+            rough = np.ascontiguousarray(points[:, None], dtype=np.float32)
+            fine = cv2.cornerSubPix(grey, rough, (half, half), (-1, -1), _SHARPEN)
             points = np.asarray(fine, dtype=float)[:, 0]
     if points is None:
         points = _search(grey, size)
