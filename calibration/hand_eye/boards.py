@@ -36,6 +36,7 @@ _LARGEST_MM, _MOST = 5000.0, 60
 _DETECT_PX = 1400  # a chessboard is searched at this width, and its corners refined in the whole picture
 _SHARPEN = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 0.002)
 _DICTIONARIES = {name[5:]: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
+_STRAIGHT_PX = 100.0  # length of a tag's side up to which the lens leaves it straight
 _TRIED = 8  # pictures that show which layout a board has, or what there is in place of it
 
 
@@ -336,6 +337,43 @@ def _markers(grey: Grey, board: Board) -> dict[int, Array]:
     return found
 
 
+def _by_sides(grey: Grey, corners: Array) -> Array:
+    """Corners (4, 2) px as the meets of lines along the sides: a corner alone is pulled inwards by the picture's blur."""
+    side = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    reach = float(np.clip(0.06 * side.min(), 2.0, 5.0))
+    s, t = np.linspace(-reach, reach, int(8 * reach) | 1), np.linspace(0.12, 0.88, 25)
+    lines = []
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = (b - a) / np.linalg.norm(b - a)
+        out = np.array([along[1], -along[0]])
+        at = (a + t[:, None] * (b - a))[:, None] + s[:, None] * out
+        value = cv2.remap(
+            grey, *np.moveaxis(at, 2, 0).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        slope = np.clip(np.gradient(value.astype(float), axis=1), 0.0, None)
+        slope = np.where(slope > 0.3 * slope.max(axis=1, keepdims=True), slope, 0.0)
+        total = slope.sum(axis=1)
+        strong = total > 0.5 * np.median(total)
+        if np.median(total) < 10.0 or int(strong.sum()) < 8:
+            return corners
+        place = (slope @ s)[strong] / total[strong]
+        keep = np.ones(len(place), dtype=bool)
+        degree = 2 if np.linalg.norm(b - a) > _STRAIGHT_PX else 1  # a lens bends the sides
+        for _ in range(3):
+            curve = np.polyfit(t[strong][keep], place[keep], degree)
+            off = np.abs(np.polyval(curve, t[strong]) - place)
+            keep = off <= max(3.0 * float(np.median(off)), 0.05)
+        tangents = []
+        for e in (0.0, 1.0):
+            foot = a + e * (b - a) + np.polyval(curve, e) * out
+            ahead = foot + (b - a) + np.polyval(np.polyder(curve), e) * out
+            tangents.append(np.cross([*foot, 1.0], [*ahead, 1.0]))
+        lines.append(tangents)
+    meets = np.array([np.cross(lines[k - 1][1], lines[k][0]) for k in range(4)])
+    refined = meets[:, :2] / meets[:, 2:]
+    return refined if float(np.linalg.norm(refined - corners, axis=1).max()) < reach else corners
+
+
 def _placed(found: dict[int, Array], board: Board) -> Array | None:
     out = np.full((len(board.points), 2), np.nan)
     for number, corners in found.items():
@@ -346,7 +384,8 @@ def _placed(found: dict[int, Array], board: Board) -> Array | None:
 
 
 def _tags(grey: Grey, board: Board) -> Array | None:
-    return _placed(_markers(grey, board), board)
+    found = {k: _by_sides(grey, corners) for k, corners in _markers(grey, board).items() if k in board.ids}
+    return _placed(found, board)
 
 
 def _circles(grey: Grey, board: Board) -> Array | None:
