@@ -106,7 +106,7 @@ class Board:
         """Orders (m,) of the points that look alike in a picture; the first is the identity."""
         n = self.columns * self.rows
         grid = np.arange(n).reshape(self.rows, self.columns)
-        found: list[NDArray[Any]] = [grid]
+        found: list[Any] = [grid]
         if self.kind == "chessboard":
             if (self.columns + self.rows) % 2 == 0:
                 found.append(np.rot90(grid, 2))
@@ -347,9 +347,8 @@ def _by_sides(grey: Grey, corners: Array) -> Array:
         along = (b - a) / np.linalg.norm(b - a)
         out = np.array([along[1], -along[0]])
         at = (a + t[:, None] * (b - a))[:, None] + s[:, None] * out
-        value = cv2.remap(
-            grey, *np.moveaxis(at, 2, 0).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        u, v = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
+        value = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         slope = np.clip(np.gradient(value.astype(float), axis=1), 0.0, None)
         slope = np.where(slope > 0.3 * slope.max(axis=1, keepdims=True), slope, 0.0)
         total = slope.sum(axis=1)

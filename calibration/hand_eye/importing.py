@@ -107,10 +107,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
     else:
         best = decision.best
         _require_one(decision, source, mounting, stated.camera_known)
-        A, B = [
-            next(r for r in _changed(listed, one) if r.form == one.form)
-            for listed, one in ((a, best.robot), (b, best.camera))
-        ]
+        A, B = [_of_all_rows(_changed(listed, one), one) for listed, one in ((a, best.robot), (b, best.camera))]
         notes += _sentences(decision, robot, camera, shift)
         units = _units(A, B, robot, camera, best, stated, source)
     if shift:
@@ -156,6 +153,12 @@ def _metric(X: Array, factor: float) -> Array:
     out = X.copy()
     out[:, :3, 3] *= factor
     return out
+
+
+def _of_all_rows(listed: list[PoseReading], chosen: PoseReading) -> PoseReading:
+    """The chosen reading with all rows: of the same form, and of the same meaning where six numbers have two."""
+    same = [one for one in listed if one.form == chosen.form]
+    return min(same, key=lambda one: float(np.abs(one.X - chosen.X[0]).max(axis=(1, 2)).min()))
 
 
 def _changed(listed: list[PoseReading], wanted: PoseReading) -> list[PoseReading]:

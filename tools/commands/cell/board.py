@@ -208,9 +208,10 @@ def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
     # the rectangle of all that is black, in the board's frame: x right, y down
     outside = {"chessboard": size, "circles": 0.25 * size, "acircles": 0.5 * size, "charuco": size}.get(board.kind, 0.0)
     low, high = points.min(axis=0) - outside, points.max(axis=0) + outside
-    _require_room(sheet, *(high - low), paper)
-    x0 = 0.5 * (sheet.width - (high - low)[0]) - low[0]
-    y0 = 0.5 * (sheet.height + FOOT_MM + (high - low)[1]) + low[1]  # of the board's origin, y up
+    width, height = (float(v) for v in high - low)
+    _require_room(sheet, width, height, paper)
+    x0 = 0.5 * (sheet.width - width) - low[0]
+    y0 = 0.5 * (sheet.height + FOOT_MM + height) + low[1]  # of the board's origin, y up
     if board.kind in ("chessboard", "charuco"):
         columns, rows = (
             (board.columns + 1, board.rows + 1) if board.kind == "chessboard" else (board.columns, board.rows)
