@@ -5,6 +5,54 @@ from typing import Any
 from weldcal.models.errors import InputError, WeldcalError
 
 
+class TooFewLandmarks(InputError):
+    """Fewer touched landmarks than the unknowns need."""
+
+
+class CollinearLandmarks(InputError):
+    """All landmarks lie on one line, which leaves a turn about it open."""
+
+
+class EqualRotations(InputError):
+    """The hand never turned between touches, so that the pen's offset cannot be told from the camera's place."""
+
+
+class TabletDataError(InputError):
+    """A file of touches cannot be used as it is."""
+
+
+class LandmarksNotFound(WeldcalError):
+    """A camera image does not show the landmarks that the tablet displays."""
+
+
+class FeatureNotFound(WeldcalError):
+    """A profile does not show the feature that was asked for."""
+
+
+class ArcNotFound(FeatureNotFound):
+    """A profile does not show an arc of the sphere."""
+
+
+class TooFewRotations(InputError):
+    """Fewer orientations of the flange than the method needs."""
+
+
+class TooFewTranslations(InputError):
+    """Fewer positions of the flange in one orientation than the method needs."""
+
+
+class DegenerateMotion(InputError):
+    """The robot's motion leaves a part of the answer open, whatever the accuracy."""
+
+
+class InconsistentData(WeldcalError):
+    """The profiles do not show one and the same object."""
+
+
+class RadiusError(InputError):
+    """The sphere's radius does not agree with what was seen of it."""
+
+
 class FlangeNotFound(WeldcalError):
     """No flange of the asked standard in a cloud; ``reason`` is the sentence without the cloud's name."""
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
-from weldcal.models.keys import did_you_mean
 from weldcal.models.mesh import TriMesh, circle, merge, plane_mesh, revolve, triangulate_polygon, wall
 
 Floats = npt.NDArray[np.float64]

@@ -45,7 +45,7 @@ class ProfilerPreset:
 
 def make_scene(mesh: TriMesh) -> Any:
     """A mesh made ready for rays: Open3D's RaycastingScene."""
-    from weldcal.models.open3d_core import o3d  # slow to import
+    from weldcal.models.mesh import o3d  # slow to import
 
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
@@ -57,7 +57,7 @@ def make_scene(mesh: TriMesh) -> Any:
 
 def cast_profiles(scene: Any, rotation: Floats, translation: Floats, preset: ProfilerPreset) -> Floats:
     """What a perfect profiler sees (n, samples, 2) [x, z] m from poses R_WS (n, 3, 3), p_WS (n, 3) m; NaN: nothing in range."""
-    from weldcal.models.open3d_core import o3d  # slow to import
+    from weldcal.models.mesh import o3d  # slow to import
 
     x = preset.x_m
     start = translation[:, None] + x[None, :, None] * rotation[:, None, :, 0]

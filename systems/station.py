@@ -14,8 +14,7 @@ from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces.bent_plate import bend
-from weldcal.models.workpieces.part import WeldPart
+from weldcal.models.workpieces.part import WeldPart, bend
 from weldcal.models.workpieces.plate import make_workpiece, seeded_groove_error
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Background, Inline, OwnProcess

@@ -17,8 +17,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text, sha256
-from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
+from weldcal.models.files import LARGEST_DOCUMENT, LARGEST_NUMBER, read_text, sha256
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 AUTO = "auto"

@@ -8,7 +8,7 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.limits import MOST_POINTS, expansion_limit
+from weldcal.models.files import MOST_POINTS, expansion_limit
 
 _ROWS = 50_000  # of text, converted at a time
 _LONGEST_LINE = 1_000_000

@@ -1,6 +1,7 @@
 """Reads point clouds from PLY, PCD, NPZ, NPY and text files; refuses damaged ones with a reason."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,135 @@ import numpy as np
 from weldcal.calibration.data.cloud_body import CloudError
 from weldcal.calibration.data.pcd import read_pcd
 from weldcal.calibration.data.ply import read_ply
-from weldcal.calibration.data.text_cloud import read_text_cloud
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import file_size
-from weldcal.models.limits import LARGEST_NUMBER, MOST_POINTS, expansion_limit
+from weldcal.models.files import LARGEST_NUMBER, LARGEST_TEXT, MOST_POINTS, expansion_limit, file_size, read_text
 from weldcal.models.result_files import write_npz
+
+_ROWS = 50_000  # converted at a time
+_LINE = re.compile(r"[^\r\n]+")
+_COMMA_DECIMAL = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_WHOLE = re.compile(r"[+-]?\d+")
+_LONGEST_NUMBER = 100  # characters
+
+
+def read_text_cloud(path: Path) -> Array:
+    """Points (N, 3): the columns that the header names x, y and z, else the first three; # and // begin comments.
+
+    All rows have as many cells. Decimal commas are read where semicolons, tabs or blanks separate the cells. Raises CloudError
+    for anything else, with the line's number; InputError: the file cannot be opened, or is not UTF-8.
+    """
+    text = read_text(path, LARGEST_TEXT)
+    rows = _rows(text)
+    first = next(rows, None)
+    if first is None:
+        raise CloudError(f"The cloud {path.name} is empty; scan again.")
+    line, row = first
+    separator = _separator(row)
+    header = [c.strip().lower() for c in _cells(row, separator)]
+    columns, width = [0, 1, 2], len(header)
+    pending: list[tuple[int, str]] = []
+    headed = _number(header[0], separator) is None
+    if headed:
+        if {"x", "y", "z"} <= set(header):
+            columns = [header.index(c) for c in "xyz"]
+        if any(header.count(c) > 1 for c in "xyz"):
+            raise CloudError(f"The header of {path.name} names x, y or z twice; keep one.")
+        below = next(rows, None)
+        if below is None:
+            raise CloudError(f"The cloud {path.name} is empty; scan again.")
+        pending.append(below)
+        if _separator(below[1]) != separator:  # a header of its own kind, such as "x y z" over "1,2,3"
+            separator = _separator(below[1])
+            width = len(_cells(below[1], separator))
+    else:
+        pending.append(first)
+    if width < 3:
+        raise CloudError(f"The file {path.name} has a row of fewer than three numbers; x, y and z are needed.")
+    blocks: list[Array] = []
+    block: list[list[float]] = []
+    # a header that names as many columns as a row has cells says that commas separate them
+    whole = separator == "," and not (headed and len(header) == width)
+    for line, row in _chain(pending, rows):
+        cells = _cells(row, separator)
+        if len(cells) != width:
+            raise CloudError(_surplus(path, line, len(cells), width))
+        whole = whole and _could_be_decimals(cells)
+        numbers = [_number(cells[c], separator) for c in columns]
+        if None in numbers:
+            bad = next(cells[c] for c, v in zip(columns, numbers, strict=True) if v is None)
+            raise CloudError(f"The file {path.name}, line {line}: '{bad[:40]}' is not a number.")
+        block.append([v for v in numbers if v is not None])
+        if len(block) == _ROWS:
+            blocks.append(np.array(block))
+            block = []
+    if whole:
+        raise CloudError(
+            f"The commas of {path.name} could be separators or decimal commas; write decimal points, or semicolons between the cells."
+        )
+    return np.concatenate([*blocks, np.array(block, dtype=float).reshape(-1, 3)])
+
+
+def _rows(text: str) -> Iterator[tuple[int, str]]:
+    """Lines with a value, numbered from 1, without comments."""
+    number, at = 1, 0
+    for match in _LINE.finditer(text):
+        number += len(re.findall(r"\r\n|\r|\n", text[at : match.start()]))
+        at = match.start()
+        row = match.group().strip().rstrip(",;").strip()
+        if row and not row.startswith(("#", "//")):
+            yield number, row
+
+
+def _chain(first: list[tuple[int, str]], rest: Iterator[tuple[int, str]]) -> Iterator[tuple[int, str]]:
+    yield from first
+    yield from rest
+
+
+def _separator(row: str) -> str:
+    """What separates the cells of a row; a blank for any number of blanks, tabs included."""
+    if ";" in row:
+        return ";"
+    if "\t" in row and len(row.split("\t")) > 2:
+        return "\t"
+    words = row.split()
+    if len(words) > 2 and not any(w.startswith(",") or w.endswith(",") for w in words):
+        return " "
+    return "," if "," in row else " "
+
+
+def _cells(row: str, separator: str) -> list[str]:
+    return row.split() if separator == " " else [cell.strip() for cell in row.split(separator)]
+
+
+def _number(cell: str, separator: str) -> float | None:
+    if "," in cell and separator != "," and _COMMA_DECIMAL.fullmatch(cell):
+        cell = cell.replace(",", ".")
+    if len(cell) > _LONGEST_NUMBER or "_" in cell:
+        return None
+    try:
+        return float(cell)
+    except ValueError:
+        return None
+
+
+def _could_be_decimals(cells: list[str]) -> bool:
+    """Whether each two whole numbers of a row could be one with a decimal comma: no sign behind the comma."""
+    return (
+        len(cells) >= 6
+        and len(cells) % 2 == 0
+        and all(_WHOLE.fullmatch(c) for c in cells)
+        and not any(c.startswith(("+", "-")) for c in cells[1::2])
+    )
+
+
+def _surplus(path: Path, line: int, n: int, width: int) -> str:
+    return (
+        f"The file {path.name}, line {line}, has {n} cells and the first row {width}: give each row the same, and decimal commas only "
+        "with semicolons or tabs between the cells."
+    )
+
 
 __all__ = ["NO_NOTES", "SUFFIXES", "CloudError", "find_cloud", "read_cloud", "save_cloud"]
 
@@ -44,7 +167,7 @@ def read_cloud(path: Path) -> Array:
     NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
     centres at whole numbers; zero or NaN depth is invalid. NPY: such points alone. Text: x, y, z are the first three columns,
     below a header or none. NaN stands for a missing pixel in organised files.
-    Raises CloudError: not a regular file, unreadable, truncated, larger than the bounds in models/limits.py, empty, NaN in a
+    Raises CloudError: not a regular file, unreadable, truncated, larger than the bounds in models/files.py, empty, NaN in a
     list of points, infinite coordinates.
     """
     reader = _READERS.get(path.suffix.lower())

@@ -9,8 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.cloud_body import CloudError, check_points, column_values, text_columns
 from weldcal.models.arrays import Array
-from weldcal.models.files import opened
-from weldcal.models.limits import expansion_limit
+from weldcal.models.files import expansion_limit, opened
 
 _SIZES = {"I": (1, 2, 4, 8), "U": (1, 2, 4, 8), "F": (4, 8)}
 _KINDS = {"I": "i", "U": "u", "F": "f"}

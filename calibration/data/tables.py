@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text
-from weldcal.models.limits import MOST_CELLS, MOST_COLUMNS
+from weldcal.models.files import MOST_CELLS, MOST_COLUMNS, read_text
 
 Row = dict[str, str]
 
@@ -19,7 +18,7 @@ def read_rows(path: Path) -> tuple[list[str], list[Row]]:
 
     The separator is the one that the header has most of: comma, semicolon, tab, else blanks. Lines that begin with #, empty
     lines and rows without a value are skipped. Decimal commas become points where the comma separates nothing. Raises
-    InputError: no regular file, no UTF-8 text, larger than the bounds in models/limits.py, a column named twice, a row with more
+    InputError: no regular file, no UTF-8 text, larger than the bounds in models/files.py, a column named twice, a row with more
     values than columns, a quote that does not end; with the line's number.
     """
     names: list[str] = []

@@ -3,23 +3,21 @@
 Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the Bayesian
 information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a size that matters. The
 thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its false alarms are counted on.
+
+With the flange's centre at the origin of its frame, a wrong rotation moves no centre; it shows only between the faces' normals and
+the poses' z axes. Then R_BC follows from the centres, and each misreading is judged by the normals.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.doctor.case import Case
-from weldcal.calibration.doctor.fit import Fit, fit
+from weldcal.calibration.doctor.fit import NU, Fit, fit
 from weldcal.calibration.doctor.models import Explained, explanations, with_arm_errors
-from weldcal.calibration.doctor.quality import (
-    installation,
-    noise_growth,
-    outliers,
-    partial_views,
-    sure_outliers,
-    too_alike,
-)
 from weldcal.calibration.doctor.readings import (
     FEWEST,
     LOOKS_WRONG_M,
@@ -28,7 +26,262 @@ from weldcal.calibration.doctor.readings import (
     looks_wrong,
     mixed_units,
 )  # fmt: skip
-from weldcal.calibration.doctor.rotations import mirrored, misread_rotations, reordered, rotations_disagree
+from weldcal.calibration.geometry.robust import f_tail
+from weldcal.calibration.geometry.se3 import log_rotation, pose
+from weldcal.models.arrays import Array
+
+_GROSS = 6.0  # spreads of a scan's distance beyond which it disagrees
+_ODD, _GROSS_M = 1e-3, 2e-3  # false alarms a set, and the least error that matters
+_MOST = 0.34  # of the scans that may be single bad ones
+_LEAST_SEEN = 0.55  # of the edge; less is a partial view
+_REFUSED = 0.2  # of the scans without a flange
+_FLAT_M = 0.02  # rms of the centres across their longest direction that does not fix the camera
+_NOISE_FACTOR = 2.0  # between the noisiest and the quietest third, the usual growth taken off
+_NOISE_CHANCE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """A cause that shows without a model of the residuals: its name, its weight (twice a log-likelihood ratio) and its numbers."""
+
+    cause: str
+    score: float
+    numbers: dict[str, float]
+    where: tuple[str, ...] = ()
+
+
+def outliers(case: Case, null: Fit) -> Explained | None:
+    """Single scans that disagree with all others, each of them anywhere (uniform in the ball that holds their errors)."""
+    r = np.linalg.norm(null.e, axis=1)
+    scale = max(float(np.median(r)) / 1.5382, 2e-5)
+    bad = r > _GROSS * scale
+    tilt_scale = max(float(np.nanmedian(null.tilt)) / 1.177, 3e-4) if np.isfinite(null.tilt).any() else 1.0
+    bad |= np.nan_to_num(null.tilt) > 8.0 * tilt_scale
+    m = int(bad.sum())
+    if m == 0 or m > _MOST * case.n or case.n - m < 5:
+        return None
+    one = fit(case.pick(~bad), start=null)
+    e = _centre_errors(case, one)
+    ball = 4.0 / 3.0 * np.pi * (1.5 * float(e[bad].max())) ** 3
+    sphere = 4.0 * np.pi if np.isfinite(case.m).all(axis=1).any() else 1.0
+    cost = m * (2.0 * np.log(ball) + 2.0 * np.log(sphere) + 2.0 * np.log(case.n))
+    numbers = {"worst_mm": 1e3 * float(e[bad].max()), "others_mm": 1e3 * float(np.median(e[~bad]))}
+    return Explained(
+        "outlier scans or partial views",
+        one.bic + cost,
+        one,
+        float(e[bad].max()),
+        numbers,
+        tuple(np.array(case.ids)[bad]),
+    )
+
+
+def sure_outliers(case: Case, null: Fit) -> Finding | None:
+    """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the residuals."""
+    r = np.linalg.norm(null.e, axis=1)
+    chance = f_tail((r / null.sigma_m) ** 2 / 3.0, 3, NU)
+    bad = (chance * case.n < _ODD) & (r > _GROSS_M)
+    m = int(bad.sum())
+    if m == 0 or m > _MOST * case.n or case.n - m < 5:
+        return None
+    numbers = {"worst_mm": 1e3 * float(r[bad].max()), "others_mm": 1e3 * float(np.median(r[~bad]))}
+    score = float(-2.0 * np.log(chance[bad] * case.n).sum())
+    return Finding("outlier scans or partial views", score, numbers, tuple(np.array(case.ids)[bad]))
+
+
+def _centre_errors(case: Case, one: Fit) -> Array:
+    q = case.c @ one.R[0].T + one.p[0] - case.b
+    return np.asarray(np.linalg.norm(q, axis=1))
+
+
+def partial_views(case: Case) -> Finding | None:
+    """Scans that show little of the flange's edge, or none of it."""
+    few = np.zeros(case.n, dtype=bool) if case.coverage is None else np.nan_to_num(case.coverage, nan=1.0) < _LEAST_SEEN
+    lost = [i for i, _ in case.refused]
+    share = (int(few.sum()) + len(lost)) / max(case.n + len(lost), 1)
+    if share < _REFUSED or int(few.sum()) + len(lost) < 2:
+        return None
+    return Finding(
+        "outlier scans or partial views", 40.0 * share + 12.0, {"share": share, "refused": float(len(lost))},
+        (*tuple(np.array(case.ids)[few]), *lost),
+    )  # fmt: skip
+
+
+def noise_growth(case: Case) -> Finding | None:
+    """Noise of the faces that grows away from a distance faster than triangulation's square law."""
+    z = np.linalg.norm(case.c, axis=1)
+    if case.noise is None or case.n < 8:
+        return None
+    known = np.isfinite(case.noise) & (case.noise > 0.0)
+    if known.sum() < 8:
+        return None
+    y = np.log(case.noise[known]) - 2.0 * np.log(z[known])
+    x = (z[known] - z[known].mean()) / max(float(z[known].std()), 1e-6)
+    A = np.column_stack([np.ones(len(x)), x, x**2])
+    left = y - A @ np.linalg.lstsq(A, y, rcond=None)[0]
+    free = len(x) - 3
+    inside = float(left @ left)
+    total = float(((y - y.mean()) ** 2).sum())
+    value = (total - inside) / 2.0 / max(inside / free, 1e-12)
+    chance = float(f_tail(value, 2, free))
+    model = y - left
+    order = np.argsort(model)
+    third = max(len(x) // 3, 2)
+    factor = float(np.exp(np.median(y[order[-third:]]) - np.median(y[order[:third]])))
+    if chance > _NOISE_CHANCE or factor < _NOISE_FACTOR:
+        return None
+    worst = np.array(case.ids)[known][order[-third:]]
+    score = len(x) * np.log(total / max(inside, 1e-12)) - 2.0 * np.log(len(x))
+    at = float(np.median(z[known][order[-third:]]))
+    numbers = {"factor": factor, "at_mm": 1e3 * at, "chance": chance}
+    if case.near_far is not None:
+        numbers |= {"near_mm": 1e3 * case.near_far[0], "far_mm": 1e3 * case.near_far[1]}
+    return Finding("scanner out of focus or range", float(score), numbers, tuple(worst))
+
+
+def too_alike(case: Case) -> Finding | None:
+    """Poses that differ too little to fix the camera. One orientation alone is no fault where the places differ enough."""
+    b = case.b - case.b.mean(axis=0)
+    width = np.linalg.svd(b, compute_uv=False) / np.sqrt(case.n)
+    R = case.X_BF[:, :3, :3]
+    turn = np.degrees(np.linalg.norm(log_rotation(np.swapaxes(R[:1], 1, 2) @ R), axis=1))
+    middle = float(np.max(turn))
+    if width[1] >= _FLAT_M:
+        return None
+    numbers = {"spread_mm": 1e3 * float(width[0]), "second_mm": 1e3 * float(width[1]), "turn_deg": middle}
+    return Finding("poses too alike", 60.0, numbers)
+
+
+def installation(case: Case, one: Fit) -> Finding | None:
+    """The camera is elsewhere than somebody measured it, by more than the measurement's stated error, while all scans agree."""
+    if case.guess is None:
+        return None
+    seen = case.c @ one.R[0].T + one.p[0]
+    expected = case.c @ case.guess[:3, :3].T + case.guess[:3, 3]
+    off = float(np.median(np.linalg.norm(seen - expected, axis=1)))
+    turn = float(np.degrees(np.linalg.norm(log_rotation((one.R[0] @ case.guess[:3, :3].T)[None])[0])))
+    if off < 2.0 * case.guess_radius:
+        return None
+    X = np.eye(4)
+    X[:3, :3] = one.R[0] @ case.guess[:3, :3].T
+    shift = one.p[0] - X[:3, :3] @ case.guess[:3, 3]
+    numbers = {
+        "off_mm": 1e3 * off,
+        "turn_deg": turn,
+        "shift_mm": 1e3 * float(np.linalg.norm(shift)),
+        "stated_mm": 1e3 * case.guess_radius,
+    }
+    return Finding("robot in another installation", float(min(10.0 * (off / case.guess_radius) ** 2, 400.0)), numbers)
+
+
+_FIT_RAD = 0.02  # normals agree with a reading
+_WRONG_RAD = 0.05  # normals disagree with the poses as they are
+_SAME = 3.0  # a mirrored scan must bring the residuals down by this factor
+_Order = Literal["xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ"]
+_ORDERS: tuple[_Order, ...] = ("xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ")
+
+
+@dataclass(frozen=True, eq=False)
+class Misread:
+    """A way of misreading rotations or scans: the cause, its words, the corrected case and its fit."""
+
+    cause: str
+    words: str
+    case: Case
+    fit: Fit
+
+
+def misread_rotations(case: Case, null: Fit) -> Misread | None:
+    """The misreading that explains why normals disagree with the poses while the centres agree; None where there is none."""
+    seen = np.asarray(np.isfinite(case.m).all(axis=1))
+    if seen.sum() < 5:
+        return None
+    by_centres = fit(case, normals=False)
+    u = case.m[seen] @ by_centres.R[0].T
+    if by_centres.rms > 3e-3 or _off(u, case.z[seen]) < _WRONG_RAD:
+        return None
+    best: tuple[float, str, Array] | None = None
+    for words, R in _readings(case.X_BF[:, :3, :3]):
+        off = _off(u, (R @ case.X_FR[:3, :3])[seen][:, :, 2])
+        if off < _FIT_RAD and (best is None or off < best[0]):
+            best = off, words, R
+    if best is None:
+        return None
+    other = case.with_poses(pose(best[2], case.X_BF[:, :3, 3]))
+    return Misread("wrong rotation convention", best[1], other, fit(other))
+
+
+def _off(u: Array, z: Array) -> float:
+    """Median angle (rad) between two lists of directions."""
+    return float(np.median(np.arctan2(np.linalg.norm(np.cross(u, z), axis=1), (u * z).sum(axis=1))))
+
+
+def _readings(R: Array) -> Iterator[tuple[str, Array]]:
+    turn = Rotation.from_matrix(R)
+    for read in _ORDERS:
+        angles = turn.as_euler(read)
+        for order in _ORDERS:
+            if order != read:
+                words = f"the rotations are Euler angles in the order {order}, and they were read in the order {read}"
+                yield words, np.asarray(Rotation.from_euler(order, angles).as_matrix())
+        yield (
+            f"the rotations are rotation vectors, and they were read as Euler angles in the order {read}",
+            np.asarray(Rotation.from_rotvec(angles).as_matrix()),
+        )
+        yield (
+            f"the rotations are Euler angles in the order {read}, and they were read as rotation vectors",
+            np.asarray(Rotation.from_euler(read, turn.as_rotvec()).as_matrix()),
+        )
+        yield (
+            "the angles are radians, and they were read as degrees",
+            np.asarray(Rotation.from_euler(read, np.degrees(angles)).as_matrix()),
+        )
+    yield (
+        "the angles are radians, and they were read as degrees",
+        np.asarray(Rotation.from_rotvec(np.degrees(turn.as_rotvec())).as_matrix()),
+    )
+
+
+def rotations_disagree(case: Case) -> dict[str, float] | None:
+    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind; None where both agree."""
+    seen = np.asarray(np.isfinite(case.m).all(axis=1))
+    if seen.sum() < 5:
+        return None
+    by_centres = fit(case, normals=False)
+    off = _off(case.m[seen] @ by_centres.R[0].T, case.z[seen])
+    if by_centres.rms > 3e-3 or off < _WRONG_RAD:
+        return None
+    return {"centres_mm": 1e3 * by_centres.rms, "normals_deg": float(np.degrees(off))}
+
+
+def mirrored(case: Case, null: Fit) -> Misread | None:
+    """The case with the scanner's x axis turned round, where only that fits; one mirror stands for all, the others are turned ones."""
+    flip = np.array([-1.0, 1.0, 1.0])
+    other = replace(case, c=case.c * flip, m=case.m * flip)
+    one = fit(other)
+    if null.rms < _SAME * max(one.rms, 3e-4):
+        return None
+    return Misread(
+        "scanner axes mirrored", "the scanner's frame is left-handed: one of its axes is mirrored", other, one
+    )
+
+
+def reordered(case: Case, null: Fit) -> Misread | None:
+    """The case with scans and poses paired in another order: backwards, or as names sort as text ("10" before "2")."""
+    n = case.n
+    text = np.array(sorted(range(n), key=lambda k: str(k + 1)))
+    back = np.argsort(text)
+    for words, order in (
+        ("the scans stand in the reverse order of the poses", np.arange(n)[::-1]),
+        ("the scans are sorted as text (1, 10, 11, 2) and the poses by number", text),
+        ("the poses are sorted as text (1, 10, 11, 2) and the scans by number", back),
+    ):
+        other = case.with_poses(case.X_BF[order])
+        one = fit(other)
+        if null.rms > _SAME * max(one.rms, 3e-4):
+            return Misread("scans and poses in different orders", words, other, one)
+    return None
+
 
 THRESHOLDS = {
     "scanner moved": 20.0,

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.quantiles import f_tail
+from weldcal.calibration.geometry.robust import f_tail
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

@@ -7,7 +7,7 @@ import numpy as np
 
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.geometry.quantiles import f_quantile
+from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import nearest_rotation
 from weldcal.models.arrays import Array
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.geometry.quantiles import chi2_quantile, f_quantile
+from weldcal.calibration.geometry.robust import chi2_quantile, f_quantile
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
 

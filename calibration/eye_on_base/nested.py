@@ -12,7 +12,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.quantiles import t_quantile
+from weldcal.calibration.geometry.robust import t_quantile
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 

@@ -17,7 +17,7 @@ from weldcal.calibration.eye_on_base.scanner_fit import (
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.quantiles import chi2_share
+from weldcal.calibration.geometry.robust import chi2_share
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 

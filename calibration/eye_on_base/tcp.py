@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.quantiles import f_tail
 from weldcal.calibration.geometry.rigid import fit_rigid
+from weldcal.calibration.geometry.robust import f_tail
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arrays import Array
 

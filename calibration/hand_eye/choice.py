@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.geometry.quantiles import t_quantile
+from weldcal.calibration.geometry.robust import t_quantile
 from weldcal.calibration.geometry.se3 import exp_rotation, mean_of
 from weldcal.calibration.hand_eye.fit import Fit, descend, fit, noise_of
 from weldcal.calibration.hand_eye.linearisation import Loss

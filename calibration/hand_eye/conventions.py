@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
-from weldcal.calibration.geometry.quantiles import f_quantile
+from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import inverse, nearest_rotation
 from weldcal.models.arrays import Array
 

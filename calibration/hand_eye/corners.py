@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.quantiles import chi2_quantile
+from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import difference, pose
 from weldcal.calibration.hand_eye.choice import CANDIDATES
 from weldcal.calibration.hand_eye.files import PosePairs

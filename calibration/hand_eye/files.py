@@ -22,8 +22,7 @@ from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import file_size
-from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER, file_size
 
 _MORE = {"robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL")}
 _EXTRAS = ("X_true", "img", "obj", "K", "dist", "q")

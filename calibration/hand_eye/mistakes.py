@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.geometry.quantiles import f_quantile
+from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES, most_promising
 from weldcal.calibration.hand_eye.determinacy import diversity

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UndeterminedPoses
-from weldcal.calibration.geometry.quantiles import f_quantile
+from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import IDENTITY, difference, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate, solve
 from weldcal.calibration.hand_eye.determinacy import (

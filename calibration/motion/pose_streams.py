@@ -25,6 +25,17 @@ from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
+
+def is_stream_file(path: Path) -> bool:
+    """Whether a file is an npz with the arrays `hand` and `eye`."""
+    if path.suffix.lower() != ".npz" or not path.is_file():
+        return False
+    try:
+        return {"hand", "eye"} <= set(read_npz(path, ("hand", "eye")))
+    except InputError:
+        return False
+
+
 _WIDEST_S, _STEP_S = 2.0, 0.005  # offsets that are searched
 _RATE_S = 0.05  # half the interval of an angular speed
 _MOST_FRAMES, _MOST_PAIRS = 2000, 300

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.profiler.errors import DegenerateMotion
+from weldcal.calibration.errors import DegenerateMotion
 from weldcal.calibration.profiler.motion import Floats
 
 VAGUE_M = 0.02  # one sigma of a direction from which on there is no calibration

@@ -18,11 +18,154 @@ from weldcal.calibration.published.algorithm1 import (
     algorithm1_step,
     translation_cost,
 )
-from weldcal.calibration.published.circle import CircleParameters, PublishedCircle, search_circle
 from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
-from weldcal.calibration.published.segmentation import SegmentationParameters, segment_flange
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
+
+SAMPLE_SIZE = 3
+_BLOCK = 64  # circles judged at once: keeps the distances of a 20 000-point face within a few megabytes
+
+
+@dataclass(frozen=True)
+class CircleParameters:
+    """Section 3.2.2: R = 31 mm, e_d = 0.3 mm, e_r = 1 mm, k_max = 10 000; m. ``only_smaller`` is the authors' program, which
+    takes radii from R - e_r to R, where the text says a tolerance."""
+
+    R: float = 0.031
+    e_d: float = 0.0003
+    e_r: float = 0.001
+    k_max: int = 10_000
+    only_smaller: bool = False
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.e_r < self.R and self.e_d > 0.0 and self.k_max > 0):
+            raise InputError("The circle search needs 0 < e_r < R, e_d > 0 and k_max > 0.")
+
+
+@dataclass(frozen=True)
+class PublishedCircle:
+    """Centre (3,) m in C, radius m, points within e_d of it, and how many of the k_max triples passed the model check."""
+
+    center_C: Array
+    radius: float
+    n_inliers: int
+    n_verified: int
+
+
+def search_circle(points_C: Array, parameters: CircleParameters | None = None, *, seed: int = 0) -> PublishedCircle:
+    """Circle through three random points of a segmented face (N, 3) m that has the most points at its radius.
+
+    Source: paper, section 2.1.4, second step, numbers of section 3.2.2. As published: no plane is fitted, "on the circle" is
+    a distance from the centre within e_d of the radius (a shell), the winner is not refined, and inner points of the face
+    draw as often as points of its edge. The authors' search has no seed: the centre it gives for the same cloud repeats
+    to a few tenths of a millimetre only, which ``seed`` hides but does not correct. Raises FlangeNotFound when no triple
+    passes the check of the radius.
+    """
+    p = parameters or CircleParameters()
+    points = np.asarray(points_C, dtype=float).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < SAMPLE_SIZE:
+        raise FlangeNotFound("The published circle search needs at least three points.")
+    rng = np.random.default_rng(seed)
+    triples = points[rng.integers(len(points), size=(p.k_max, SAMPLE_SIZE))]
+    centers, radii = circumcircles(triples)
+    smallest, largest = p.R - p.e_r, p.R if p.only_smaller else p.R + p.e_r
+    good = np.isfinite(radii) & (radii >= smallest) & (radii <= largest)
+    centers, radii = centers[good], radii[good]
+    if len(radii) == 0:
+        raise FlangeNotFound(
+            f"None of {p.k_max} random circles has a radius from {1e3 * smallest:.0f} to {1e3 * largest:.0f} mm."
+        )
+    # |p - c| from the expanded square: one product of matrices, after moving the origin near to lose no digits
+    origin = points.mean(axis=0)
+    near, c = points - origin, centers - origin
+    square = (near**2).sum(axis=1)
+    counts = np.empty(len(c), dtype=int)
+    for k in range(0, len(c), _BLOCK):
+        block = slice(k, k + _BLOCK)
+        d2 = square - 2.0 * c[block] @ near.T + (c[block] ** 2).sum(axis=1)[:, None]
+        d = np.sqrt(np.maximum(d2, 0.0))
+        counts[block] = (np.abs(d - radii[block, None]) < p.e_d).sum(axis=1)
+    best = int(np.argmax(counts))
+    return PublishedCircle(centers[best], float(radii[best]), int(counts[best]), len(radii))
+
+
+def circumcircles(triples: Array) -> tuple[Array, Array]:
+    """Centres (k, 3) and radii (k,) of the circles through point triples (k, 3, 3); radius NaN where the points are
+    collinear or repeated."""
+    A, u, v = triples[:, 0], triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
+    w = np.cross(u, v)
+    uu, vv, ww = ((x * x).sum(axis=1) for x in (u, v, w))
+    flat = ww <= 1e-18 * uu * vv
+    ww = np.where(flat, 1.0, ww)
+    to_center = (np.cross(w, u) * vv[:, None] + np.cross(v, w) * uu[:, None]) / (2.0 * ww[:, None])
+    radii = np.where(flat, np.nan, np.linalg.norm(to_center, axis=1))
+    return A + to_center, radii
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentationParameters:
+    """Numbers of the segmentation, m. Section 2.1.4 names the steps but no number; these are the ones that the authors
+    published beside the paper for the UR10e: filters of 50 neighbours and one standard deviation, applied twice, clusters
+    of 8 000 to 100 000 points linked over 0.5 mm, and a face of 0.9 to 1.1 flange diameters."""
+
+    depth_m: tuple[float, float] = (0.4, 1.0)
+    neighbours: int = 50
+    deviations: float = 1.0
+    passes: int = 2
+    link_m: float = 0.0005
+    cluster_points: tuple[int, int] = (8_000, 100_000)
+    plane_m: float = 0.001
+    plane_draws: int = 10_000
+    width_in_diameters: tuple[float, float] = (0.9, 1.1)
+    depth_in_diameters: float = 0.55
+
+
+def segment_flange(
+    points_C: Array, radius_m: float = 0.031, parameters: SegmentationParameters | None = None, *, seed: int = 0
+) -> Array:
+    """The points (n, 3) m of the first cluster whose dominant plane has about the size of a flange of that radius.
+
+    ``points_C``: a scene (N, 3) or (H, W, 3) m, NaN where invalid. Source: paper, section 2.1.4, first step; the largest
+    clusters are tried first. Its failings are kept: the size is measured along the camera's axes, so a flange that leans
+    is narrower than allowed; the fixed number of points ties it to one resolution and distance; a plate of the same size
+    passes (three did for the UR5, section 3.2.2). Deterministic for ``seed``. Raises FlangeNotFound, saying at which
+    step nothing was left.
+    """
+    import open3d as o3d  # slow to import
+
+    p = parameters or SegmentationParameters()
+    flat = np.asarray(points_C, dtype=float).reshape(-1, 3)
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    flat = flat[(flat[:, 2] > p.depth_m[0]) & (flat[:, 2] < p.depth_m[1])]
+    if len(flat) <= p.neighbours:
+        raise FlangeNotFound(f"The published pass-through from {p.depth_m[0]:g} to {p.depth_m[1]:g} m leaves no scene.")
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(flat))
+    for _ in range(p.passes):
+        cloud, _kept = cloud.remove_statistical_outlier(p.neighbours, p.deviations)
+    # Euclidean clusters are DBSCAN's in which every point is a core point
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        labels = np.asarray(cloud.cluster_dbscan(eps=p.link_m, min_points=1))
+    names, sizes = np.unique(labels[labels >= 0], return_counts=True)
+    allowed = (sizes >= p.cluster_points[0]) & (sizes <= p.cluster_points[1])
+    if not allowed.any():
+        largest = int(sizes.max(initial=0))
+        raise FlangeNotFound(
+            f"No cluster has the published {p.cluster_points[0]} to {p.cluster_points[1]} points; the largest has {largest}."
+        )
+    o3d.utility.random.seed(seed)
+    diameter = 2.0 * radius_m
+    for name in names[allowed][np.argsort(-sizes[allowed], kind="stable")]:
+        cluster = cloud.select_by_index(np.nonzero(labels == name)[0].tolist())
+        _model, inliers = cluster.segment_plane(p.plane_m, 3, p.plane_draws)
+        face = np.asarray(cluster.points)[np.asarray(inliers, dtype=int)]
+        extent = np.ptp(face, axis=0) / diameter
+        low, high = p.width_in_diameters
+        if low < extent[0] < high and low < extent[1] < high and extent[2] < p.depth_in_diameters:
+            return np.asarray(face)
+    raise FlangeNotFound("No cluster of the published size has a plane as wide as the flange.")
+
 
 Method = Literal["point_to_point", "point_to_plane"]
 

@@ -24,7 +24,7 @@ from weldcal.calibration.refinement.kinematics_fit import (
     fit_kinematics,
     unsought,
 )
-from weldcal.calibration.refinement.local_choice import GAIN, PlainSolve, calibrate_plain
+from weldcal.calibration.refinement.local_field import GAIN, PlainSolve, calibrate_plain
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arrays import Array

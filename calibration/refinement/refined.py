@@ -11,8 +11,7 @@ from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.refinement.kinematics_choice import choose_kinematics, kinematics_text, with_kinematics
-from weldcal.calibration.refinement.local_choice import PlainSolve, choose_local, with_field
-from weldcal.calibration.refinement.local_field import LocalField
+from weldcal.calibration.refinement.local_field import LocalField, PlainSolve, choose_local, with_field
 from weldcal.calibration.refinement.stated_arm import arm_document
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array

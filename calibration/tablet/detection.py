@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.errors import LandmarksNotFound
+from weldcal.calibration.errors import LandmarksNotFound
 from weldcal.models.arrays import Array
 
 Grey = NDArray[np.uint8]

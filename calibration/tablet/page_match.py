@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 
-from weldcal.calibration.tablet.errors import TabletDataError
+from weldcal.calibration.errors import TabletDataError
 from weldcal.models.arrays import Array
 
 _NEAREST = 0.5  # of the landmarks' least distance: a touch farther from its landmark may be nearer to another

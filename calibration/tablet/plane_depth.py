@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from weldcal.calibration.tablet.errors import LandmarksNotFound
+from weldcal.calibration.errors import LandmarksNotFound
 from weldcal.models.arrays import Array
 
 _LEAST_PIXELS = 50

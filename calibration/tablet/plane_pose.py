@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.tablet.errors import LandmarksNotFound
+from weldcal.calibration.errors import LandmarksNotFound
 from weldcal.calibration.tablet.touches import check_layout
 from weldcal.models.arrays import Array
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
+from weldcal.calibration.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.models.arrays import Array
 
 MIN_LANDMARKS = 4

@@ -20,7 +20,7 @@ from weldcal.calibration.eye_on_base.stated_error import (
     scatter_elsewhere,
 )
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.quantiles import f_quantile
+from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.refinement.kinematics_fit import FactoryPrior
 from weldcal.calibration.refinement.local_field import field_from_document

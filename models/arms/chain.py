@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.kinematics import ArmModel, known_arms, load_arm
 from weldcal.models.arrays import Array
+from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
-from weldcal.models.keys import did_you_mean
 
 RESIDUAL = 1e-9  # m and rad: what a returned solution fulfils
 _HERE = Path(__file__).resolve().parent

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
-from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER
 
 if TYPE_CHECKING:
     from pydrake.math import RigidTransform

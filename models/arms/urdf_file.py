@@ -12,8 +12,7 @@ from pydrake.multibody.tree import Joint, RevoluteJoint, RigidBody
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text
-from weldcal.models.limits import LARGEST_DOCUMENT
+from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
 BASES, FLANGES = ("base", "base_link"), ("tool0", "flange", "ee_link", "link_ee", "hand", "tool_link")
 """Names of links that are taken for base and flange, the first that is there; otherwise the root, and the end of the chain."""

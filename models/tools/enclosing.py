@@ -55,7 +55,7 @@ def _capsule_about(points: Array) -> tuple[Array, Array, float]:
 
 @lru_cache(maxsize=8)
 def _read(path: str, unit_m: float, changed: int) -> TriMesh:
-    from weldcal.models.open3d_core import o3d
+    from weldcal.models.mesh import o3d
 
     found = o3d.io.read_triangle_mesh(Path(path))
     vertices, triangles = np.asarray(found.vertices), np.asarray(found.triangles)

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text
-from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER, read_text
 from weldcal.models.workpieces.drawing import draw_seam
 from weldcal.models.workpieces.seams import JOINTS, DrawnSeam
 from weldcal.models.workpieces.shape import PartShape

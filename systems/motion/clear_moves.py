@@ -9,9 +9,16 @@ from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
 from weldcal.models.errors import InputError
-from weldcal.systems.motion.goals import stands_at
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
+
+AT_HOME_RAD = 0.01  # within this distance of home the job starts without a move
+
+
+def stands_at(q: NDArray[np.float64], q_home: NDArray[np.float64]) -> bool:
+    """Whether each joint (6,) rad is within AT_HOME_RAD of home."""
+    return bool(np.max(np.abs(q - q_home)) <= AT_HOME_RAD)
+
 
 Joints = NDArray[np.float64]
 

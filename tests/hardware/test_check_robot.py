@@ -23,8 +23,7 @@ from tests.hardware.emulator_process import Emulator, emulator_process
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.faults import SENTENCES
+from weldcal.systems.drivers.ur.faults import SENTENCES, RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.readiness import preflight as module
 from weldcal.systems.drivers.ur.readiness.kinematics_info import KinematicsInfo, read_kinematics
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad

@@ -15,12 +15,10 @@ from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenari
 from tests.ur_rtde import NEEDS_UR_RTDE
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.ur.errors import RobotRefused
-from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.faults import Fault, RobotRefused
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
-from weldcal.systems.drivers.ur.torch.off_switch import MASK, VALUE
-from weldcal.systems.drivers.ur.torch.set_points import Level
+from weldcal.systems.drivers.ur.torch.set_points import MASK, VALUE, Level
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.station import make_station
 from weldcal.systems.wall_clock import WallClock

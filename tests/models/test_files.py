@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from weldcal.models.array_files import read_npy, read_npz
+from weldcal.models.array_files import read_grey_image, read_npy, read_npz
 from weldcal.models.documents import Section, parse_document, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_bytes, read_text, sha256
-from weldcal.models.images import read_grey_image
 from weldcal.tools.worlds.binary_damage import _bomb, _objects
 
 READERS: dict[str, Callable[[Path], object]] = {

@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 
 from tests.browser import Browser, colours
 from weldcal.systems.cell import Cell, build_cell
-from weldcal.systems.motion.operator_panel import HOLD_BUTTON
+from weldcal.systems.motion.spine import HOLD_BUTTON
 from weldcal.systems.scenario.loading import load_scenario
 
 

@@ -17,7 +17,7 @@ from pydrake.systems.primitives import LogVectorOutput
 
 from weldcal.systems.cell import build_cell
 from weldcal.systems.leaf_system import DECLARATIONS, LeafSystem, without_owner
-from weldcal.systems.motion.operator_panel import OperatorPanel
+from weldcal.systems.motion.spine import OperatorPanel
 from weldcal.systems.person import Person
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario

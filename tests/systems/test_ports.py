@@ -52,7 +52,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
 from weldcal.systems.drivers.simulated.streaming.replay import FrameReplay
 from weldcal.systems.drivers.simulated.streaming.scanner import DepthStream, StreamingScanner
-from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigitizer
+from weldcal.systems.drivers.simulated.tablet_world import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
 from weldcal.systems.drivers.ur.touch_probe import ProbeInput, Touches, UrTouchProbeInput
@@ -96,15 +96,12 @@ from weldcal.systems.messages import (
     TorchTouch,
     UrStatus,
 )
-from weldcal.systems.motion.command_arbiter import CommandArbiter
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.flange_mover import FlangeMover
 from weldcal.systems.motion.frame_queue import FrameQueue
-from weldcal.systems.motion.operator_panel import OperatorPanel
 from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
-from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.systems.motion.singularity_guard import SingularityGuard
-from weldcal.systems.motion.slew_limiter import SlewLimiter
+from weldcal.systems.motion.spine import CommandArbiter, OperatorPanel, ProcessSwitch, SlewLimiter
 from weldcal.systems.person import Person
 from weldcal.systems.recording.player import PortPlayer
 from weldcal.systems.recording.port_recorder import PortRecorder, PortSink

@@ -16,9 +16,8 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.checks import check_numbers, check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_class, scenario_names
-from weldcal.systems.scenario.numbers import check_numbers
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.systems.scenario.surroundings import surroundings_of
 

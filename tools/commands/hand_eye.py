@@ -26,9 +26,8 @@ from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, 
 from weldcal.calibration.hand_eye.pictures import PictureResult, PictureSet, read_pictures, solve_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.motion.stream_file import is_stream_file
-from weldcal.calibration.planning.next_pose import next_pose
-from weldcal.calibration.planning.view import View, view_of
+from weldcal.calibration.motion.pose_streams import is_stream_file
+from weldcal.calibration.planning.next_pose import View, next_pose, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner

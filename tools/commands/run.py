@@ -18,8 +18,8 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
+from weldcal.models.documents import nearest
 from weldcal.models.errors import InputError
-from weldcal.models.keys import nearest
 from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.simulated.ur import SimulatedUr

@@ -17,9 +17,8 @@ from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_el
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.joint_angles import joint_angles
 from weldcal.calibration.refinement.local_field import field_from_document
-from weldcal.calibration.refinement.stated_arm import shared_error
+from weldcal.calibration.refinement.stated_arm import joint_angles, shared_error
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

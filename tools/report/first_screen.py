@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
-from weldcal.calibration.geometry.quantiles import chi2_quantile
+from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

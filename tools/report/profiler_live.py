@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.geometry.quantiles import chi2_quantile, chi2_share
+from weldcal.calibration.geometry.robust import chi2_quantile, chi2_share
 from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.estimates import pose_sigmas

@@ -23,8 +23,8 @@ from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
 from weldcal.calibration.tablet.wrist.files import load_visit
 from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.array_files import read_grey_image
 from weldcal.models.errors import InputError
-from weldcal.models.images import read_grey_image
 from weldcal.systems.scenario.loading import load_scenario, scenario_class
 from weldcal.tools.commands.profiler.files import read_profiler_file
 from weldcal.tools.worlds import binary_damage, text_damage

@@ -18,10 +18,9 @@ from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import Depth, noisy_depth
-from weldcal.models.exposure import mixed_exposure
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 from weldcal.models.mesh import TriMesh, merge, revolve
-from weldcal.models.scanner_streams import ScannerStream
+from weldcal.models.scanner_streams import ScannerStream, mixed_exposure
 from weldcal.models.scanners import ScannerPreset
 
 Pixels = npt.NDArray[np.intp]

@@ -13,7 +13,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.models.arms.chain import chain_poses, load_chain
 from weldcal.models.arrays import Array
-from weldcal.models.limits import MOST_POINTS
+from weldcal.models.files import MOST_POINTS
 
 ENDINGS = (".mcap", ".db3", ".bag")
 INSTALL = "pip install 'weldcal[ros]'"

@@ -10,7 +10,7 @@ from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.readings import PoseNumbers, PoseReading, parse_form, readings
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
-from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER
 
 _ORTHONORMAL = 0.05  # rotations with two decimals deviate by 0.02 at most
 _UNIT_LENGTH = 0.05  # of quaternions with two decimals

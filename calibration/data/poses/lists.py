@@ -16,8 +16,7 @@ from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.errors import InputError
-from weldcal.models.files import file_size, read_text
-from weldcal.models.limits import MOST_CELLS
+from weldcal.models.files import MOST_CELLS, file_size, read_text
 
 TEXT = (
     ".csv",

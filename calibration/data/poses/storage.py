@@ -12,8 +12,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.documents import as_number, parse_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text
-from weldcal.models.limits import DEEPEST, LARGEST_DOCUMENT, MOST_NODES
+from weldcal.models.files import DEEPEST, LARGEST_DOCUMENT, MOST_NODES, read_text
 
 
 def read_tree(path: Path) -> Any:

@@ -10,8 +10,7 @@ from scipy.spatial import cKDTree
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.mesh import TriMesh
-from weldcal.models.open3d_core import o3d
+from weldcal.models.mesh import TriMesh, o3d
 
 _SAMPLES_PER_M2 = 6e5  # one in 1.3 mm
 _INSIDE_M = 1e-4

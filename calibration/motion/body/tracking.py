@@ -14,7 +14,7 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.open3d_core import o3d
+from weldcal.models.mesh import o3d
 
 _STAGES = ((0.03, 12), (0.008, 12), (0.0025, 25))  # largest distance of a pair (m) and iterations
 _POINTS = 5000  # of a scan that are registered

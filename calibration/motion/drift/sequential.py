@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.geometry.quantiles import chi2_threshold
+from weldcal.calibration.geometry.robust import chi2_threshold
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.motion.drift.hypotheses import RAMP, RAMP_S, STEP, DriftFilter, FilterConfig
 from weldcal.calibration.motion.drift.noise import FrameNoise, NoiseMemory, measured_noise

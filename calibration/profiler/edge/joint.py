@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.profiler.edge.model import (
     EdgeState,
     left_covariance,
@@ -19,7 +20,6 @@ from weldcal.calibration.profiler.edge.model import (
     whitened,
 )
 from weldcal.calibration.profiler.edge.start import edge_starts
-from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, checked_points
 from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
 from weldcal.models.errors import InputError

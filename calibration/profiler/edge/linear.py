@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewRotations, TooFewTranslations
 from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewRotations, TooFewTranslations
 from weldcal.calibration.profiler.motion import (
     FlangePoses,
     Floats,

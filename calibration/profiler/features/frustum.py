@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
-from weldcal.calibration.profiler.errors import FeatureNotFound
+from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 
@@ -69,7 +69,7 @@ def fit_frustum(points: ArrayLike) -> Frustum:
 
 def _normals(p: Floats) -> Floats:
     """Unit normal (n, 3) at each point from its neighbours, by Open3D."""
-    from weldcal.models.open3d_core import o3d
+    from weldcal.models.mesh import o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))

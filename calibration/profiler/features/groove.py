@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
-from weldcal.calibration.profiler.errors import FeatureNotFound
+from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from weldcal.calibration.profiler.errors import ArcNotFound
+from weldcal.calibration.errors import ArcNotFound
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 

@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
-from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
 from weldcal.calibration.profiler.sphere.model import Layout, Problem, SphereData, SphereSigmas, corrected

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
+from weldcal.calibration.errors import DegenerateMotion, RadiusError, TooFewRotations, TooFewTranslations
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.profiler.errors import DegenerateMotion, RadiusError, TooFewRotations, TooFewTranslations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_axes_spread
 from weldcal.models.errors import InputError
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from weldcal.calibration.profiler.errors import RadiusError
+from weldcal.calibration.errors import RadiusError
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, last_step
 from weldcal.calibration.profiler.sphere.model import Layout, Problem, SphereData, SphereSigmas
 from weldcal.calibration.profiler.sphere.start import sphere_starts

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.tablet.errors import EqualRotations, TabletDataError, TooFewLandmarks
+from weldcal.calibration.errors import EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.tablet.page_match import check_page_match
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER
 
 # keys of the file and their dimensions for one visit; one more in front where visits differ in it
 DIMENSIONS = {

@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from scipy.optimize import minimize
 from scipy.special import log_ndtr
 
-from weldcal.calibration.tablet.errors import CollinearLandmarks, LandmarksNotFound
+from weldcal.calibration.errors import CollinearLandmarks, LandmarksNotFound
 from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches, check_touches, same_landmark

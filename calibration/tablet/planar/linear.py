@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.errors import TooFewLandmarks
+from weldcal.calibration.errors import TooFewLandmarks
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches, check_touches, same_landmark
 from weldcal.models.arrays import Array

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.tablet.errors import TabletDataError
+from weldcal.calibration.errors import TabletDataError
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS
 from weldcal.calibration.tablet.wrist.fit import WristFit, WristTouches
 

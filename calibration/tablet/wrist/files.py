@@ -1,26 +1,173 @@
 """Reads a tablet visit: the page's CSV, robot poses and an image."""
 
-from collections.abc import Mapping
+import contextlib
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.tables import Row
-from weldcal.calibration.tablet.detection import Look
-from weldcal.calibration.tablet.errors import TabletDataError
-from weldcal.calibration.tablet.intrinsics import Intrinsics, load_intrinsics
+from weldcal.calibration.data.tables import Row, read_rows
+from weldcal.calibration.errors import LandmarksNotFound, TabletDataError
+from weldcal.calibration.tablet.detection import Look, arrange, find_marks
 from weldcal.calibration.tablet.page_match import check_page_match
-from weldcal.calibration.tablet.tables import landmark, number, read_table
 from weldcal.calibration.tablet.wrist.fit import WristTouches
-from weldcal.calibration.tablet.wrist.page_grid import find_page
+from weldcal.models.array_files import read_grey_image
 from weldcal.models.arrays import Array
+from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
-from weldcal.models.files import sha256
-from weldcal.models.images import read_grey_image
+from weldcal.models.files import LARGEST_DOCUMENT, LARGEST_NUMBER, read_text, sha256
+
+MOST_COLUMNS = 30
+_ON_GRID_PX = 1.5  # of the page: its landmarks sit on whole device pixels
+_MORE_ROWS = 8  # rows below the last touched one that are looked for in the image
+
+
+def grid_columns(shown_px: Mapping[int, Array]) -> tuple[int, int]:
+    """Columns of the page, and rows down to its last touched landmark, from coordinates (2,) px by landmark number.
+
+    A landmark's number is its row times the columns plus its column; x goes with the column and y with the row, evenly, in
+    whichever way the page is turned. Raises TabletDataError where no number of columns explains the coordinates.
+    """
+    numbers = np.array(sorted(shown_px))
+    at = np.array([shown_px[k] for k in numbers])
+    for columns in range(2, MOST_COLUMNS + 1):
+        row, column = np.divmod(numbers, columns)
+        if len(set(row)) < 2 or len(set(column)) < 2:
+            continue
+        A = np.c_[column, row, np.ones(len(numbers))]
+        fit, *_ = np.linalg.lstsq(A, at, rcond=None)
+        if np.abs(A @ fit - at).max() > _ON_GRID_PX or np.linalg.matrix_rank(A) < 3:
+            continue
+        right, down = fit[0], fit[1]
+        square = abs(right @ down) < 0.02 * np.linalg.norm(right) * np.linalg.norm(down)
+        if square and right[0] * down[1] - right[1] * down[0] > 0.0:
+            return columns, int(row.max()) + 1
+    raise TabletDataError(
+        "The numbers and coordinates of the landmarks make no grid row by row from 0; give --seen instead of the picture."
+    )
+
+
+def find_page(grey: NDArray[np.uint8], shown_px: Mapping[int, Array], look: Look) -> Array:
+    """Positions (n, 2) px in the image (h, w) of all of the page's landmarks, in their order.
+
+    Rows that nobody touched are not in the file, but they are in the image: the page has as many rows as are found.
+    Raises LandmarksNotFound, TabletDataError.
+    """
+    columns, rows = grid_columns(shown_px)
+    points, full = find_marks(grey, columns * (rows + _MORE_ROWS), look)
+    for more in range(_MORE_ROWS, 0, -1):
+        if len(points) >= columns * (rows + more):
+            with contextlib.suppress(LandmarksNotFound):
+                return arrange(points, full, columns, rows + more)
+    return arrange(points, full, columns, rows)
+
+
+def read_table(path: Path, columns: Sequence[str]) -> list[Row]:
+    """Rows of a CSV file that has at least these columns (lower case); a cell that is missing is empty.
+
+    Raises TabletDataError: no such file, no text, a column missing.
+    """
+    try:
+        names, rows = read_rows(path)
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
+    missing = [c for c in columns if c not in names]
+    if missing:
+        raise TabletDataError(f"'{path.name}' lacks the column{'s' if len(missing) > 1 else ''} {', '.join(missing)}.")
+    return rows
+
+
+def number(row: Row, column: str, path: Path) -> float:
+    """The finite number of a column; raises TabletDataError."""
+    try:
+        value = float(row[column])
+    except ValueError:
+        value = float("nan")
+    if not math.isfinite(value):
+        raise TabletDataError(f"'{path.name}': '{row[column][:40]}' in the column {column} is not a number.")
+    if abs(value) > LARGEST_NUMBER:
+        raise TabletDataError(f"'{path.name}': {row[column][:40]} in the column {column} is beyond {LARGEST_NUMBER:g}.")
+    return value
+
+
+def landmark(row: Row, path: Path) -> int:
+    """The landmark's number, from 0; raises TabletDataError."""
+    value = number(row, "landmark", path)
+    if value < 0.0 or value != int(value):
+        raise TabletDataError(f"'{path.name}': landmarks are whole numbers from 0, not '{row['landmark'][:40]}'.")
+    return int(value)
+
+
+_LEAST_FOCAL_PX = 1e-3  # anything less is no camera, and its rays overflow
+_COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients that OpenCV knows
+_MATRIX, _DISTORTION = ("camera_matrix", "K", "k", "M"), ("distortion_coefficients", "D", "d", "distortion")
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera: focal lengths and principal point (px, centre of the first pixel at (0, 0)), OpenCV distortion."""
+
+    focal_px: Array
+    centre_px: Array
+    distortion: Array
+
+    def rays(self, uv_px: Array) -> Array:
+        """Undistorted viewing rays (n, 2) of pixels (n, 2)."""
+        K = np.array([[self.focal_px[0], 0, self.centre_px[0]], [0, self.focal_px[1], self.centre_px[1]], [0, 0, 1]])
+        return np.asarray(cv2.undistortPoints(uv_px[:, None], K, self.distortion)[:, 0], dtype=float)
+
+
+def load_intrinsics(path: Path) -> Intrinsics:
+    """Intrinsics from a YAML file: fx, fy, cx, cy and optionally distortion (OpenCV's order), or camera_matrix (K) and
+    distortion_coefficients (D) as lists or with their `data`. Raises TabletDataError."""
+    try:
+        text = read_text(path, LARGEST_DOCUMENT)
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
+    try:
+        d = _document(path, text)
+        numbers = [float(d[key]) for key in ("fx", "fy", "cx", "cy")] if "fx" in d else _from_matrix(d)
+        found: Any = next((d[key] for key in _DISTORTION if d.get(key) is not None), [])
+        distortion = np.ravel(np.array(_data(found), dtype=float))
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
+    except Exception as error:  # unreadable in any way: the same sentence
+        raise TabletDataError(
+            f"'{path.name}' must hold fx, fy, cx and cy in pixels, or camera_matrix (and distortion, where known)."
+        ) from error
+    if distortion.size not in (0, *_COUNTS):
+        counts = ", ".join(map(str, _COUNTS))
+        raise TabletDataError(f"'{path.name}': distortion holds {distortion.size} numbers; OpenCV knows {counts}.")
+    if not (np.abs([*numbers, *distortion]) <= LARGEST_NUMBER).all() or min(numbers[:2]) < _LEAST_FOCAL_PX:
+        raise TabletDataError(
+            f"'{path.name}' holds a focal length that is not positive, or a value that is not a number."
+        )
+    return Intrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion if distortion.size else np.zeros(5))
+
+
+def _document(path: Path, text: str) -> dict[str, Any]:
+    if not text.startswith("%YAML:"):
+        return dict(parse_document(path.name, text))
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)  # OpenCV's own dialect
+    nodes = {key: storage.getNode(key) for key in (*_MATRIX, *_DISTORTION)}
+    return {key: node.mat().ravel().tolist() for key, node in nodes.items() if not node.empty()}
+
+
+def _data(value: Any) -> Any:
+    return value["data"] if isinstance(value, dict) else value
+
+
+def _from_matrix(d: dict[str, Any]) -> list[float]:
+    K = np.array(_data(next(d[key] for key in _MATRIX if key in d)), dtype=float).reshape(3, 3)
+    return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+
 
 TOUCH_COLUMNS = ("landmark", "landmark_x_px", "landmark_y_px", "touch_x_px", "touch_y_px", "mm_per_px")
 POSE_COLUMNS = ("landmark", "x", "y", "z", "qw", "qx", "qy", "qz")

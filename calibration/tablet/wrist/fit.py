@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import least_squares
 
+from weldcal.calibration.errors import TabletDataError
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import check_layout, check_turns
 from weldcal.models.arrays import Array

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from weldcal.models.base_circles import BaseCircle
+from weldcal.models.robots import BaseCircle
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.second_arm import PlacedArm
 from weldcal.systems.drivers.simulated.world import Fittings

@@ -23,8 +23,8 @@ from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
-from weldcal.models.base_circles import BaseCircle
 from weldcal.models.flanges import flange_mesh
+from weldcal.models.robots import BaseCircle
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.bodies.tool import (

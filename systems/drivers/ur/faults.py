@@ -2,6 +2,16 @@
 
 from enum import IntEnum
 
+from weldcal.models.errors import WeldcalError
+
+
+class RobotRefused(WeldcalError):
+    """The robot or its state does not allow the job to start; nothing has moved."""
+
+
+class RobotUnreachable(RobotRefused):
+    """Nothing answers at the robot's address."""
+
 
 class Fault(IntEnum):
     """The first fault is latched; only a new start clears it."""

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.systems.drivers.ur.errors import RobotRefused
-from weldcal.systems.drivers.ur.faults import Fault, sentence
+from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits

@@ -31,10 +31,32 @@ from weldcal.systems.drivers.ur.supervisor import (
     RobotSample,
     Supervisor,
 )
-from weldcal.systems.drivers.ur.time_scale import TimeScale
-from weldcal.systems.drivers.ur.torch.arc_inputs import ArcInputs
-from weldcal.systems.drivers.ur.torch.gas import Gas
-from weldcal.systems.drivers.ur.torch.set_points import Level, SetPoints, apart
+from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas, Level, SetPoints, apart
+
+FRESH_S = 0.012  # of robot time; three periods of the commands
+ZERO_S = 0.050
+RISE_PER_S = 10.0
+
+
+class TimeScale:
+    """The factor of the newest velocity: 1 while it is fresh, falling to 0 at ZERO_S, rising again by RISE_PER_S.
+
+    The direction is kept, so that the arm stays on its path; the cell reads where the arm is and goes on from there.
+    """
+
+    def __init__(self, pace: float) -> None:
+        self._pace = pace
+        self._last = 0.0
+        self.factor = 1.0
+
+    def step(self, now: float, age_s: float) -> float:
+        """The factor for a velocity that was given `age_s` (host time) before `now` (s, monotonic)."""
+        age, passed = self._pace * age_s, self._pace * max(now - self._last, 0.0)
+        fresh = min(max((ZERO_S - age) / (ZERO_S - FRESH_S), 0.0), 1.0)
+        self.factor = min(fresh, self.factor + RISE_PER_S * passed)
+        self._last = now
+        return self.factor
+
 
 ACCELERATION = 40.0  # rad/s^2 of speedj: the cell ramps the stream, the controller only follows
 LATE_PASS_S = 0.020

@@ -9,9 +9,9 @@ from pydrake.systems.framework import Context
 from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
 from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
 from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
-from weldcal.models.base_circles import base_circle
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.robots import base_circle
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
@@ -23,7 +23,7 @@ from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
-from weldcal.systems.scenario.numbers import check_home
+from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.station import Station

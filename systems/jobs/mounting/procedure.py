@@ -14,7 +14,7 @@ from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
 from weldcal.systems.messages import JobCommand, Message, UrStatus
-from weldcal.systems.motion.goals import stands_at
+from weldcal.systems.motion.clear_moves import stands_at
 
 Route = tuple[tuple[int, Array], ...]
 """Moves one after the other: number of the arm, and its joints (6,) rad."""

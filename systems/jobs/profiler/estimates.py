@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.profiler.edge.features import extract_edge
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.edge.model import EdgeState, measurement_covariance, predicted, whitened
-from weldcal.calibration.profiler.errors import FeatureNotFound
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.sphere.arc import find_arc

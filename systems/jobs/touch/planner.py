@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.planning.clearance import arm_bodies
 from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
-from weldcal.calibration.touch.fitted import around, fit_touched_plane
+from weldcal.calibration.touch.table import around, fit_touched_plane
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError

@@ -9,8 +9,8 @@ from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
 from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
+from weldcal.systems.motion.clear_moves import stands_at
 from weldcal.systems.motion.drift_monitor import DriftStatus
-from weldcal.systems.motion.goals import stands_at
 
 SCAN_TIMEOUT_S = 8.0
 WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "home")

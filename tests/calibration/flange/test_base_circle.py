@@ -12,8 +12,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.base_circle import fit_base_circle
 from weldcal.calibration.flange.fit import FlangeGuess
-from weldcal.models.base_circles import base_circle
 from weldcal.models.errors import InputError
+from weldcal.models.robots import base_circle
 
 Array = NDArray[np.float64]
 FOOT = base_circle("ur10e")

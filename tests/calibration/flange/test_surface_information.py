@@ -7,14 +7,16 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.flange.surface_information import (
+from weldcal.calibration.published.icp import (
     COMPONENTS,
+    CentreVerification,
+    icp_error,
     information,
+    make_verification,
     sigmas,
     surface_normals,
     unobservable_components,
 )
-from weldcal.calibration.published.icp import CentreVerification, icp_error, make_verification
 from weldcal.models.flanges import face_points, flange_mesh, get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f, t
 
-from weldcal.calibration.geometry.quantiles import (
+from weldcal.calibration.geometry.robust import (
     chi2_quantile,
     chi2_share,
     chi2_threshold,

@@ -11,8 +11,7 @@ from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
 from weldcal.calibration.hand_eye.mountings import MOUNTINGS, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, as_transform, solve_problem
-from weldcal.calibration.planning.next_pose import next_pose
-from weldcal.calibration.planning.view import view_of
+from weldcal.calibration.planning.next_pose import next_pose, view_of
 from weldcal.models.arms.chain import chain_forward, load_chain
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import get_scanner

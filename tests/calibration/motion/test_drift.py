@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter, FilterConfig
+from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter, FieldConfig, FilterConfig, PoseField
 from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
-from weldcal.calibration.motion.drift.pose_field import FieldConfig, PoseField
 from weldcal.calibration.motion.drift.residuals import CLOCK, SIZE, Rows
 from weldcal.calibration.motion.drift.sequential import CREEP, MOVED, WARM_UP, DriftConfig, DriftTest
 from weldcal.tools.worlds.features import Change, World, WorldConfig, simulate

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.errors import DatasetError, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.calibration.motion.pose_streams import PoseStreams, read_streams, synchronise
-from weldcal.calibration.motion.stream_file import is_stream_file
+from weldcal.calibration.motion.pose_streams import PoseStreams, is_stream_file, read_streams, synchronise
 from weldcal.models.arrays import Array
 from weldcal.tools.commands.hand_eye import run_hand_eye
 

@@ -9,17 +9,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.places import SHARED_DATA, needs
-from weldcal.calibration.profiler.edge.features import extract_edge
-from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_crb, edge_joint
-from weldcal.calibration.profiler.edge.linear import edge_linear
-from weldcal.calibration.profiler.edge.model import EdgeState, predicted
-from weldcal.calibration.profiler.errors import (
+from weldcal.calibration.errors import (
     DegenerateMotion,
     FeatureNotFound,
     InconsistentData,
     TooFewRotations,
     TooFewTranslations,
 )
+from weldcal.calibration.profiler.edge.features import extract_edge
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_crb, edge_joint
+from weldcal.calibration.profiler.edge.linear import edge_linear
+from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.models.errors import InputError
 

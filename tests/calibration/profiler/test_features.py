@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.places import SHARED_DATA, needs
+from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.profiler.arm_errors import DhArm
-from weldcal.calibration.profiler.errors import FeatureNotFound
 from weldcal.calibration.profiler.features.frustum import fit_frustum, without_spikes
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses

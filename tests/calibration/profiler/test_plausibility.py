@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from tests.calibration.profiler.test_cli import called, edge_csv, found
 from tests.calibration.profiler.test_sphere import DATA, MM, SIGMAS, clean, needs_data, poses
-from weldcal.calibration.profiler.errors import RadiusError
+from weldcal.calibration.errors import RadiusError
 from weldcal.calibration.profiler.sphere.joint import _clearly_less, choose_model
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.calibration.profiler.sphere.radius import check_radius, free_radius

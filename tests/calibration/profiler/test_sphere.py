@@ -10,15 +10,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.places import SHARED_DATA, needs
-from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
-from weldcal.calibration.profiler.errors import (
+from weldcal.calibration.errors import (
     ArcNotFound,
     DegenerateMotion,
     InconsistentData,
     RadiusError,
     TooFewTranslations,
 )
+from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, choose_model, leave_one_out_m, sphere_joint

@@ -9,19 +9,22 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm1_step, axes_cost, work_radius_cost
-from weldcal.calibration.published.circle import CircleParameters, circumcircles, search_circle
 from weldcal.calibration.published.icp import VerificationError
 from weldcal.calibration.published.pipeline import (
+    CircleParameters,
     PublishedParameters,
     PublishedVerification,
+    SegmentationParameters,
     all_pairs,
     at_flange,
+    circumcircles,
     find_centres,
     published_model,
     published_pairs,
     run_published,
+    search_circle,
+    segment_flange,
 )
-from weldcal.calibration.published.segmentation import SegmentationParameters, segment_flange
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange
 

@@ -15,8 +15,14 @@ from weldcal.calibration.eye_on_base.nested import bootstrap_interval
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.refinement.local_choice import LocalChoice, choose_local, with_field
-from weldcal.calibration.refinement.local_field import LocalField, field_from_document, fit_field
+from weldcal.calibration.refinement.local_field import (
+    LocalChoice,
+    LocalField,
+    choose_local,
+    field_from_document,
+    fit_field,
+    with_field,
+)
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 

@@ -8,8 +8,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.calibration.tablet.image import grid, picture, project
+from weldcal.calibration.errors import LandmarksNotFound
 from weldcal.calibration.tablet.detection import find_landmarks
-from weldcal.calibration.tablet.errors import LandmarksNotFound
 from weldcal.calibration.tablet.plane_depth import plane_depth
 from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose
 

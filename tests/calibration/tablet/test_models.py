@@ -9,7 +9,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.places import SHARED_DATA, require_data
-from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TooFewLandmarks
+from weldcal.calibration.errors import CollinearLandmarks, EqualRotations, TooFewLandmarks
 from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_plane_motion, hand_over, refine_rounded
 from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
 from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose

@@ -11,10 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.places import SHARED_DATA, require_data
-from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
-from weldcal.calibration.tablet.published.calibration import hand_to_touch, tablet_stage1, tablet_stage2
+from weldcal.calibration.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
+from weldcal.calibration.tablet.published.calibration import evolve, hand_to_touch, tablet_stage1, tablet_stage2
 from weldcal.calibration.tablet.published.chain import DH_NAMES, HTM_NAMES, place_landmarks, search_range
-from weldcal.calibration.tablet.published.evolution import evolve
 from weldcal.calibration.tablet.published.two_stage import (
     AFFINE_NONE,
     Sign,

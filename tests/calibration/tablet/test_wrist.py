@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.calibration.errors import EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.calibration.tablet.errors import EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.tablet.wrist.fit import WristTouches, fit_wrist, seen_point
 
 X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])

@@ -14,9 +14,17 @@ from typer.testing import CliRunner
 
 from weldcal.calibration.data.results import save_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
-from weldcal.calibration.touch.fitted import fit_touched_plane, fit_touched_sphere
 from weldcal.calibration.touch.judge import judge_touches
-from weldcal.calibration.touch.table import CAMERA, DIRECTION, POSE, REQUIRED, TIP, read_touches
+from weldcal.calibration.touch.table import (
+    CAMERA,
+    DIRECTION,
+    POSE,
+    REQUIRED,
+    TIP,
+    fit_touched_plane,
+    fit_touched_sphere,
+    read_touches,
+)
 from weldcal.calibration.touch.touches import POINT, Touch
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app

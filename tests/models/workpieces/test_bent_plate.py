@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces.bent_plate import FELT_EDGE_M, bend, divided, rolled
+from weldcal.models.workpieces.part import FELT_EDGE_M, bend, divided, rolled
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 
 R = 0.150

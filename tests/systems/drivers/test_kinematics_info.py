@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, link_frames, load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
+from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KINEMATICS_TOLERANCE_M,
     KINEMATICS_TOLERANCE_RAD,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.systems.drivers.ur.clock import ClockMap
+from weldcal.systems.drivers.ur.robot import ClockMap
 
 OFFSET = 1234.5
 QUICKEST = 3e-4  # of the way of a package

@@ -1,7 +1,6 @@
 """Gas flows before the torch and after it, by the controller's time."""
 
-from weldcal.systems.drivers.ur.torch.arc_inputs import ArcInputs
-from weldcal.systems.drivers.ur.torch.gas import Gas
+from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas
 
 
 def run(gas: Gas, wanted: list[bool]) -> list[tuple[bool, bool]]:

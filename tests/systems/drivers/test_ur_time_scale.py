@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from weldcal.systems.drivers.ur.time_scale import FRESH_S, RISE_PER_S, ZERO_S, TimeScale
+from weldcal.systems.drivers.ur.worker import FRESH_S, RISE_PER_S, ZERO_S, TimeScale
 
 PASS_S = 0.004
 

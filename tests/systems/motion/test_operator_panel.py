@@ -9,7 +9,7 @@ import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
-from weldcal.systems.motion.operator_panel import HOLD_BUTTON, PACE_SLIDER, OperatorPanel
+from weldcal.systems.motion.spine import HOLD_BUTTON, PACE_SLIDER, OperatorPanel
 from weldcal.systems.person import Person
 
 

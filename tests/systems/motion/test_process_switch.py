@@ -17,7 +17,7 @@ from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.sequencer import JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import JobCommand, UrStatus
-from weldcal.systems.motion.process_switch import ProcessSwitch
+from weldcal.systems.motion.spine import ProcessSwitch
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
 
 WELD = JobCommand(phase="weld", mode="weld", process_on=True)

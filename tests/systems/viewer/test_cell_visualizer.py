@@ -18,7 +18,6 @@ from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOu
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.mesh import TriMesh
-from weldcal.models.outline import outline
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.cell import Cell, build_cell
@@ -30,6 +29,7 @@ from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.viewer.cell_visualizer import ROOT, CellVisualizer, face_residuals
 from weldcal.systems.viewer.scene import uncertainty_at
 from weldcal.systems.viewer.shapes import diverging
+from weldcal.systems.viewer.weld_view import outline
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Diagnostics, Measurement, Phase, WeldingCommand, WeldingState
 

@@ -9,7 +9,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.scanners import get_scanner
-from weldcal.models.workpieces.bent_plate import bend, rolled
+from weldcal.models.workpieces.part import bend, rolled
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 from weldcal.tools.worlds.parts.plates import Scene, scan_part, sideways
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from weldcal.tools.worlds.weld.seams import arcs
-from weldcal.welding.seam.corner import CornerConfig, fill_corner, is_jump
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.refinement import RefinedSeam, RefinementConfig, local_fit, refine
+from weldcal.welding.seam.refinement import (
+    CornerConfig,
+    RefinedSeam,
+    RefinementConfig,
+    fill_corner,
+    is_jump,
+    local_fit,
+    refine,
+)
 
 MM = 1e-3
 CONFIG = CornerConfig()

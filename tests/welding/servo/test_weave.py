@@ -12,9 +12,15 @@ from weldcal.tools.worlds.weld.budgets import NOMINAL
 from weldcal.tools.worlds.weld.plant import simulate
 from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.record.process import path_error
-from weldcal.welding.servo.settings import ServoConfig, ServoConfigError, ToolGeometry
+from weldcal.welding.servo.settings import (
+    ServoConfig,
+    ServoConfigError,
+    ToolGeometry,
+    WeaveConfig,
+    WeaveError,
+    weave_at,
+)
 from weldcal.welding.servo.state import Phase
-from weldcal.welding.servo.weave import WeaveConfig, WeaveError, weave_at
 
 MM = 1e-3
 

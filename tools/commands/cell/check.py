@@ -27,7 +27,7 @@ from weldcal.systems.drivers.sensors.preflight import Sensed
 from weldcal.systems.drivers.sensors.wired_camera import WiredFingerCamera
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.drivers.ur.errors import RobotUnreachable
+from weldcal.systems.drivers.ur.faults import RobotUnreachable
 from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe

@@ -10,10 +10,10 @@ import yaml
 from numpy.typing import NDArray
 
 from weldcal.calibration.data.tables import read_rows
+from weldcal.models.array_files import read_grey_image
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
-from weldcal.models.images import read_grey_image
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.models.tools.loading import WELDING, load_tool

@@ -8,10 +8,10 @@ import typer
 
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.data.tables import read_rows
+from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.motion.line_clock import offset_from_line
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
-from weldcal.calibration.profiler.errors import FeatureNotFound
 from weldcal.calibration.profiler.record import load_record
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

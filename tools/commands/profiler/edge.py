@@ -6,11 +6,11 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 
+from weldcal.calibration.errors import FeatureNotFound, InconsistentData
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
-from weldcal.calibration.profiler.errors import FeatureNotFound, InconsistentData
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
 from weldcal.calibration.profiler.plan import (
     Field,

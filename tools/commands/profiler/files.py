@@ -12,8 +12,7 @@ from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.array_files import AnyArray, read_npz
 from weldcal.models.errors import InputError
-from weldcal.models.files import sha256
-from weldcal.models.limits import LARGEST_NUMBER
+from weldcal.models.files import LARGEST_NUMBER, sha256
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 NEAR_M = 0.02  # nor always this near

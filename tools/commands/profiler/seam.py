@@ -5,7 +5,7 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 
-from weldcal.calibration.profiler.errors import FeatureNotFound
+from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.record import load_record

@@ -6,8 +6,8 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 
+from weldcal.calibration.errors import ArcNotFound
 from weldcal.calibration.profiler.arm_errors import DhArm
-from weldcal.calibration.profiler.errors import ArcNotFound
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.plan import (
     Field,

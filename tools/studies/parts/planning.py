@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import SCANNERS, get_scanner
-from weldcal.models.workpieces.bent_plate import bend
+from weldcal.models.workpieces.part import bend
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch

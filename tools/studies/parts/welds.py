@@ -6,8 +6,8 @@ from typing import Annotated
 
 import numpy as np
 
+from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
-from weldcal.models.keys import did_you_mean
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.cli.subject import one_of

@@ -9,9 +9,16 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_plane_motion, hand_over
 from weldcal.calibration.tablet.planar.linear import fit_linear
-from weldcal.calibration.tablet.published.calibration import StageResult, hand_to_touch, tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.published.calibration import (
+    PUBLISHED_GENERATIONS,
+    PUBLISHED_POPULATION,
+    StageResult,
+    evolve,
+    hand_to_touch,
+    tablet_stage1,
+    tablet_stage2,
+)
 from weldcal.calibration.tablet.published.chain import Model, place_landmarks
-from weldcal.calibration.tablet.published.evolution import PUBLISHED_GENERATIONS, PUBLISHED_POPULATION, evolve
 from weldcal.calibration.tablet.published.two_stage import Fitness, Sign, fitness, stage1_residuals
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array

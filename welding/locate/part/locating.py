@@ -46,7 +46,7 @@ def locate_part(
 
 def _about_seam(points: Floats, eye: Floats, seam: DrawnSeam) -> tuple[Floats, Floats]:
     """All of the scan's points (N,3) in the box about the seam, with normals (N,3) towards the eye (3,)."""
-    from weldcal.models.open3d_core import o3d
+    from weldcal.models.mesh import o3d
 
     reach = REACH_M + 2.0 * MOST_M
     low, high = seam.points_P.min(axis=0) - reach, seam.points_P.max(axis=0) + reach

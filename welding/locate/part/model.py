@@ -43,7 +43,7 @@ class PartModel:
     """A mesh in frame P, m, prepared for registration."""
 
     def __init__(self, mesh: TriMesh, seed: int = 0) -> None:
-        from weldcal.models.open3d_core import o3d
+        from weldcal.models.mesh import o3d
 
         self.mesh = mesh
         tensor: Any = o3d.core.Tensor

@@ -79,7 +79,7 @@ def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) 
     Raises:
         PartNotFound: fewer than `least` points.
     """
-    from weldcal.models.open3d_core import o3d
+    from weldcal.models.mesh import o3d
 
     if len(points) < least:
         raise PartNotFound(f"The scan has only {len(points)} points: move the part into view.")

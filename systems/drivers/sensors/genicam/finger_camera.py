@@ -3,9 +3,8 @@
 import dataclasses as dc
 
 from weldcal.systems.drivers.sensors.acquisition import Source
-from weldcal.systems.drivers.sensors.genicam.components import picture_of
+from weldcal.systems.drivers.sensors.genicam.components import get_profile, picture_of
 from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
-from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
 from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
 from weldcal.systems.drivers.sensors.own_process import OwnProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_camera

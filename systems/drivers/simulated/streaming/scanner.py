@@ -13,8 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, State
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from weldcal.models.errors import InputError
-from weldcal.models.exposure import mixed_exposure
-from weldcal.models.scanner_streams import ScannerStream, get_stream
+from weldcal.models.scanner_streams import ScannerStream, get_stream, mixed_exposure
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
 from weldcal.systems.drivers.simulated.rendered_scanner import (
     DepthSensor,

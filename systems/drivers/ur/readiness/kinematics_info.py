@@ -13,7 +13,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_li
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.robots import CONTROLLER_MODELS
-from weldcal.systems.drivers.ur.errors import RobotRefused
+from weldcal.systems.drivers.ur.faults import RobotRefused
 from weldcal.systems.drivers.ur.readiness import operator_actions as actions
 from weldcal.systems.drivers.ur.wire.line import Line
 

@@ -13,7 +13,7 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
+from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.readiness import operator_actions as actions
 from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KINEMATICS_TOLERANCE_M,
@@ -32,11 +32,41 @@ from weldcal.systems.drivers.ur.readiness.load import (
     mounting_finding,
     payload_finding,
 )
-from weldcal.systems.drivers.ur.readiness.needs import OUTPUTS, WAITS_FOR
 from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, SET_POINTS, UPPER_OFFSET, ranges, register_names
-from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported
 from weldcal.systems.drivers.ur.wire.dashboard import ask
 from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
+
+POLYSCOPE_X = 10
+OLDEST_5, OLDEST_X = (5, 12), (10, 10)
+
+
+def is_supported(version: tuple[int, ...]) -> bool:
+    """Whether it is PolyScope 5.12 or newer, or PolyScope X 10.10 or newer."""
+    return OLDEST_X <= version[:2] < (11, 0) or OLDEST_5 <= version[:2] < (6, 0)
+
+
+OUTPUTS = (
+    "runtime_state",
+    "robot_mode",
+    "safety_mode",
+    "speed_scaling",
+    "target_speed_fraction",
+    "actual_q",
+    "actual_qd",
+    "actual_TCP_pose",
+    "tcp_offset",
+)
+# Without power there are no joint positions and no kinematics; without a dashboard remote control cannot be checked.
+WAITS_FOR = {
+    "standstill": ("power",),
+    "joint limits": ("power",),
+    "kinematics": ("power",),
+    "flange pose": ("power", "kinematics"),
+    "model": ("program",),
+    "operational mode": ("program",),
+    "remote control": ("program",),
+}
+
 
 RUNNING, NORMAL, REDUCED, STOPPED = 7, 1, 2, 1
 FULL_SPEED = 0.99

@@ -1,9 +1,58 @@
 """Set points of the power source, wire feed and arc voltage, at the controller's analog outputs."""
 
+import contextlib
 import dataclasses as dc
 import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from weldcal.models.errors import InputError
+from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
+from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
+
+
+@dataclass(frozen=True)
+class ArcInputs:
+    """Standard digital inputs of the power source: arc established, arc fault; None where one is not wired."""
+
+    established: int | None = None
+    arc_fault: int | None = None
+
+    @property
+    def wired(self) -> bool:
+        """Whether there is one."""
+        return self.established is not None or self.arc_fault is not None
+
+    def arc(self, bits: int) -> bool | None:
+        """Whether the arc is established; None where that is not wired."""
+        return None if self.established is None else bool(bits >> self.established & 1)
+
+    def fault(self, bits: int) -> bool:
+        """Whether the power source reports a fault."""
+        return self.arc_fault is not None and bool(bits >> self.arc_fault & 1)
+
+
+@dataclass
+class Gas:
+    """The gas valve's sequence, s of the controller's time: `before_s` of gas, then the torch, then `after_s` of gas."""
+
+    before_s: float = 0.0
+    after_s: float = 0.0
+    _opened_at: float | None = None
+    _needed_at: float = float("-inf")
+
+    def step(self, now: float, wanted: bool) -> tuple[bool, bool]:
+        """Whether the valve is open, and whether the torch may be on, at `now` while the cell wants the torch or not."""
+        if wanted:
+            self._opened_at = now if self._opened_at is None else self._opened_at
+            self._needed_at = now
+            return True, now - self._opened_at >= self.before_s
+        flows = self._opened_at is not None and now - self._needed_at < self.after_s
+        if not flows:
+            self._opened_at = None
+        return flows, False
+
 
 OUTPUTS = (0, 1)
 VOLT, MILLIAMPERE = "V", "mA"
@@ -97,3 +146,51 @@ class SetPoints:
 def apart(asked: float, shown: float) -> bool:
     """Whether an output shows something else than what it is asked for (shares of its range)."""
     return not abs(asked - shown) <= TOLERANCE  # also of NaN
+
+
+TIMEOUT_S = 2.0
+MASK, VALUE = "standard_digital_output_mask", "standard_digital_output"
+ANALOG = (
+    "standard_analog_output_mask",
+    "standard_analog_output_type",
+    "standard_analog_output_0",
+    "standard_analog_output_1",
+)
+
+
+class OffSwitch:
+    """Turns the torch's output off and its analog outputs (`levels`) to zero; only the guard script turns it on, because it detects a lost client.
+
+    The connection is opened at the start and held, so that turning off takes one small package.
+
+    Raises:
+        RobotRefused: another client writes the outputs; RobotUnreachable: no RTDE server answers.
+    """
+
+    def __init__(self, host: str, output: int, gas: int | None = None, levels: Sequence[Level] = ()) -> None:
+        self._probe = RtdeProbe(host, TIMEOUT_S)
+        recipe = self._probe.grant((MASK, VALUE, *(ANALOG if levels else ())))
+        if recipe is None:
+            self._probe.close()
+            raise RobotRefused("Another RTDE client or a fieldbus writes the controller's digital or analog outputs.")
+
+        def package(mask: int, value: int, analog_mask: int = 0) -> bytes:
+            digital = struct.pack(">BBB", recipe, mask, value)
+            return digital + (struct.pack(">BBdd", analog_mask, types, 0.0, 0.0) if levels else b"")
+
+        types = sum(level.volts << level.output for level in levels)
+        self._package = package(1 << output, 0, sum(1 << level.output for level in levels))
+        self._gas = {} if gas is None else {on: package(1 << gas, on << gas) for on in (False, True)}
+
+    def off(self) -> None:
+        """Send the package. A broken connection is ignored: the guard and the controller turn the output off then."""
+        self._write(self._package)
+
+    def gas(self, on: bool) -> None:
+        """Open or close the gas valve, where one is wired. As `off`."""
+        if self._gas:
+            self._write(self._gas[on])
+
+    def _write(self, package: bytes) -> None:
+        with contextlib.suppress(RobotUnreachable):
+            self._probe.write(package)

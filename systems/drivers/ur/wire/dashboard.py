@@ -1,6 +1,6 @@
 """Client of the PolyScope 5 dashboard: sends one command line and reads one answer, on a new connection each time."""
 
-from weldcal.systems.drivers.ur.errors import RobotUnreachable
+from weldcal.systems.drivers.ur.faults import RobotUnreachable
 from weldcal.systems.drivers.ur.wire.line import Line
 
 DASHBOARD_PORT = 29999

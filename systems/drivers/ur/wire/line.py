@@ -9,7 +9,7 @@ import time
 from types import TracebackType
 
 from weldcal.systems.addresses import controller_address
-from weldcal.systems.drivers.ur.errors import RobotUnreachable
+from weldcal.systems.drivers.ur.faults import RobotUnreachable
 
 RELEASE_WAIT_S = 0.3
 

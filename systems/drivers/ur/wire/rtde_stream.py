@@ -11,7 +11,7 @@ import struct
 import time
 from collections.abc import Sequence
 
-from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
+from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.wire.rtde_client import CODES, IN_USE, NOT_FOUND, RtdeProbe
 
 E_SERIES, FASTEST_HZ, CB3_HZ = 5, 500.0, 125.0

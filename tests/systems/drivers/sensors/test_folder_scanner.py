@@ -16,9 +16,7 @@ import pytest
 from tests.systems.drivers.sensors.scripted import wait_until
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, DeviceFault
-from weldcal.systems.drivers.sensors.files.new import NewFiles
-from weldcal.systems.drivers.sensors.files.source import LISTING_SHARE, FolderSource
-from weldcal.systems.drivers.sensors.files.triggers import KEEP_ALIVE, TcpTrigger
+from weldcal.systems.drivers.sensors.files.source import KEEP_ALIVE, LISTING_SHARE, FolderSource, NewFiles, TcpTrigger
 from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, acquire
 

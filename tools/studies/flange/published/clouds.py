@@ -17,7 +17,6 @@ from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Algorithm1State, algorithm1_start, algorithm1_step
-from weldcal.calibration.published.circle import search_circle
 from weldcal.calibration.published.icp import Verification, icp_error, make_verification, sight
 from weldcal.calibration.published.pipeline import (
     Method,
@@ -27,6 +26,7 @@ from weldcal.calibration.published.pipeline import (
     find_centres,
     published_model,
     published_pairs,
+    search_circle,
 )
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
