@@ -14,8 +14,7 @@ from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.documents import as_number
 from weldcal.models.errors import InputError
-from weldcal.models.files import read_text
-from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
+from weldcal.models.files import LARGEST_DOCUMENT, LARGEST_NUMBER, read_text
 
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "mtx", "m1", "m", "cammatrix", "intrinsic", "intrinsics", "kmatrix")
 _DISTORTION = ("distortioncoefficients", "distortioncoeffs", "distortion", "distcoeffs", "distcoeff", "dist", "d", "d1", "coeffs", "distcoefs", "kc")  # fmt: skip

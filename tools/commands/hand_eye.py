@@ -23,7 +23,8 @@ from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
-from weldcal.calibration.hand_eye.pictures import PictureResult, PictureSet, read_pictures, solve_pictures
+from weldcal.calibration.hand_eye.picture_solution import PictureResult, solve_pictures
+from weldcal.calibration.hand_eye.pictures import PictureSet, read_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.motion.pose_streams import is_stream_file

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from tests.calibration.hand_eye import rendering as draw
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import difference, moved
-from weldcal.calibration.hand_eye import pictures
+from weldcal.calibration.hand_eye import picture_search
 from weldcal.calibration.hand_eye.boards import Board, find_board, parse_board, with_layout
 from weldcal.calibration.hand_eye.bundle import Corners, adjust
 from weldcal.calibration.hand_eye.choice import CANDIDATES
@@ -80,7 +80,7 @@ def chess(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, draw.World]:
 @pytest.fixture
 def once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same picture is searched once in the whole module."""
-    search = pictures.find_board
+    search = picture_search.find_board
 
     def remembered(grey: np.ndarray, board: Board) -> np.ndarray:
         key = (str(board), hash(grey.tobytes()))
@@ -88,7 +88,7 @@ def once(monkeypatch: pytest.MonkeyPatch) -> None:
             FOUND[key] = search(grey, board)
         return FOUND[key]
 
-    monkeypatch.setattr(pictures, "find_board", remembered)
+    monkeypatch.setattr(picture_search, "find_board", remembered)
 
 
 def quick(pairs: PosePairs) -> np.ndarray:
