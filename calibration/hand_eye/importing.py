@@ -35,6 +35,15 @@ class StatedForms:
     camera_poses: str | None = None
     unit: str | None = None
     decide: bool = True  # whether the data choose the reading: not where the file holds motions
+    camera_known: bool = False  # whether the camera's poses were computed here, so that their reading is no question
+
+
+class WrongScale(InconsistentPoses):
+    """The camera's positions fit the robot's motion with one factor that is no ratio of units."""
+
+    def __init__(self, factor: float, sentence: str) -> None:
+        super().__init__(sentence)
+        self.factor = factor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -99,11 +108,8 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
         units = _units(A, B, robot, camera, None, stated, source)
     else:
         best = decision.best
-        _require_one(decision, source, mounting)
-        A, B = [
-            next(r for r in _changed(listed, one) if r.form == one.form)
-            for listed, one in ((a, best.robot), (b, best.camera))
-        ]
+        _require_one(decision, source, mounting, stated.camera_known)
+        A, B = [_of_all_rows(_changed(listed, one), one) for listed, one in ((a, best.robot), (b, best.camera))]
         notes += _sentences(decision, robot, camera, shift)
         units = _units(A, B, robot, camera, best, stated, source)
     if shift:
@@ -149,6 +155,12 @@ def _metric(X: Array, factor: float) -> Array:
     out = X.copy()
     out[:, :3, 3] *= factor
     return out
+
+
+def _of_all_rows(listed: list[PoseReading], chosen: PoseReading) -> PoseReading:
+    """The chosen reading with all rows: of the same form, and of the same meaning where six numbers have two."""
+    same = [one for one in listed if one.form == chosen.form]
+    return min(same, key=lambda one: float(np.abs(one.X - chosen.X[0]).max(axis=(1, 2)).min()))
 
 
 def _changed(listed: list[PoseReading], wanted: PoseReading) -> list[PoseReading]:
@@ -198,7 +210,7 @@ def _decided(a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: i
     return (best, by) if best.best.agrees or len(a) > 1 or len(b) > 1 else (None, 0)
 
 
-def _require_one(decision: Decision, source: str, mounting: str) -> None:
+def _require_one(decision: Decision, source: str, mounting: str, camera_known: bool) -> None:
     """Refuses readings that agree equally and differ in the result. Raises InconsistentPoses."""
     best = decision.best
     other = "eye_on_base" if mounting == "eye_in_hand" else "eye_in_hand"
@@ -211,6 +223,13 @@ def _require_one(decision: Decision, source: str, mounting: str) -> None:
                 f"or state the forms with --robot-form and --camera-form."
             )
         return
+    if camera_known and best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
+        form = best.robot.form if best.robot.form.endswith(",inverse") else f"{best.robot.form},inverse"
+        raise InconsistentPoses(
+            f"The robot poses of '{source}' contradict the pictures as given ({mounting}), and agree ({_residual(best)}) in two ways that the "
+            f"data cannot tell apart: the camera is mounted {other} (--mounting {other}), or the robot poses are inverted (--robot-form {form}). "
+            "State the one that is true."
+        )
     if best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
         raise InconsistentPoses(
             f"The poses of '{source}' contradict each other as given ({mounting}), and agree ({_residual(best)}) in three ways that the data "
@@ -332,8 +351,9 @@ def _refuse_scale(ratio: float, unit: str, source: str) -> None:
             f"positions by {UNITS[near] / UNITS[unit]:g}."
         )
     squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
-    raise InconsistentPoses(
+    raise WrongScale(
+        factor,
         f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g} (from {unit} to the right length): "
         f"the size of the board's squares or of the marker is wrong by that factor{squares}, or they have another unit. Correct the size, "
-        f"or multiply the positions by {factor:.4g}."
+        f"or multiply the positions by {factor:.4g}.",
     )

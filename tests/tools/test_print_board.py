@@ -12,6 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from weldcal.calibration.hand_eye.boards import find_board, parse_board
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.board import PAPERS, Board, board_sheet, tag_sheet
@@ -38,11 +39,19 @@ class Page:
         self.lines: list[list[float]] = []
         body = text.split("stream\n", 1)[1].split("\nendstream", 1)[0]
         scale = float(re.match(NUMBER + " 0 0", body).group(1)) * 25.4 / 72.0  # type: ignore[union-attr]
-        grey, path = 0, []
+        grey, path, outline = 0, [], []
         for line in body.splitlines():
             *values, operator = line.split()
             if operator == "re":
                 path.append([float(v) * scale for v in values])
+            elif operator == "m":
+                outline = [[float(v) * scale for v in values[:2]]]
+            elif operator == "c":
+                outline += self._curve(outline[-1], [float(v) * scale for v in values])
+            elif operator == "f" and len(outline) > 4:
+                top = [(x * PIXELS_PER_MM, (self.height_mm - y) * PIXELS_PER_MM) for x, y in outline]
+                cv2.fillPoly(self.picture, [np.round(top).astype(np.int32)], 255 * grey)
+                outline = []
             elif operator == "f":
                 for rectangle in path:
                     self._fill(rectangle, 255 * grey)
@@ -52,6 +61,13 @@ class Page:
             elif operator == "S":
                 self.lines.append([float(v) * scale for v in (values[0], values[1], values[3], values[4])])
         self.text = body
+
+    @staticmethod
+    def _curve(start: list[float], values: list[float]) -> list[list[float]]:
+        """Points of a Bezier curve."""
+        p = np.array([start, values[:2], values[2:4], values[4:]])
+        t = np.linspace(0.0, 1.0, 20)[1:, None]
+        return ((1 - t) ** 3 * p[0] + 3 * t * (1 - t) ** 2 * p[1] + 3 * t**2 * (1 - t) * p[2] + t**3 * p[3]).tolist()
 
     def _check_offsets(self, content: bytes) -> None:
         start = int(content.rsplit(b"startxref\n", 1)[1].split()[0])
@@ -142,3 +158,22 @@ def test_the_command_writes_the_page_and_the_boards_numbers(tmp_path: Path) -> N
     assert Page((tmp_path / "board.pdf").read_bytes()).width_mm == pytest.approx(210.0, abs=0.01)
     done = runner.invoke(app, ["print-board", "tags", "--ids", "seven", "--out", str(tmp_path)])
     assert done.exit_code == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["chessboard:7x5:20", "charuco:6x4:25:18:5X5_50", "circles:6x4:25", "acircles:3x5:20", "tag:7:80:APRILTAG_36h11", "tags:3x2:40:10:4X4_50"],
+)  # fmt: skip
+def test_a_described_board_is_printed_at_true_scale_with_its_description(text: str, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["print-board", text, "--out", str(tmp_path / "o"), "--json"])
+    assert done.exit_code == 0
+    page = Page(Path(json.loads(done.stdout.splitlines()[-1])["pdf"]).read_bytes())
+    assert f"(--board {text})" in page.text
+    scale = 4
+    picture = cv2.resize(page.picture, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+    board = parse_board(text)
+    found = find_board(picture, board)
+    assert np.isfinite(found).all()
+    mm = (found - found[0]) / (PIXELS_PER_MM / scale)
+    expected = 1e3 * (board.points - board.points[0])[:, :2]
+    assert np.abs(np.linalg.norm(mm, axis=1) - np.linalg.norm(expected, axis=1)).max() < 0.15

@@ -2,6 +2,7 @@
 
 import signal
 from collections.abc import Iterable, Iterator, MutableMapping
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import typer
@@ -22,6 +23,8 @@ GROUPS = {
     "profiler": "Calibrate a laser profiler and map a seam.",
 }
 """The groups of commands with their help text; a group that is not here needs no text."""
+DEFAULTS = {"hand-eye": "ax-yb"}
+"""The command of a group that is meant where a file follows the group's name."""
 
 ORDER = (
     *(
@@ -90,6 +93,9 @@ class CommandGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Imports the command that is called; a failed import is one sentence, with --debug its traceback."""
+        default = DEFAULTS.get(self.name or "")
+        if default and args and args[0] not in self.commands and Path(args[0]).exists():
+            args = [default, *args]
         if args and args[0] in self.commands:
             with console.boundary(json_wanted="--json" in args, debug="--debug" in args):
                 self.commands[args[0]]

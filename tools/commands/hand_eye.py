@@ -16,6 +16,7 @@ from weldcal.calibration.data.poses.lists import folder_lists, two_lists
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
+from weldcal.calibration.hand_eye.boards import FORMS, parse_board
 from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_corners, refine_with_corners
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
@@ -25,6 +26,8 @@ from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
+from weldcal.calibration.hand_eye.picture_solution import PictureResult, solve_pictures
+from weldcal.calibration.hand_eye.pictures import PictureSet, read_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.motion.pose_streams import Synchronised, are_trajectories, is_stream_file, synchronise_lists
@@ -78,6 +81,23 @@ RobotOption = Annotated[
 ScannerOption = Annotated[
     str | None, option("--camera", "NAME", "The scanner, for example phoxi_s: the next pose is then in its view.")
 ]
+BoardOption = Annotated[
+    str | None,
+    option(
+        "--board",
+        "BOARD",
+        f"Calibrate from pictures of this board, lengths in mm: {', '.join(FORMS.values())}. COLSxROWS of a chessboard are inner corners.",
+    ),
+]
+IntrinsicsOption = Annotated[
+    Path | None,
+    option(
+        "--intrinsics",
+        "FILE",
+        "With --board: the file that states the camera (ROS, OpenCV, Kalibr).",
+        show_default="a camera file in the folder, else estimated",
+    ),
+]
 
 
 @command("hand-eye ax-xb", short_help="Solve AX = XB for the camera's pose.")
@@ -91,11 +111,24 @@ def ax_xb(
     camera_poses: CameraPosesOption = None,
     robot_form: RobotFormOption = None,
     camera_form: CameraFormOption = None,
+    board: BoardOption = None,
+    intrinsics: IntrinsicsOption = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = XB for the camera's pose. With poses, the target's pose is estimated too, so that each counts once."""
     stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
-    return _solve("ax-xb", call, file, mounting=mounting, unit=unit, motions=motions, limit_mm=limit_mm, stated=stated)
+    return _solve(
+        "ax-xb",
+        call,
+        file,
+        mounting=mounting,
+        unit=unit,
+        motions=motions,
+        limit_mm=limit_mm,
+        stated=stated,
+        board=board,
+        intrinsics=intrinsics,
+    )
 
 
 @command("hand-eye ax-yb", short_help="Solve AX = YB for the poses of camera and target.")
@@ -126,6 +159,8 @@ def ax_yb(
     camera_poses: CameraPosesOption = None,
     robot_form: RobotFormOption = None,
     camera_form: CameraFormOption = None,
+    board: BoardOption = None,
+    intrinsics: IntrinsicsOption = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""
@@ -142,6 +177,8 @@ def ax_yb(
         kinematics=kinematics,
         limit_mm=limit_mm,
         stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form),
+        board=board,
+        intrinsics=intrinsics,
     )
 
 
@@ -194,6 +231,8 @@ def run_hand_eye(
     seed: int = 0,
     limit_mm: float | None = None,
     stated: StatedForms | None = None,
+    board: str | None = None,
+    intrinsics: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> HandEyeReport:
     """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved. Writes report.html besides the exports.
@@ -201,7 +240,8 @@ def run_hand_eye(
     ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the scanner, for
     the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and robot errors is applied:
     the robot's errors are sought in the poses that the corners left); ``kinematics``: file of that robot's own kinematics, whose poses
-    at the joint angles replace the stated ones. ``limit_mm`` is the held-out error at the target, 95 %, that the job allows.
+    at the joint angles replace the stated ones. ``limit_mm`` is the held-out error at the target, 95 %, that the job allows. ``board``: the board in
+    the pictures of the folder ``file``, see ``parse_board``; ``intrinsics``: the file that states their camera.
 
     Raises:
         InputError, WeldcalError: the file or the options cannot be used. Where the poses contradict each other, the
@@ -214,23 +254,34 @@ def run_hand_eye(
     if kinematics is not None and robot is None:
         raise InputError("A kinematics file (--kinematics) needs the robot's name. Add --robot, for example ur10e.")
     arm = None if robot is None else load_chain(robot, kinematics)
+    if board is not None and camera is not None and Path(camera).is_file():
+        intrinsics, camera = Path(camera), None
+    if board is None and intrinsics is not None:
+        raise InputError("A camera file (--intrinsics) goes with pictures: name the board in them with --board.")
+    if board is not None and (motions or corners is False or refine is not None or equation == "axb-ycz"):
+        raise InputError("Pictures (--board) are solved by their corners: omit --motions, --no-corners and --refine.")
     scanner = None if camera is None else get_scanner(camera)
     if refine is not None and arm is None:
         raise InputError("Robot errors (--refine) need the robot's name. Add --robot, for example ur10e.")
-    streams = None
-    if is_stream_file(file):
+    streams, shots = None, None
+    if board is not None:
+        shots = read_pictures(file, parse_board(board), mounting=mounting, unit=unit, stated=stated, camera=intrinsics)
+    elif is_stream_file(file):
         if unit not in (None, "m") or motions:
             raise InputError("Two streams of poses are in metres; omit --unit and --motions.")
         from weldcal.calibration.motion.pose_streams import read_streams, synchronise
 
         streams = synchronise(read_streams(file), mounting=mounting or "eye_in_hand", source=file.name)
         say(streams.sentence)
-    stated = replace(stated or StatedForms(), decide=not motions)
-    if streams is None and not motions:
-        streams = _trajectories(file, mounting, stated)
-        if streams is not None:
-            say(streams.sentence)
-    pairs = read_pairs(file, mounting=mounting, length=unit, stated=stated) if streams is None else streams.pairs
+    if shots is not None:
+        pairs = shots.pairs
+    else:
+        stated = replace(stated or StatedForms(), decide=not motions)
+        if streams is None and not motions:
+            streams = _trajectories(file, mounting, stated)
+            if streams is not None:
+                say(streams.sentence)
+        pairs = read_pairs(file, mounting=mounting, length=unit, stated=stated) if streams is None else streams.pairs
     for sentence in understood(pairs):
         say(sentence)
     found = get_mounting(pairs.mode)
@@ -240,6 +291,7 @@ def run_hand_eye(
         right = "axb-ycz" if found.name == "co_manipulation" else "ax-yb"
         raise InputError(f"'{file.name}' is {found.name}. Solve it with 'weldcal hand-eye {right}'.")
     config = HandEyeConfig(seed=seed)
+    pictures: PictureResult | None = None
     if motions:
         if equation != "ax-xb":
             raise InputError("Motions (--motions) belong to ax-xb.")
@@ -248,11 +300,17 @@ def run_hand_eye(
     else:
         problem = problem_of_pairs(pairs)
         say(check_poses(problem).sentence())
-        result = solve_pairs(pairs, config)
-    said: list[str] = []
+        if shots is None:
+            result = solve_pairs(pairs, config)
+        else:
+            result, pairs, pictures = _solved_pictures(shots, config)
+            problem = problem_of_pairs(pairs)
+    said: list[str] = [] if pictures is None else pictures.sentences
     adopted = False
     optional = corners is None
-    if corners is None:
+    if pictures is not None:
+        corners = False
+    elif corners is None:
         corners = pairs.has_corners and not motions and found.name in ("eye_in_hand", "eye_on_base")
     if corners:
         if motions or found.name == "co_manipulation":
@@ -293,6 +351,7 @@ def run_hand_eye(
         streams=streams,
         limit_mm=limit_mm,
         folder=out,
+        pictures=pictures,
     )
     write_atomic(out / "report.html", hand_eye_report(report, file.name, provenance.sha256))
     return report
@@ -313,6 +372,16 @@ def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Sync
         one.stated(form, f"--{who}-form") for one, form, who in zip(lists, forms, ("robot", "camera"), strict=True)
     )
     return synchronise_lists(robot, camera, mounting=mounting_name(mounting or "eye_in_hand"), source=path.name)
+
+
+def _solved_pictures(shots: PictureSet, config: HandEyeConfig) -> tuple[HandEyeResult, PosePairs, PictureResult]:
+    """The result of pictures; which of them are not used is said by their names."""
+    result, pairs, pictures = solve_pictures(shots, lambda pairs: solve_pairs(pairs, config))
+    left = [f"{p.name} ({p.why[0].lower()}{p.why[1:].rstrip('.')})" for p in pictures.pictures if p.why]
+    warnings = [w for w in result.warnings if "were excluded:" not in w]
+    if left:
+        warnings.insert(0, f"{len(left)} of {len(pictures.pictures)} pictures are not used: {'; '.join(left)}.")
+    return replace(result, warnings=tuple(warnings)), pairs, pictures
 
 
 def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, optional: bool) -> CornerRefinement | None:

@@ -1,5 +1,6 @@
 """The result of `weldcal hand-eye` and its page: poses and how sure they are, errors of every sample, comparison of methods."""
 
+from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
+from weldcal.calibration.hand_eye.picture_solution import PictureResult
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.motion.pose_streams import Synchronised
 from weldcal.calibration.planning.next_pose import NextPose
@@ -46,6 +48,7 @@ class HandEyeReport:
     folder: Path | None = None
     reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     read_notes: tuple[str, ...] = ()
+    pictures: PictureResult | None = None
 
     @property
     def first(self) -> FirstScreen:
@@ -79,24 +82,31 @@ class HandEyeReport:
                 "clock_offset_ms": 1e3 * self.streams.offset_s,
                 "clock_offset_sigma_ms": 1e3 * self.streams.sigma_s,
             }
-        return out | {
-            "held_out_deg": used.rms_deg,
-            "held_out_mm": 1e3 * used.rms_translation,
-            "held_out_of": held_out_set(r),
-            "residual_deg": np.degrees(r.rotation_rad),
-            "residual_mm": 1e3 * r.translation,
-            "inliers": r.inliers,
-            "unobservable": list(r.unobservable),
-            "warnings": list(r.warnings),
-            "condition": r.condition,
-            "method": r.method,
-            "reading": {who: dict(found) for who, found in self.reading.items()},
-            "notes": list(self.read_notes),
-            "comparison": [{"method": c.method, "held_out_deg": c.deg, "held_out_mm": c.mm} for c in self.comparison],
-            "next_pose": self.advice or None,
-            "corners": self.corners or None,
-            "seconds": self.seconds,
-        }
+        pictures = {} if self.pictures is None else _of_pictures(self.pictures)
+        return (
+            out
+            | pictures
+            | {
+                "held_out_deg": used.rms_deg,
+                "held_out_mm": 1e3 * used.rms_translation,
+                "held_out_of": held_out_set(r),
+                "residual_deg": np.degrees(r.rotation_rad),
+                "residual_mm": 1e3 * r.translation,
+                "inliers": r.inliers,
+                "unobservable": list(r.unobservable),
+                "warnings": list(r.warnings),
+                "condition": r.condition,
+                "method": r.method,
+                "reading": {who: dict(found) for who, found in self.reading.items()},
+                "notes": list(self.read_notes),
+                "comparison": [
+                    {"method": c.method, "held_out_deg": c.deg, "held_out_mm": c.mm} for c in self.comparison
+                ],
+                "next_pose": self.advice or None,
+                "corners": self.corners or None,
+                "seconds": self.seconds,
+            }
+        )
 
     def text(self) -> str:
         """What is printed between the poses' diversity and the first screen: directions, sketch, uncertainty, comparison.
@@ -126,6 +136,41 @@ class HandEyeReport:
                     f"{c.method:<12}  {'no answer':>12}" if failed else f"{c.method:<12}  {c.deg:12.4f}  {c.mm:12.3f}"
                 ]
         return "\n".join(lines)
+
+
+def _of_pictures(found: PictureResult) -> dict[str, object]:
+    """What the JSON object has of pictures."""
+    b = found.bundle
+    return {
+        "board": str(found.board),
+        "camera_matrix": b.K,
+        "distortion": b.distortion,
+        "camera_estimated": len(found.free) > 0,
+        "camera_sigma": b.camera_sigma,
+        "reprojection_px": found.reprojection_px,
+        "robot_sigma_deg": float(np.degrees(b.sigma_rad)),
+        "robot_sigma_mm": 1e3 * b.sigma_m,
+        "pictures": [
+            {
+                "file": p.name,
+                "used": not p.why,
+                "points": p.found,
+                "reprojection_px": None if p.why else p.rms_px,
+                "why_not": p.why or None,
+            }
+            for p in found.pictures
+        ],
+    }
+
+
+def picture_rows(found: PictureResult | None) -> list[tuple[str, str, str, str]]:
+    """For each picture a data URI of its thumbnail, its name, its points and error, and why it is not used."""
+    rows = []
+    for p in found.pictures if found is not None else ():
+        uri = f"data:image/jpeg;base64,{b64encode(p.thumbnail).decode()}" if p.thumbnail else ""
+        error = "" if p.why else f", {fixed(p.rms_px, 3)} px"
+        rows.append((uri, p.name, f"{p.found} points{error}", p.why))
+    return rows
 
 
 def _held_out(held_out: HandEyeHeldOut, of: str) -> str:
@@ -230,6 +275,7 @@ def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:
         few=most if 0.8 * len(r.inliers) > most else None,
         streams=None if report.streams is None else report.streams.sentence,
         corners=report.corners,
+        pictures=picture_rows(report.pictures),
         seconds=report.seconds,
         digest=digest,
     )

@@ -95,8 +95,13 @@ def read_lists(path: Path) -> list[Listing]:
         raise DatasetError(str(problem)) from problem
 
 
-def folder_lists(folder: Path) -> list[Listing]:
+def folder_lists(folder: Path, needed: int = 2, skip: frozenset[Path] = frozenset()) -> list[Listing]:
     """Every list of poses of a folder: of its files, and of files with one pose each (pos01.yaml, pos02.yaml ...), one level deep.
+
+    Args:
+        folder: the folder.
+        needed: lists without which a file that cannot be read is refused.
+        skip: files that hold something else.
 
     Raises:
         DatasetError: a file that should hold poses cannot be read.
@@ -107,7 +112,9 @@ def folder_lists(folder: Path) -> list[Listing]:
         label = "" if place == folder else place.name
         if place in numbered:
             label = re.sub(r"\d+", "", label)
-        for path in sorted((p for p in place.iterdir() if _may_hold_poses(p)), key=lambda p: natural(p.name)):
+        for path in sorted(
+            (p for p in place.iterdir() if p not in skip and _may_hold_poses(p)), key=lambda p: natural(p.name)
+        ):
             stem = (
                 re.sub(r"\d+$", "", path.stem)
                 if number_of(path.stem) is not None and place not in numbered
@@ -123,7 +130,7 @@ def folder_lists(folder: Path) -> list[Listing]:
             found += _group(files, label)
         except DatasetError as why:
             problem = problem or why
-    if len(found) < 2 and problem is not None:
+    if len(found) < needed and problem is not None:
         raise problem
     return found
 

@@ -10,6 +10,8 @@ import numpy as np
 import typer
 import yaml
 
+from weldcal.calibration.hand_eye.boards import EXAMPLES, dictionary, parse_board
+from weldcal.calibration.hand_eye.boards import Board as DescribedBoard
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic
@@ -28,7 +30,12 @@ Rectangle = tuple[float, float, float, float]
 @command("print-board", short_help="Write a calibration board or tags as PDF at true scale.")
 def print_board(
     call: Call,
-    kind: Annotated[str, typer.Argument(metavar="[KIND]", help="charuco (a board) or tags.")] = "charuco",
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="[BOARD]", help="charuco (a board), tags, or what hand-eye --board takes: chessboard:9x6:25 ..."
+        ),
+    ] = "charuco",
     columns: Annotated[int, option("--columns", "N", "Squares of the board across.")] = 8,
     rows: Annotated[int, option("--rows", "N", "Squares of the board down.")] = 6,
     square_mm: Annotated[float, option("--square-mm", "MM", "Side of a square.")] = 4.0,
@@ -43,7 +50,10 @@ def print_board(
 ) -> Outcome:
     """Write a ChArUco board, or tags, as board.pdf at true scale, with a line of 100 mm to check the print by."""
     board = None
-    if kind == "charuco":
+    if ":" in kind:
+        sheet = described_sheet(parse_board(kind), paper)
+        kind = kind.partition(":")[0]
+    elif kind == "charuco":
         board = Board(columns, rows, square_mm, marker_mm, dictionary)
         sheet = board_sheet(board, paper)
     elif kind == "tags":
@@ -53,7 +63,9 @@ def print_board(
         tags = [TagModel(dictionary, int(word), 1e-3 * size_mm) for word in words for _ in range(copies)]
         sheet = tag_sheet(tags, paper)
     else:
-        raise InputError(f"There is no board of the kind '{kind}': use charuco or tags.")
+        raise InputError(
+            f"There is no board of the kind '{kind}': use charuco, tags, or a description such as {EXAMPLES['chessboard'].split()[0]}."
+        )
     written = write_board(call.folder("print-board", kind), sheet, board)
     return Outcome({"state": "done", "kind": kind, **written, "note": NOTE})
 
@@ -68,6 +80,7 @@ class Sheet:
     white: list[Rectangle] = field(default_factory=list)
     lines: list[Rectangle] = field(default_factory=list)
     texts: list[tuple[float, float, float, str]] = field(default_factory=list)
+    discs: list[tuple[float, float, float]] = field(default_factory=list)  # x, y and radius of black discs
 
     def marker(self, cells: np.ndarray, x: float, y: float, side: float) -> None:
         """A marker with its lower left corner at x, y; `cells` (n, n) is 1 where it is white, its first row on top."""
@@ -100,6 +113,18 @@ class Sheet:
             draw.append(f"{colour} g")
             draw += [f"{x:.4f} {y:.4f} {w:.4f} {h:.4f} re" for x, y, w, h in rectangles]
             draw.append("f" if rectangles else "n")
+        draw.append("0 g")
+        for x, y, r in self.discs:
+            h = 0.5522847498 * r  # control points of four Bezier curves that follow a circle to 0.03 % of its radius
+            draw.append(f"{x + r:.4f} {y:.4f} m")
+            for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
+                first, second, end = (
+                    ((a * r, b * h), (a * h, b * r), (0.0, b * r))
+                    if a == b
+                    else ((a * h, b * r), (a * r, b * h), (a * r, 0.0))
+                )
+                draw.append(" ".join(f"{x + u:.4f} {y + v:.4f}" for u, v in (first, second, end)) + " c")
+            draw.append("f")
         draw.append("0 G 0.15 w")
         draw += [f"{x0:.4f} {y0:.4f} m {x1:.4f} {y1:.4f} l S" for x0, y0, x1, y1 in self.lines]
         draw.append("0 g")
@@ -173,6 +198,49 @@ def board_sheet(board: Board, paper: str) -> Sheet:
         f"ChArUco {board.columns} x {board.rows}, squares {board.square_mm:g} mm, markers {board.marker_mm:g} mm"
     )
     return sheet
+
+
+def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
+    """What a description of a board says, in the middle of a page, with the description. Raises InputError where it does not fit."""
+    sheet = _page(paper)
+    size, gap = 1e3 * board.size, 1e3 * board.inner
+    points = 1e3 * board.points[:, :2]
+    # the rectangle of all that is black, in the board's frame: x right, y down
+    outside = {"chessboard": size, "circles": 0.25 * size, "acircles": 0.5 * size, "charuco": size}.get(board.kind, 0.0)
+    low, high = points.min(axis=0) - outside, points.max(axis=0) + outside
+    width, height = (float(v) for v in high - low)
+    _require_room(sheet, width, height, paper)
+    x0 = 0.5 * (sheet.width - width) - low[0]
+    y0 = 0.5 * (sheet.height + FOOT_MM + height) + low[1]  # of the board's origin, y up
+    if board.kind in ("chessboard", "charuco"):
+        columns, rows = (
+            (board.columns + 1, board.rows + 1) if board.kind == "chessboard" else (board.columns, board.rows)
+        )
+        for i in range(rows):
+            for j in range(columns):
+                if (i + j) % 2 == 0:
+                    sheet.black.append((x0 + low[0] + j * size, y0 - low[1] - (i + 1) * size, size, size))
+    if board.kind == "charuco":
+        found = board.opencv
+        for corners, marker in zip(found.getObjPoints(), np.ravel(found.getIds()), strict=True):
+            left, top = 1e3 * np.asarray(corners).min(axis=0)[:2]
+            sheet.marker(marker_cells(board.dictionary, int(marker)), x0 + left, y0 - top - gap, gap)
+    elif board.kind in ("tag", "tags"):
+        for number, place in board.ids.items():
+            left, top = points[4 * place]
+            sheet.marker(marker_cells(board.dictionary, number), x0 + left, y0 - top - size, size)
+    elif board.kind in ("circles", "acircles"):
+        radius = (0.25 if board.kind == "circles" else 0.45) * size
+        sheet.discs += [(x0 + u, y0 - v, radius) for u, v in points]
+    sheet.ruler(f"--board {board}")
+    return sheet
+
+
+def marker_cells(name: str, number: int) -> np.ndarray:
+    """Cells (n, n) of a marker with its border of one cell, 1 where it is white."""
+    found = dictionary(name)
+    side = int(found.markerSize) + 2
+    return np.asarray(cv2.aruco.generateImageMarker(found, number, side) > 127, dtype=np.uint8)
 
 
 def tag_sheet(tags: Iterable[TagModel], paper: str) -> Sheet:

@@ -1,0 +1,192 @@
+"""Search a board in pictures, and estimate the camera from what was found."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.data.camera_file import CameraFile
+from weldcal.calibration.errors import DatasetError
+from weldcal.calibration.geometry.robust import chi2_quantile
+from weldcal.calibration.geometry.se3 import exp_rotation, pose
+from weldcal.calibration.hand_eye.boards import EXAMPLES, Board, find_board, what_is_there, with_layout
+from weldcal.calibration.hand_eye.picture_files import load_grey
+from weldcal.models.arrays import Array
+
+FEWEST = 4
+"""Pictures with the board that are needed."""
+GROSS = 4.0
+"""Times the median error of a picture, beyond which it does not fit the camera."""
+_K3_LEVEL = 0.999  # at which a third radial coefficient is no chance
+_THUMBNAIL_PX = 240
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Picture:
+    """One picture.
+
+    Attributes:
+        name: of its file.
+        points: of the board (m, 2) px; NaN where one was not found.
+        size: width and height, px; zeros where it cannot be read.
+        thumbnail: a small JPEG with the points drawn.
+        why: why it is not used, one sentence; empty where it is.
+        rms_px: rms reprojection error; NaN where it is not used.
+    """
+
+    name: str
+    points: Array
+    size: tuple[int, int]
+    thumbnail: bytes
+    why: str = ""
+    rms_px: float = float("nan")
+
+    @property
+    def found(self) -> int:
+        """Number of points that were found."""
+        return int(np.isfinite(self.points[:, 0]).sum())
+
+
+def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, list[Picture]]:
+    """The board in every picture, on two threads.
+
+    Raises:
+        DatasetError: it is in fewer than four; the sentence says what was found in its place.
+    """
+    some = (
+        [g for g in (load_grey(files[k]) for k in spread(len(files), 6)) if g is not None] if board.layouts > 1 else []
+    )
+    board = with_layout(some, board)
+
+    def one(path: Path) -> Picture:
+        grey = load_grey(path)
+        none = np.full((len(board.points), 2), np.nan)
+        if grey is None:
+            return Picture(
+                name=path.name, points=none, size=(0, 0), thumbnail=b"", why="It cannot be read as a picture."
+            )
+        points = find_board(grey, board)
+        least = 4 if board.kind == "tag" else min(8, len(board.points))
+        why = ""
+        if int(np.isfinite(points[:, 0]).sum()) < least:
+            points, why = none, "The board was not found: show it whole, sharp, evenly lit, with a white margin."
+        return Picture(
+            name=path.name, points=points, size=grey.shape[::-1], thumbnail=_thumbnail(grey, points), why=why
+        )
+
+    before = cv2.getNumThreads()
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        pictures = list(pool.map(one, files))
+    cv2.setNumThreads(before)
+    n = sum(not p.why for p in pictures)
+    if n < FEWEST:
+        some = [g for g in (load_grey(files[k]) for k in spread(len(files), 6)) if g is not None]
+        there = what_is_there(some, board)
+        raise DatasetError(
+            f"The board {board} was found in {n} of {len(files)} pictures of '{source}', and {FEWEST} are needed"
+            + (
+                f": {there}. Correct --board."
+                if there
+                else f". Check --board, such as {EXAMPLES[board.kind]}, and the pictures."
+            )
+        )
+    return board, pictures
+
+
+def spread(n: int, most: int) -> list[int]:
+    """At most so many of the indices below n, evenly chosen."""
+    return sorted({int(k) for k in np.linspace(0, n - 1, min(n, most)).round()})
+
+
+def _thumbnail(grey: NDArray[np.uint8], points: Array) -> bytes:
+    scale = min(1.0, _THUMBNAIL_PX / max(grey.shape))
+    small = cv2.cvtColor(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+    for u, v in points[np.isfinite(points[:, 0])]:
+        cv2.circle(small, (round(scale * u), round(scale * v)), 2, (0, 120, 255), -1, cv2.LINE_AA)
+    ok, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])
+    return data.tobytes() if ok else b""
+
+
+def common_size(pictures: Sequence[Picture]) -> tuple[int, int]:
+    """The size of most pictures in which the board was found."""
+    sizes = [p.size for p in pictures if not p.why]
+    return max(set(sizes), key=sizes.count)
+
+
+def sized(picture: Picture, size: tuple[int, int]) -> Picture:
+    """The picture, not used where it has another size."""
+    if picture.why or picture.size == size:
+        return picture
+    return replace(
+        picture, why=f"It has {picture.size[0]} x {picture.size[1]} pixels, and the others have {size[0]} x {size[1]}."
+    )
+
+
+def estimate_camera(
+    pictures: list[Picture], board: Board, size: tuple[int, int], file: CameraFile | None, named: str | bool
+) -> tuple[Array, Array, NDArray[np.int64], list[Picture]]:
+    """Camera matrix, distortion, which of their numbers are free, and the pictures, those that do not fit left out."""
+    if file is not None:
+        if file.size is not None and file.size != size:
+            raise DatasetError(
+                f"The camera file {named or ''} is for pictures of {file.size[0]} x {file.size[1]} pixels, and these have {size[0]} x {size[1]}: "
+                "give the file of this resolution, or leave it out to estimate the camera."
+            )
+        return file.K, file.distortion, np.zeros(0, dtype=np.int64), pictures
+    start = np.array(
+        [[1.2 * max(size), 0.0, 0.5 * size[0] - 0.5], [0.0, 1.2 * max(size), 0.5 * size[1] - 0.5], [0.0, 0.0, 1.0]]
+    )
+    fixed = cv2.CALIB_FIX_K3
+    few = board.kind == "tag"  # four corners a picture do not show the lens
+    if few:
+        fixed |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_PRINCIPAL_POINT
+    flags = fixed | (cv2.CALIB_USE_INTRINSIC_GUESS if few else 0)
+    for _ in range(4):
+        kept = [k for k, p in enumerate(pictures) if not p.why]
+        if len(kept) < FEWEST:
+            raise DatasetError("Fewer than four pictures fit one camera: give the camera with --intrinsics FILE.")
+        obj = [board.points[np.isfinite(pictures[k].points[:, 0])].astype(np.float32) for k in kept]
+        img = [pictures[k].points[np.isfinite(pictures[k].points[:, 0])].astype(np.float32) for k in kept]
+        try:
+            found = cv2.calibrateCameraExtended(obj, img, size, start.copy(), np.zeros(5), flags=flags)
+        except cv2.error as problem:
+            raise DatasetError("The pictures do not show one camera: give it with --intrinsics FILE.") from problem
+        error = np.ravel(found[7])
+        bad = error > GROSS * float(np.median(error)) + 0.3
+        if not bad.any():
+            break
+        for k, e in zip(np.array(kept)[bad], error[bad], strict=True):
+            pictures[k] = replace(pictures[k], why=f"Its points do not fit the camera of the others ({e:.1f} px).")
+    K, dist = np.asarray(found[1], dtype=float), np.ravel(np.asarray(found[2], dtype=float))[:5]
+    free = np.array([0, 1, 2, 3, 4, 5] if few else [0, 1, 2, 3, 4, 5, 6, 7])
+    if not few:
+        more = cv2.calibrateCamera(obj, img, size, K.copy(), dist.copy(), flags=cv2.CALIB_USE_INTRINSIC_GUESS)
+        numbers = 2.0 * sum(len(o) for o in obj)
+        if numbers * 2.0 * np.log(max(found[0], 1e-9) / max(more[0], 1e-9)) > float(chi2_quantile(_K3_LEVEL, 1)):
+            K, dist = np.asarray(more[1], dtype=float), np.ravel(np.asarray(more[2], dtype=float))[:5]
+            free = np.append(free, 8)
+    if not (0.2 * max(size) < K[0, 0] < 50.0 * max(size)) or not np.isfinite(dist).all():
+        raise DatasetError(
+            f"The pictures do not determine the camera (focal length {K[0, 0]:.0f} px of {size[0]} pixels): tilt the board by 20 to 40 degrees in "
+            "some pictures, or give the camera with --intrinsics FILE."
+        )
+    return K, dist, free.astype(np.int64), pictures
+
+
+def solutions(points: Array, board: Board, K: Array, dist: Array) -> list[tuple[float, Array]]:
+    """Poses (4, 4) of the board in the camera that fit a picture, with their rms reprojection errors px, best first."""
+    seen = np.isfinite(points[:, 0])
+    obj, img = board.points[seen], points[seen]
+    found = []
+    kind = cv2.SOLVEPNP_IPPE
+    count, turns, shifts, _ = cv2.solvePnPGeneric(obj, img, K, dist, flags=kind)
+    for turn, shift in zip(turns[:count], shifts[:count], strict=True):
+        w, t = cv2.solvePnPRefineLM(obj, img, K, dist, turn.copy(), shift.copy())
+        uv, _ = cv2.projectPoints(obj, w, t, K, dist)
+        error = float(np.sqrt(((np.asarray(uv)[:, 0] - img) ** 2).sum(axis=1).mean()))
+        found.append((error, pose(exp_rotation(np.ravel(w)), np.ravel(t))))
+    return sorted(found, key=lambda one: one[0])

@@ -1,0 +1,187 @@
+"""Solve camera, hand-eye pose and target from the pictures of a board, and say which pictures were used."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
+from weldcal.calibration.hand_eye.boards import Board
+from weldcal.calibration.hand_eye.bundle import Bundle, Corners, adjust
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.picture_search import FEWEST, GROSS, Picture, solutions
+from weldcal.calibration.hand_eye.pictures import PictureSet, angles
+from weldcal.calibration.hand_eye.solve import HandEyeResult
+from weldcal.models.arrays import Array
+
+_CHANGED_PX = 1.3  # a second solution may have at most so many times the reprojection error of the first
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PictureResult:
+    """What the pictures add to a hand-eye result.
+
+    Attributes:
+        board: the board.
+        pictures: all pictures, with their errors and why some are not used.
+        bundle: the adjustment.
+        camera: the file that states the camera, or empty where it was estimated.
+        free: the numbers of the camera that were estimated.
+        reprojection_px: rms over all points of the pictures used.
+    """
+
+    board: Board
+    pictures: tuple[Picture, ...]
+    bundle: Bundle
+    camera: str
+    free: NDArray[np.int64]
+    reprojection_px: float
+
+    @property
+    def sentences(self) -> list[str]:
+        """What was found, for the reader."""
+        used = [p for p in self.pictures if not p.why]
+        b = self.bundle
+        lines = [
+            f"{len(used)} of {len(self.pictures)} pictures used, {self.board}, reprojection {self.reprojection_px:.3f} px rms.",
+            f"Robot poses as found: {np.degrees(b.sigma_rad):.4f} degrees and {1e3 * b.sigma_m:.3f} mm per axis (1 sigma, at the flange).",
+        ]
+        lines += [f"{p.name} is not used. {p.why}" for p in self.pictures if p.why]
+        K, s = b.K, b.camera_sigma
+        if len(s) >= 4:
+            words = ("fx", "fy", "cx", "cy")
+            values = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+            lines.append(
+                "Camera estimated: "
+                + ", ".join(f"{w} {v:.2f} +- {e:.2f}" for w, v, e in zip(words, values, s, strict=False))
+                + " px."
+            )
+        elif self.camera:
+            lines.append(f"Camera from {self.camera}.")
+        return lines
+
+
+def solve_pictures(
+    data: PictureSet, solve: Callable[[PosePairs], HandEyeResult]
+) -> tuple[HandEyeResult, PosePairs, PictureResult]:
+    """Hand-eye pose, target and camera from pictures: the poses' solution as the start, then the adjustment of the corners.
+
+    Returns:
+        The result, with X, Y and covariance of the adjustment; the pairs under the camera that was found; what the pictures add.
+
+    Raises:
+        as ``solve``; DatasetError: too few pictures agree.
+    """
+    pairs = data.pairs
+    result = solve(pairs)
+    pairs, changed = _nearest(pairs, result, data.board)
+    if changed:
+        result = solve(pairs)
+    keep = result.inliers.copy()
+    for _ in range(3):
+        bundle = _adjusted(pairs, result, keep, data)
+        bad = bundle.rms_px > GROSS * float(np.median(bundle.rms_px)) + 0.3
+        if not bad.any() or int((~bad).sum()) < FEWEST:
+            break
+        keep[np.flatnonzero(keep)[bad]] = False
+    if len(data.free):
+        pairs = _reprojected(replace(pairs, K=bundle.K, dist=bundle.distortion), data.board)
+        result = solve(pairs)
+    pictures = list(data.pictures)
+    errors = np.full(len(keep), np.nan)
+    errors[keep] = bundle.rms_px
+    for k, row in enumerate(data.rows):
+        if keep[k]:
+            pictures[row] = replace(pictures[row], rms_px=float(errors[k]))
+        else:
+            deg, mm = np.degrees(result.rotation_rad[k]), 1e3 * result.translation[k]
+            why = f"Board and robot pose disagree with the other pictures by {deg:.2f} degrees and {mm:.1f} mm."
+            pictures[row] = replace(pictures[row], why=why)
+    weight = np.isfinite(pairs.img[keep][..., 0]).sum(axis=1) if pairs.img is not None else np.ones(int(keep.sum()))
+    total = float(np.sqrt((weight * bundle.rms_px**2).sum() / weight.sum()))
+    found = PictureResult(
+        board=data.board,
+        pictures=tuple(pictures),
+        bundle=bundle,
+        camera=data.camera,
+        free=data.free,
+        reprojection_px=total,
+    )
+    if not result.unobservable:
+        result = replace(
+            result,
+            poses={"X": _transform(bundle.X), "Y": _transform(bundle.Y)},
+            covariance={"X": bundle.covariance[:6, :6], "Y": bundle.covariance[6:, 6:]},
+            joint_covariance=bundle.covariance,
+            degrees_of_freedom=bundle.degrees_of_freedom,
+        )
+    return replace(result, inliers=keep), pairs, found
+
+
+def _transform(X: Array) -> RigidTransform:
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
+
+
+def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], data: PictureSet) -> Bundle:
+    assert pairs.img is not None
+    assert pairs.K is not None
+    assert pairs.dist is not None
+    return adjust(
+        Corners(
+            robot=pairs.robot[keep], img=pairs.img[keep], obj=data.board.points, eye_in_hand=pairs.mode == "eye_in_hand"
+        ),
+        np.asarray(result.X.GetAsMatrix4()),
+        np.asarray(result.Y.GetAsMatrix4()),
+        pairs.K,
+        pairs.dist,
+        free=data.free,
+        sigma_px=0.3,
+        sigma_rad=result.sigma_rotation_rad,
+        sigma_m=result.sigma_translation,
+    )
+
+
+def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[PosePairs, bool]:
+    """The pairs with, for each picture, the solution that lies nearest to what the result predicts: a plane and a symmetric board have several."""
+    assert pairs.img is not None
+    assert pairs.K is not None
+    assert pairs.dist is not None
+    X, Y = np.asarray(result.X.GetAsMatrix4()), np.asarray(result.Y.GetAsMatrix4())
+    predicted = inverse(pairs.F @ X) @ Y
+    camera, img, changed = pairs.camera.copy(), pairs.img.copy(), False
+    for i, picture in enumerate(pairs.img):
+        tried = []
+        for order in board.symmetries:
+            found = solutions(picture[order], board, pairs.K, pairs.dist)
+            tried += [(e, C, order) for e, C in found]
+        least = min(e for e, _, _ in tried)
+        close = [one for one in tried if one[0] <= _CHANGED_PX * least + 0.05]
+        off = [float(angles(one[1][:3, :3].T @ predicted[i, :3, :3])) for one in close]
+        best = close[int(np.argmin(off))]
+        now = float(angles(camera[i, :3, :3].T @ predicted[i, :3, :3]))
+        if min(off) < 0.5 * now and now > 0.05:
+            camera[i], img[i], changed = best[1], picture[best[2]], True
+    return replace(pairs, camera=camera, img=img), changed
+
+
+def _reprojected(pairs: PosePairs, board: Board) -> PosePairs:
+    """The pairs with the boards' poses under their camera, each the solution nearest to the present one."""
+    assert pairs.img is not None
+    assert pairs.K is not None
+    assert pairs.dist is not None
+    camera = pairs.camera.copy()
+    for i, picture in enumerate(pairs.img):
+        seen = np.isfinite(picture[:, 0])
+        w, t = cv2.solvePnPRefineLM(
+            board.points[seen],
+            picture[seen],
+            pairs.K,
+            pairs.dist,
+            cv2.Rodrigues(camera[i, :3, :3])[0],
+            camera[i, :3, 3:].copy(),
+        )
+        camera[i] = pose(exp_rotation(np.ravel(w)), np.ravel(t))
+    return replace(pairs, camera=camera)

@@ -1,0 +1,305 @@
+"""Read pictures of a board with the robot's poses: pair them, and turn symmetric boards as the robot's rotations say."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.data.camera_file import read_camera
+from weldcal.calibration.data.poses.listing import Listing, listing_of
+from weldcal.calibration.data.poses.lists import folder_lists, together, whose
+from weldcal.calibration.data.poses.names import mounting_name, number_of
+from weldcal.calibration.errors import DatasetError, InconsistentPoses
+from weldcal.calibration.geometry.se3 import nearest_rotation, pose
+from weldcal.calibration.hand_eye.boards import Board
+from weldcal.calibration.hand_eye.conventions import UNITS
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
+from weldcal.calibration.hand_eye.picture_files import camera_in, picture_files
+from weldcal.calibration.hand_eye.picture_search import (
+    FEWEST,
+    Picture,
+    common_size,
+    estimate_camera,
+    find_in,
+    sized,
+    solutions,
+    spread,
+)
+from weldcal.models.arrays import Array
+
+_TRIED_SHIFTS = (0, 1, -1, 2, -2, 3, -3)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PictureSet:
+    """Pictures with the robot's poses, ready to solve.
+
+    Attributes:
+        pairs: robot and camera poses of the n usable pictures, with points and camera.
+        pictures: all pictures.
+        rows: the picture of each pair (n,).
+        board: the board.
+        camera: the file that states the camera, or empty where it is estimated.
+        free: the camera's numbers that are estimated, see ``adjust``.
+    """
+
+    pairs: PosePairs
+    pictures: tuple[Picture, ...]
+    rows: NDArray[np.int64]
+    board: Board
+    camera: str
+    free: NDArray[np.int64]
+
+
+def read_pictures(
+    folder: Path,
+    board: Board,
+    *,
+    mounting: str | None,
+    unit: str | None = None,
+    stated: StatedForms | None = None,
+    camera: Path | None = None,
+) -> PictureSet:
+    """The pictures of a folder with the robot's poses.
+
+    Args:
+        folder: it holds the pictures and the robot's poses in any form of docs/datasets.md; ``--camera-poses`` of ``stated`` names the
+            pictures, where there are several kinds.
+        board: the board in them.
+        mounting: eye_in_hand or eye_on_base.
+        unit: of the robot's positions.
+        stated: what the user states of the robot's poses.
+        camera: a file that states the camera; without it one of the folder is taken, or the camera is estimated.
+
+    Raises:
+        DatasetError: pictures, poses or camera cannot be used; InconsistentPoses: they contradict each other.
+    """
+    if not folder.is_dir():
+        raise DatasetError(
+            f"'{folder.name}' is no folder: --board needs the folder of the pictures and of the robot's poses."
+        )
+    stated = stated or StatedForms()
+    mode = "" if mounting is None else mounting_name(mounting)
+    if mode not in ("eye_in_hand", "eye_on_base"):
+        raise DatasetError(
+            f"'{folder.name}' does not say where the camera is; add --mounting eye_in_hand (on the flange) or eye_on_base (fixed)."
+        )
+    if unit is not None and unit not in UNITS:
+        raise DatasetError(f"There is no unit '{unit}'; use {', '.join(UNITS)}.")
+    files = picture_files(folder, stated.camera_poses)
+    stated_camera = (camera, read_camera(camera)) if camera is not None else camera_in(folder)
+    skip = frozenset() if stated_camera is None else frozenset({stated_camera[0]})
+    robot = _robot(folder, stated, skip, unit)
+    board, pictures = find_in(files, board, folder.name)
+    size = common_size(pictures)
+    pictures = [sized(p, size) for p in pictures]
+    file = None if stated_camera is None else stated_camera[1]
+    K, dist, free, pictures = estimate_camera(pictures, board, size, file, camera is not None and camera.name)
+    return _paired(
+        files=files, pictures=pictures, board=board, robot=robot, mode=mode, stated=stated, source=folder.name, K=K, dist=dist, free=free,
+        camera="" if stated_camera is None or len(free) else stated_camera[0].name,
+    )  # fmt: skip
+
+
+def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str | None) -> Listing:
+    """The list of the robot's poses among those of a folder. Raises DatasetError where there is none, or several."""
+    lists = folder_lists(folder, 1, skip)
+    known = ", ".join(repr(one.name) for one in lists[:8])
+    if stated.robot_poses is not None:
+        lists = [one for one in lists if stated.robot_poses in one.name]
+        if len(lists) != 1:
+            raise DatasetError(
+                f"--robot-poses {stated.robot_poses} names {len(lists)} of the lists of '{folder.name}': {known or 'none'}."
+            )
+    if not lists:
+        raise DatasetError(
+            f"'{folder.name}' holds pictures and no robot poses: add robot.csv with the header id,x,y,z,qx,qy,qz,qw, one row per picture, or "
+            "one file per picture."
+        )
+    if len(lists) > 1:
+        mine = [one for one in lists if whose(one.name) == "robot"]
+        others = [one for one in lists if whose(one.name) != "camera"]
+        lists = mine if len(mine) == 1 else others if len(others) == 1 else lists
+    if len(lists) > 1:
+        raise DatasetError(
+            f"The names of the lists of '{folder.name}' do not tell the robot's poses: {known}. Name them with --robot-poses."
+        )
+    return replace(lists[0], unit=lists[0].unit or unit or "")
+
+
+def _paired(
+    *,
+    files: list[Path],
+    pictures: list[Picture],
+    board: Board,
+    robot: Listing,
+    mode: str,
+    stated: StatedForms,
+    source: str,
+    K: Array,
+    dist: Array,
+    free: NDArray[np.int64],
+    camera: str,
+) -> PictureSet:
+    """Pairs of the robot's and the boards' poses; flips of symmetric boards follow from the robot's rotations."""
+    C = np.tile(np.eye(4), (len(pictures), 1, 1))
+    for k, picture in enumerate(pictures):
+        if not picture.why:
+            found = solutions(picture.points, board, K, dist)
+            if found:
+                C[k] = found[0][1]
+            else:
+                pictures[k] = replace(picture, why="Its points give no pose of the board.")
+    name = f"{files[0].name} ... {files[-1].name}"
+    labels = np.zeros(len(pictures), dtype=np.int64)
+    stated = replace(stated, robot_poses=robot.name, camera_poses=name, unit=None, camera_known=True)
+    problem: InconsistentPoses | DatasetError | None = None
+    for numbered in _numbered(robot, pictures):
+        choices: list[NDArray[np.int64]] = [labels]
+        if len(board.symmetries) > 1:
+            choices = _flips(numbered, _listing(name, pictures, C), pictures, board)
+        for choice in choices:
+            listing = _listing(name, pictures, _flipped(C, choice, board))
+            try:
+                found_pairs = import_pairs([numbered, listing], source, mode, stated)
+            except WrongScale as why:
+                size = 1e3 * board.size * why.factor
+                problem = InconsistentPoses(
+                    f"The board in the pictures of '{source}' fits the robot's motion with its lengths multiplied by {why.factor:.4g}: a size of "
+                    f"{size:.4g} mm in place of {1e3 * board.size:g} mm. Measure the board and correct --board, or correct --unit of the robot."
+                )
+                break
+            except (InconsistentPoses, DatasetError) as why:
+                problem = problem or why
+                continue
+            return _set(found_pairs, pictures, choice, board, mode, source, K, dist, free, camera)
+    assert problem is not None
+    raise problem
+
+
+def _set(
+    found: ImportedPairs, pictures: list[Picture], labels: NDArray[np.int64], board: Board, mode: str, source: str, K: Array, dist: Array,
+    free: NDArray[np.int64], camera: str,
+) -> PictureSet:  # fmt: skip
+    rows = np.asarray(found.rows[1], dtype=np.int64)
+    turned = [replace(p, points=p.points[board.symmetries[int(f)]]) for p, f in zip(pictures, labels, strict=True)]
+    paired = set(rows.tolist())
+    turned = [
+        p if p.why or k in paired else replace(p, why="No robot pose belongs to it.") for k, p in enumerate(turned)
+    ]
+    pairs = PosePairs(
+        source=source,
+        robot=found.robot,
+        camera=found.camera,
+        mode=mode,
+        img=np.stack([turned[k].points for k in rows]),
+        obj=board.points,
+        K=K,
+        dist=dist,
+        reading=found.reading,
+        notes=found.notes,
+        ids=tuple(turned[k].name for k in rows),
+    )
+    return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=camera, free=free)
+
+
+def _listing(name: str, pictures: Sequence[Picture], C: Array) -> Listing:
+    out = tuple((k, p.why) for k, p in enumerate(pictures) if p.why)
+    found = listing_of(
+        name, C[:, :3, 3], C[:, :3, :3], rotation="matrix", ids=tuple(Path(p.name).stem for p in pictures), unit="m", form="pictures of a board"
+    )  # fmt: skip
+    return replace(found, left_out=out)
+
+
+def _numbered(robot: Listing, pictures: Sequence[Picture]) -> list[Listing]:
+    """The robot's poses with the numbers of the pictures, where rows have no names and there are more rows than pictures: counted from 0 or 1."""
+    numbers = [number_of(Path(p.name).stem) for p in pictures]
+    if robot.ids or len(robot) == len(pictures) or None in numbers:
+        return [robot]
+    found = [
+        replace(robot, ids=tuple(str(first + k) for k in range(len(robot))))
+        for first in (1, 0)
+        if first <= min(n for n in numbers if n is not None)
+        and max(n for n in numbers if n is not None) < first + len(robot)
+    ]
+    return found or [robot]
+
+
+def _flipped(C: Array, labels: NDArray[np.int64], board: Board) -> Array:
+    """The boards' poses with another order of their points."""
+    turns = [_turn(board, order) for order in board.symmetries]
+    return np.stack([X @ turns[int(k)] for X, k in zip(C, labels, strict=True)])
+
+
+def _turn(board: Board, order: NDArray[np.int64]) -> Array:
+    """S (4, 4) with S p = p[order]: a board whose points are taken in this order has the pose C S instead of C."""
+    p, q = board.points, board.points[order]
+    a, b = p - p.mean(axis=0), q - q.mean(axis=0)
+    # in-plane points: add the normal, so that the rotation is the proper one
+    R = nearest_rotation(b.T @ a + np.linalg.norm(a) ** 2 * np.outer([0.0, 0.0, 1.0], [0.0, 0.0, 1.0]))
+    return pose(R, q.mean(axis=0) - R @ p.mean(axis=0))
+
+
+def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: Board) -> list[NDArray[np.int64]]:
+    """Orders of the points of each picture that agree best with the angles of the robot's relative rotations, most likely first."""
+    rows_r, rows_c, _ = together(robot, camera)
+    good = robot.good[rows_r] & camera.good[rows_c]
+    rows_r, rows_c = rows_r[good], rows_c[good]
+    turns = np.stack([_turn(board, order)[:3, :3] for order in board.symmetries])
+    C = camera.readings[0].X[rows_c, :3, :3]
+    n = len(C)
+    tried: dict[bytes, tuple[float, NDArray[np.int64]]] = {}
+    for shift in _TRIED_SHIFTS:
+        m = n - abs(shift)
+        if m < FEWEST:
+            continue
+        a, b = slice(max(shift, 0), max(shift, 0) + m), slice(max(-shift, 0), max(-shift, 0) + m)
+        turned = np.einsum("nij,sjk->nsik", C[b], turns)
+        theirs = angles(np.einsum("asji,btjk->abstik", turned, turned, optimize=True))
+        for reading in robot.readings:
+            R = reading.X[rows_r[a], :3, :3]
+            ours = angles(np.einsum("aji,bjk->abik", R, R, optimize=True))
+            cost = np.minimum(np.abs(theirs - ours[:, :, None, None]), 0.5)
+            labels, value = _least(cost)
+            whole = np.zeros(len(pictures), dtype=np.int64)
+            whole[rows_c[b]] = labels
+            value /= m * (m - 1)
+            value += 1e-6 * abs(shift)
+            key = whole.tobytes()
+            if key not in tried or value < tried[key][0]:
+                tried[key] = value, whole
+    best = sorted(tried.values(), key=lambda one: one[0])
+    return [labels for _, labels in best[:8]] or [np.zeros(len(pictures), dtype=np.int64)]
+
+
+def angles(R: Array) -> Array:
+    """Angles (...) rad of rotations (..., 3, 3)."""
+    trace = np.einsum("...ii->...", R)
+    return np.asarray(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
+
+
+def _least(cost: Array) -> tuple[NDArray[np.int64], float]:
+    """Labels (n,) of least total cost[a, b, label a, label b]: coordinate descent from the labels that each picture alone suggests."""
+    n = len(cost)
+    best: tuple[NDArray[np.int64], float] | None = None
+    each = np.arange(n)
+    for anchor in spread(n, 8):
+        labels = cost[anchor, :, 0, :].argmin(axis=1)
+        labels[anchor] = 0
+        for _ in range(10):
+            before = labels.copy()
+            for k in range(n):
+                total = cost[k, each, :, labels]
+                total[k] = 0.0
+                labels[k] = int(total.sum(axis=0).argmin())
+            if (labels == before).all():
+                break
+        value = float(cost[each[:, None], each[None], labels[:, None], labels[None]].sum())
+        if best is None or value < best[1] - 1e-9:
+            first = labels.copy()
+            best = first, value
+    assert best is not None
+    return best
