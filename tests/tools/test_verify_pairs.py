@@ -45,7 +45,7 @@ def pairs(n: int, seed: int, X: Array, noise: float = 1.0) -> tuple[Array, Array
 def saved(folder: Path, n: int, seed: int, X: Array, mode: str = "eye_in_hand", noise: float = 1.0) -> Path:
     A, B, _ = pairs(n, seed, X, noise)
     words = {"mode": mode} if mode else {}
-    np.savez(folder / "pairs.npz", A=A, B=B, **words)
+    np.savez(folder / "pairs.npz", A=A, B=B, **words)  # type: ignore[arg-type]
     return folder / "pairs.npz"
 
 
@@ -158,7 +158,8 @@ def test_a_result_of_the_same_pairs_is_no_verification(tmp_path: Path, monkeypat
         run = CliRunner().invoke(app, ["verify", result, "pairs.npz", "--json", "--out", f"v{len(result)}"])
         assert run.exit_code == 0
         assert json.loads(run.stdout.splitlines()[-1])["verdict"] == "not a verification"
-    np.savez("pairs.npz", **dict(zip("AB", pairs(24, 12, truth(10))[:2], strict=True)))
+    A, B, _ = pairs(24, 12, truth(10))
+    np.savez("pairs.npz", A=A, B=B)
     run = CliRunner().invoke(app, ["verify", "own", "pairs.npz", "--json", "--out", "new"])
     assert json.loads(run.stdout.splitlines()[-1])["verdict"] == "use it"
     assert (tmp_path / "new" / "report.html").is_file()
@@ -210,6 +211,8 @@ def test_a_camera_beside_the_robot_is_judged_too(tmp_path: Path) -> None:
 
 def test_kalibr_states_the_body_in_the_camera_and_the_inverse_is_named(tmp_path: Path) -> None:
     X = truth(18)
-    found = verdict(write("Kalibr", np.linalg.inv(X), tmp_path), saved(tmp_path, 16, 19, X)).verdict
+    found = verdict(
+        write("Kalibr", np.asarray(np.linalg.inv(X), dtype=np.float64), tmp_path), saved(tmp_path, 16, 19, X)
+    ).verdict
     assert found.verdict == "do not use"
     assert found.reason.startswith("The inverse of RESULT fits: 0.")
