@@ -101,6 +101,10 @@ def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
             raise InputError(
                 f"A row of the section {section} of '{name}' ends before its column Axis: the file is cut off there."
             )
+        if len(row) > len(header):
+            raise InputError(
+                f"A row of the section {section} of '{name}' has {len(row)} cells, and its header {len(header)}; export it again."
+            )
         frame = row[0]
         if frame not in frames:
             frames[frame] = {}

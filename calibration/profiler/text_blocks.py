@@ -75,7 +75,7 @@ def blocks_of(text: str, name: str) -> list[Block]:
     header: tuple[str, ...] = ()
     caption = ""
     rows: list[list[float]] = []
-    first = total = 0
+    first = total = wide = 0
 
     def close() -> None:
         nonlocal rows, caption
@@ -98,6 +98,7 @@ def blocks_of(text: str, name: str) -> list[Block]:
             continue
         bare = line.lstrip("#%!/ \t") if line.lstrip().startswith(("#", "%", "!", "//")) else line
         cells = cells_of(bare, separator)
+        size = len(cells)
         while len(cells) > 1 and cells[-1] == "":
             cells.pop()
         values = [number_in(c) for c in cells]
@@ -106,10 +107,17 @@ def blocks_of(text: str, name: str) -> list[Block]:
         if (
             bare is line
             and numbers
-            and (all(v is not None for v in values) or (header and len(cells) == len(header) and numbers >= 2))
+            and (
+                all(v is not None for v in values)
+                or (header and len(cells) == len(header) and numbers >= 1 + (not rows))
+            )
         ):
             if not rows:
-                first = number
+                first, wide = number, size
+            if not header and size != wide:
+                raise InputError(f"'{name}', line {number}: {size} cells, and {wide} in the rows before it.")
+            if rows and any(v is None and k < len(rows[0]) and np.isfinite(rows[0][k]) for k, v in enumerate(values)):
+                raise InputError(f"'{name}', line {number}, holds words where numbers are needed; correct it.")
             rows.append(kept)
             total += len(kept)
             if total > MOST_CELLS:
