@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.cloud_body import CloudError, cloud_stream
-from weldcal.calibration.data.cloud_form import CloudForm
-from weldcal.calibration.data.depth import (
+from weldcal.calibration.data.cloud_files.body import CloudError, cloud_stream
+from weldcal.calibration.data.cloud_files.depth import (
     IMAGES,
     back_projected,
     camera_of,
@@ -18,10 +17,11 @@ from weldcal.calibration.data.depth import (
     is_depth_array,
     read_depth_image,
 )
-from weldcal.calibration.data.grid import measured
-from weldcal.calibration.data.intrinsics import checked_intrinsics, intrinsics_of
-from weldcal.calibration.data.pcd import read_pcd
-from weldcal.calibration.data.ply import read_ply
+from weldcal.calibration.data.cloud_files.form import CloudForm
+from weldcal.calibration.data.cloud_files.grid import measured
+from weldcal.calibration.data.cloud_files.intrinsics import checked_intrinsics, intrinsics_of
+from weldcal.calibration.data.cloud_files.pcd import read_pcd
+from weldcal.calibration.data.cloud_files.ply import read_ply
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

@@ -26,8 +26,8 @@ from weldcal.calibration.data.checks import (
     to_metres,
     unit_quaternion,
 )
+from weldcal.calibration.data.cloud_files.depth import camera_of, is_depth
 from weldcal.calibration.data.clouds import NO_NOTES, CloudError, cloud_id, ending_of, find_cloud, save_cloud
-from weldcal.calibration.data.depth import camera_of, is_depth
 from weldcal.calibration.data.header import DatasetHeader, PoseForm, Units, without_cloud_form
 from weldcal.calibration.data.poses.bag import ENDINGS as RECORDINGS
 from weldcal.calibration.data.poses.bag import find_bag, read_bag

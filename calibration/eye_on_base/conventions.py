@@ -25,7 +25,7 @@ _SAME_M, _SAME_RAD = 1e-3, 2e-3  # results that are the same
 _STEPS = 4
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ScanAgreement:
     """How well the scans agree with a reading: rms angle of the normals (rad) and distance of the centres (m), the spread of the centres (m),
     R_BC and p_BC, and whether a list is changed beyond what is stated."""
@@ -144,11 +144,11 @@ def _fit(reading: PoseReading, rows: Array, p_CR: Array, n_C: Array, X_FR: Array
         cut = np.sort(size)[kept - 1] + 1e-9
         weight = np.minimum(1.0, (1.5 * cut / np.maximum(size, 1e-12)) ** 2)
     return ScanAgreement(
-        reading,
-        float(np.sqrt((np.sort(tilt)[:kept] ** 2).mean())) + _NORMAL_FLOOR,
-        float(np.sqrt((np.sort(off)[:kept] ** 2).mean())) + _CENTRE_FLOOR_M,
-        float(np.sqrt(p_B.var(axis=0).sum())) + 1e-9,
-        R,
-        middle_B - R @ middle_C,
-        changed,
+        reading=reading,
+        normal=float(np.sqrt((np.sort(tilt)[:kept] ** 2).mean())) + _NORMAL_FLOOR,
+        centre=float(np.sqrt((np.sort(off)[:kept] ** 2).mean())) + _CENTRE_FLOOR_M,
+        spread=float(np.sqrt(p_B.var(axis=0).sum())) + 1e-9,
+        R=R,
+        p=middle_B - R @ middle_C,
+        changed=changed,
     )

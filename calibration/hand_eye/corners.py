@@ -10,7 +10,7 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import difference, pose
 from weldcal.calibration.hand_eye.choice import CANDIDATES
-from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import NAMES, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.models.arrays import Array

@@ -10,9 +10,9 @@ from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES, most_promising
 from weldcal.calibration.hand_eye.determinacy import diversity
-from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.fit import descend
 from weldcal.calibration.hand_eye.linearisation import inverse_information
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, residuals
 from weldcal.calibration.hand_eye.repeats import one_per_pose
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem

@@ -19,8 +19,8 @@ from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.errors import DatasetError, UndeterminedPoses
 from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, pose
-from weldcal.calibration.hand_eye.conventions import UNITS
-from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.pairs.conventions import UNITS
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import solve_problem
 from weldcal.calibration.motion.stream import ContinuousMotion

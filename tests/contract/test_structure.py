@@ -13,13 +13,13 @@ from tests.places import ROOT
 
 # A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
 BOUNDS = {
-    "modules": 619,  # files with code in the five folders
-    "code lines": 84_000,  # without blank lines, comments and docstrings
-    "lines of studies": 10_300,  # in tools/studies, all lines
+    "modules": 655,  # files with code in the five folders
+    "code lines": 90_400,  # without blank lines, comments and docstrings
+    "lines of studies": 10_200,  # in tools/studies, all lines
     "tests that import studies": 2,  # outside tests/tools/studies
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only
-    "import closure of calibrate": 109,  # modules with code that the command needs, directly or not
+    "import closure of calibrate": 113,  # modules with code that the command needs, directly or not
     "import cycles": 0,  # modules that import themselves through others, imports under TYPE_CHECKING included
     "full folders": 0,  # outside tools/, with more than FULLEST_FOLDER modules
 }

@@ -15,7 +15,7 @@ from tests.calibration.hand_eye.stated_forms import truth
 from tests.documents.scans import write_scans
 from tests.tools.test_verify_pairs import pairs
 from weldcal.calibration.data.dataset import load_dataset
-from weldcal.calibration.hand_eye.files import read_pairs
+from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.tools.cli.app import app
 
 

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from weldcal.calibration.hand_eye.boards import find_board, parse_board
+from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.board import PAPERS, Board, board_sheet, tag_sheet

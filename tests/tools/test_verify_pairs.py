@@ -15,7 +15,7 @@ import weldcal
 from tests.calibration.hand_eye.stated_forms import FORMS, truth, write
 from tests.documents.scans import write_scans
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.hand_eye.judging import judge_pose
+from weldcal.calibration.hand_eye.pairs.judging import judge_pose
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig
 from weldcal.tools.cli.app import app

@@ -17,6 +17,7 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.result_files import write_apart
 from weldcal.models.scanners import get_scanner
+from weldcal.tools.report.doctor import worded
 
 _NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "too few scans")
 """Causes that the solver names itself, or that are none."""
@@ -73,8 +74,6 @@ def examined_where_refused(
 
 def _name_cause(problem: WeldcalError, case: Case) -> None:
     """Adds the doctor's first cause to the sentence, with its evidence and remedy, unless the sentence names it."""
-    from weldcal.tools.commands.doctor import worded  # it imports this module
-
     causes = worded("", diagnose(case), most=1).causes
     if not causes or causes[0].name in _NAMED_ALREADY:
         return

@@ -16,18 +16,18 @@ from weldcal.calibration.data.poses.lists import folder_lists, two_lists
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
-from weldcal.calibration.hand_eye.boards import FORMS, parse_board
 from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_corners, refine_with_corners
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
-from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
-from weldcal.calibration.hand_eye.importing import FARTHEST_M, StatedForms, import_pairs
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
-from weldcal.calibration.hand_eye.picture_solution import PictureResult, solve_pictures
-from weldcal.calibration.hand_eye.pictures import PictureSet, read_pictures
+from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
+from weldcal.calibration.hand_eye.pairs.importing import FARTHEST_M, StatedForms, import_pairs
+from weldcal.calibration.hand_eye.pictures.boards import FORMS, parse_board
+from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_pictures
+from weldcal.calibration.hand_eye.pictures.solution import PictureResult, solve_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.motion.pose_streams import Synchronised, are_trajectories, is_stream_file, synchronise_lists

@@ -18,8 +18,8 @@ from weldcal.calibration.data.header import Units
 from weldcal.calibration.data.poses.lists import folder_lists, read_lists, two_lists
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.hand_eye.files import PosePairs, pairs_of_lists, read_pairs
-from weldcal.calibration.hand_eye.importing import StatedForms
+from weldcal.calibration.hand_eye.pairs.files import PosePairs, pairs_of_lists, read_pairs
+from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.refinement.stated_arm import joint_angles
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

@@ -10,10 +10,10 @@ from weldcal.calibration.data.poses.bag import find_bag
 from weldcal.calibration.data.poses.pairing import FOLDERS
 from weldcal.calibration.data.stated_pose import StatedPose, read_stated_pose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
-from weldcal.calibration.hand_eye.importing import StatedForms
-from weldcal.calibration.hand_eye.judging import Judgement, judge_pose
 from weldcal.calibration.hand_eye.mountings import get_mounting
+from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
+from weldcal.calibration.hand_eye.pairs.importing import StatedForms
+from weldcal.calibration.hand_eye.pairs.judging import Judgement, judge_pose
 from weldcal.calibration.hand_eye.solve import HandEyeConfig
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic

@@ -9,7 +9,7 @@ import numpy as np
 
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
-from weldcal.calibration.hand_eye.picture_solution import PictureResult
+from weldcal.calibration.hand_eye.pictures.solution import PictureResult
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.motion.pose_streams import Synchronised
 from weldcal.calibration.planning.next_pose import NextPose

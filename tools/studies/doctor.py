@@ -6,7 +6,7 @@ from typing import Annotated
 
 from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
-from weldcal.tools.commands.doctor import worded
+from weldcal.tools.report.doctor import worded
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
 from weldcal.tools.worlds.doctor import CAUSES, clean
 

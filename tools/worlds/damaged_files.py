@@ -17,7 +17,7 @@ from pydrake.common.yaml import yaml_dump_typed
 from weldcal.calibration.data.clouds import read_cloud
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import load_result
-from weldcal.calibration.hand_eye.files import read_pairs
+from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.calibration.profiler.record import load_record
 from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result

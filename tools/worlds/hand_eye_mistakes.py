@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose, random_rotations
-from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError

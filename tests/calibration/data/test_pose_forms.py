@@ -15,7 +15,7 @@ from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.poses.names import mounting_name, natural
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import inverse, pose
-from weldcal.calibration.hand_eye.files import read_pairs
+from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 

@@ -11,7 +11,7 @@ import pytest
 from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.calibration.doctor.record import case_text, read_case
 from weldcal.models.errors import InputError
-from weldcal.tools.commands.doctor import CHECKED, worded
+from weldcal.tools.report.doctor import CHECKED, worded
 from weldcal.tools.worlds.doctor import CAUSES, UNKNOWN, clean
 
 SEED = 31

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import PoseNumbers, readings
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.hand_eye.conventions import decide
-from weldcal.calibration.hand_eye.files import read_pairs
+from weldcal.calibration.hand_eye.pairs.conventions import decide
+from weldcal.calibration.hand_eye.pairs.files import read_pairs
 
 SETS = 24
 MOVING = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "XYX", "XZX", "YXY", "YZY", "ZXZ", "ZYZ")

@@ -17,7 +17,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from scipy.spatial.transform import Rotation
 
 from tests.calibration.hand_eye.poses import co_manipulation, eye_in_hand
-from weldcal.calibration.hand_eye.files import read_pairs
+from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.tools.commands.hand_eye import run_hand_eye
 from weldcal.tools.report.hand_eye import HandEyeReport
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from tests.calibration.hand_eye.poses import Array, co_manipulation, eye_in_hand
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import inverse
-from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.opencv_methods import opencv_held_out
+from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.starts import motions
 from weldcal.models.errors import InputError

@@ -9,8 +9,8 @@ import pytest
 
 from tests.calibration.hand_eye.poses import Array, eye_in_hand, random_poses
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.tools.worlds.hand_eye_mistakes import MISTAKES, fuzz, judge, random_world

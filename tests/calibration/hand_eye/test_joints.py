@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform
 from tests.calibration.hand_eye.poses import Array, noise, random_poses
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.joints import JointRefinement, flange_poses, poses_of_arm, refine_joints
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeResult, solve_problem
 from weldcal.models.arms.chain import Chain, chain_forward, load_chain

@@ -13,7 +13,7 @@ from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.poses.listing import Listing, listing_of_array
 from weldcal.calibration.data.poses.lists import together
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.hand_eye.files import read_pairs
+from weldcal.calibration.hand_eye.pairs.files import read_pairs
 
 
 def listing(n: int, times: np.ndarray | None = None) -> Listing:

@@ -10,8 +10,8 @@ import pytest
 from tests.calibration.hand_eye.pair_sources import NAMED, READ, REFUSED
 from tests.calibration.hand_eye.pair_world import BASE, X_BASE, X
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.hand_eye.files import read_pairs
-from weldcal.calibration.hand_eye.importing import StatedForms
+from weldcal.calibration.hand_eye.pairs.files import read_pairs
+from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import solve_problem
 

@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 from tests.calibration.hand_eye import rendering as draw
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import difference, moved
-from weldcal.calibration.hand_eye import picture_search
-from weldcal.calibration.hand_eye.boards import Board, find_board, parse_board, with_layout
-from weldcal.calibration.hand_eye.bundle import Corners, adjust
 from weldcal.calibration.hand_eye.choice import CANDIDATES
-from weldcal.calibration.hand_eye.files import PosePairs
-from weldcal.calibration.hand_eye.importing import StatedForms
-from weldcal.calibration.hand_eye.picture_files import picture_files
-from weldcal.calibration.hand_eye.pictures import read_pictures
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
+from weldcal.calibration.hand_eye.pairs.importing import StatedForms
+from weldcal.calibration.hand_eye.pictures import search as picture_search
+from weldcal.calibration.hand_eye.pictures.boards import Board, find_board, parse_board, with_layout
+from weldcal.calibration.hand_eye.pictures.bundle import Corners, adjust
+from weldcal.calibration.hand_eye.pictures.files import picture_files
+from weldcal.calibration.hand_eye.pictures.sets import read_pictures
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.tools.cli.app import app

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import chi2
 
 from tests.places import SHARED_DATA, require_data
-from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
+from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.models.errors import InputError
 from weldcal.tools.studies.hand_eye.comparison import SETS, HandEyeBenchmark, run_hand_eye_benchmark
 

@@ -10,8 +10,8 @@ import numpy as np
 import typer
 import yaml
 
-from weldcal.calibration.hand_eye.boards import EXAMPLES, dictionary, parse_board
-from weldcal.calibration.hand_eye.boards import Board as DescribedBoard
+from weldcal.calibration.hand_eye.pictures.boards import EXAMPLES, dictionary, parse_board
+from weldcal.calibration.hand_eye.pictures.boards import Board as DescribedBoard
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic

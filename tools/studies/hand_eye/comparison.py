@@ -284,7 +284,7 @@ def run_hand_eye_benchmark(
 ) -> HandEyeBenchmark:
     """All of it; ``data``: folder of sets (pairs.npz each), None to leave them out; ``quick``: few trials and
     no OpenCV on the sets, for a test. Raises InputError, before any work, where the folder holds no set."""
-    from weldcal.calibration.hand_eye.files import read_pairs
+    from weldcal.calibration.hand_eye.pairs.files import read_pairs
 
     report = HandEyeBenchmark()
     sets = sorted(data.glob("*/pairs.npz")) if data is not None else []

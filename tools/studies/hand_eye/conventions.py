@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.poses.readings import PoseReading, readings
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import inverse, pose
-from weldcal.calibration.hand_eye.conventions import Decision, agreements, decide
+from weldcal.calibration.hand_eye.pairs.conventions import Decision, agreements, decide
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, Table
 from weldcal.tools.worlds.written_poses import WrittenSet, written_set

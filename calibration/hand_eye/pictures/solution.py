@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.calibration.hand_eye.boards import Board
-from weldcal.calibration.hand_eye.bundle import Bundle, Corners, adjust
-from weldcal.calibration.hand_eye.files import PosePairs
-from weldcal.calibration.hand_eye.picture_search import FEWEST, GROSS, Picture, solutions
-from weldcal.calibration.hand_eye.pictures import PictureSet, angles
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
+from weldcal.calibration.hand_eye.pictures.boards import Board
+from weldcal.calibration.hand_eye.pictures.bundle import Bundle, Corners, adjust
+from weldcal.calibration.hand_eye.pictures.search import FEWEST, GROSS, Picture, solutions
+from weldcal.calibration.hand_eye.pictures.sets import PictureSet, angles
 from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.models.arrays import Array
 

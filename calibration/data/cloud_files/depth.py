@@ -5,9 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.cloud_body import CloudError
-from weldcal.calibration.data.cloud_form import CloudForm
-from weldcal.calibration.data.intrinsics import Intrinsics, checked_intrinsics, find_intrinsics, intrinsics_of
+from weldcal.calibration.data.cloud_files.body import CloudError
+from weldcal.calibration.data.cloud_files.form import CloudForm
+from weldcal.calibration.data.cloud_files.intrinsics import (
+    Intrinsics,
+    checked_intrinsics,
+    find_intrinsics,
+    intrinsics_of,
+)
 from weldcal.models.array_files import npy_shape, png_depth, read_raw_image
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

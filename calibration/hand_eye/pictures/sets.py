@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.camera_file import read_camera
 from weldcal.calibration.data.poses.listing import Listing, listing_of
-from weldcal.calibration.data.poses.lists import folder_lists, together, whose
-from weldcal.calibration.data.poses.names import mounting_name, number_of
+from weldcal.calibration.data.poses.lists import folder_lists, together
+from weldcal.calibration.data.poses.names import mounting_name, number_of, whose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import nearest_rotation, pose
-from weldcal.calibration.hand_eye.boards import Board
-from weldcal.calibration.hand_eye.conventions import UNITS
-from weldcal.calibration.hand_eye.files import PosePairs
-from weldcal.calibration.hand_eye.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
-from weldcal.calibration.hand_eye.picture_files import camera_in, picture_files
-from weldcal.calibration.hand_eye.picture_search import (
+from weldcal.calibration.hand_eye.pairs.conventions import UNITS
+from weldcal.calibration.hand_eye.pairs.files import PosePairs
+from weldcal.calibration.hand_eye.pairs.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
+from weldcal.calibration.hand_eye.pictures.boards import Board
+from weldcal.calibration.hand_eye.pictures.files import camera_in, picture_files
+from weldcal.calibration.hand_eye.pictures.search import (
     FEWEST,
     Picture,
     common_size,

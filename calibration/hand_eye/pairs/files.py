@@ -16,9 +16,9 @@ from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.hand_eye.conventions import UNITS
-from weldcal.calibration.hand_eye.importing import StatedForms, import_pairs
 from weldcal.calibration.hand_eye.mountings import chain, get_mounting
+from weldcal.calibration.hand_eye.pairs.conventions import UNITS
+from weldcal.calibration.hand_eye.pairs.importing import StatedForms, import_pairs
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

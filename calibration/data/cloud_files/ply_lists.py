@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.data.cloud_body import CloudError
+from weldcal.calibration.data.cloud_files.body import CloudError
 
 _LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
 _CELLS = re.compile(rb"\x00{1,65536}|(?:\x01.{4}){1,4096}", re.DOTALL)  # of a range_grid with a byte and a 4-byte index

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.cloud_body import CloudError
+from weldcal.calibration.data.cloud_files.body import CloudError
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

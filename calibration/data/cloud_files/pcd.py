@@ -10,8 +10,14 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 
-from weldcal.calibration.data.cloud_body import CloudError, check_points, cloud_stream, column_values, text_columns
-from weldcal.calibration.data.cloud_form import CloudForm
+from weldcal.calibration.data.cloud_files.body import (
+    CloudError,
+    check_points,
+    cloud_stream,
+    column_values,
+    text_columns,
+)
+from weldcal.calibration.data.cloud_files.form import CloudForm
 from weldcal.models.arrays import Array
 from weldcal.models.files import expansion_limit
 

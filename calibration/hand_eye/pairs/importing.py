@@ -10,7 +10,7 @@ from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.hand_eye.conventions import UNITS, Agreement, Decision, decide
+from weldcal.calibration.hand_eye.pairs.conventions import UNITS, Agreement, Decision, decide
 from weldcal.models.arrays import Array
 
 _MOST_COMPARED = 60  # poses that decide the reading: more do not make it surer

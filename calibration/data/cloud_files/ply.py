@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.data.cloud_body import (
+from weldcal.calibration.data.cloud_files.body import (
     CloudError,
     check_points,
     cloud_stream,
@@ -17,8 +17,8 @@ from weldcal.calibration.data.cloud_body import (
     text_columns,
     text_lines,
 )
-from weldcal.calibration.data.grid import sensor_width
-from weldcal.calibration.data.ply_lists import Element, cells, layout, text_cells, walked
+from weldcal.calibration.data.cloud_files.grid import sensor_width
+from weldcal.calibration.data.cloud_files.ply_lists import Element, cells, layout, text_cells, walked
 from weldcal.models.arrays import Array
 
 _TYPES = {

@@ -13,8 +13,8 @@ from weldcal.calibration.data.camera_file import CameraFile
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
-from weldcal.calibration.hand_eye.boards import EXAMPLES, Board, find_board, what_is_there, with_layout
-from weldcal.calibration.hand_eye.picture_files import load_grey
+from weldcal.calibration.hand_eye.pictures.boards import EXAMPLES, Board, find_board, what_is_there, with_layout
+from weldcal.calibration.hand_eye.pictures.files import load_grey
 from weldcal.models.arrays import Array
 
 FEWEST = 4

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.data.cloud_body import CloudError
+from weldcal.calibration.data.cloud_files.body import CloudError
 from weldcal.models.arrays import Array
 
 _SAMPLE = 4000  # pairs of neighbours that are compared

@@ -1,0 +1,1 @@
+"""Forms of point clouds and depth images."""

@@ -1,0 +1,1 @@
+"""Pairs of poses: read, decided by the data, judged."""

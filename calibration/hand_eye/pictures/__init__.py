@@ -1,0 +1,1 @@
+"""Hand-eye calibration from pictures of a board."""
