@@ -87,7 +87,7 @@ class Board:
     @cached_property
     def points(self) -> Array:
         """Points (m, 3) of the board in its frame, m; row by row, for tags the four corners clockwise from the upper left."""
-        xy: Array
+        xy: NDArray[np.floating[Any]]
         j, i = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         if self.kind == "charuco":
             return np.asarray(self.opencv.getChessboardCorners(), dtype=float)
