@@ -34,7 +34,7 @@ class Repeats:
     agrees: NDArray[np.bool_]
 
 
-def one_per_pose(problem: Problem) -> Repeats:
+def one_per_pose(problem: Problem, *, join: bool = True) -> Repeats:
     """Join the samples at one robot pose into one observation.
 
     An error of the robot or of the camera at that pose is the same in each repeat, so that repeats do not average it. Poses and
@@ -42,7 +42,7 @@ def one_per_pose(problem: Problem) -> Repeats:
     """
     n = len(problem)
     alone = Repeats(problem, np.arange(n), np.ones(n, dtype=bool))
-    if problem.tied or n < 2 or not problem.all_full:
+    if not join or problem.tied or n < 2 or not problem.all_full:
         return alone
     place = _places(problem)
     if int(place.max()) == n - 1:

@@ -33,7 +33,8 @@ _RIGID = 0.05  # deviation of a rotation from orthonormal that two printed decim
 @dataclass(frozen=True)
 class HandEyeConfig:
     """Settings. ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive;
-    ``allow_open``: give an answer even where more than one direction of translation stays open."""
+    ``allow_open``: give an answer even where more than one direction of translation stays open; ``join_repeats``: samples at one robot
+    pose are one observation."""
 
     seed: int = 0
     folds: int = 5
@@ -41,6 +42,7 @@ class HandEyeConfig:
     allow_coplanar: bool = False
     allow_open: bool = False
     candidates: tuple[Candidate, ...] = CANDIDATES
+    join_repeats: bool = True
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ def solve_problem(
     config = config or HandEyeConfig()
     labels = labels or {}
     diverse = check_poses(problem, allow_coplanar=config.allow_coplanar)
-    samples, repeats = problem, one_per_pose(problem)
+    samples, repeats = problem, one_per_pose(problem, join=config.join_repeats)
     problem, observation = repeats.problem, repeats.observation
     choice = solve(
         problem,

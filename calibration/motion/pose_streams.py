@@ -22,7 +22,7 @@ from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
-from weldcal.calibration.hand_eye.solve import solve_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
@@ -232,7 +232,11 @@ def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: 
         H = hand.poses(t[which] - d)
         return H if in_hand else inverse(H)
 
-    first = solve_problem(full_problem(moved(start, chosen), inverse(E[chosen]), free=(True, True, False)))
+    # the offset is not known yet: equal robot poses have unequal camera poses
+    config = HandEyeConfig(join_repeats=False)
+    first = solve_problem(
+        full_problem(moved(start, chosen), inverse(E[chosen]), free=(True, True, False)), config=config
+    )
     X, Y = (np.asarray(first.poses[name].GetAsMatrix4()) for name in ("X", "Y"))
 
     def poses_of(x: Array) -> tuple[Array, Array]:

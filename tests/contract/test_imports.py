@@ -120,6 +120,9 @@ def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
         target = folder / "weldcal" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(path, target)
+    shutil.copy(
+        ROOT / "__init__.py", folder / "weldcal" / "__init__.py"
+    )  # a package of its own, before the installed one
     return folder
 
 

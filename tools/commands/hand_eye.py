@@ -187,7 +187,7 @@ def stated_forms(
 ) -> StatedForms:
     """What the options state of the two lists of poses."""
     forms = [PoseForm() if form is None else PoseForm(rotation=form) for form in (robot_form, camera_form)]
-    return StatedForms(forms[0], forms[1], robot_poses, camera_poses)
+    return StatedForms(robot=forms[0], camera=forms[1], robot_poses=robot_poses, camera_poses=camera_poses)
 
 
 @command("hand-eye axb-ycz", short_help="Solve AXB = YCZ for two robots.")

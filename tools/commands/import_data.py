@@ -26,6 +26,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.models.result_files import write_atomic, write_npz
 from weldcal.tools.cli.options import Call, FlangeOption, Outcome, command
+from weldcal.tools.cli.result_folder import RUNNING
 from weldcal.tools.commands.hand_eye import (
     CameraFormOption,
     CameraPosesOption,
@@ -91,7 +92,7 @@ def import_(
     """
     stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
     folder = call.folder("import", sources[0].resolve().stem)
-    if any(folder.iterdir() if folder.is_dir() else ()) and any(one.name != "UNFINISHED" for one in folder.iterdir()):
+    if folder.is_dir() and any(one.name not in ("UNFINISHED", RUNNING) for one in folder.iterdir()):
         raise InputError(f"'{folder}' is not empty: choose another folder with --out.")
     if len(sources) == 1 and holds_scans(sources[0]):
         found = import_scans(sources[0], folder, flange=flange, mounting=mounting)

@@ -22,10 +22,10 @@ _NEAREST_M = 0.02
 FARTHEST_M = 20.0
 """Median distance of a robot's poses from its base beyond which the unit is wrong."""
 _SCALE_SIGMA = 4.0
-_LEAST_SCALE = 0.1  # of the logarithm: a factor that is nearer to a unit is a matter of the result, which names it
+_LEAST_SCALE = 0.2  # of the logarithm: a factor that is nearer to a unit is a matter of the result, which names it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StatedForms:
     """What the user states of the two lists: form and name of each, and the unit of lengths of both."""
 

@@ -40,7 +40,7 @@ _STRAIGHT_PX = 100.0  # length of a tag's side up to which the lens leaves it st
 _TRIED = 8  # pictures that show which layout a board has, or what there is in place of it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Board:
     """A calibration board. Its points lie in the plane z = 0 of the board's frame: x right, y down, z into the board.
 
@@ -181,7 +181,7 @@ def parse_board(text: str) -> Board:
                 raise DatasetError(wrong)
             found["inner" if name in ("MARKER", "GAP") else "size"] = 1e-3 * float(match[1])
     _check(kind, found, text)
-    return Board(kind, **found)
+    return Board(kind=kind, **found)
 
 
 def _check(kind: str, found: dict[str, Any], text: str) -> None:

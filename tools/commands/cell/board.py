@@ -70,7 +70,7 @@ def print_board(
     return Outcome({"state": "done", "kind": kind, **written, "note": NOTE})
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Sheet:
     """A page: black rectangles, then white ones over them, thin lines (x0, y0, x1, y1) and texts (x, y, size, words), in mm."""
 
@@ -284,7 +284,8 @@ def write_board(folder: Path, sheet: Sheet, board: Board | None) -> dict[str, st
 def _page(paper: str) -> Sheet:
     if paper not in PAPERS:
         raise InputError(f"There is no paper '{paper}': use one of {', '.join(PAPERS)}.")
-    return Sheet(*PAPERS[paper])
+    width, height = PAPERS[paper]
+    return Sheet(width=width, height=height)
 
 
 def _require_room(sheet: Sheet, width: float, height: float, paper: str) -> None:

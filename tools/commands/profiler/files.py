@@ -46,7 +46,7 @@ class PosesStated:
     pitch_mm: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Measurements:
     """The contents of a file, in m and rad.
 
@@ -150,11 +150,13 @@ def read_profiler_file(
         if stated != PosesStated():
             raise InputError("An NPZ holds its poses as T. Omit --poses, --robot-form and --pitch.")
         arrays, profiles = _from_npz(path, unit, dataset, trial)
-        file = Measurements(arrays, profiles, sha256(path))
+        file = Measurements(arrays=arrays, profiles=profiles, digest=sha256(path))
     elif stated == PosesStated() and _is_own_table(path):
         arrays, profiles = _from_csv(path)
         told = cut_off(path)
-        file = Measurements(arrays, profiles, sha256(path), () if told is None else (told,))
+        file = Measurements(
+            arrays=arrays, profiles=profiles, digest=sha256(path), warnings=() if told is None else (told,)
+        )
     else:
         file = _imported(path, unit, stated)
     _check_numbers(path, file.arrays, file.profiles)
@@ -191,9 +193,13 @@ def _imported(path: Path, unit: str | None, stated: PosesStated) -> Measurements
         arrays["points"] = np.vstack(found.profiles)
     told = cut_off(path) if found.single and path.suffix.lower() == ".csv" else None
     return Measurements(
-        arrays, None if found.single else found.profiles, digest_of(path, stated.poses), () if told is None else (told,),
-        found.readings, found.reading,
-    )  # fmt: skip
+        arrays=arrays,
+        profiles=None if found.single else found.profiles,
+        digest=digest_of(path, stated.poses),
+        warnings=() if told is None else (told,),
+        readings=found.readings,
+        reading=found.reading,
+    )
 
 
 def digest_of(path: Path, poses: Path | None = None) -> str:
