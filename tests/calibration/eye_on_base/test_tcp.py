@@ -46,11 +46,12 @@ def test_the_sentence_gives_the_line_that_cures_it() -> None:
     sentence = found.sentence(RigidTransform())
     assert "TCP of (" in sentence
     assert "150.0) mm" in sentence
-    assert "-0.15000]} (m) in dataset.yaml" in sentence
-    # where a feature was given, the line that replaces it
-    feature = RigidTransform([0.14, 0.0, -0.012])
-    assert "0.14" in found.sentence(feature)
-    assert "-0.16200]}" in found.sentence(feature)
+    assert "write poses: {tcp: [0.0000, 0.0000, 0.1500, 0.0, 0.0, 0.0]} (m, rad) in dataset.yaml" in sentence
+    # a feature stays as it is: where it lies is nothing to the TCP, how it is turned is
+    shifted = RigidTransform([0.14, 0.0, -0.012])
+    assert found.sentence(shifted) == sentence
+    turned = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.14, 0.0, -0.012])
+    assert "{tcp: [0.0000, 0.0000, -0.1500, 0.0, 0.0, 0.0]}" in found.sentence(turned)
     assert "pairs.csv" in found.sentence(None)
     assert tcp.translation()[2] == pytest.approx(-found.offset_m[2], abs=1e-4)
 

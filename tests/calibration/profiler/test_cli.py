@@ -153,7 +153,7 @@ def test_a_groove_is_mapped_with_what_was_calibrated(tmp_path: Path) -> None:
     ("words", "sentence"),
     [
         (("edge", "none.npz"), "There is no file"),
-        (("edge", "t.txt"), "neither .npz nor .csv"),
+        (("edge", "t.txt"), "'t.txt' holds no row of numbers. A table of profiles has columns such as scan,x_mm"),
         (("edge", "broken.npz", "--unit", "mm"), "cannot be read as NPZ"),
         (("edge", "p.npz"), "does not state its unit"),
         (("edge", "p.npz", "--unit", "inch"), "m or mm, not 'inch'"),
@@ -161,7 +161,7 @@ def test_a_groove_is_mapped_with_what_was_calibrated(tmp_path: Path) -> None:
         (("edge", "e.csv", "--method", "best"), "joint or paper"),
         (("edge", "e.csv", "--feature", "bar"), "no profiles"),
         (("edge", "e.csv", "--sigma-x", "0"), "must be positive"),
-        (("edge", "bad.csv"), "header needs x_mm"),
+        (("edge", "bad.csv"), "has the columns a, b: no x and z of profile points. Name them px_mm and pz_mm"),
         (("edge", "word.csv"), "not a number"),
         (("sphere", "e.csv"), "no 'profiles' of the sphere"),
         (("sphere", "e.csv", "--tip", "1,2"), "three numbers in mm"),
@@ -247,4 +247,4 @@ def test_a_noisier_sensor_is_no_outlier_and_an_outlier_is_named(tmp_path: Path) 
         assert record.covariance is not None
         error = record.translation - STATE.translation
         assert (np.abs(error) < 4.0 * np.sqrt(np.diag(record.covariance))[3:]).all()
-    assert "outlier scans 5" in called("edge", tmp_path / "said.npz", "--out", tmp_path / "said")[1]
+    assert "outlier scans 5" in called("edge", tmp_path / "said.npz", "--out", tmp_path / "printed")[1]

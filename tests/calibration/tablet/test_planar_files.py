@@ -75,7 +75,7 @@ def test_hands_that_are_finer_are_not_fitted_as_intervals(tmp_path: Path) -> Non
     d = fields(simulate_trial((5, 0)))
     d["hand"] = d["hand"] + np.random.default_rng(0).uniform(-0.1, 0.1, (9, 2))
     assert run(tmp_path, d)["hand_step_mm"] == 0.0
-    assert run(tmp_path, d, "--hand-step-mm", "1")["hand_step_mm"] == 1.0
+    assert run(tmp_path, d, "--hand-step-mm", "1", "--overwrite")["hand_step_mm"] == 1.0
 
 
 def fitted(path: Path, d: Fields) -> VisitFits:
