@@ -30,7 +30,7 @@ _SPARE = 2.5  # numbers per unknown below which an answer cannot be checked
 _RIGID = 0.05  # deviation of a rotation from orthonormal that two printed decimals explain
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HandEyeConfig:
     """Settings. ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive;
     ``allow_open``: give an answer even where more than one direction of translation stays open; ``join_repeats``: samples at one robot
