@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -171,3 +172,20 @@ def _too_large(path: Path, limit: int) -> InputError:
 
 def _reason(error: Exception) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+_MOST_DIGITS = 40
+"""Digits in a row beyond which a text holds no measurement: a double has 17."""
+
+
+def require_short_numbers(text: str, name: str) -> None:
+    """Refuse a text with a number of more digits in a row than any measurement has.
+
+    Raises:
+        InputError: with the number's beginning.
+    """
+    found = re.search(rf"\d{{{_MOST_DIGITS},}}", text)
+    if found is not None:
+        raise InputError(
+            f"'{name}' holds a number of {len(found[0])} digits ({found[0][:6]} ...): the file is damaged. Export it again."
+        )

@@ -18,7 +18,7 @@ from weldcal.calibration.profiler.gocator import gocator_profiles, is_gocator
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.calibration.profiler.text_blocks import Block, blocks_of
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_NUMBER, MOST_COLUMNS, read_text
+from weldcal.models.files import LARGEST_NUMBER, MOST_COLUMNS, read_text, require_short_numbers
 
 TREES = (".yml", ".yaml", ".json", ".xml")
 TABLES = (".csv", ".txt", ".tsv", ".asc", ".dat", ".xyz", ".xz")
@@ -85,6 +85,7 @@ def read_profiles(path: Path, pitch_mm: float | None = None) -> Profiles:
     if path.suffix.lower() in TREES:
         return _from_tree(path)
     text = read_text(path)
+    require_short_numbers(text, path.name)
     if is_gocator(text):
         found = gocator_profiles(text, path.name)
         return Profiles(

@@ -15,6 +15,7 @@ from weldcal.calibration.data.poses.names import whose
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
+from weldcal.models.files import require_short_numbers
 
 _CELL = re.compile(rf"{NUMBER}|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
 _KEYED = re.compile(rf"[\"']?\b([A-Za-z_][\w.]{{0,40}})[\"']?\s{{0,9}}[:=]\s{{0,9}}[\"']?({NUMBER})(?![\w.])")
@@ -37,6 +38,7 @@ def lists_of_text(text: str, name: str) -> list[Listing]:
         DatasetError: it holds no pose, or one that cannot be read; the sentence says what to change.
     """
     text = text.lstrip("\ufeff")
+    require_short_numbers(text, name)
     if re.search(r"IMAGE_ID,\s*QW|two lines of data per image", text):
         raise DatasetError(
             f"'{name}' is COLMAP's images.txt: its poses lead from the world to the camera and have no unit of length. Write the inverse "
