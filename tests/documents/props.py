@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 import weldcal
+from tests.calibration.hand_eye import rendering
 from tests.calibration.tablet.visit import write_visit
 from tests.documents.scans import write_scans
 from tests.places import ROOT, SHARED_DATA
@@ -65,6 +66,14 @@ def _camera_pose(path: Path) -> None:
     X = random_poses(2, np.random.default_rng(3))[0]
     vector = (*X.translation(), *rotation_vector(X.rotation()))
     path.write_text("rows: 6\ncols: 1\ndata:\n" + "".join(f"  - [{v:.9f}]\n" for v in vector), encoding="utf-8")
+
+
+def _pictures(path: Path) -> None:
+    """Twelve pictures of a chessboard by a camera at the flange, and the robot's poses."""
+    drawing = rendering.draw_chessboard(9, 6, 25)
+    found = rendering.world(drawing, 5, 12)
+    rendering.write_pictures(path, drawing, found, 5, sub=2)
+    rendering.write_robot(path / "poses.txt", found.robot)
 
 
 def _two_robots(path: Path) -> None:
@@ -167,6 +176,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "one_scan": lambda path: write_scans(path, 1, 5),
     "pairs.npz": lambda path: _hand_eye(path, "eye_in_hand"),
     "eMc.yaml": _camera_pose,
+    "my_pictures": _pictures,
     "samples.npz": lambda path: _hand_eye(path, "eye_in_hand"),
     "fixed_camera.npz": lambda path: _hand_eye(path, "eye_on_base"),
     "two_robots.npz": _two_robots,

@@ -9,6 +9,9 @@ import sys
 import tomllib
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from tests.documents.blocks import Block
 from tests.documents.props import lay_out
 from tests.documents.scans import write_scans
@@ -49,6 +52,8 @@ def check_yaml(block: Block, folder: Path, entry_points: str = "") -> str:
     lay_out(block.text, folder)
     if re.search(r"^schema: 1", block.text, re.MULTILINE):
         return _dataset(block, folder)
+    if re.search(r"^intrinsics:", block.text, re.MULTILINE):
+        return _depth_images(block, folder)
     if re.search(r"^width:", block.text, re.MULTILINE):
         file = folder / "scanner.yaml"
         file.write_text(block.text, encoding="utf-8")
@@ -76,6 +81,20 @@ def _dataset(block: Block, folder: Path) -> str:
     data = load_dataset(scans)
     assert set(data.clouds) == {"pose01", "pose02"}
     return "dataset"
+
+
+def _depth_images(block: Block, folder: Path) -> str:
+    """The keys of depth images, added to the dataset.yaml of a folder that holds some."""
+    scans = write_scans(folder / "scans", 2, 0)
+    with (scans / "dataset.yaml").open("a", encoding="utf-8") as file:
+        file.write(block.text)
+    for cloud in list((scans / "clouds").iterdir()):
+        cv2.imwrite(str(cloud.with_suffix(".png")), np.full((480, 640), 700, np.uint16))
+        cloud.unlink()
+    data = load_dataset(scans)
+    assert set(data.clouds) == {"pose01", "pose02"}
+    assert np.allclose(data.cloud("pose01")[..., 2], 0.7)
+    return "dataset of depth images"
 
 
 def _with_driver(file: Path, folder: Path, entry_points: str) -> str:

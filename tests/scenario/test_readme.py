@@ -21,6 +21,15 @@ RUN_BY = {
     "./tools/run test": "test_the_commands_of_the_readme_are_run",
     "./tools/run calibrate my_scans --out my-calibration": "test_the_users_own_scans_calibrate_and_others_verify_them",
     "./tools/run verify my-calibration other_scans": "test_the_users_own_scans_calibrate_and_others_verify_them",
+    "./tools/run hand-eye ax-yb pairs.npz --mounting eye_in_hand": (
+        "test_a_command_without_a_simulation_does_what_the_page_says"
+    ),
+    "./tools/run hand-eye ax-yb my_pictures --mounting eye_in_hand --board chessboard:9x6:25": (
+        "test_a_command_without_a_simulation_does_what_the_page_says"
+    ),
+    "./tools/run verify eMc.yaml pairs.npz --mounting eye_in_hand": (
+        "test_a_command_without_a_simulation_does_what_the_page_says"
+    ),
     "./tools/run demo --robot emulated": "test_the_same_calibration_on_the_emulated_robot_ends_with_the_same_figures",
     "./tools/run check-robot 192.168.56.101": "test_the_command_ends_with_1_and_the_first_sentence",
     "./tools/run demo --robot 192.168.56.101 --dry-run": (
