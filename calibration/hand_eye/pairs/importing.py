@@ -22,6 +22,7 @@ _NEAREST_M = 0.02
 FARTHEST_M = 20.0
 """Median distance of a robot's poses from its base beyond which the unit is wrong."""
 _SCALE_SIGMA = 4.0
+_OTHER_UNIT = 0.1  # of the logarithm: how near a factor must be to that of another unit than the robot's
 _LEAST_SCALE = 0.2  # of the logarithm: a factor that is nearer to a unit is a matter of the result, which names it
 
 
@@ -337,7 +338,8 @@ def _camera_unit(ratio: float | None, robot: str, B: PoseReading, source: str) -
         far = float(np.median(np.linalg.norm(B.X[:, :3, 3], axis=1)))
         return "mm" if far > _MILLIMETRES_FROM else "m" if far <= _METRES_TO else robot
     near = min(UNITS, key=lambda u: abs(np.log(ratio / UNITS[u])))
-    if abs(np.log(ratio / UNITS[near])) > _LEAST_SCALE:
+    # a factor near that of another unit may be the size of a square: 28.5 mm are no inch
+    if abs(np.log(ratio / UNITS[near])) > (_LEAST_SCALE if near == robot else _OTHER_UNIT):
         _refuse_scale(ratio, "m", source)
     return near
 
