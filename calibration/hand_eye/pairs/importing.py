@@ -347,7 +347,7 @@ def _camera_unit(ratio: float | None, robot: str, B: PoseReading, source: str) -
 def _refuse_scale(ratio: float, unit: str, source: str) -> None:
     factor = ratio / UNITS[unit]
     near = min(UNITS, key=lambda u: abs(np.log(ratio / UNITS[u])))
-    if near != unit and abs(np.log(ratio / UNITS[near])) < _LEAST_SCALE:
+    if near != unit and abs(np.log(ratio / UNITS[near])) < _OTHER_UNIT:
         raise InconsistentPoses(
             f"The camera positions of '{source}' are in {near} by the robot's motion, and in {unit} as stated. Correct the unit, or multiply the "
             f"positions by {UNITS[near] / UNITS[unit]:g}."
