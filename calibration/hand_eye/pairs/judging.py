@@ -101,7 +101,7 @@ class Judgement:
 def judge_pose(
     problem: Problem, forms: list[Array], covariance: Array | None = None, config: HandEyeConfig | None = None
 ) -> tuple[int, Judgement]:
-    """Judge a stated X of F X G = Y; of several readings of one pose that which the pairs contradict least.
+    """Judge a stated X of F X G = Y; of several readings of one pose, the one that the pairs contradict least.
 
     With X fixed, Y is the mean of F X G. The new solution has X and Y free; its X and the stated one differ by e with the covariance C of the
     new solution (plus the stated one). If the stated pose is right, e' C^-1 e / 6 has the distribution F(6, degrees of freedom): for a linear
