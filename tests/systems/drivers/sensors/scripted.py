@@ -141,16 +141,17 @@ class MjpegCamera:
                     continue
                 if not self.frozen:
                     number += 1
-                self.taken[number] = time.monotonic()
-                under_way.append((time.monotonic() + self.delay_s, self._part(number)))
+                # the two clocks read together: what draws and encodes comes after
+                self.taken[number], unix_s = time.monotonic(), time.time()
+                under_way.append((self.taken[number] + self.delay_s, self._part(number, unix_s)))
                 while under_way and under_way[0][0] <= time.monotonic():
                     client.sendall(under_way.popleft()[1])
 
-    def _part(self, number: int) -> bytes:
+    def _part(self, number: int, unix_s: float) -> bytes:
         jpeg = bytes(cv2.imencode(".jpg", self.draws(number))[1])
         if self.garbage:
             jpeg = bytes(np.random.default_rng(number).integers(0, 255, len(jpeg), dtype=np.uint8))
-        stamp = b"" if self.epoch_s is None else f"X-Timestamp: {self.epoch_s + time.time():.6f}\r\n".encode()
+        stamp = b"" if self.epoch_s is None else f"X-Timestamp: {self.epoch_s + unix_s:.6f}\r\n".encode()
         length = b"" if self.lengthless else f"Content-Length: {len(jpeg)}\r\n".encode()
         return b"--frame\r\nContent-Type: image/jpeg\r\n" + length + stamp + b"\r\n" + jpeg + b"\r\n"
 
