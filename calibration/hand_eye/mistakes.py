@@ -1,6 +1,6 @@
 """Detects usual mistakes in pose files: applies each correction and names the one that makes the poses agree."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,8 @@ _FEWEST = 5
 _AGREE = 0.05  # rad, or share of the lesser spread: residuals of poses that agree
 _STEP = 1e-4  # of the scale, for its derivative
 _ROUGH_POSES = 400
+_FITS = 4.0  # sigma per axis: a row with this correction agrees with the others
+_MOST_ODD = 20  # excluded rows that are explained one by one
 _SURE = 6.0  # standard deviations at which a scale is off
 _LEAST_SCALE = 3e-3  # and by how much it must be, to be worth a sentence
 
@@ -68,6 +70,93 @@ def likely_mistake(pairs: PosePairs, given: HandEyeResult | None, config: HandEy
         ):
             return f"These poses contradict each other as given, but agree if {trial.sentence}: correct the file and run again."
     return None
+
+
+def explain_outliers(pairs: PosePairs, result: HandEyeResult) -> tuple[str, ...]:
+    """Sentences with the cause of poses that were excluded, where the solution of the others shows one. One robot only.
+
+    A pose of one list that fits another row's pose of the other list was paired wrongly. One transform on the flange's side of the robot's
+    poses (TCP), or on the base's side (frame), that makes several rows fit is their cause. Of one row alone six free numbers would always
+    fit: its cause is a shift along one axis of the flange that leaves nothing else.
+    """
+    odd = np.flatnonzero(~result.inliers)
+    if pairs.mode not in ("eye_in_hand", "eye_on_base") or not 0 < len(odd) <= _MOST_ODD:
+        return ()
+    X, Y = (np.asarray(result.poses[k].GetAsMatrix4()) for k in "XY")
+    sigma = result.sigma_rotation_rad + 1e-12, result.sigma_translation + 1e-12
+
+    def misfit(robot: Array, camera: Array) -> tuple[Array, Array]:
+        F = replace(pairs, robot=robot, camera=np.broadcast_to(camera, robot.shape)).F
+        w, d = residuals(full_problem(F, np.broadcast_to(camera, robot.shape)), (X, Y, IDENTITY), result.noise_centre)
+        return w / sigma[0], d / sigma[1]
+
+    def fits(robot: Array, camera: Array, sigmas: float = _FITS) -> Array:
+        return _small(*misfit(robot, camera), sigmas)
+
+    said: list[str] = []
+    moved: dict[str, dict[int, int]] = {"camera": {}, "robot": {}}
+    for i in map(int, odd):
+        alike = np.broadcast_to(pairs.robot[i], pairs.robot.shape)
+        for who, found in (("camera", fits(pairs.robot, pairs.camera[i])), ("robot", fits(alike, pairs.camera))):
+            like = np.flatnonzero(found)
+            if len(like) and (result.observation[like] == result.observation[like[0]]).all():
+                moved[who][i] = int(like[0])
+    exchanged = [(i, j) for i, j in moved["camera"].items() if i < j and moved["camera"].get(j) == i]
+    for pair in exchanged:
+        said.append(f"Poses {_listed(pairs, pair)} are exchanged in one list: both fit when they change places.")
+    named = {i for pair in exchanged for i in pair}
+    for who, other in (("camera", "robot"), ("robot", "camera")):
+        wrong = [i for i in moved[who] if i not in named]
+        named |= set(wrong)
+        if wrong:
+            said.append(
+                f"The {who}'s pose{'s' * (len(wrong) > 1)} {_listed(pairs, wrong)} fit{'s' * (len(wrong) == 1)} the {other}'s "
+                f"{_listed(pairs, [moved[who][i] for i in wrong])} instead: check how these rows are paired."
+            )
+    left = np.array([i for i in odd if i not in named], dtype=int)
+    R, G = pairs.robot[left], pairs.camera[left]
+    F = Y @ inverse(G) @ inverse(X)
+    right = F if pairs.mode == "eye_in_hand" else inverse(F)
+    tools, frames = inverse(right) @ R, R @ inverse(right)
+    nothing = np.zeros(len(left), dtype=bool)
+    by_tool = max((fits(R @ inverse(T), G, 2.0 * _FITS) for T in tools), key=np.sum, default=nothing)
+    by_frame = max((fits(inverse(S) @ R, G, 2.0 * _FITS) for S in frames), key=np.sum, default=nothing)
+    on_flange, else_ = ("camera", "target") if pairs.mode == "eye_in_hand" else ("target", "camera")
+    for rows, others, changes, words in (
+        (by_tool, by_frame, tools, f"another TCP, or if the {on_flange} moved on the flange"),
+        (by_frame, by_tool, frames, f"another base or user frame, or if the {else_} moved"),
+    ):
+        if rows.sum() > max(others.sum(), 1):
+            p = ", ".join(f"{1e3 * v:.1f}" for v in np.median(changes[rows, :3, 3], axis=0))
+            turn = np.degrees(np.median(Rotation.from_matrix(changes[rows, :3, :3]).magnitude()))
+            said.append(
+                f"Poses {_listed(pairs, left[rows].tolist())} fit if the robot's poses had {words}: offset ({p}) mm, turned by {turn:.1f} degrees."
+            )
+            return tuple(said)
+    for k, i in enumerate(left):
+        axes = np.concatenate([R[k, :3, :3].T, np.eye(3)])
+        shifted = np.repeat(R[k : k + 1], 6, axis=0)
+        w, d = misfit(shifted, G[k])
+        shifted[:, :3, 3] += axes
+        slope = misfit(shifted, G[k])[1] - d
+        shift = (slope * d).sum(axis=1) / (slope**2).sum(axis=1)
+        good = _small(w, d - shift[:, None] * slope, _FITS)
+        if good[:3].any() and not good[3:].any():
+            axis = int(np.argmax(good[:3]))
+            said.append(
+                f"Pose {_listed(pairs, [i])} fits if the robot's pose had another TCP: offset {1e3 * shift[axis]:.1f} mm along {'xyz'[axis]} of "
+                "the flange."
+            )
+    return tuple(said)
+
+
+def _small(w: Array, d: Array, sigmas: float) -> Array:
+    return np.asarray(np.maximum((w**2).sum(axis=1), (d**2).sum(axis=1)) < 3.0 * sigmas**2)
+
+
+def _listed(pairs: PosePairs, rows: Sequence[int]) -> str:
+    words = [f"{k} ('{pairs.ids[k]}')" if pairs.ids else str(k) for k in rows]
+    return f"{', '.join(words[:-1])} and {words[-1]}" if words[1:] else words[0]
 
 
 def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:

@@ -20,7 +20,7 @@ from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_co
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
-from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
+from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
@@ -453,7 +453,9 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     if mistake is not None:
         raise InconsistentPoses(mistake)
     scale = scale_warning(problem, result)
-    return result if scale is None else replace(result, warnings=(*result.warnings, scale))
+    return replace(
+        result, warnings=(*result.warnings, *explain_outliers(pairs, result), *([] if scale is None else [scale]))
+    )
 
 
 def solve_arrays(
