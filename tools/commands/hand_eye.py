@@ -445,11 +445,11 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     try:
         result = solve_problem(problem, config=config, equation=mounting.equation, labels=mounting.labels)
     except (InconsistentPoses, UndeterminedPoses) as e:
-        mistake = likely_mistake(pairs, None, config)
+        mistake = likely_mistake(pairs)
         if mistake is None:
             raise
         raise InconsistentPoses(mistake) from e
-    mistake = likely_mistake(pairs, result, config)
+    mistake = likely_mistake(pairs)
     if mistake is not None:
         raise InconsistentPoses(mistake)
     scale = scale_warning(problem, result)
