@@ -474,7 +474,9 @@ def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
     rows = [MethodRow("weldcal", ours.held_out.rms_deg, 1e3 * ours.held_out.rms_translation)]
     if problem.free == (True, True, False):
         for m in METHODS:
-            held = opencv_held_out(m, problem.F, problem.G, most=most_compared(len(problem.F)))
+            held = opencv_held_out(
+                m, problem.F, problem.G, most=most_compared(len(problem.F)), observation=ours.observation
+            )
             whole = bool(np.isfinite(held.translation).all())
             rows.append(
                 MethodRow(

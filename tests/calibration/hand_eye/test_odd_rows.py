@@ -63,6 +63,17 @@ def test_an_image_of_the_neighbour_is_named(mode: str) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
+def test_a_robot_pose_of_the_row_before_is_named(mode: str) -> None:
+    """Without noise of the robot the row is a repeat of the row before, to the last digit."""
+    robot, camera, X = world(mode, 2)
+    robot[5] = robot[4]
+    result = solved(robot, camera, mode)
+    (said,) = causes(result)
+    assert said == "The robot's pose 5 fits the camera's 4 instead: check how these rows are paired."
+    assert result.normalised_error("X", RigidTransform(X)) < result.region(0.999)
+
+
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("axis", range(3))
 def test_one_pose_with_another_tcp_is_named(mode: str, axis: int) -> None:
     robot, camera, X = world(mode, 3)

@@ -100,8 +100,9 @@ class HandEyeBenchmark:
 
 def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: bool = True) -> DatasetRow:
     """Ours and OpenCV's on poses F X G = Y, held out on the same folds; without ``opencv`` its columns are NaN."""
-    ours = solve_problem(full_problem(F, G))
-    theirs = {m: opencv_held_out(m, F, G) for m in METHODS} if opencv else {}
+    # each sample counts, repeats too, as in the figures that were published with the sets
+    ours = solve_problem(full_problem(F, G), config=HandEyeConfig(join_repeats=False))
+    theirs = {m: opencv_held_out(m, F, G, observation=np.arange(len(F))) for m in METHODS} if opencv else {}
     none = {"-": float("nan")}
     deg = {m: h.rms_deg for m, h in theirs.items() if np.isfinite(h.rotation_rad).all()} or none
     mm = {m: 1e3 * h.rms_translation for m, h in theirs.items() if np.isfinite(h.translation).all()} or none
