@@ -18,7 +18,7 @@ from weldcal.models.arrays import Array
 Flags = NDArray[np.bool_]
 
 _GATE = 8.0  # sigma per axis, as in the eye-on-base solver: only gross outliers go
-_AGREEING = 0.7  # share of the poses that a trimmed fit keeps
+_AGREEING = 0.6  # share of the poses that a trimmed fit keeps: the others may be outliers
 _SUSPECT = 2.0  # sigma per axis of a residual that makes a trimmed fit worth its time
 _WORST_SHARE = 0.1  # of the extent: residuals beyond it are no calibration
 _WORST_TURN_RAD = 0.2
@@ -153,7 +153,7 @@ def _concentrated(problem: Problem, state: State) -> State:
     Least trimmed squares by concentration steps (Rousseeuw and Van Driessen 1999). Poses with less than three numbers for each unknown
     are not trimmed.
     """
-    n, kept = len(problem), None
+    n, kept, begin, least = len(problem), None, state, np.inf
     most = int(np.ceil(_AGREEING * n))
     if not problem.all_full or problem.tied or 6 * most < 3 * problem.size:
         return state
@@ -163,6 +163,11 @@ def _concentrated(problem: Problem, state: State) -> State:
         size = np.column_stack([(w**2).sum(axis=1) / noise.rotation, (d**2).sum(axis=1) / noise.translation])
         if kept is None and (size < 3.0 * _SUSPECT**2).all():
             return state
+        # the median of all poses must fall, or the start was the better one
+        spread = noise.rotation * noise.translation
+        if kept is not None and spread > least:
+            return begin
+        least = spread if kept is None else least
         rows = np.sort(np.argsort(size.sum(axis=1), kind="stable")[:most])
         if kept is not None and np.array_equal(rows, kept):
             break
