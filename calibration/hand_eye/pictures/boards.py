@@ -33,7 +33,9 @@ EXAMPLES = {
     "tags": "tags:4x3:40:10:4X4_50 (4 x 3 tags of 40 mm, gaps of 10 mm)",
 }
 _LARGEST_MM, _MOST = 5000.0, 60
-_DETECT_PX = 1400  # a chessboard is searched at this width, and its corners refined in the whole picture
+_DETECT_PX = 1400  # what a picture shows in place of the board is searched at this width
+_LARGE_PX = 1750  # beyond it a chessboard is searched in reduced pictures first
+_REDUCED_PX = (700, 1400)
 _SHARPEN = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 0.002)
 _DICTIONARIES = {name[5:]: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 _STRAIGHT_PX = 100.0  # length of a tag's side up to which the lens leaves it straight
@@ -258,21 +260,18 @@ def _right_handed(points: Array, columns: int, rows: int) -> bool:
 
 def _chessboard(grey: Grey, board: Board) -> Array | None:
     size = (board.columns, board.rows)
-    scale = min(1.0, _DETECT_PX / max(grey.shape))
-    points: Array | None = None
-    if scale < 0.8:
-        points = _search(_smaller(grey, scale), size)
-        if points is not None:
-            points = (points + 0.5) / scale - 0.5
-            gap = float(np.linalg.norm(np.diff(points.reshape(board.rows, board.columns, 2), axis=1), axis=2).min())
-            half = int(np.clip(0.3 * gap, 3, 15))
-            rough = np.ascontiguousarray(points[:, None], dtype=np.float32)
-            fine = cv2.cornerSubPix(grey, rough, (half, half), (-1, -1), _SHARPEN)
-            points = np.asarray(fine, dtype=float)[:, 0]
-    if points is None:
-        points = _search(grey, size)
-    if points is None:
+    width, plain = max(grey.shape), cv2.CALIB_CB_NORMALIZE_IMAGE
+    ways = [(1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
+    if width > _LARGE_PX:
+        ways = [(min(px / width, 1.0), plain) for px in (*_REDUCED_PX, width)]
+    rough = next((found for way in ways if (found := _search(grey, size, *way)) is not None), None)
+    if rough is None:
         return None
+    there = rough.reshape(board.rows, board.columns, 2)
+    gap = min(float(np.linalg.norm(np.diff(there, axis=k), axis=2).min()) for k in (0, 1))
+    half = int(np.clip(0.3 * gap, 3, 15))
+    fine = cv2.cornerSubPix(grey, np.ascontiguousarray(rough[:, None], np.float32), (half, half), (-1, -1), _SHARPEN)
+    points = np.asarray(fine, dtype=float)[:, 0]
     grid = points.reshape(board.rows, board.columns, 2)
     if not _right_handed(points, board.columns, board.rows):
         grid = grid[:, ::-1]
@@ -289,9 +288,10 @@ def _smaller(grey: Grey, scale: float) -> Grey:
     return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _search(grey: Grey, size: tuple[int, int]) -> Array | None:
-    found, points = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY)
-    return np.asarray(points, dtype=float)[:, 0] if found else None
+def _search(grey: Grey, size: tuple[int, int], scale: float, flags: int) -> Array | None:
+    """Corners (m, 2) px of a chessboard that is searched in a picture reduced by ``scale``, in pixels of the whole one."""
+    found, points = cv2.findChessboardCornersSB(_smaller(grey, scale), size, flags=flags)
+    return (np.asarray(points, dtype=float)[:, 0] + 0.5) / scale - 0.5 if found else None
 
 
 def _dark(grey: Grey, grid: Array) -> bool:

@@ -78,10 +78,8 @@ def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, li
             name=path.name, points=points, size=grey.shape[::-1], thumbnail=_thumbnail(grey, points), why=why
         )
 
-    before = cv2.getNumThreads()
     with ThreadPoolExecutor(max_workers=2) as pool:
         pictures = list(pool.map(one, files))
-    cv2.setNumThreads(before)
     n = sum(not p.why for p in pictures)
     if n < FEWEST:
         some = [g for g in (load_grey(files[k]) for k in spread(len(files), 6)) if g is not None]

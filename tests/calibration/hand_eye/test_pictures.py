@@ -123,6 +123,33 @@ def test_every_kind_of_board_is_found_where_it_was_drawn(text: str) -> None:
         assert error < 0.6
 
 
+@pytest.mark.parametrize("small", [False, True])
+def test_a_large_picture_is_searched_in_a_small_one(small: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three times as large, or a part of the whole: corners of a tenth of a pixel, and no search that samples the picture up."""
+    drawing, calls = BOARDS["chessboard:9x6:20"], []
+    C = draw.world(drawing, 0, 1).camera[0]
+    picture = draw.render(drawing, C, np.random.default_rng(0), sub=3)
+    truth = draw.project(np.c_[1e-3 * drawing.points, np.zeros(len(drawing.points))], C)
+    if small:
+        whole = np.full((2048, 2448), 110, np.uint8)
+        whole[900:1380, 300:940] = picture
+        picture, truth = whole, truth + np.array([300.0, 900.0])
+    else:
+        picture = cv2.resize(picture, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+        truth = 3.0 * (truth + 0.5) - 0.5
+    search = cv2.findChessboardCornersSB
+
+    def counted(grey: np.ndarray, size: tuple[int, int], flags: int) -> tuple[bool, np.ndarray]:
+        calls.append((grey.shape[1], bool(flags & cv2.CALIB_CB_ACCURACY)))
+        return search(grey, size, flags=flags)
+
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", counted)
+    found = find_board(picture, parse_board("chessboard:9x6:20"))
+    assert np.sqrt(((found - truth) ** 2).mean()) < (0.03 if small else 0.15)
+    assert calls[0] == (700, False)
+    assert not any(up for _, up in calls)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
