@@ -54,6 +54,7 @@ class Board:
         dictionary: name of the markers' dictionary, or empty.
         id: number of the tag (kind tag).
         layout: 1 for OpenCV's ChArUco layout before 4.6; for tags the order of the numbers and the first corner, see ``layouts``.
+        radius: of circles, m, as the pictures show it; 0 until then.
     """
 
     kind: str
@@ -64,6 +65,7 @@ class Board:
     dictionary: str = ""
     id: int = 0
     layout: int = 0
+    radius: float = 0.0
 
     def __str__(self) -> str:
         """The string that describes the board."""
@@ -217,7 +219,7 @@ def find_board(grey: Grey, board: Board) -> Array:
     elif board.kind in ("tag", "tags"):
         found = _tags(grey, board)
     else:
-        found = _circles(grey, board)
+        found = find_circles(grey, board)[0]
     return none if found is None else found
 
 
@@ -388,24 +390,30 @@ def _tags(grey: Grey, board: Board) -> Array | None:
     return _placed(found, board)
 
 
-def _circles(grey: Grey, board: Board) -> Array | None:
+def find_circles(grey: Grey, board: Board) -> tuple[Array | None, float]:
+    """Centroids (m, 2) px of a board's circles, and the circles' radius, m; None and NaN where they are not found."""
     kind = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
-    size = (board.columns, board.rows)
-    for colour in (0, 255):
-        points = None
-        for scale in (min(1.0, 1000.0 / max(grey.shape)), 1.0):
-            small = _smaller(grey, scale)
-            detector = _blobs(small, colour)
-            for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
-                found, points = cv2.findCirclesGrid(small, size, flags=flags, blobDetector=detector)
-                if found:
-                    break
+    size, scales = (board.columns, board.rows), {min(1.0, 1000.0 / max(grey.shape)), 1.0}
+    for colour, scale in ((c, s) for c in (0, 255) for s in sorted(scales)):
+        small = _smaller(grey, scale)
+        detector = _blobs(small, colour)
+        for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
+            found, points = cv2.findCirclesGrid(small, size, flags=flags, blobDetector=detector)
             if found:
-                centres = (np.asarray(points, dtype=float)[:, 0] + 0.5) / scale - 0.5
-                return _in_order(_centres(grey, centres, colour), board)
-            if scale == 1.0:
-                break
-    return None
+                rough = (np.asarray(points, dtype=float)[:, 0] + 0.5) / scale - 0.5
+                centres, areas = _centres(grey, rough, colour)
+                order = _in_order(centres, board)
+                return centres[order], _radius(centres[order], areas[order], board)
+    return None, np.nan
+
+
+def _radius(centres: Array, areas: Array, board: Board) -> float:
+    """Radius m of a board's circles from their areas px^2, by the homography of their centres."""
+    H: Any = cv2.findHomography(board.points[:, :2], centres)[0]
+    if H is None:
+        return np.nan
+    w = np.column_stack([board.points[:, :2], np.ones(len(centres))]) @ H[2]
+    return float(np.sqrt(np.nanmedian(areas * np.abs(w) ** 3) / (np.pi * abs(np.linalg.det(H)))))
 
 
 def _blobs(grey: Grey, colour: int) -> Any:
@@ -421,11 +429,11 @@ def _blobs(grey: Grey, colour: int) -> Any:
     return opencv.SimpleBlobDetector_create(settings)
 
 
-def _centres(grey: Grey, points: Array, colour: int) -> Array:
-    """Centroids (m, 2) px of the contrast of circles in the whole picture."""
+def _centres(grey: Grey, points: Array, colour: int) -> tuple[Array, Array]:
+    """Centroids (m, 2) px of the contrast of circles in the whole picture, and their areas (m,) px^2, NaN where they are not clear."""
     far = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(far, np.inf)
-    out = points.copy()
+    out, areas = points.copy(), np.full(len(points), np.nan)
     for k, (u, v) in enumerate(points):
         half = int(np.ceil(0.5 * far[k].min()))
         x0, y0 = max(round(u) - half, 0), max(round(v) - half, 0)
@@ -440,16 +448,16 @@ def _centres(grey: Grey, points: Array, colour: int) -> Array:
             y, x = np.mgrid[: window.shape[0], : window.shape[1]]
             centre = np.array([x0 + (weight * x).sum() / weight.sum(), y0 + (weight * y).sum() / weight.sum()])
             if float(np.linalg.norm(centre - points[k])) < 0.25 * half:
-                out[k] = centre
-    return out
+                out[k], areas[k] = centre, weight.sum() / (high - low)
+    return out, areas
 
 
-def _in_order(points: Array, board: Board) -> Array:
-    if _right_handed(points, board.columns, board.rows):
-        return points
-    grid = points.reshape(board.rows, board.columns, 2)
-    grid = grid[:, ::-1] if board.kind == "circles" else grid[::-1]
-    return np.asarray(grid.reshape(-1, 2))
+def _in_order(points: Array, board: Board) -> NDArray[np.int64]:
+    """The order (m,) in which points that OpenCV found are the board's."""
+    order = np.arange(len(points)).reshape(board.rows, board.columns)
+    if not _right_handed(points, board.columns, board.rows):
+        order = order[:, ::-1] if board.kind == "circles" else order[::-1]
+    return order.ravel()
 
 
 def what_is_there(greys: Sequence[Grey], board: Board) -> str:

@@ -13,7 +13,14 @@ from weldcal.calibration.data.camera_file import CameraFile
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
-from weldcal.calibration.hand_eye.pictures.boards import EXAMPLES, Board, find_board, what_is_there, with_layout
+from weldcal.calibration.hand_eye.pictures.boards import (
+    EXAMPLES,
+    Board,
+    find_board,
+    find_circles,
+    what_is_there,
+    with_layout,
+)
 from weldcal.calibration.hand_eye.pictures.files import load_grey
 from weldcal.models.arrays import Array
 
@@ -23,6 +30,8 @@ GROSS = 4.0
 """Times the median error of a picture, beyond which it does not fit the camera."""
 _K3_LEVEL = 0.999  # at which a third radial coefficient is no chance
 _THUMBNAIL_PX = 240
+_RING = 32  # points of a circle that is projected
+_CENTRED = 2  # corrections of the centroids of circles, each with the camera that the one before gave
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,6 +71,8 @@ def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, li
     )
     board = with_layout(some, board)
 
+    radii: list[float] = []
+
     def one(path: Path) -> Picture:
         grey = load_grey(path)
         none = np.full((len(board.points), 2), np.nan)
@@ -69,7 +80,12 @@ def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, li
             return Picture(
                 name=path.name, points=none, size=(0, 0), thumbnail=b"", why="It cannot be read as a picture."
             )
-        points = find_board(grey, board)
+        if board.kind in ("circles", "acircles"):
+            found, radius = find_circles(grey, board)
+            points = none if found is None else found
+            radii.append(radius)
+        else:
+            points = find_board(grey, board)
         least = 4 if board.kind == "tag" else min(8, len(board.points))
         why = ""
         if int(np.isfinite(points[:, 0]).sum()) < least:
@@ -80,6 +96,8 @@ def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, li
 
     with ThreadPoolExecutor(max_workers=2) as pool:
         pictures = list(pool.map(one, files))
+    if np.isfinite(radii).any():
+        board = replace(board, radius=float(np.nanmedian(radii)))
     n = sum(not p.why for p in pictures)
     if n < FEWEST:
         some = [g for g in (load_grey(files[k]) for k in spread(len(files), 6)) if g is not None]
@@ -127,7 +145,24 @@ def sized(picture: Picture, size: tuple[int, int]) -> Picture:
 def estimate_camera(
     pictures: list[Picture], board: Board, size: tuple[int, int], file: CameraFile | None, named: str | bool
 ) -> tuple[Array, Array, NDArray[np.int64], list[Picture]]:
-    """Camera matrix, distortion, which of their numbers are free, and the pictures, those that do not fit left out."""
+    """Camera matrix, distortion, which of their numbers are free, and the pictures, those that do not fit left out.
+
+    The centroids of circles become pictures of their centres.
+    """
+    centroids = [p.points for p in pictures]
+    K, dist, free, pictures = _estimate(pictures, board, size, file, named)
+    for _ in range(_CENTRED if board.radius > 0.0 else 0):
+        for k, picture in enumerate(pictures):
+            if not picture.why and (found := solutions(picture.points, board, K, dist)):
+                offsets = centre_offsets(board, found[0][1], K, dist)
+                pictures[k] = replace(picture, points=centroids[k] - offsets)
+        K, dist, free, pictures = _estimate(pictures, board, size, file, named)
+    return K, dist, free, pictures
+
+
+def _estimate(
+    pictures: list[Picture], board: Board, size: tuple[int, int], file: CameraFile | None, named: str | bool
+) -> tuple[Array, Array, NDArray[np.int64], list[Picture]]:
     if file is not None:
         if file.size is not None and file.size != size:
             raise DatasetError(
@@ -173,6 +208,25 @@ def estimate_camera(
             "some pictures, or give the camera with --intrinsics FILE."
         )
     return K, dist, free.astype(np.int64), pictures
+
+
+def centre_offsets(board: Board, C: Array, K: Array, dist: Array) -> Array:
+    """Centroids (m, 2) px of the pictures of a board's circles, less the pictures of their centres: a picture of a circle is no circle.
+
+    Args:
+        board: with the circles' radius.
+        C: its pose in the camera (4, 4).
+        K, dist: the camera.
+    """
+    turn = np.linspace(0.0, 2.0 * np.pi, _RING, endpoint=False)
+    ring = board.radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(_RING)], axis=1)
+    points = np.concatenate([board.points[:, None], board.points[:, None] + ring], axis=1).reshape(-1, 3)
+    uv = np.asarray(cv2.projectPoints(points, cv2.Rodrigues(C[:3, :3])[0], C[:3, 3], K, dist)[0], dtype=float)
+    uv = uv.reshape(len(board.points), 1 + _RING, 2)
+    a = uv[:, 1:] - uv[:, :1]
+    b = np.roll(a, -1, axis=1)
+    double = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]  # twice the area of a triangle
+    return np.asarray((double[..., None] * (a + b)).sum(axis=1) / (3.0 * double.sum(axis=1))[:, None])
 
 
 def solutions(points: Array, board: Board, K: Array, dist: Array) -> list[tuple[float, Array]]:

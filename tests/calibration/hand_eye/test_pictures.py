@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ from weldcal.calibration.hand_eye.choice import CANDIDATES
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pictures import search as picture_search
-from weldcal.calibration.hand_eye.pictures.boards import Board, find_board, parse_board, with_layout
+from weldcal.calibration.hand_eye.pictures.boards import Board, find_board, find_circles, parse_board, with_layout
 from weldcal.calibration.hand_eye.pictures.bundle import Corners, adjust
 from weldcal.calibration.hand_eye.pictures.files import picture_files
 from weldcal.calibration.hand_eye.pictures.sets import read_pictures
@@ -148,6 +149,41 @@ def test_a_large_picture_is_searched_in_a_small_one(small: bool, monkeypatch: py
     assert np.sqrt(((found - truth) ** 2).mean()) < (0.03 if small else 0.15)
     assert calls[0] == (700, False)
     assert not any(up for _, up in calls)
+
+
+@pytest.mark.parametrize("text", ["circles:7x5:20", "circles:6x4:20", "acircles:4x11:12"])
+def test_centroids_of_circles_become_their_centres(text: str) -> None:
+    """The pictures of the drawn circles' centres, by the lens equation, are met five times better than by the centroids."""
+    drawing, board = BOARDS[text], parse_board(text)
+    C = draw.world(drawing, 1, 1).camera[0]
+    found, radius = find_circles(draw.render(drawing, C, np.random.default_rng(0), sub=5), board)
+    assert found is not None
+    truth = draw.project(np.c_[1e-3 * drawing.points, np.zeros(len(drawing.points))], C)
+    off = found[min(board.symmetries, key=lambda order: float(np.abs(found[order] - truth).max()))] - truth
+    left = off - picture_search.centre_offsets(replace(board, radius=radius), C, draw.K, draw.DIST)
+    assert radius == pytest.approx((0.45 if board.kind == "acircles" else 0.25) * board.size, rel=0.01)
+    assert np.sqrt((left**2).mean()) < 0.2 * np.sqrt((off**2).mean())
+
+
+def test_a_camera_is_estimated_from_the_centres_of_circles() -> None:
+    """Exact corners of a large tilted board: with its circles' offsets added, the camera is found as without them."""
+    board, drawing = parse_board("circles:7x5:20"), BOARDS["circles:7x5:20"]
+    board = replace(board, radius=0.009)
+    pictures = [
+        picture_search.Picture(
+            name=str(k),
+            points=draw.project(board.points, C) + picture_search.centre_offsets(board, C, draw.K, draw.DIST),
+            size=draw.SIZE,
+            thumbnail=b"",
+        )
+        for k, C in enumerate(draw.world(drawing, 4, 12).camera)
+    ]
+    K, _, _, corrected = picture_search.estimate_camera(pictures, board, draw.SIZE, None, False)
+    assert np.abs(K - draw.K).max() < 0.01
+    assert all(
+        np.abs(p.points - draw.project(board.points, C)).max() < 1e-3
+        for p, C in zip(corrected, draw.world(drawing, 4, 12).camera, strict=True)
+    )
 
 
 @pytest.mark.parametrize(
