@@ -33,12 +33,14 @@ EXAMPLES = {
     "tags": "tags:4x3:40:10:4X4_50 (4 x 3 tags of 40 mm, gaps of 10 mm)",
 }
 _LARGEST_MM, _MOST = 5000.0, 60
-_DETECT_PX = 1400  # what a picture shows in place of the board is searched at this width
 _LARGE_PX = 1750  # beyond it a chessboard is searched in reduced pictures first
 _REDUCED_PX = (700, 1400)
 _SHARPEN = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 0.002)
 _DICTIONARIES = {name[5:]: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
-_STRAIGHT_PX = 100.0  # length of a tag's side up to which the lens leaves it straight
+SIDE = np.linspace(0.12, 0.88, 25)
+"""Places along a tag's side where its edge is measured."""
+_CURVED_PX = 100.0  # length of a tag's side from which on its curvature can be measured
+_USUAL = "4X4_1000 5X5_1000 6X6_1000 7X7_1000 ARUCO_ORIGINAL APRILTAG_36h11 APRILTAG_25h9"  # dictionaries in use
 _TRIED = 8  # pictures that show which layout a board has, or what there is in place of it
 
 
@@ -266,8 +268,7 @@ def _chessboard(grey: Grey, board: Board) -> Array | None:
     ways = [(1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
     if width > _LARGE_PX:
         ways = [(min(px / width, 1.0), plain) for px in (*_REDUCED_PX, width)]
-    rough = next((found for way in ways if (found := _search(grey, size, *way)) is not None), None)
-    if rough is None:
+    if (rough := next((found for way in ways if (found := _search(grey, size, *way)) is not None), None)) is None:
         return None
     there = rough.reshape(board.rows, board.columns, 2)
     gap = min(float(np.linalg.norm(np.diff(there, axis=k), axis=2).min()) for k in (0, 1))
@@ -330,13 +331,15 @@ def _charuco(grey: Grey, board: Board) -> Array | None:
 def _markers(grey: Grey, board: Board) -> dict[int, Array]:
     """Corners (4, 2) px of every marker of the board's dictionary by its number; where the border is two cells wide, of that kind."""
     found: dict[int, Array] = {}
-    for border in (1, 2):
-        detector = cv2.aruco.ArucoDetector(dictionary(board.dictionary), _parameters(markerBorderBits=border))
+    near = {"minMarkerDistanceRate": 0.02}  # of tags whose edge is near that of the paper
+    for more, border in (({}, 1), ({}, 2), (near, 1)):
+        if len(found) >= len(board.ids):
+            break
+        detector = cv2.aruco.ArucoDetector(dictionary(board.dictionary), _parameters(markerBorderBits=border, **more))
         corners, ids, _ = detector.detectMarkers(grey)
         if ids is not None and len(ids) > len(found):
-            found = {
-                int(k): np.asarray(c, dtype=float).reshape(4, 2) for c, k in zip(corners, ids.ravel(), strict=True)
-            }
+            places = np.asarray(corners, dtype=float).reshape(-1, 4, 2)
+            found = dict(zip(ids.ravel().tolist(), places, strict=True))
     return found
 
 
@@ -344,7 +347,7 @@ def _by_sides(grey: Grey, corners: Array) -> Array:
     """Corners (4, 2) px as the meets of lines along the sides: a corner alone is pulled inwards by the picture's blur."""
     side = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     reach = float(np.clip(0.06 * side.min(), 2.0, 5.0))
-    s, t = np.linspace(-reach, reach, int(8 * reach) | 1), np.linspace(0.12, 0.88, 25)
+    s, t = np.linspace(-reach, reach, int(8 * reach) | 1), SIDE
     lines = []
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         along = (b - a) / np.linalg.norm(b - a)
@@ -360,20 +363,33 @@ def _by_sides(grey: Grey, corners: Array) -> Array:
             return corners
         place = (slope @ s)[strong] / total[strong]
         keep = np.ones(len(place), dtype=bool)
-        degree = 2 if np.linalg.norm(b - a) > _STRAIGHT_PX else 1  # a lens bends the sides
+        degree = degree_of(a, b)
         for _ in range(3):
             curve = np.polyfit(t[strong][keep], place[keep], degree)
             off = np.abs(np.polyval(curve, t[strong]) - place)
             keep = off <= max(3.0 * float(np.median(off)), 0.05)
-        tangents = []
-        for e in (0.0, 1.0):
-            foot = a + e * (b - a) + np.polyval(curve, e) * out
-            ahead = foot + (b - a) + np.polyval(np.polyder(curve), e) * out
-            tangents.append(np.cross([*foot, 1.0], [*ahead, 1.0]))
-        lines.append(tangents)
-    meets = np.array([np.cross(lines[k - 1][1], lines[k][0]) for k in range(4)])
-    refined = meets[:, :2] / meets[:, 2:]
-    return refined if float(np.linalg.norm(refined - corners, axis=1).max()) < reach else corners
+        lines.append(tangents(a, b, curve))
+    fine = meets(lines)
+    return fine if float(np.linalg.norm(fine - corners, axis=1).max()) < reach else corners
+
+
+def degree_of(a: Array, b: Array) -> int:
+    """Degree of the curve that is fitted to a tag's side from a to b px, which a lens bends."""
+    return 2 if np.linalg.norm(b - a) > _CURVED_PX else 1
+
+
+def tangents(a: Array, b: Array, curve: Array) -> list[Array]:
+    """Lines (3,) along the ends of a tag's side from a to b px, which is ``curve`` (a polynomial of 0 to 1) px outside of its chord."""
+    out = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
+    feet = [a + e * (b - a) + np.polyval(curve, e) * out for e in (0.0, 1.0)]
+    ways = [b - a + np.polyval(np.polyder(curve), e) * out for e in (0.0, 1.0)]
+    return [np.cross([*foot, 1.0], [*(foot + way), 1.0]) for foot, way in zip(feet, ways, strict=True)]
+
+
+def meets(lines: Sequence[list[Array]]) -> Array:
+    """Corners (4, 2) px of a tag from the lines along the ends of its sides."""
+    found = np.array([np.cross(lines[k - 1][1], lines[k][0]) for k in range(4)])
+    return np.asarray(found[:, :2] / found[:, 2:])
 
 
 def _placed(found: dict[int, Array], board: Board) -> Array | None:
@@ -461,7 +477,7 @@ def _in_order(points: Array, board: Board) -> NDArray[np.int64]:
 
 
 def what_is_there(greys: Sequence[Grey], board: Board) -> str:
-    """What the first pictures show in place of the board: a sentence, or empty where nothing is known."""
+    """What the first pictures show in place of the board, or empty where nothing is known."""
     for grey in greys[:_TRIED]:
         if board.kind in ("charuco", "tag", "tags"):
             markers = _markers(grey, board)
@@ -469,21 +485,12 @@ def what_is_there(greys: Sequence[Grey], board: Board) -> str:
                 ids = ", ".join(str(k) for k in sorted(markers)[:12])
                 what = "" if board.kind != "charuco" else " and the squares do not fit them"
                 return f"markers of {board.dictionary} were found ({ids}){what}"
-            for name in (
-                "4X4_1000",
-                "5X5_1000",
-                "6X6_1000",
-                "7X7_1000",
-                "ARUCO_ORIGINAL",
-                "APRILTAG_36h11",
-                "APRILTAG_25h9",
-            ):
+            for name in _USUAL.split():
                 markers = _markers(grey, replace(board, dictionary=name))
                 if len(markers) > 1 or (board.kind == "tag" and markers):
                     ids = ", ".join(str(k) for k in sorted(markers)[:12])
                     return f"markers of {name} were found ({ids}), none of {board.dictionary}"
-        scale = min(1.0, _DETECT_PX / max(grey.shape))
-        small = _smaller(grey, scale)
+        small = _smaller(grey, min(1.0, _REDUCED_PX[-1] / max(grey.shape)))
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
         found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
         if found and meta is not None:

@@ -15,9 +15,13 @@ from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
 from weldcal.calibration.hand_eye.pictures.boards import (
     EXAMPLES,
+    SIDE,
     Board,
+    degree_of,
     find_board,
     find_circles,
+    meets,
+    tangents,
     what_is_there,
     with_layout,
 )
@@ -30,8 +34,8 @@ GROSS = 4.0
 """Times the median error of a picture, beyond which it does not fit the camera."""
 _K3_LEVEL = 0.999  # at which a third radial coefficient is no chance
 _THUMBNAIL_PX = 240
-_RING = 32  # points of a circle that is projected
-_CENTRED = 2  # corrections of the centroids of circles, each with the camera that the one before gave
+_RING = 32  # points of a circle, or of a tag's side, that is projected
+_CENTRED = 2  # corrections of the points, each with the camera that the one before gave
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -147,15 +151,14 @@ def estimate_camera(
 ) -> tuple[Array, Array, NDArray[np.int64], list[Picture]]:
     """Camera matrix, distortion, which of their numbers are free, and the pictures, those that do not fit left out.
 
-    The centroids of circles become pictures of their centres.
+    Points become pictures of the board's points, see ``offsets``.
     """
-    centroids = [p.points for p in pictures]
+    measured = [p.points for p in pictures]
     K, dist, free, pictures = _estimate(pictures, board, size, file, named)
-    for _ in range(_CENTRED if board.radius > 0.0 else 0):
+    for _ in range(_CENTRED if board.radius > 0.0 or board.kind in ("tag", "tags") else 0):
         for k, picture in enumerate(pictures):
             if not picture.why and (found := solutions(picture.points, board, K, dist)):
-                offsets = centre_offsets(board, found[0][1], K, dist)
-                pictures[k] = replace(picture, points=centroids[k] - offsets)
+                pictures[k] = replace(picture, points=measured[k] - offsets(board, found[0][1], K, dist))
         K, dist, free, pictures = _estimate(pictures, board, size, file, named)
     return K, dist, free, pictures
 
@@ -195,7 +198,7 @@ def _estimate(
         for k, e in zip(np.array(kept)[bad], error[bad], strict=True):
             pictures[k] = replace(pictures[k], why=f"Its points do not fit the camera of the others ({e:.1f} px).")
     K, dist = np.asarray(found[1], dtype=float), np.ravel(np.asarray(found[2], dtype=float))[:5]
-    free = np.array([0, 1, 2, 3, 4, 5] if few else [0, 1, 2, 3, 4, 5, 6, 7])
+    free = np.arange(8)
     if not few:
         more = cv2.calibrateCamera(obj, img, size, K.copy(), dist.copy(), flags=cv2.CALIB_USE_INTRINSIC_GUESS)
         numbers = 2.0 * sum(len(o) for o in obj)
@@ -210,23 +213,48 @@ def _estimate(
     return K, dist, free.astype(np.int64), pictures
 
 
-def centre_offsets(board: Board, C: Array, K: Array, dist: Array) -> Array:
-    """Centroids (m, 2) px of the pictures of a board's circles, less the pictures of their centres: a picture of a circle is no circle.
+def offsets(board: Board, C: Array, K: Array, dist: Array) -> Array:
+    """Points (m, 2) px as they are measured without noise, less the pictures of the board's points.
+
+    The picture of a circle is no circle about the picture of its centre. Straight lines along a tag's sides, which the lens bends, meet
+    beside the picture of its corner.
 
     Args:
-        board: with the circles' radius.
+        board: circles with their radius, or tags; other boards have none.
         C: its pose in the camera (4, 4).
         K, dist: the camera.
     """
-    turn = np.linspace(0.0, 2.0 * np.pi, _RING, endpoint=False)
-    ring = board.radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(_RING)], axis=1)
-    points = np.concatenate([board.points[:, None], board.points[:, None] + ring], axis=1).reshape(-1, 3)
-    uv = np.asarray(cv2.projectPoints(points, cv2.Rodrigues(C[:3, :3])[0], C[:3, 3], K, dist)[0], dtype=float)
-    uv = uv.reshape(len(board.points), 1 + _RING, 2)
-    a = uv[:, 1:] - uv[:, :1]
-    b = np.roll(a, -1, axis=1)
-    double = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]  # twice the area of a triangle
-    return np.asarray((double[..., None] * (a + b)).sum(axis=1) / (3.0 * double.sum(axis=1))[:, None])
+    true = _projected(board.points, C, K, dist)
+    if board.radius > 0.0:
+        turn = np.linspace(0.0, 2.0 * np.pi, _RING, endpoint=False)
+        ring = board.radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(_RING)], axis=1)
+        a = _projected(board.points[:, None] + ring, C, K, dist) - true[:, None]
+        b = np.roll(a, -1, axis=1)
+        double = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]  # twice the area of a triangle
+        return np.asarray((double[..., None] * (a + b)).sum(axis=1) / (3.0 * double.sum(axis=1))[:, None])
+    if board.kind not in ("tag", "tags"):
+        return np.zeros_like(true)
+    corners = board.points.reshape(-1, 4, 3)
+    along = np.linspace(0.0, 1.0, _RING)[:, None] * (np.roll(corners, -1, axis=1) - corners)[:, :, None]
+    sides = _projected(corners[:, :, None] + along, C, K, dist)
+    measured = []
+    for tag in sides:
+        lines = []
+        for uv in tag:
+            chord = uv[-1] - uv[0]
+            t = (uv - uv[0]) @ chord / (chord @ chord)
+            outside = (uv - uv[0]) @ [chord[1], -chord[0]] / np.linalg.norm(chord)
+            curve = np.polyfit(SIDE, np.interp(SIDE, t, outside), degree_of(uv[0], uv[-1]))
+            lines.append(tangents(uv[0], uv[-1], curve))
+        measured.append(meets(lines))
+    return np.concatenate(measured) - true
+
+
+def _projected(points: Array, C: Array, K: Array, dist: Array) -> Array:
+    """Pixels (..., 2) of points (..., 3) of the board."""
+    flat = np.ascontiguousarray(points.reshape(-1, 3))
+    uv = cv2.projectPoints(flat, cv2.Rodrigues(C[:3, :3])[0], C[:3, 3], K, dist)[0]
+    return np.asarray(uv, dtype=float).reshape(*points.shape[:-1], 2)
 
 
 def solutions(points: Array, board: Board, K: Array, dist: Array) -> list[tuple[float, Array]]:

@@ -81,6 +81,7 @@ class Sheet:
     lines: list[Rectangle] = field(default_factory=list)
     texts: list[tuple[float, float, float, str]] = field(default_factory=list)
     discs: list[tuple[float, float, float]] = field(default_factory=list)  # x, y and radius of black discs
+    origin: tuple[float, float] = (0.0, 0.0)  # of the frame of the board that it shows
 
     def marker(self, cells: np.ndarray, x: float, y: float, side: float) -> None:
         """A marker with its lower left corner at x, y; `cells` (n, n) is 1 where it is white, its first row on top."""
@@ -212,6 +213,7 @@ def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
     _require_room(sheet, width, height, paper)
     x0 = 0.5 * (sheet.width - width) - low[0]
     y0 = 0.5 * (sheet.height + FOOT_MM + height) + low[1]  # of the board's origin, y up
+    sheet.origin = (x0, y0)
     if board.kind in ("chessboard", "charuco"):
         columns, rows = (
             (board.columns + 1, board.rows + 1) if board.kind == "chessboard" else (board.columns, board.rows)

@@ -30,7 +30,8 @@ from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, swit
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.hand_eye.cells import hand_eye_cells, mountings
-from weldcal.tools.studies.hand_eye.conventions import hand_eye_conventions
+from weldcal.tools.studies.hand_eye.conventions import hand_eye_conventions as conventions
+from weldcal.tools.studies.hand_eye.pictures import hand_eye_pictures as pictures
 from weldcal.tools.studies.harness import Figures, Row, Study, Table
 from weldcal.tools.worlds.hand_eye_mistakes import fuzz
 
@@ -395,7 +396,9 @@ def hand_eye_sets(
 
 
 @command("benchmark hand-eye", short_help="Compare the hand-eye solvers with OpenCV's.", options=FARM)
-@one_of("sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings, conventions=hand_eye_conventions)
+@one_of(
+    "sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings, conventions=conventions, pictures=pictures
+)
 def hand_eye(call: Call) -> None:
     """Compare the hand-eye solvers with OpenCV's on public data (sets) and on imperfect cells (cells), test them in simulation,
     calibrate every mounting live (mountings), and read pose lists in random conventions (conventions)."""
