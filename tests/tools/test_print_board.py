@@ -125,7 +125,7 @@ def test_the_line_to_measure_is_100_mm_long_and_says_so() -> None:
     lengths = [np.hypot(x1 - x0, y1 - y0) for x0, y0, x1, y1 in page.lines]
     assert max(lengths) == pytest.approx(100.0, abs=1e-3)
     assert "This line is 100 mm long" in page.text
-    assert "squares 4 mm, markers 3 mm" in page.text
+    assert "--board charuco:8x6:4:3:4X4_50" in page.text
 
 
 @pytest.mark.parametrize(

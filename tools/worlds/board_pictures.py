@@ -87,33 +87,20 @@ def printed(text: str) -> Drawing:
     return Drawing(image[low[1] : high[1], low[0] : high[0]], origin, 1e3 * board.points[:, :2])
 
 
-def distorted(x: Array, y: Array) -> tuple[Array, Array]:
-    """Brown's lens model, written from its equation."""
-    r2, d = x * x + y * y, DIST
-    radial = 1.0 + d[0] * r2 + d[1] * r2 * r2
-    return (
-        x * radial + 2 * d[2] * x * y + d[3] * (r2 + 2 * x * x),
-        y * radial + d[2] * (r2 + 2 * y * y) + 2 * d[3] * x * y,
-    )
-
-
 def project(points: Array, C: Array) -> Array:
     """Pixels (n, 2) of points (n, 2) mm of the board under its pose C."""
-    q = 1e-3 * points @ C[:3, :2].T + C[:3, 3]
-    x, y = distorted(q[:, 0] / q[:, 2], q[:, 1] / q[:, 2])
-    return np.stack([K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]], axis=1)
+    p = np.column_stack([1e-3 * points, np.zeros(len(points))])
+    return np.asarray(cv2.projectPoints(p, cv2.Rodrigues(C[:3, :3])[0], C[:3, 3], K, DIST)[0], dtype=float)[:, 0]
 
 
 @lru_cache(maxsize=1)
 def _rays() -> tuple[Any, Any]:
-    """Undistorted rays x, y at z = 1 of every sample of the picture, by fixed-point iteration."""
-    u, v = ((np.arange(n * _SUB) + 0.5) / _SUB - 0.5 for n in SIZE)
-    xd, yd = np.meshgrid((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1])
-    x, y = xd, yd
-    for _ in range(8):
-        a, b = distorted(x, y)
-        x, y = x + xd - a, y + yd - b
-    return x.astype(np.float32), y.astype(np.float32)
+    """Undistorted rays x, y at z = 1 of every sample of the picture."""
+    u, v = np.meshgrid(*((np.arange(n * _SUB) + 0.5) / _SUB - 0.5 for n in SIZE))
+    exact = (cv2.TERM_CRITERIA_COUNT, 10, 0.0)
+    rays = cv2.undistortPointsIter(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K, DIST, None, None, exact)
+    x, y = np.asarray(rays, dtype=np.float32).reshape(*u.shape, 2).transpose(2, 0, 1)
+    return x, y
 
 
 def render(drawing: Drawing, C: Array, rng: np.random.Generator) -> NDArray[np.uint8]:

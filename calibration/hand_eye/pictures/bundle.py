@@ -125,13 +125,7 @@ class _Adjustment:
             return r, r, r
         jac = np.asarray(jac, dtype=float).reshape(len(k), 2, -1)
         D = jac[:, :, 3:6] @ RX.T
-        parts = [
-            jac[:, :, 6:][:, :, self.free],
-            D @ skew(v),
-            -D,
-            -(D @ chain) @ skew(y),
-            D @ chain,
-        ]
+        parts = [jac[:, :, 6:][:, :, self.free], D @ skew(v), -D, -(D @ chain) @ skew(y), D @ chain]
         own = D @ to_noise
         return r, np.concatenate(parts, axis=2), np.concatenate([-own @ skew(turned), own], axis=2)
 

@@ -17,13 +17,14 @@ from weldcal.calibration.hand_eye.pairs.conventions import UNITS
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
 from weldcal.calibration.hand_eye.pictures.boards import Board
-from weldcal.calibration.hand_eye.pictures.files import camera_in, picture_files
 from weldcal.calibration.hand_eye.pictures.search import (
     FEWEST,
     Picture,
+    camera_in,
     common_size,
     estimate_camera,
     find_in,
+    picture_files,
     sized,
     solutions,
     spread,

@@ -180,25 +180,8 @@ class Board:
 
 def board_sheet(board: Board, paper: str) -> Sheet:
     """The board in the middle of a page. Raises InputError where it does not fit."""
-    sheet = _page(paper)
-    width, height = board.columns * board.square_mm, board.rows * board.square_mm
-    _require_room(sheet, width, height, paper)
-    x0, y1 = 0.5 * (sheet.width - width), 0.5 * (sheet.height + FOOT_MM + height)
-    found, with_marker = board.opencv(), set()
-    for corners, marker in zip(found.getObjPoints(), np.ravel(found.getIds()), strict=True):
-        left, top = 1e3 * np.asarray(corners).min(axis=0)[:2]  # OpenCV counts y down from the board's upper edge
-        with_marker.add((int(left // board.square_mm), int(top // board.square_mm)))
-        cells = tag_cells(TagModel(board.dictionary, int(marker)))
-        sheet.marker(cells, x0 + left, y1 - top - board.marker_mm, board.marker_mm)
-    for column in range(board.columns):
-        for row in range(board.rows):
-            if (column, row) not in with_marker:
-                corner = (x0 + column * board.square_mm, y1 - (row + 1) * board.square_mm)
-                sheet.black.append((*corner, board.square_mm, board.square_mm))
-    sheet.ruler(
-        f"ChArUco {board.columns} x {board.rows}, squares {board.square_mm:g} mm, markers {board.marker_mm:g} mm"
-    )
-    return sheet
+    sizes = f"{board.square_mm:.12g}:{board.marker_mm:.12g}:{board.dictionary}"
+    return described_sheet(parse_board(f"charuco:{board.columns}x{board.rows}:{sizes}"), paper)
 
 
 def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
