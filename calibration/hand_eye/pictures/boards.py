@@ -339,7 +339,7 @@ def _markers(grey: Grey, board: Board) -> dict[int, Array]:
         corners, ids, _ = detector.detectMarkers(grey)
         if ids is not None and len(ids) > len(found):
             places = np.asarray(corners, dtype=float).reshape(-1, 4, 2)
-            found = dict(zip(ids.ravel().tolist(), places, strict=True))
+            found = {int(k): corner for k, corner in zip(ids.ravel(), places, strict=True)}
     return found
 
 
