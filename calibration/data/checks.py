@@ -133,8 +133,9 @@ def to_metres(points: Array, unit: str, name: str) -> Array:
     Raises CloudError.
     """
     points = measured(points, name)
-    finite = points[np.isfinite(points[..., 2])]
-    distance = float(np.median(np.linalg.norm(finite[:: 1 + len(finite) // _SAMPLE], axis=1)))
+    finite = np.flatnonzero(np.isfinite(points[..., 2]))
+    some = points.reshape(-1, points.shape[-1])[finite[:: 1 + len(finite) // _SAMPLE]]
+    distance = float(np.median(np.linalg.norm(some, axis=1)))
     if unit == AUTO:
         unit = "mm" if distance > REACH_M[1] else "m"
     points *= UNITS[unit]
