@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.cell.board import PAPERS, Board, board_sheet, tag_sheet
+from weldcal.tools.commands.cell.board import PAPERS, Board, board_sheet, described_sheet, tag_sheet
 from weldcal.welding.finger.deformation import TagModel
 
 DPI = 600
@@ -104,6 +104,14 @@ def test_the_squares_of_a_board_have_their_size(board: Board, paper: str) -> Non
     assert np.abs(offset - offset.mean(axis=0)).max() < 0.02
     middle = found.mean(axis=0)
     assert middle[0] == pytest.approx(0.5 * page.width_mm, abs=0.05)
+
+
+def test_a_wide_board_is_printed_across_the_page() -> None:
+    board = parse_board("chessboard:9x6:20")
+    page = Page(described_sheet(board, "A4").pdf())
+    assert (page.width_mm, page.height_mm) == pytest.approx((297.0, 210.0), abs=0.01)
+    found = find_board(page.picture, board).reshape(6, 9, 2) / PIXELS_PER_MM
+    assert np.linalg.norm(np.diff(found, axis=1), axis=2) == pytest.approx(20.0, abs=0.05)
 
 
 def test_a_tag_has_its_size_and_its_number() -> None:

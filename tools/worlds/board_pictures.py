@@ -15,7 +15,7 @@ from weldcal.calibration.data.poses.listing import listing_of_array
 from weldcal.calibration.geometry.se3 import difference, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_solve
 from weldcal.calibration.hand_eye.pictures.boards import parse_board
-from weldcal.calibration.hand_eye.pictures.search import Picture
+from weldcal.calibration.hand_eye.pictures.search import Picture, offsets
 from weldcal.calibration.hand_eye.pictures.sets import picture_set, read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import solve_pictures
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform
@@ -108,7 +108,8 @@ def render(drawing: Drawing, C: Array, rng: np.random.Generator) -> NDArray[np.u
     x, y = _rays()
     H = np.linalg.inv(C[:3, [0, 1, 3]]).astype(np.float32)  # rays to points of the plane
     p = [H[k, 0] * x + H[k, 1] * y + H[k, 2] for k in range(3)]
-    j, i = ((1e3 * p[k] / p[2] + np.float32(drawing.origin[k])) * np.float32(PX_PER_MM) - 0.5 for k in (0, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays along the plane
+        j, i = ((1e3 * p[k] / p[2] + np.float32(drawing.origin[k])) * np.float32(PX_PER_MM) - 0.5 for k in (0, 1))
     found = cv2.remap(drawing.image, j, i, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
     value = cv2.resize(found.astype(np.float32), SIZE, interpolation=cv2.INTER_AREA)
     value = 20.0 + 0.8 * cv2.GaussianBlur(value, (0, 0), _BLUR_PX) + rng.normal(0.0, _NOISE, value.shape)
@@ -148,8 +149,10 @@ def calibrated(kind: str, board: str, seed: int) -> Mapping[str, object]:
     robot = world.robot
     try:
         if kind == "corners":
+            noise = rng.normal(0.0, _CORNER_PX, (_N, *drawing.points.shape))
             points = [
-                project(drawing.points, C) + rng.normal(0.0, _CORNER_PX, drawing.points.shape) for C in world.camera
+                project(drawing.points, C) + offsets(what, C, K, DIST) + e
+                for C, e in zip(world.camera, noise, strict=True)
             ]
             shots = [Picture(name=f"{k:02d}.png", points=p, size=SIZE, thumbnail=b"") for k, p in enumerate(points)]
             data = picture_set(shots, what, listing_of_array("robot", robot, unit="m"), mode, kind)

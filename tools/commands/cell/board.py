@@ -193,6 +193,12 @@ def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
     outside = {"chessboard": size, "circles": 0.25 * size, "acircles": 0.5 * size, "charuco": size}.get(board.kind, 0.0)
     low, high = points.min(axis=0) - outside, points.max(axis=0) + outside
     width, height = (float(v) for v in high - low)
+    side = Sheet(width=sheet.height, height=sheet.width)
+    if (
+        sheet.width - 2.0 * MARGIN_MM < width <= side.width - 2.0 * MARGIN_MM
+        and height <= side.height - 2.0 * MARGIN_MM - FOOT_MM
+    ):
+        sheet = side
     _require_room(sheet, width, height, paper)
     x0 = 0.5 * (sheet.width - width) - low[0]
     y0 = 0.5 * (sheet.height + FOOT_MM + height) + low[1]  # of the board's origin, y up
