@@ -217,19 +217,10 @@ def adjust(
     square = (r**2).sum(axis=1)
     rms = np.array([np.sqrt(square[a:b].mean()) for a, b in zip(work.bounds[:-1], work.bounds[1:], strict=True)])
     return Bundle(
-        X=state.X,
-        Y=state.Y,
-        K=state.K,
-        distortion=state.dist,
-        covariance=covariance,
-        camera_sigma=np.sqrt(np.diag(S)[: len(free)]),
-        sigma_px=px,
-        sigma_rad=rad,
-        sigma_m=m,
-        rms_px=rms,
-        off=state.off,
+        X=state.X, Y=state.Y, K=state.K, distortion=state.dist, covariance=covariance,
+        camera_sigma=np.sqrt(np.diag(S)[: len(free)]), sigma_px=px, sigma_rad=rad, sigma_m=m, rms_px=rms, off=state.off,
         degrees_of_freedom=dof,
-    )
+    )  # fmt: skip
 
 
 def _moved(sigma: float, square: float, least: float) -> float:

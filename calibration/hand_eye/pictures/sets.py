@@ -220,18 +220,10 @@ def _set(
         p if p.why or k in paired else replace(p, why="No robot pose belongs to it.") for k, p in enumerate(turned)
     ]
     pairs = PosePairs(
-        source=source,
-        robot=found.robot,
-        camera=found.camera,
-        mode=mode,
-        img=np.stack([turned[k].points for k in rows]),
-        obj=board.points,
-        K=K,
-        dist=dist,
-        reading=found.reading,
-        notes=found.notes,
-        ids=tuple(turned[k].name for k in rows),
-    )
+        source=source, robot=found.robot, camera=found.camera, mode=mode,
+        img=np.stack([turned[k].points for k in rows]), obj=board.points, K=K, dist=dist, reading=found.reading,
+        notes=found.notes, ids=tuple(turned[k].name for k in rows),
+    )  # fmt: skip
     return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=camera, free=free)
 
 

@@ -102,21 +102,15 @@ def solve_pictures(
     weight = np.isfinite(pairs.img[keep][..., 0]).sum(axis=1) if pairs.img is not None else np.ones(int(keep.sum()))
     total = float(np.sqrt((weight * bundle.rms_px**2).sum() / weight.sum()))
     found = PictureResult(
-        board=data.board,
-        pictures=tuple(pictures),
-        bundle=bundle,
-        camera=data.camera,
-        free=data.free,
+        board=data.board, pictures=tuple(pictures), bundle=bundle, camera=data.camera, free=data.free,
         reprojection_px=total,
-    )
+    )  # fmt: skip
     if not result.unobservable:
         result = replace(
-            result,
-            poses={"X": as_transform(bundle.X), "Y": as_transform(bundle.Y)},
+            result, poses={"X": as_transform(bundle.X), "Y": as_transform(bundle.Y)},
             covariance={"X": bundle.covariance[:6, :6], "Y": bundle.covariance[6:, 6:]},
-            joint_covariance=bundle.covariance,
-            degrees_of_freedom=bundle.degrees_of_freedom,
-        )
+            joint_covariance=bundle.covariance, degrees_of_freedom=bundle.degrees_of_freedom,
+        )  # fmt: skip
     return replace(result, inliers=keep), pairs, found
 
 
@@ -125,18 +119,10 @@ def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], 
     assert pairs.K is not None
     assert pairs.dist is not None
     return adjust(
-        Corners(
-            robot=pairs.robot[keep], img=pairs.img[keep], obj=data.board.points, eye_in_hand=pairs.mode == "eye_in_hand"
-        ),
-        np.asarray(result.X.GetAsMatrix4()),
-        np.asarray(result.Y.GetAsMatrix4()),
-        pairs.K,
-        pairs.dist,
-        free=data.free,
-        sigma_px=0.3,
-        sigma_rad=result.sigma_rotation_rad,
-        sigma_m=result.sigma_translation,
-    )
+        Corners(robot=pairs.robot[keep], img=pairs.img[keep], obj=data.board.points, eye_in_hand=pairs.mode == "eye_in_hand"),
+        np.asarray(result.X.GetAsMatrix4()), np.asarray(result.Y.GetAsMatrix4()), pairs.K, pairs.dist, free=data.free,
+        sigma_px=0.3, sigma_rad=result.sigma_rotation_rad, sigma_m=result.sigma_translation,
+    )  # fmt: skip
 
 
 def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[PosePairs, bool]:
