@@ -68,7 +68,7 @@ def printed(text: str) -> Drawing:
     """The board that a string describes, as it is printed on A3."""
     sheet, board = described_sheet(parse_board(text), "A3"), parse_board(text)
     image: Any = np.full((round(sheet.height * PX_PER_MM), round(sheet.width * PX_PER_MM)), 245, np.uint8)
-    corners = []
+    corners: list[tuple[float, float]] = []
     for value, rectangles in ((15, sheet.black), (245, sheet.white)):
         for x, y, w, h in rectangles:
             left, right = (round(v * PX_PER_MM) for v in (x, x + w))
@@ -98,7 +98,7 @@ def _rays() -> tuple[Any, Any]:
     """Undistorted rays x, y at z = 1 of every sample of the picture."""
     u, v = np.meshgrid(*((np.arange(n * _SUB) + 0.5) / _SUB - 0.5 for n in SIZE))
     exact = (cv2.TERM_CRITERIA_COUNT, 10, 0.0)
-    rays = cv2.undistortPointsIter(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K, DIST, None, None, exact)
+    rays = cv2.undistortPointsIter(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K, DIST, np.eye(3), np.eye(3), exact)
     x, y = np.asarray(rays, dtype=np.float32).reshape(*u.shape, 2).transpose(2, 0, 1)
     return x, y
 
@@ -113,7 +113,7 @@ def render(drawing: Drawing, C: Array, rng: np.random.Generator) -> NDArray[np.u
     found = cv2.remap(drawing.image, j, i, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
     value = cv2.resize(found.astype(np.float32), SIZE, interpolation=cv2.INTER_AREA)
     value = 20.0 + 0.8 * cv2.GaussianBlur(value, (0, 0), _BLUR_PX) + rng.normal(0.0, _NOISE, value.shape)
-    return np.clip(np.rint(value), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(value), 0, 255), dtype=np.uint8)
 
 
 def views(drawing: Drawing, rng: np.random.Generator, n: int, *, eye_in_hand: bool, deg: float, mm: float) -> World:
