@@ -245,6 +245,12 @@ class Problem:
             start += n
         return np.asarray(out)
 
+    def shared(self, r: Floats) -> float:
+        """Sum of squares of what the whitened residuals (m,) of each scan share with an error of the robot's position."""
+        ends = np.cumsum(self.count)
+        parts = zip(self._whiten or [], ends - self.count, ends, strict=False)
+        return float(sum(np.sum((U.T @ r[a:b]) ** 2) for (U, _), a, b in parts))
+
     def derivatives(self, x: Floats) -> Floats:
         """Jacobian of `residual`."""
         pose, c, _, _, arm = self.layout.unpack(x)

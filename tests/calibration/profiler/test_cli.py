@@ -225,7 +225,7 @@ def test_points_of_three_numbers_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_direction_that_is_open_by_centimetres_is_refused() -> None:
-    vague = SimpleNamespace(reduced_chi2=1.0, covariance=np.diag([1e-6] * 3 + [1e-8, 1e-8, 0.4**2]))
+    vague = SimpleNamespace(reduced_chi2=1.0, scans_chi2=1.0, covariance=np.diag([1e-6] * 3 + [1e-8, 1e-8, 0.4**2]))
     with pytest.raises(
         InputError, match=r"translation along \(0.00, 0.00, 1.00\) of the flange almost open \(one sigma 400 mm\)"
     ):
