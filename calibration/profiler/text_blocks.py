@@ -75,6 +75,7 @@ def blocks_of(text: str, name: str) -> list[Block]:
     header: tuple[str, ...] = ()
     caption = ""
     rows: list[list[float]] = []
+    worded: set[int] = set()  # columns that hold words in the first row
     first = total = wide = 0
 
     def close() -> None:
@@ -114,6 +115,9 @@ def blocks_of(text: str, name: str) -> list[Block]:
         ):
             if not rows:
                 first, wide = number, size
+                worded = {k for k, v in enumerate(values) if v is None}
+            elif any(k in worded and v is not None and np.isfinite(v) for k, v in enumerate(values)):
+                raise InputError(f"'{name}', line {first}, holds words where numbers are needed; correct it.")
             if not header and size != wide:
                 raise InputError(f"'{name}', line {number}: {size} cells, and {wide} in the rows before it.")
             if rows and any(v is None and k < len(rows[0]) and np.isfinite(rows[0][k]) for k, v in enumerate(values)):

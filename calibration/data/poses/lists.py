@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.listing import Listing, listing_of_array
+from weldcal.calibration.data.poses.listing import Listing, listing_of_array, require_pose
 from weldcal.calibration.data.poses.names import last_key, natural, number_of, whose
 from weldcal.calibration.data.poses.storage import read_tree, tree_of_text
 from weldcal.calibration.data.poses.text import lists_of_text
@@ -64,6 +64,15 @@ _INVERSE = re.compile(r"(?i)base2(gripper|ee|hand|tool|flange)|cam(era)?2(target
 
 def read_lists(path: Path) -> list[Listing]:
     """Every list of poses of one file.
+
+    Raises:
+        DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
+    """
+    return require_pose(lists_of_file(path))
+
+
+def lists_of_file(path: Path) -> list[Listing]:
+    """Every list of poses of one of many files: a single pose may be missing there, and is left out.
 
     Raises:
         DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
@@ -145,12 +154,18 @@ def _numbered_folders(folder: Path) -> frozenset[Path]:
 
 
 def _may_hold_poses(path: Path) -> bool:
-    return (
-        path.is_file()
-        and path.suffix.lower() in ENDINGS
-        and path.name.lower() not in _OWN
-        and not path.name.startswith((".", "_"))
-    )
+    """Whether a file's name is that of poses. Raises DatasetError where another thing than a file or a folder has such a name."""
+    named = path.suffix.lower() in ENDINGS and path.name.lower() not in _OWN and not path.name.startswith((".", "_"))
+    if named and not path.is_file() and (not path.is_dir() or _one_of_files(path)):
+        raise DatasetError(f"'{path.name}' is no file that can be read; replace it by a file, or remove it.")
+    return named and path.is_file()
+
+
+def _one_of_files(folder: Path) -> bool:
+    """Whether a folder has the name of one of several numbered files beside it."""
+    stem = re.sub(r"\d+$", "", folder.stem)
+    alike = (p for p in folder.parent.glob(f"*{folder.suffix}") if re.sub(r"\d+$", "", p.stem) == stem and p.is_file())
+    return stem != folder.stem and next(alike, None) is not None
 
 
 def _group(files: list[Path], label: str) -> list[Listing]:
@@ -158,7 +173,7 @@ def _group(files: list[Path], label: str) -> list[Listing]:
     prefix = f"{label}/" if label else ""
     if len(files) == 1:
         return [_renamed(one, prefix) for one in read_lists(files[0])]
-    lists = [read_lists(path) for path in files]
+    lists = [lists_of_file(path) for path in files]
     many = next((p for p, found in zip(files, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
     alike = len({p.name for p in files}) == 1 and len(files) > 1  # the same file in each of several folders
     ids = tuple((p.parent.name if alike else p.stem) for p in files)

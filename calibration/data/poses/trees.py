@@ -188,19 +188,20 @@ def stacked(lists: list[Listing], name: str, ids: tuple[str, ...] = ()) -> Listi
     first = lists[0].numbers[0]
     if any(one.numbers[0].kind != first.kind for one in lists):
         raise DatasetError(f"'{name}' holds poses in different forms; write all in one.")
-    bad = [k for k, one in enumerate(lists) if one.left_out]
+    bad = {k: why for k, one in enumerate(lists) for _, why in one.left_out}
     units = {one.unit for one in lists}
     found = []
     # six numbers may begin with the position or with the rotation
     for k in range(min(len(one.numbers) for one in lists)):
         p = np.concatenate([one.numbers[k].p for one in lists])
         r = np.concatenate([one.numbers[k].r for one in lists])
-        p[bad] = np.nan
+        p[list(bad)] = np.nan
         found.append(listing_of(
             name, p, r, rotation=first.rotation, angles=first.angles, usual=first.usual, vector=first.vector, ids=ids,
             unit=lists[0].unit if len(units) == 1 else "", form=lists[0].form,
         ))  # fmt: skip
-    return replace(found[0], numbers=tuple(n for one in found for n in one.numbers))
+    left_out = tuple((k, bad.get(k, why)) for k, why in found[0].left_out)
+    return replace(found[0], numbers=tuple(n for one in found for n in one.numbers), left_out=left_out)
 
 
 def _joined(node: Mapping[Any, Any], name: str, at: str) -> Iterator[tuple[Listing, set[str]]]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.calibration.data.pose_texts import TEXTS, TURN, N, P, Q, V, join
-from weldcal.calibration.data.poses.lists import read_lists
+from weldcal.calibration.data.poses.listing import _orthonormal
+from weldcal.calibration.data.poses.lists import folder_lists, read_lists
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.errors import DatasetError
 
@@ -56,3 +58,29 @@ def test_matlab_arrays_with_the_poses_last_are_read(tmp_path: Path) -> None:
     lists = read_lists(tmp_path / "a.mat")
     assert {one.name for one in lists} == {"a.mat, A", "a.mat, B"}
     assert pytest.approx(X) == lists[0].readings[0].X
+
+
+def test_a_sample_that_is_no_file_is_refused_and_not_skipped(tmp_path: Path) -> None:
+    X = np.eye(4)
+    for k in range(6):
+        X[0, 3] = 0.1 * k
+        (tmp_path / f"sample_{k}.json").write_text(json.dumps({"robot": X.tolist(), "camera": X.tolist()}))
+    for one in folder_lists(tmp_path):
+        assert len(one) == 6
+        assert [row for row, _ in one.left_out] == [0]
+        assert "nothing was detected" in one.left_out[0][1]
+    (tmp_path / "sample_3.json").unlink()
+    assert [len(one) for one in folder_lists(tmp_path)] == [5, 5]
+    for other in (lambda p: p.mkdir(), lambda p: p.symlink_to("nothing.json"), lambda p: p.symlink_to("/dev/zero")):
+        other(tmp_path / "sample_3.json")
+        with pytest.raises(DatasetError, match=r"'sample_3\.json' is no file"):
+            folder_lists(tmp_path)
+        (tmp_path / "sample_3.json").rmdir() if (tmp_path / "sample_3.json").is_dir() else (
+            tmp_path / "sample_3.json"
+        ).unlink()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_numbers_whose_squares_overflow_are_no_rotation() -> None:
+    assert not _orthonormal(np.full((3, 3, 3), 1e200))
+    assert _orthonormal(TURN.as_matrix())

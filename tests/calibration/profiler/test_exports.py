@@ -16,6 +16,7 @@ from weldcal.calibration.errors import InconsistentData
 from weldcal.calibration.profiler.importing import ImportedProfiles, import_profiles
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.reading_choice import ReadingFit, choose_reading, sphere_fit
+from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 
 RADIUS = 20.0
@@ -450,3 +451,36 @@ def test_two_readings_that_agree_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(InconsistentData, match="--robot-form quaternion_xyzw or --robot-form quaternion_wxyz"):
         choose_reading(found.readings, alike, "sphere")
     check_poses(read(tmp_path / "export.csv", form="quaternion_xyzw"))
+
+
+@pytest.mark.parametrize(
+    ("write", "old", "new", "sentence"),
+    [
+        (gocator_uniform, "Axis,-11.8000,", "Axis,-11,8000,", "states 60 columns and names 61"),
+        (scancontrol_table, "\n0;", "\n1.558,0;", "line 3, holds words"),
+    ],
+)
+def test_a_comma_too_many_is_refused(
+    tmp_path: Path, write: Callable[[World], str], old: str, new: str, sentence: str
+) -> None:
+    text = write(world())
+    assert old in text
+    (tmp_path / "a.csv").write_text(text.replace(old, new, 1))
+    (tmp_path / "poses.csv").write_text(quaternions(world()))
+    with pytest.raises(InputError, match=sentence):
+        import_profiles(tmp_path / "a.csv")
+
+
+def test_a_row_of_a_gocator_with_one_cell_more_is_refused(tmp_path: Path) -> None:
+    rows = gocator_raw(world()).replace("\r", "").split("\n")
+    k = next(k for k, row in enumerate(rows) if ",Z," in row)
+    short = [",".join([*row.split(",")[:-1], ""]) if j == k else row for j, row in enumerate(rows)]
+    (tmp_path / "poses.csv").write_text(quaternions(world()))
+    (tmp_path / "a.csv").write_text("\n".join(short))
+    import_profiles(tmp_path / "a.csv")
+    cells = short[k].split(",")
+    at = next(j for j, c in enumerate(cells) if "." in c)
+    cells[at] = cells[at].replace(".", ",")
+    (tmp_path / "a.csv").write_text("\n".join([*rows[:k], ",".join(cells), *rows[k + 1 :]]))
+    with pytest.raises(InputError, match="cells, and its header 69"):
+        import_profiles(tmp_path / "a.csv")
