@@ -352,6 +352,15 @@ def test_profiles_pair_with_poses_by_number(tmp_path: Path) -> None:
     check_poses(read(tmp_path / "scancontrol_table.csv"))
 
 
+def test_points_in_any_order_keep_their_poses(tmp_path: Path) -> None:
+    rows = [f"{k},{100.0 * k},0,500,1,0,0,0,{k},{200 + k}" for k in (4, 2, 0, 3, 1)]
+    (tmp_path / "a.csv").write_text("scan,x_mm,y_mm,z_mm,qw,qx,qy,qz,px_mm,pz_mm\n" + "\n".join(rows) + "\n")
+    found = import_profiles(tmp_path / "a.csv")
+    assert found.profiles is not None
+    x = np.array([p[0, 0] for p in found.profiles])
+    np.testing.assert_allclose(found.readings[0].X[:, 0, 3], 100.0 * x)
+
+
 def test_a_refusal_names_the_columns_and_its_advice_works(tmp_path: Path) -> None:
     (tmp_path / "export.csv").write_text(gocator_raw(world()), newline="")
     code, text, _ = run("sphere", tmp_path / "export.csv", "--radius", RADIUS)
