@@ -44,10 +44,20 @@ class Listing:
 
     @cached_property
     def readings(self) -> tuple[PoseReading, ...]:
-        """All readings of the list, the usual one first; rows that are left out are identities."""
+        """All readings of the list, the usual one first; rows that are left out are identities.
+
+        Raises:
+            DatasetError: the numbers contradict what is stated, with the position before and after the rotation.
+        """
         found: list[PoseReading] = []
+        problem: DatasetError | None = None
         for one in self.numbers:
-            found += readings(one)
+            try:
+                found += readings(one)
+            except DatasetError as why:
+                problem = problem or why
+        if problem is not None and not found:
+            raise problem
         return tuple(found)
 
     @property

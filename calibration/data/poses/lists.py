@@ -84,7 +84,7 @@ def lists_of_file(path: Path) -> list[Listing]:
             return lists_of_tree(dict(read_npz(path)), path.name)
         if ending == ".npy":
             return [listing_of_array(path.name, _numbers(path, read_npy(path)))]
-        if ending == ".mat":
+        if ending == ".mat" and not _is_text(path):
             return lists_of_tree(_matlab(path), path.name)
         if ending == ".xlsx":
             return _workbook(path)
@@ -316,6 +316,12 @@ def _numbers(path: Path, value: Any) -> Any:
     if value.dtype.kind not in "fiu":
         raise DatasetError(f"'{path.name}' holds words, not numbers.")
     return value.astype(float)
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a .mat file is a table of numbers, as MATLAB's save -ascii writes it."""
+    with path.open("rb") as stream:
+        return re.fullmatch(rb"[\s\d.eE+,;-]+", stream.read(128)) is not None
 
 
 def _matlab(path: Path) -> dict[str, Any]:

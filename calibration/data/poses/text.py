@@ -4,6 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import PurePath
 from typing import Any
 
@@ -84,6 +85,8 @@ def _numbers(text: str, name: str) -> list[Listing]:
     if header is not None:
         return _table(*_whole_header(lines, header), name)
     rows = [line for line in lines if line.numeric >= 3]
+    if len(lines) in (6, 7, 12, 16) and all(line.numeric == 1 == len(line.cells) for line in lines):
+        rows = [_Line(lines[0].number, [line.cells[0] for line in lines])]  # a number a line
     if not rows:
         raise DatasetError(
             f"'{name}' holds no poses: no row of it has numbers. A table of poses has columns x,y,z with qw,qx,qy,qz or rx,ry,rz, or 6, 7 or "
@@ -109,6 +112,17 @@ def _numbers(text: str, name: str) -> list[Listing]:
         return [
             _bare([row[k : k + half] for row in plain], f"{name}, columns {k + 1} to {k + half}, {who}", ids)
             for k, who in ((0, "robot"), (half, "camera"))
+        ]
+    gap = next((k for k, (a, b) in enumerate(pairwise(rows), 1) if k == len(rows) // 2 and b.number > a.number + 1), 0)
+    if (
+        gap
+        and 2 * gap == len(rows) >= 6
+        and len(plain[0]) in (6, 7, 12, 16)
+        and rows[-1].number - rows[gap].number == gap - 1 == rows[gap - 1].number - rows[0].number
+    ):
+        return [  # two blocks of as many rows, the robot's first
+            _bare(mine, f"{name}, lines {of[0].number} to {of[-1].number}, {who}", ())
+            for mine, of, who in ((plain[:gap], rows[:gap], "robot"), (plain[gap:], rows[gap:], "camera"))
         ]
     return [_bare(plain, name, ids)]
 
@@ -173,7 +187,10 @@ def _bare(rows: list[list[float]], name: str, ids: tuple[str, ...]) -> Listing:
     n = len(rows[0])
     uneven = next((k for k, row in enumerate(rows) if len(row) != n), None)
     if uneven is not None:
-        raise DatasetError(f"'{name}' has {n} numbers in its first row and {len(rows[uneven])} in row {uneven + 1}.")
+        raise DatasetError(
+            f"'{name}' has {n} numbers in its first row and {len(rows[uneven])} in row {uneven + 1}. Remove the rows that hold no pose, such as a "
+            "result below the poses."
+        )
     table = np.array(rows)
     if n == 4 and len(table) % 4 and len(table) % 3 == 0:
         table = table.reshape(-1, 12)

@@ -129,13 +129,19 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
     columns, _ = columns_of(list(flat))
     direct = [n for n in flat if len({c.prefix for c in columns}) <= 1 or not columns]
     if len(columns) >= 6 and direct and len({c.prefix for c in columns}) == 1:
-        yield from table_lists(list(flat), np.array([list(flat.values())]), label)
         roots = {list(flat)[c.index].partition(".")[0] for c in columns}
-        node = {
+        beside = {
             k: v for k, v in node.items() if str(k).lower() not in roots and isinstance(v, Mapping | list | np.ndarray)
         }
-        if len(roots) > 1:  # the whole mapping is the pose
-            return
+        if len(roots) > 1:  # the whole mapping is the pose, but for matrices beside it
+            beside = {k: v for k, v in beside.items() if (a := _array(v)) is not None and a.size in (12, 16)}
+            keys = [str(k) for k, v in node.items() if isinstance(v, list) and _flat({k: v})]
+            stem = re.sub(
+                "_?(r|t|rot|trans)?(vec|rotation|translation|position|orientation)$", "", min(keys, default="")
+            )
+            label = f"{label}, {stem}" if beside and len(stem) > 1 else label
+        yield from table_lists(list(flat), np.array([list(flat.values())]), label)
+        node = beside
     used = set()
     for listing, keys in _joined(node, name, at):
         used |= keys
@@ -293,7 +299,7 @@ def _axis_angle(value: Mapping[Any, Any], path: str) -> dict[str, float]:
         return {}
     size = float(np.linalg.norm(axis))
     parent = f"{path.rpartition('.')[0]}."
-    vector = float(angle) * axis / (size if size > 0.0 else 1.0)
+    vector = as_number(angle) * axis / (size if size > 0.0 else 1.0)
     return dict(zip((f"{parent}rvec_{a}".lstrip(".") for a in "xyz"), map(float, vector), strict=True))
 
 

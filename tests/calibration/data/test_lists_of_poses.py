@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.calibration.data.pose_texts import TEXTS, TURN, N, P, Q, V, join
+from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import _orthonormal
-from weldcal.calibration.data.poses.lists import folder_lists, read_lists
+from weldcal.calibration.data.poses.lists import folder_lists, read_lists, two_lists
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.errors import DatasetError
 
@@ -84,3 +86,51 @@ def test_a_sample_that_is_no_file_is_refused_and_not_skipped(tmp_path: Path) -> 
 def test_numbers_whose_squares_overflow_are_no_rotation() -> None:
     assert not _orthonormal(np.full((3, 3, 3), 1e200))
     assert _orthonormal(TURN.as_matrix())
+
+
+def test_a_stated_form_holds_for_one_order_of_position_and_rotation(tmp_path: Path) -> None:
+    rows = "\n".join(join(P[k], np.degrees(V[k])) for k in range(N))
+    (found,) = lists_of_text(rows + "\n", "a.txt")
+    assert len(found.numbers) == 2  # the rotation may come first
+    for form, turn in (("rotation_vector,deg", TURN), ("euler_xyz,deg", Rotation.from_euler("xyz", V))):
+        (reading,) = found.stated(PoseForm(rotation=form), "--robot-form").readings
+        assert pytest.approx(turn.as_matrix(), abs=1e-6) == reading.X[:, :3, :3]
+
+
+def test_two_blocks_of_as_many_rows_are_the_robots_and_the_cameras() -> None:
+    blocks = ["\n".join(join(sign * P[k], Q[k]) for k in range(N)) for sign in (1.0, -1.0)]
+    robot, camera = lists_of_text("\n\n\n".join(blocks) + "\n", "a.txt")
+    assert robot.name.endswith("robot")
+    assert camera.readings[0].X[:, :3, 3] == pytest.approx(-P, abs=1e-6)
+    (one,) = lists_of_text("\n\n".join([blocks[0], *blocks[1].splitlines()[:2]]) + "\n", "a.txt")
+    assert len(one) == N + 2
+
+
+def test_files_with_a_number_a_line_are_poses(tmp_path: Path) -> None:
+    for k in range(N):
+        (tmp_path / f"pos{k}.txt").write_text("\n".join(map(str, (*np.degrees(V[k]), *(1e3 * P[k])))) + "\n")
+    (found,) = folder_lists(tmp_path, needed=1)
+    assert any(one.X[:, :3, 3] == pytest.approx(1e3 * P) for one in found.readings)
+
+
+def test_a_table_that_matlab_saves_as_text_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.mat").write_text("\n".join("   ".join(f"{v:.8e}" for v in (*P[k], *Q[k])) for k in range(N)) + "\n")
+    (found,) = read_lists(tmp_path / "a.mat")
+    assert found.readings[0].X[:, :3, 3] == pytest.approx(P, abs=1e-7)
+
+
+def test_a_matrix_and_two_vectors_in_one_document_are_two_lists(tmp_path: Path) -> None:
+    for k in range(N):
+        X = np.eye(4)
+        X[:3, :3], X[:3, 3] = TURN.as_matrix()[k], P[k]
+        sample = {
+            "O_T_EE": X.ravel().tolist(),
+            "T_cam_target_rvec": V[k][:, None].tolist(),
+            "T_cam_target_tvec": (-P[k])[:, None].tolist(),
+            "detected": True,
+        }
+        (tmp_path / f"pose_{k:02d}").mkdir()
+        (tmp_path / f"pose_{k:02d}" / "data.json").write_text(json.dumps(sample))
+    robot, camera = two_lists(folder_lists(tmp_path), "a")
+    assert robot.readings[0].X[:, :3, 3] == pytest.approx(P)
+    assert camera.readings[0].X[:, :3, 3] == pytest.approx(-P)
