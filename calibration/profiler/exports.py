@@ -239,10 +239,10 @@ def _without_empty(points: Floats) -> Floats:
 
 
 def _empty(z: Floats) -> np.ndarray[Any, Any]:
-    """Heights that mean that nothing was measured: -99.9999 ... -99999.9999, and -2147483648 and its neighbours in raw integers."""
+    """Heights that mean that nothing was measured: -99.9999 ... -99999.9999, -10000, -100000, and -2147483648 and its neighbours in raw integers."""
     marks = np.zeros(z.shape, bool)
     for power in (2, 3, 4, 5):
-        mark = (z > -(10.0**power)) & (z <= -(10.0**power) + 2.5e-3)
+        mark = (z > -(10.0**power)) & (z <= -(10.0**power) + 2.5e-3) | ((power > 3) & (z == -(10.0**power)))
         marks |= mark
     return marks | (z < -2.1e9)
 

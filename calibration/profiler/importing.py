@@ -120,7 +120,7 @@ def profiles_of(path: Path, pitch_mm: float | None = None) -> tuple[Profiles, li
     files = [p for p in files if p not in set(poses) and p.suffix.lower() in (*TABLES, *TREES)]
     groups: dict[tuple[Path, str, str], list[Path]] = {}
     for p in files:
-        stem = re.sub(r"\d+", "", p.stem) if number_of(p.stem) is not None else p.stem
+        stem = re.sub(r" ?\(\d+\)$|\d+", "", p.stem)  # copies are "a.txt", "a (1).txt"
         groups.setdefault((p.parent, stem, p.suffix.lower()), []).append(p)
     if not groups:
         names = ", ".join(p.name for p in poses[:4]) or "no table"
@@ -202,7 +202,11 @@ def _poses(path: Path, found: Profiles, beside: Sequence[Path], stated: Path | N
                 f"{', '.join(p.name for p, _ in fitting)} each hold {len(found)} poses; name the file of the flange's with --poses FILE."
             )
     elif single:
-        return _listing(single, path.name)
+        try:
+            return _listing(single, path.name)
+        except InputError:
+            if any(_POSE_NAME.search(p.stem) or _POSE_NAME.search(p.parent.name) for p in single):
+                raise
     raise InputError(_no_poses(found))
 
 

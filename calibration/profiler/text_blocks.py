@@ -49,10 +49,16 @@ def separator_of(lines: list[str]) -> str:
 def cells_of(line: str, separator: str) -> list[str]:
     """The cells of a line, stripped, with decimal points."""
     plain = re.sub(r"\s+([\[(])", r"\1", line).split() if separator == " " else line.split(separator)
+    if separator not in line and len(words := line.split()) > 1 and all(map(_is_number, words)):
+        plain = words  # blanks in one line of a table with another mark
     cells = [c.strip().strip("\"'") for c in plain]
     if separator != ",":
         cells = [c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c) else c for c in cells]
     return cells
+
+
+def _is_number(word: str) -> bool:
+    return re.fullmatch(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?", word) is not None
 
 
 def number_in(cell: str) -> float | None:

@@ -11,8 +11,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat, savemat
+from scipy.io import savemat
 
+from weldcal.calibration.data.poses.matlab import matlab_arrays
 from weldcal.tools.worlds.text_damage import Damage, Rng, any_text
 
 _HUGE = ("0", "-1", "59", "61", "100000000", "5000000000", "99999999999999999999", "1.5", "x", "")
@@ -145,7 +146,7 @@ def matlab(content: bytes, rng: Rng) -> Damage:
     kind = int(rng.integers(7))
     if kind == 6:
         return any_bytes(content, rng)
-    arrays = {k: v for k, v in loadmat(io.BytesIO(content)).items() if not k.startswith("__")}
+    arrays = matlab_arrays(content, "a.mat")
     name = str(_pick(rng, list(arrays)))
     if kind == 4:
         del arrays[name]
@@ -153,10 +154,12 @@ def matlab(content: bytes, rng: Rng) -> Damage:
         arrays[f"{name}{name}"] = arrays[name]
     else:
         value = arrays[name]
-        if value.dtype == object and rng.random() < 0.5:  # one of the cells
-            changed = _changed(value[0, 0], kind, rng)
-            value = value.copy()
-            value[0, 0] = value[0, 0] if changed is None else changed
+        if isinstance(value, list):  # cells
+            cells = np.empty((1, len(value)), dtype=object)
+            for k, cell in enumerate(value):
+                changed = _changed(np.array(cell), kind, rng) if k == 0 else None
+                cells[0, k] = np.array(cell) if changed is None else changed
+            value = cells
         else:
             changed = _changed(value, kind, rng)
             value = value if changed is None else changed

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of_array, require_pose
+from weldcal.calibration.data.poses.matlab import matlab_arrays
 from weldcal.calibration.data.poses.names import last_key, natural, number_of, whose
 from weldcal.calibration.data.poses.storage import read_tree, tree_of_text
 from weldcal.calibration.data.poses.text import lists_of_text
@@ -18,7 +19,7 @@ from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_text, require_few_lines
+from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_bytes, read_text, require_few_lines
 
 TEXT = (
     ".csv",
@@ -85,7 +86,7 @@ def lists_of_file(path: Path) -> list[Listing]:
         if ending == ".npy":
             return [listing_of_array(path.name, _numbers(path, read_npy(path)))]
         if ending == ".mat" and not _is_text(path):
-            return lists_of_tree(_matlab(path), path.name)
+            return lists_of_tree(matlab_arrays(read_bytes(path, LARGEST_DOCUMENT), path.name), path.name)
         if ending == ".xlsx":
             return _workbook(path)
         if ending in TREES:
@@ -322,28 +323,6 @@ def _is_text(path: Path) -> bool:
     """Whether a .mat file is a table of numbers, as MATLAB's save -ascii writes it."""
     with path.open("rb") as stream:
         return re.fullmatch(rb"[\s\d.eE+,;-]+", stream.read(128)) is not None
-
-
-def _matlab(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat
-
-    try:
-        found = loadmat(path, simplify_cells=True)
-    except NotImplementedError as problem:
-        raise DatasetError(f"'{path.name}' is a MATLAB 7.3 file: save it with save('{path.name}', '-v7').") from problem
-    except Exception as problem:  # scipy raises many kinds for a damaged file
-        raise DatasetError(f"'{path.name}' cannot be read as a MATLAB file ({type(problem).__name__}).") from problem
-    return {k: _cells(v) for k, v in found.items() if not k.startswith("__")}
-
-
-def _cells(value: Any) -> Any:
-    """Cell arrays of MATLAB as lists."""
-    if isinstance(value, dict):
-        return {str(k): _cells(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        items = [_cells(v) for v in value.ravel()]
-        return [v.tolist() if isinstance(v, np.ndarray) else v for v in items]
-    return value
 
 
 def _workbook(path: Path) -> list[Listing]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from tests.calibration.data.pose_texts import TEXTS, TURN, N, P, Q, V, join
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import _orthonormal
 from weldcal.calibration.data.poses.lists import folder_lists, read_lists, two_lists
+from weldcal.calibration.data.poses.matlab import matlab_arrays
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.errors import DatasetError
 
@@ -134,3 +136,46 @@ def test_a_matrix_and_two_vectors_in_one_document_are_two_lists(tmp_path: Path) 
     robot, camera = two_lists(folder_lists(tmp_path), "a")
     assert robot.readings[0].X[:, :3, 3] == pytest.approx(P)
     assert camera.readings[0].X[:, :3, 3] == pytest.approx(-P)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_matlab_files_are_read_as_scipy_reads_them(packed: bool) -> None:
+    from scipy.io import loadmat, savemat
+
+    cells = np.empty((1, 3), dtype=object)
+    for k in range(3):
+        cells[0, k] = np.arange(16.0).reshape(4, 4) + k
+    given = {
+        "A": np.arange(24.0).reshape(2, 3, 4),
+        "n": np.int16([[1, 2], [3, 4]]),
+        "one": 5.0,
+        "cells": cells,
+        "s": {"R": np.eye(3), "word": "x"},
+    }
+    stream = io.BytesIO()
+    savemat(stream, given, do_compression=packed)
+    found, scipys = matlab_arrays(stream.getvalue(), "a.mat"), loadmat(stream, simplify_cells=True)
+    for key in ("A", "n", "one"):
+        np.testing.assert_array_equal(found[key], scipys[key])
+    np.testing.assert_array_equal(np.array(found["cells"]), np.stack(list(scipys["cells"])))
+    np.testing.assert_array_equal(found["s"]["R"], np.eye(3))
+    with pytest.raises(DatasetError, match=r"save it with save\('a.mat', '-v7'\)"):
+        matlab_arrays(b"MATLAB 7.3 MAT-file", "a.mat")
+
+
+def test_damaged_matlab_files_are_refused_or_read() -> None:
+    from scipy.io import savemat
+
+    stream = io.BytesIO()
+    savemat(stream, {"A": np.arange(48.0).reshape(3, 4, 4)}, do_compression=False)
+    content, refused = stream.getvalue(), 0
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        damaged = bytearray(content)
+        for at in rng.integers(126, 200, 2):
+            damaged[at] ^= 1 << int(rng.integers(8))
+        try:
+            matlab_arrays(bytes(damaged[: int(rng.integers(128, len(content) + 1))]), "a.mat")
+        except DatasetError:
+            refused += 1
+    assert 200 < refused < 400

@@ -1,19 +1,23 @@
 """Six to twelve scans of a sphere: the one pose that they show, an honest covariance, or a refusal."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.calibration.profiler.test_exports import P_FS, R_FS, RADIUS, World, world
+from tests.calibration.profiler.test_exports import P_FS, R_FS, RADIUS, World, quaternions, world
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.errors import DegenerateMotion
+from weldcal.calibration.profiler.edge.features import _robust_line
+from weldcal.calibration.profiler.importing import import_profiles
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.reading_choice import choose_reading, sphere_fit
 from weldcal.calibration.profiler.result import believed_covariance
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereData
+from weldcal.models.errors import InputError
 
 
 def measured(w: World) -> SphereData:
@@ -70,3 +74,25 @@ def test_one_axis_is_no_evidence_against_a_reading() -> None:
         sphere_joint(data, "rigid")
     k, _ = choose_reading(readings, sphere_fit(data.profiles, data.radius_m), "sphere")
     assert readings[k].form == "euler_xyz"
+
+
+def test_a_table_with_blanks_in_one_line_is_one_profile(tmp_path: Path) -> None:
+    w = world()
+    for k, z in enumerate(w.z):
+        rows = [f"{a:.4f}\t{-10000.0 if np.isnan(v) else v:.4f}" for a, v in zip(w.x, z, strict=True)]
+        rows[5] = rows[5].replace("\t", "  ")
+        name = "scan.txt" if k == 0 else f"scan ({k}).txt"  # as copies are named
+        (tmp_path / name).write_text("\n".join(rows) + "\n")
+    with pytest.raises(InputError, match=f"holds {len(w.p)} profiles of {len(w.x)} points and no flange pose"):
+        import_profiles(tmp_path)
+    (tmp_path / "poses.csv").write_text(quaternions(w))
+    found = import_profiles(tmp_path)
+    assert found.profiles is not None
+    assert [np.isfinite(p).all(axis=1).sum() for p in found.profiles] == [np.isfinite(z).sum() for z in w.z]
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_flank_of_points_above_each_other_has_a_slope() -> None:
+    x = np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0])
+    a, b, _, _ = _robust_line(x, 2.0 + 0.5 * x)
+    assert (a, b) == (pytest.approx(2.0), pytest.approx(0.5))
