@@ -61,7 +61,8 @@ def fit_base_circle(
     config = config or BaseCircleConfig()
     if guess.normal_C is None:
         raise FlangeNotFound("A base circle needs a guess with its normal: give normal_C.")
-    window = window_about(points_C, guess.center_C, guess.radius_m, 1)
+    part = window_about(points_C, guess.center_C, guess.radius_m, 1)
+    window = None if part is None else points_C[part]
     valid = np.zeros((0, 0), dtype=bool) if window is None else np.isfinite(window[..., 2])
     if window is None or int(valid.sum()) < config.min_points:
         raise FlangeNotFound(f"Fewer than {config.min_points} valid points lie where the base circle is expected.")

@@ -1,14 +1,13 @@
 """Fits the concentric edges of a flat face and tests whether it is a flange."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
-from weldcal.calibration.flange.edge_labels import refine_circle
-from weldcal.calibration.flange.rim import EdgePoints, FacePixels, coverage, plane_axes, sector_edges
-from weldcal.calibration.flange.scene import Scene
+from weldcal.calibration.flange.rim import connected_parts, coverage, plane_axes, sector_edges
 from weldcal.calibration.geometry.circle import CircleFit, fit_circle
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane
 from weldcal.models.arrays import Array
@@ -23,8 +22,9 @@ _BORE_SEEN = 0.25
 _FILLED = 0.4  # share of the bore's core that must not be face
 _HOLLOW = 0.7  # share of the ring between the edges that must be face; its holes take up to a seventh of it
 _FULL = 0.85  # and must be where the bore's edge itself was not found
+_SLOTTED = 0.4  # and where the face shows all round both edges: slots between them take half of it on some arms
+_ALL_ROUND = 0.9
 _MIXED, _MOST_MIXED = 1.5, 0.2  # pitches, and at most this share of the ring
-_SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ def thickness(plane: PlaneFit) -> float:
 
 
 def faces_on_plane(
-    scene: Scene,
+    points: Array,
     seed_point: Array,
     normal: Array,
     standard: FlangeStandard,
@@ -98,17 +98,17 @@ def faces_on_plane(
     refusal: Refusal,
 ) -> list[Face]:
     """Find flange faces on one plane (point and normal (3,)), among its connected parts of about the flange's size."""
-    d = scene.points - seed_point
+    d = points - seed_point
     around = np.einsum("nk,nk->n", d, d) < (1.2 * standard.outer_m) ** 2
     try:
-        plane = fit_plane(scene.points[around], (seed_point, normal), tolerance=3.0 * config.hypothesis_tolerance_m)
+        plane = fit_plane(points[around], (seed_point, normal), tolerance=3.0 * config.hypothesis_tolerance_m)
     except PlaneFitError as e:
         refusal.note(1, str(e))
         return []
     if plane.rms > config.max_plane_rms_m:
         refusal.note(1, f"The face is not flat: {1e3 * plane.rms:.2f} mm rms from its plane.")
         return []
-    xy, pitch, part = scene.parts(plane, thickness(plane), seed_point, 2.0 * standard.outer_m)
+    xy, pitch, part = _parts(points, plane, seed_point, 2.0 * standard.outer_m)
     if len(xy) < config.min_points:
         refusal.note(1, f"Only {len(xy)} points lie on the largest flat face; the flange needs {config.min_points}.")
         return []
@@ -121,7 +121,7 @@ def faces_on_plane(
         if outer is None:
             continue
         center = plane.point + np.column_stack(plane_axes(plane.normal)) @ outer.center
-        close = scene.near(center, 0.68 * standard.outer_m + 3.0 * pitch)
+        close = near(points, center, 0.68 * standard.outer_m + 3.0 * pitch)
         face = _measure(close, plane, outer, pitch, standard, config, refusal)
         if face is not None:
             faces.append(face)
@@ -160,7 +160,7 @@ def _first_circle(
 
 
 def _measure(
-    scene: Scene,
+    points: Array,
     plane: PlaneFit,
     outer: CircleFit,
     pitch: float,
@@ -173,29 +173,28 @@ def _measure(
     slack = bounds[1] - standard.outer_radius_m
     bore: CircleFit | None = None
     xy, count = np.zeros((0, 2)), 0
-    for final in (False, True):
+    for _ in range(2):
         center3 = plane.point + np.column_stack(plane_axes(plane.normal)) @ outer.center
         inner = standard.bore_radius_m if bore is None else bore.radius
         ring = _between(
-            scene.points - center3,
+            points - center3,
             plane.normal,
             inner + _margin(pitch, outer.radius - inner),
             outer.radius - _margin(pitch, outer.radius - inner),
             2.0 * thickness(plane),
         )
         try:
-            plane = fit_plane(scene.points[ring], (plane.point, plane.normal), tolerance=2.0 * thickness(plane))
+            plane = fit_plane(points[ring], (plane.point, plane.normal), tolerance=2.0 * thickness(plane))
             count = int(ring.sum())
             center = (center3 - plane.point) @ np.column_stack(plane_axes(plane.normal))
-            t = thickness(plane)
-            xy, edges, pixels = scene.edges(plane, t, center3, 0.7 * standard.outer_m, labels=final)
-            outer = _edge(xy, edges, pixels, center, outer.radius, pitch, t, standard, outer=True)
+            xy = _on_plane(points, plane, center3, 0.7 * standard.outer_m)
+            outer = _edge(xy, center, outer.radius, pitch, outer=True)
         except (PlaneFitError, CircleFitError) as e:
             refusal.note(4, str(e))
             return None
         try:
             radius = standard.face_inner_radius_m if bore is None else bore.radius
-            bore = _edge(xy, edges, pixels, outer.center, radius, pitch, t, standard, outer=False)
+            bore = _edge(xy, outer.center, radius, pitch, outer=False)
         except CircleFitError:
             bore = None
         if bore is not None and (
@@ -269,39 +268,35 @@ def lowered_by(beyond: Array, height: float, chamfer: float) -> float:
     return chamfer + half + min(half, _HIDDEN_LESS * chamfer) if goes_on else chamfer
 
 
-def _edge(
-    xy: Array,
-    edges: EdgePoints | None,
-    pixels: FacePixels | None,
-    center: Array,
-    radius: float,
-    pitch: float,
-    height: float,
-    standard: FlangeStandard,
-    *,
-    outer: bool,
-) -> CircleFit:
-    """One edge near an expected circle. Raises CircleFitError where too little of it was seen."""
+def _edge(xy: Array, center: Array, radius: float, pitch: float, *, outer: bool) -> CircleFit:
+    """One edge near an expected circle. Raises CircleFitError where too little of it shows."""
     width = 2.0 * pitch + 0.0012
-    if edges is None:
-        found = sector_edges(xy, center, pitch, outer=outer, band=(radius - width, radius + width))
-        return fit_circle(found, initial=(center, radius), noise_floor=0.1 * pitch)
-    d = edges.points - center
-    rho = np.hypot(d[:, 0], d[:, 1])
-    near = np.abs(rho - radius) < width
-    if int(near.sum()) < 12:
-        raise CircleFitError("Too little of the edge was seen.")
-    lowered = lowered_by(edges.beyond[near], height, standard.chamfer_m)
-    points = edges.points[near] - lowered * edges.slide[near]
-    sigma = np.hypot((edges.step[near] * d[near]).sum(axis=1) / rho[near], 0.3 * pitch)
-    start = fit_circle(points, sigma=sigma, initial=(center, radius), noise_floor=0.03 * pitch)
-    if pixels is None:
-        return start
-    places = pixels.points - lowered * pixels.slide
-    d = places - start.center
-    close = np.abs(np.hypot(d[:, 0], d[:, 1]) - start.radius) < clear_band(standard, pitch, outer)
-    fit = refine_circle(places[close], pixels.on_face[close], start, pitch, outer=outer)
-    return replace(fit, covariance=_SHARED * fit.covariance)
+    found = sector_edges(xy, center, pitch, outer=outer, band=(radius - width, radius + width))
+    return fit_circle(found, initial=(center, radius), noise_floor=0.1 * pitch)
+
+
+def near(points: Array, center: Array, radius: float) -> Array:
+    """Those of the points (N, 3) in a box about ``center`` (3,) with half-edge ``radius`` m."""
+    return points[(np.abs(points - center) < radius).all(axis=1)]
+
+
+def _on_plane(points: Array, plane: PlaneFit, center: Array, reach: float) -> Array:
+    """Points on the face within ``reach`` of ``center``, in the plane's axes (N, 2)."""
+    d = points - center
+    flat = np.abs(d @ plane.normal - float((plane.point - center) @ plane.normal)) < thickness(plane)
+    close = flat & (np.einsum("nk,nk->n", d, d) < reach**2)
+    return np.asarray((points[close] - plane.point) @ np.column_stack(plane_axes(plane.normal)))
+
+
+def _parts(points: Array, plane: PlaneFit, center: Array, reach: float) -> tuple[Array, float, NDArray[np.intp]]:
+    """The face points (N, 2), the pitch between them (m), and the connected part each belongs to, largest 0."""
+    xy = _on_plane(points, plane, center, reach)
+    if len(xy) < 6:
+        return xy, 1e-3, np.zeros(len(xy), dtype=np.intp)
+    few = xy[:: max(1, len(xy) // 200)]
+    # the 4th neighbour on a square grid is one pitch away; less sensitive to doubled points than the 1st
+    pitch = float(np.median(np.asarray(cKDTree(xy).query(few, k=5)[0])[:, -1]))
+    return xy, pitch, connected_parts(xy, 2.5 * pitch)
 
 
 def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> Face | None:
@@ -336,7 +331,7 @@ def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusa
         )
     elif m.core_share > _FILLED:
         refusal.note(6, f"The disc found has no bore of {1e3 * standard.bore_m:.1f} mm: it is not the flange.")
-    elif m.ring_share < (_HOLLOW if m.bore is not None else _FULL):
+    elif m.ring_share < _least_ring(m):
         refusal.note(
             6,
             f"Only {100 * m.ring_share:.0f} % of the ring between the edge and a bore of {1e3 * standard.bore_m:.1f} mm is "
@@ -346,6 +341,13 @@ def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusa
         quality = m.coverage + (1.0 if m.bore is not None else 0.0) - m.outer.rms / rough
         return Face(m.plane, m.outer, m.bore, m.coverage, m.count, quality)
     return None
+
+
+def _least_ring(m: Measured) -> float:
+    """The share of the ring between the edges that must be face."""
+    if m.bore is None:
+        return _FULL
+    return _SLOTTED if min(m.coverage, m.bore_coverage) > _ALL_ROUND else _HOLLOW
 
 
 def _concentric(outer: CircleFit, bore: CircleFit, pitch: float) -> bool:

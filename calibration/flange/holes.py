@@ -137,7 +137,8 @@ def _face(points: Array, fit: FlangeFit, standard: FlangeStandard, axes: Array) 
     if cloud.ndim == 3:
         pitches = typical_pitches(cloud)
         step = 1 if pitches is None else max(1, int(reach / (6.0 * pitches[0])))
-        cloud = window_about(cloud, fit.center_C, 1.1 * reach, step)
+        part = window_about(cloud, fit.center_C, 1.1 * reach, step)
+        cloud = None if part is None else cloud[part]
         if cloud is None:
             return None
     flat = np.ascontiguousarray(cloud.reshape(-1, 3).T) - np.asarray(fit.center_C)[:, None]

@@ -1,45 +1,14 @@
-"""Locates the edges of a flat face: mask crossings in organised clouds, extreme points per sector in unordered ones."""
-
-from dataclasses import dataclass
+"""Locates the edges of a flat face in a cloud without a pixel grid: the extreme points of each sector."""
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from weldcal.calibration.flange.rays import RayModel
 from weldcal.models.arrays import Array
 
-Mask = NDArray[np.bool_]
-
-SMOOTHING_PX = 1.0  # of the face mask before its edge is located
 _SECTOR_PITCHES = (
     3.0  # a sector is this many point pitches wide: so narrow that many edge points average, yet none is empty
 )
-
-
-@dataclass(frozen=True)
-class FacePixels:
-    """Pixels about a face seen through a grid: place under their rays in the plane (N, 2) m, which is on the face,
-    ``slide``."""
-
-    points: Array
-    on_face: Mask
-    slide: Array
-
-
-@dataclass(frozen=True)
-class EdgePoints:
-    """Edge points of a face seen through a pixel grid, in the plane's axes.
-
-    ``points`` (N, 2) m; ``step`` (N, 2) m, one step of the grid across the edge; ``slide`` (N, 2), how far along the
-    plane a point moves per metre that the plane is raised under its ray; ``beyond`` (N,) m, height of the pixel past
-    the edge.
-    """
-
-    points: Array
-    step: Array
-    slide: Array
-    beyond: Array
 
 
 def plane_axes(normal: Array) -> tuple[Array, Array]:
@@ -51,57 +20,6 @@ def plane_axes(normal: Array) -> tuple[Array, Array]:
     length = (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]) ** 0.5
     a, b, c = e[0] / length, e[1] / length, e[2] / length
     return np.array([a, b, c]), np.array([y * c - z * b, z * a - x * c, x * b - y * a])
-
-
-def organised_edges(points: Array, face: Mask, rays: RayModel, point: Array, normal: Array) -> EdgePoints:
-    """Edge points of the mask ``face`` (H, W) of an organised cloud (H, W, 3), in the plane's axes about ``point``.
-
-    The mask is smoothed (Gaussian) and its level 1/2 is found between neighbours along rows and columns: unbiased at a
-    straight edge, and a circle only shrinks a little all round. Pixels that say nothing (see ``unknown_pixels``) take
-    no part: a scanner loses pixels at a sharp step and keeps them where a chamfer softens it, which would pull the
-    centre to one side.
-    """
-    axes = np.column_stack(plane_axes(normal))
-    known = np.asarray(~unknown_pixels(points), dtype=np.float64)
-    total = ndimage.gaussian_filter(known, SMOOTHING_PX, truncate=3.0, mode="nearest")
-    level = (
-        ndimage.gaussian_filter(face * known, SMOOTHING_PX, truncate=3.0, mode="constant") / np.maximum(total, 1e-3)
-        - 0.5
-    )
-    up = level > 0.0
-    v, u = np.nonzero(up[:, 1:] != up[:, :-1])
-    q, w = np.nonzero(up[1:, :] != up[:-1, :])
-    across = level[v, u] / (level[v, u] - level[v, u + 1])
-    down = level[q, w] / (level[q, w] - level[q + 1, w])
-    uu, vv = np.concatenate([u + across, w]), np.concatenate([v, q + down])
-    half = np.concatenate([np.tile([0.5, 0.0], (len(u), 1)), np.tile([0.0, 0.5], (len(w), 1))])
-    ahead = (rays.on_plane(uu + half[:, 0], vv + half[:, 1], point, normal) - point) @ axes
-    behind = (rays.on_plane(uu - half[:, 0], vv - half[:, 1], point, normal) - point) @ axes
-    middle = rays.on_plane(uu, vv, point, normal)
-    off_v = np.concatenate([v, np.where(up[q, w], q + 1, q)])
-    off_u = np.concatenate([np.where(up[v, u], u + 1, u), w])
-    return EdgePoints(
-        points=(middle - point) @ axes,
-        step=ahead - behind,
-        slide=(middle @ axes) / (middle @ normal)[:, None],
-        beyond=(points[off_v, off_u] - point) @ normal,
-    )
-
-
-def face_pixels(points: Array, face: Mask, rays: RayModel, point: Array, normal: Array) -> FacePixels:
-    """Pixels of a grid (H, W, 3) labelled on or off the face (all but small gaps), in the plane's axes."""
-    axes = np.column_stack(plane_axes(normal))
-    v, u = np.nonzero(~unknown_pixels(points))
-    on_plane = rays.on_plane(u.astype(float), v.astype(float), point, normal)
-    return FacePixels((on_plane - point) @ axes, face[v, u], (on_plane @ axes) / (on_plane @ normal)[:, None])
-
-
-def unknown_pixels(points: Array) -> Mask:
-    """Mask (H, W) of small gaps without a reading, which carry no information on an edge. A gap that holds 3 x 3 pixels
-    counts as off the face."""
-    gap = np.isnan(points[..., 2])
-    void = ndimage.binary_opening(np.pad(gap, 2, constant_values=True), np.ones((3, 3), dtype=bool))[2:-2, 2:-2]
-    return np.asarray(gap & ~void)
 
 
 def sector_edges(xy: Array, center: Array, pitch: float, *, outer: bool, band: tuple[float, float]) -> Array:
@@ -146,14 +64,6 @@ def connected_parts(xy: Array, cell: float) -> NDArray[np.intp]:
     image[grid[:, 0], grid[:, 1]] = True
     labels, _ = ndimage.label(image, structure=np.ones((3, 3)))
     return _by_size(np.asarray(labels[grid[:, 0], grid[:, 1]], dtype=np.intp))
-
-
-def connected_pixels(mask: Mask) -> NDArray[np.intp]:
-    """Connected parts of a pixel mask (H, W): label image, largest part 0, next 1, ...; -1 outside the mask."""
-    labels, _ = ndimage.label(mask)
-    out = np.full(mask.shape, -1)
-    out[mask] = _by_size(np.asarray(labels[mask], dtype=np.intp))
-    return out
 
 
 def _by_size(part: NDArray[np.intp]) -> NDArray[np.intp]:

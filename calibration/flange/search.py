@@ -17,6 +17,7 @@ from weldcal.models.flanges import FlangeStandard
 _ACROSS = 7.0  # thinned pixels across the flat ring: fewer do not keep it in one piece between its holes
 _BEND_M = 2.5e-4  # least depth by which three neighbours must bend to be no plane, above the scan's own noise
 _BEND_SIGMAS = (5.0, 3.5)  # of that noise's third; first the one that breaks no face, then the one that stops at less
+_LAYERS, _LAYER_PIXELS, _LAYER_LEAST = 8.0, 40_000, 30  # an eighth of the depth, of so many pixels, with its own noise
 _WIDEST = 3.0  # of the flange's diameter: a part that leaked onto its surroundings
 _ROUND = 0.03  # of the flange's diameter: most of an outline lies so close to its circle
 _VERY_ROUND = 0.012  # such a part is tried before the rest is looked at
@@ -35,21 +36,31 @@ class Part:
     misfit: float
 
 
-def search_frame(cloud: Array, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> Face | None:
-    """The best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted."""
+def search_frame(
+    cloud: Array,
+    standard: FlangeStandard,
+    config: FlangeFitConfig,
+    refusal: Refusal,
+    measured: NDArray[np.bool_] | None = None,
+) -> Face | None:
+    """The best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted. Of a thinned scan,
+    whose missing pixels are interpolated, ``measured`` (H, W) says which were not."""
     pitches = typical_pitches(cloud)
     if pitches is None:
         refusal.note(0, "The cloud holds no valid point.")
         return None
     ring = standard.face_outer_radius_m - standard.face_inner_radius_m
-    near, pitch = pitches
+    down = typical_pitches(np.swapaxes(cloud, 0, 1)) or pitches
+    across, along = pitches[1] / max(pitches[1], down[1]), down[1] / max(pitches[1], down[1])
+    near, pitch = max(pitches[0], down[0]), max(pitches[1], down[1])
     widest = [max(1, int(ring / (_ACROSS * p))) for p in (near, pitch, 2.0 * pitch)]
     # coarse first; where a part leaks over a shallow step at one scale or threshold, it ends there at another
     scales = [(w, s) for s in _BEND_SIGMAS for w in sorted(set(widest), reverse=True)]
     tried: list[tuple[Array, float]] = []
-    for step, sigmas in scales:
+    for wide, sigmas in scales:
         best: Face | None = None
-        for part in flat_parts(cloud[::step, ::step], standard, config, sigmas):
+        step = (round(wide / along), round(wide / across))
+        for part in flat_parts(cloud[:: step[0], :: step[1]], standard, config, sigmas):
             if any(
                 float(np.linalg.norm(part.center - c)) < 0.02 * standard.outer_m
                 and abs(part.radius - r) < 0.02 * standard.outer_m
@@ -60,7 +71,10 @@ def search_frame(cloud: Array, standard: FlangeStandard, config: FlangeFitConfig
             window = window_about(cloud, part.center, 0.62 * standard.outer_m + 3.0 * pitch, step)
             if window is None:
                 continue
-            face = measure_window(window, part.center, part.normal, part.radius, standard, config, refusal)
+            known = None if measured is None else measured[window]
+            face = measure_window(
+                cloud[window], part.center, part.normal, part.radius, standard, config, refusal, known
+            )
             if face is None:
                 continue
             if best is None or face.quality > best.quality:
@@ -87,18 +101,20 @@ def typical_pitches(cloud: Array) -> tuple[float, float] | None:
     return float(near), float(middle)
 
 
-def window_about(cloud: Array, center: Array, radius: float, step: int) -> Array | None:
-    """The part of a scan that holds all pixels within ``radius`` (m) of a centre (3,), found on every ``step``-th one."""
-    thin = cloud[::step, ::step]
+def window_about(cloud: Array, center: Array, radius: float, step: int | tuple[int, int]) -> tuple[slice, slice] | None:
+    """The rows and columns of a scan that hold all pixels within ``radius`` (m) of a centre (3,), found on every ``step``-th one, or
+    every so many rows and columns."""
+    sv, su = (step, step) if isinstance(step, int) else step
+    thin = cloud[::sv, ::su]
     with np.errstate(invalid="ignore"):
         near = np.abs(thin - center) < radius
     near = near[..., 0] & near[..., 1] & near[..., 2]
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     if len(rows) == 0:
         return None
-    v = slice(max((int(rows[0]) - 1) * step, 0), (int(rows[-1]) + 2) * step)
-    u = slice(max((int(columns[0]) - 1) * step, 0), (int(columns[-1]) + 2) * step)
-    return cloud[v, u]
+    v = slice(max((int(rows[0]) - 1) * sv, 0), (int(rows[-1]) + 2) * sv)
+    u = slice(max((int(columns[0]) - 1) * su, 0), (int(columns[-1]) + 2) * su)
+    return v, u
 
 
 def flat_parts(
@@ -115,12 +131,9 @@ def flat_parts(
         bend_u = np.abs(inverse[1:-1, 2:] + inverse[1:-1, :-2] - 2.0 * inverse[1:-1, 1:-1])
         bend_v = np.abs(inverse[2:, 1:-1] + inverse[:-2, 1:-1] - 2.0 * inverse[1:-1, 1:-1])
         bend = np.maximum(bend_u, bend_v)
-    known = bend[np.isfinite(bend)]
-    if len(known) < 20:
+    if np.count_nonzero(np.isfinite(bend)) < 20:
         return
-    few = known[:: max(1, len(known) // 4000)]
-    # most of a scan is smooth: its lower third shows the noise, which is even in inverse depth for a triangulating scanner
-    noise = float(np.partition(few, len(few) // 3)[len(few) // 3])
+    noise = _noise_by_depth(bend, inverse[1:-1, 1:-1])
     with np.errstate(invalid="ignore"):
         flat = (bend < np.maximum(_BEND_M * np.square(inverse[1:-1, 1:-1]), sigmas * noise)).astype(np.uint8)
     _count, labels, stats, _centroids = cv2.connectedComponentsWithStats(flat, connectivity=4, ltype=cv2.CV_32S)
@@ -136,19 +149,37 @@ def flat_parts(
     yield from sorted(parts, key=lambda p: p.misfit)
 
 
+def _noise_by_depth(bend: NDArray[np.float32], inverse: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Noise (h, w) of the bend at each pixel: what the lower third of the pixels of about its depth shows, most of a scan being
+    smooth. A floor far behind the flange has another noise than the flange."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        layer = np.rint(_LAYERS * np.log(np.abs(inverse)))
+    known = np.isfinite(bend) & np.isfinite(layer)
+    layer = np.where(known, layer - layer[known].min(), 0.0).astype(np.intp)
+    at = np.flatnonzero(known)[:: max(1, np.count_nonzero(known) // _LAYER_PIXELS)]
+    value, of = bend.ravel()[at], layer.ravel()[at]
+    whole = np.partition(value, len(value) // 3)[len(value) // 3]
+    table = np.full(int(layer.max()) + 1, whole, dtype=np.float32)
+    for k in np.unique(of):
+        mine = value[of == k]
+        if len(mine) >= _LAYER_LEAST:
+            table[k] = np.partition(mine, len(mine) // 3)[len(mine) // 3]
+    return np.asarray(table[layer])
+
+
 def _likeliest(
     labels: NDArray[np.int32], stats: NDArray[np.int32], z: NDArray[np.float32], grid: Array, standard: FlangeStandard
 ) -> list[int]:
     """Labels of the parts whose box in the image could hold the flange, the most flange-like box first."""
     some = grid[:: max(1, z.shape[0] // 24), :: max(1, z.shape[1] // 24)]
-    u = np.arange(0, z.shape[1], max(1, z.shape[1] // 24), dtype=float)
-    ray = some[..., 0] / some[..., 2]
-    known = np.isfinite(ray)
-    if int(known.sum()) < 2:
+    ray = some[..., :2] / some[..., 2:]
+    known = np.isfinite(ray[..., 0])
+    if int(known.sum()) < 3:
         return []
-    # metres per pixel and metre of depth, from the rays' own spread
-    uu = np.broadcast_to(u, ray.shape)[known]
-    per_pixel = float(np.ptp(ray[known])) / max(float(np.ptp(uu)), 1.0)
+    # metres per pixel and metre of depth, along each axis of the image
+    v, u = (k * max(1, n // 24) for k, n in zip(np.nonzero(known), z.shape, strict=True))
+    c = np.linalg.lstsq(np.column_stack([np.ones(len(u)), u, v]), ray[known], rcond=None)[0]
+    per_u, per_v = np.hypot(c[1:, 0], c[1:, 1])
     count = len(stats)
     first = np.full(count, -1)
     flat = labels.ravel()
@@ -157,7 +188,7 @@ def _likeliest(
     first[0] = -1
     rows, columns = np.divmod(np.maximum(first, 0), labels.shape[1])
     depth = z[rows + 1, columns + 1].astype(float)
-    diagonal = np.hypot(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) * depth * per_pixel
+    diagonal = np.hypot(stats[:, cv2.CC_STAT_WIDTH] * per_u, stats[:, cv2.CC_STAT_HEIGHT] * per_v) * depth
     expected = np.sqrt(2.0) * standard.outer_m
     with np.errstate(invalid="ignore"):
         able = (first >= 0) & (diagonal > 0.35 * expected) & (diagonal < _WIDEST * standard.outer_m)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
 from weldcal.calibration.flange.edge_labels import refine_circle
@@ -33,6 +34,8 @@ _FLAT_NOISE = 2.5  # and in multiples of its noise: a ball bends more
 _BEFORE_M = 0.002  # what stands so far before the face hides it and says nothing of its edge
 _RING_SEEN = 0.6
 _LABELLED = 1.2  # pitches about an edge whose pixels place it; farther ones say nothing that nearer ones do not
+_LABEL_SECTORS = 24  # of a thinned scan's edge: each with points on both sides of it, or none of its points counts
+_BEYOND = 0.6  # share of the places beyond it that show something: with less, the outermost points place it better
 _DOMED = 0.8  # of its rms: a face whose inner half stands so far above or below its outer half is a ball or a dish
 _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
@@ -49,6 +52,7 @@ class _Window:
     slope: Array  # normal times ray
     face: Mask
     known: Mask
+    measured: Mask | None  # None: all that have a depth
 
 
 def measure_window(
@@ -59,10 +63,12 @@ def measure_window(
     standard: FlangeStandard,
     config: FlangeFitConfig,
     refusal: Refusal,
+    measured: Mask | None = None,
 ) -> Face | None:
     """Fit the face with an outer edge near ``center`` (3,) m and ``radius`` m in a part (h, w, 3) of a scan.
 
-    ``normal`` (3,) outward, within a few degrees. None with the reason noted where it fails a test of a flange.
+    ``normal`` (3,) outward, within a few degrees. ``measured`` (h, w) of a thinned scan with interpolated pixels: only
+    those that were measured place plane and edges. None with the reason noted where it fails a test of a flange.
     """
     z = np.ascontiguousarray(grid[..., 2], dtype=np.float64)
     valid = np.isfinite(z)
@@ -71,7 +77,8 @@ def measure_window(
         return None
     rays = _rays(grid, valid)
     try:
-        plane = _plane(grid, z, rays, center, normal, (standard.face_inner_radius_m + 0.0015, radius - 0.0015), config)
+        shown = grid if measured is None else np.where(measured[..., None], grid, np.nan)
+        plane = _plane(shown, z, rays, center, normal, (standard.face_inner_radius_m + 0.0015, radius - 0.0015), config)
     except PlaneFitError as e:
         refusal.note(1, str(e))
         return None
@@ -80,7 +87,7 @@ def measure_window(
         return None
     axes = np.column_stack(plane_axes(plane.normal))
     height = thickness(plane)
-    w = _window(z, valid, rays, plane, axes, height)
+    w = _window(z, valid, rays, plane, axes, height, measured)
     cx, cy = (center - plane.point) @ axes
     try:
         outer, bore, hidden, pitch = _edges(w, plane, axes, height, (float(cx), float(cy)), radius, standard)
@@ -130,7 +137,15 @@ def _noise(z: Array, rays: tuple[Array, Array], plane: PlaneFit) -> float:
     return float(np.median(bend)) * 1.4826 / np.sqrt(6.0) if len(bend) else 0.0
 
 
-def _window(z: Array, valid: Mask, rays: tuple[Array, Array], plane: PlaneFit, axes: Array, height: float) -> _Window:
+def _window(
+    z: Array,
+    valid: Mask,
+    rays: tuple[Array, Array],
+    plane: PlaneFit,
+    axes: Array,
+    height: float,
+    measured: Mask | None,
+) -> _Window:
     rx, ry = rays
     n, p = plane.normal, plane.point
     slope = n[0] * rx
@@ -140,13 +155,19 @@ def _window(z: Array, valid: Mask, rays: tuple[Array, Array], plane: PlaneFit, a
     x, y = (along * (a[0] * rx + a[1] * ry + a[2]) - float(a @ p) for a in axes.T)
     with np.errstate(invalid="ignore"):
         above = z * slope - float(n @ p)
+        if measured is not None:
+            # between measured pixels the nearest one decides: no slope from a face down to what lies beyond it
+            row, column = ndimage.distance_transform_edt(~measured, return_distances=False, return_indices=True)
+            above = np.where(valid, above[row, column], np.nan)
+            z = (above + float(n @ p)) / slope
         face = np.abs(above) < height
         hidden = above > max(3.0 * height, _BEFORE_M)
     gap = (~valid).view(np.uint8)
     void = cv2.morphologyEx(
         cv2.copyMakeBorder(gap, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=1), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
     )[2:-2, 2:-2]
-    return _Window(z=z, rays=rays, x=x, y=y, slope=slope, face=face, known=(valid | (void > 0)) & ~hidden)
+    known = (valid | (void > 0)) & ~hidden
+    return _Window(z=z, rays=rays, x=x, y=y, slope=slope, face=face, known=known, measured=measured)
 
 
 def _edges(
@@ -281,6 +302,19 @@ def _labelled(
     if hidden.any():
         seen = ~hidden[_sector(xy[:, 0] - start.center[0], xy[:, 1] - start.center[1], len(hidden))]
         at, xy = at[seen], xy[seen]
+    if w.measured is not None:
+        # an edge against nothing has a label on one side only, which would pull it
+        at, xy = (a[w.measured.ravel()[at]] for a in (at, xy))
+        on = w.face.ravel()[at]
+        sector = _sector(xy[:, 0] - start.center[0], xy[:, 1] - start.center[1], _LABEL_SECTORS)
+        both = (
+            np.bincount(sector[on], minlength=_LABEL_SECTORS) * np.bincount(sector[~on], minlength=_LABEL_SECTORS) > 0
+        )
+        beyond = (rho2 > (start.radius + pitch) ** 2) & (rho2 < (start.radius + 4.0 * pitch) ** 2)
+        known = float(np.isfinite(w.z[beyond]).mean()) if outer and beyond.any() else 1.0
+        if np.count_nonzero(both) < 0.5 * _LABEL_SECTORS or known < _BEYOND:
+            raise CircleFitError("Too few points lie on both sides of the edge.")
+        at, xy = at[both[sector]], xy[both[sector]]
     fit = refine_circle(xy, w.face.ravel()[at], start, pitch, outer=outer)
     # a part of a circle leans on each of its pixels: 1.5 to 2 times the variance in simulated half-hidden flanges
     return replace(fit, covariance=_SHARED / max(1.0 - float(hidden.mean()), 0.2) * fit.covariance)
@@ -310,11 +344,14 @@ def _face(
     count = int(np.count_nonzero(ring & w.face))
     on_ring = int(np.count_nonzero(ring & w.known))
     said = core & (w.known | np.isfinite(w.z))
+    spacing = pitch
+    if w.measured is not None:
+        spacing *= float(np.sqrt(count / max(np.count_nonzero(ring & w.face & w.measured), 1)))
     measured = Measured(
         plane=plane,
         outer=outer,
         bore=bore,
-        pitch=pitch,
+        pitch=spacing,
         coverage=_seen(w, outer, hidden, pitch),
         bore_coverage=0.0 if bore is None else _seen(w, bore, None, pitch),
         count=count,
@@ -330,6 +367,8 @@ def _face(
         refusal.note(6, "The ring found is domed: it is not the flange.")
         return None
     ring &= w.face
+    if w.measured is not None:
+        ring &= w.measured
     points = grid[ring]
     try:
         better = fit_plane(points, (plane.point, plane.normal), tolerance=2.0 * thickness(plane))

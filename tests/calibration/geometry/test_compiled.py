@@ -16,7 +16,7 @@ from weldcal.calibration.flange.holes import find_holes
 from weldcal.calibration.flange.track import borders, near_edge, ring_points
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.geometry.circle import circle_steps
-from weldcal.calibration.geometry.plane import plane_steps, weighted_moments
+from weldcal.calibration.geometry.plane import plane_steps
 from weldcal.calibration.geometry.robust import middle, solved
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
@@ -85,7 +85,7 @@ def test_the_machine_code_is_kept_for_the_next_process() -> None:
 
 
 def test_what_a_live_calibration_runs_is_compiled_before_it_runs() -> None:
-    loops = (circle_steps, weighted_moments, ring_points, plane_steps, borders, near_edge, border_likelihood)
+    loops = (circle_steps, ring_points, plane_steps, borders, near_edge, border_likelihood)
 
     def compiled() -> list[int]:
         return [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]

@@ -50,7 +50,7 @@ def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress
     def find(points: Array, guess: FlangeGuess | None = None) -> Callable[[], Array]:
         return lambda: fit_flange(points, standard, guess=guess).center_C
 
-    ours: list[tuple[str, Callable[[], Array], float]] = [(f"segmented cloud, {len(cloud)} points", find(cloud), 1.0)]
+    ours: list[tuple[str, Callable[[], Array], float]] = [(f"segmented cloud, {len(cloud)} points", find(cloud), 50.0)]
     for name, target in (("0.5", 20.0), ("3.2", 30.0)):
         points = frames[name].points_C
         ours.append((f"{name} Mpx frame", find(points), target))
