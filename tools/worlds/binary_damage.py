@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.io import savemat
 
-from weldcal.calibration.data.poses.matlab import matlab_arrays
+from weldcal.calibration.data.poses.storage import matlab_arrays
 from weldcal.tools.worlds.text_damage import Damage, Rng, any_text
 
 _HUGE = ("0", "-1", "59", "61", "100000000", "5000000000", "99999999999999999999", "1.5", "x", "")

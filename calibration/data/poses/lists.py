@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.poses.listing import Listing, listing_of_array, require_pose
-from weldcal.calibration.data.poses.matlab import matlab_arrays
 from weldcal.calibration.data.poses.names import last_key, natural, number_of, whose
-from weldcal.calibration.data.poses.storage import read_tree, tree_of_text
+from weldcal.calibration.data.poses.storage import matlab_arrays, read_tree, tree_of_text
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
 from weldcal.calibration.errors import DatasetError
@@ -218,6 +217,9 @@ def two_lists(
     Raises:
         DatasetError: a stated name is in none or several lists, or the names do not tell which list is whose.
     """
+    many = [one for one in lists if len(one) > 1]
+    if robot is None and camera is None and len(many) > 1:
+        lists = many  # a pose alone beside lists is a result
     known = ", ".join(repr(one.name) for one in lists[:8]) or "none"
     chosen: dict[str, Listing] = {}
     for who, key in (("robot", robot), ("camera", camera)):

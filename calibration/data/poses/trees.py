@@ -20,7 +20,7 @@ _PARTNERS = {
     "orientations": "positions", "orientation": "position", "r": "t", "q": "t",
 }  # fmt: skip
 _NO_POSES = re.compile(
-    r"(?i)^(q|joints?|joint_.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(camera|intrinsic|projection|rectif)\w*matrix|.*(coeffs?|distortion)|covariance.*)$"
+    r"(?i)^(q|joint.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(camera|intrinsic|projection|rectif)\w*matrix|.*(coeffs?|distortion)|covariance.*)$"
 )
 _VECTOR = re.compile(r"(?i)(rvec|rotvec|rotation_?vector|axis_?angle|rodrigues)")
 _QUATERNION = re.compile(r"(?i)(^q$|quat|rotation|^ori|wxyz|xyzw)")

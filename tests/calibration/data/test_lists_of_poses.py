@@ -14,7 +14,7 @@ from tests.calibration.data.pose_texts import TEXTS, TURN, N, P, Q, V, join
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import _orthonormal
 from weldcal.calibration.data.poses.lists import folder_lists, read_lists, two_lists
-from weldcal.calibration.data.poses.matlab import matlab_arrays
+from weldcal.calibration.data.poses.storage import matlab_arrays
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.errors import DatasetError
 
@@ -179,3 +179,17 @@ def test_damaged_matlab_files_are_refused_or_read() -> None:
         except DatasetError:
             refused += 1
     assert 200 < refused < 400
+
+
+def test_joint_angles_and_a_result_beside_the_lists_are_no_lists(tmp_path: Path) -> None:
+    X = np.tile(np.eye(4), (N, 1, 1))
+    X[:, :3, :3], X[:, :3, 3] = TURN.as_matrix(), P
+    pairs = [[a.tolist(), a.tolist()] for a in X]
+    log = {
+        "Result in Pose Format": [*P[1], *Q[1]],
+        "Joint Dataset": np.column_stack([V, P]).tolist(),
+        "Transform Dataset": pairs,
+    }
+    (tmp_path / "log.json").write_text(json.dumps(log))
+    robot, camera = two_lists(read_lists(tmp_path / "log.json"), "log.json")
+    assert (robot.name, camera.name) == tuple(f"log.json, Transform Dataset, {who}" for who in ("robot", "camera"))

@@ -134,7 +134,8 @@ def calibrate_edge(
     if feature and len(keep) and not keep.any():
         other = ", ".join(f"--feature {kind}" for kind in FEATURES if kind != feature)
         raise InputError(
-            f"None of the {len(keep)} profiles shows a {feature} with its near face on the {side}. Try --side {'right' if side == 'left' else 'left'}, or {other}."
+            f"None of the {len(keep)} profiles shows the feature {feature} with its near face on the {side}. "
+            f"Try --side {'right' if side == 'left' else 'left'}, or {other}."
         )
     check_number(poses, points.shape, "profile points [x, z]", (2,))
     poses, points = poses[keep], points[keep]
