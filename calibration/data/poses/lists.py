@@ -21,33 +21,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_bytes, read_text, require_few_lines
 
 TEXT = (
-    ".csv",
-    ".txt",
-    ".tsv",
-    ".script",
-    ".urscript",
-    ".dat",
-    ".src",
-    ".ls",
-    ".mod",
-    ".prg",
-    ".tum",
-    ".log",
-    ".asc",
-    ".urp",
-    ".sys",
-    ".jbi",
-    ".dtx",
-    ".as",
-    ".py",
-    ".m",
-    ".drl",
-    ".lua",
-    ".pnt",
-    ".pos",
-    ".jsonl",
-    ".out",
-)
+    ".csv", ".txt", ".tsv", ".script", ".urscript", ".dat", ".src", ".ls", ".mod", ".prg", ".tum", ".log", ".asc", ".urp", ".sys", ".jbi",
+    ".dtx", ".as", ".py", ".m", ".drl", ".lua", ".pnt", ".pos", ".jsonl", ".out",
+)  # fmt: skip
 TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib", ".rob")
 ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
 ENDINGS = (*TEXT, *TREES, *ARRAYS)

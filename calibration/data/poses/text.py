@@ -26,6 +26,22 @@ _COMMENT = ("#", "%", "//", "!", ";")
 _BEYOND = 1e300  # a number of so many digits that it has no value
 _COSINE = 1.1  # no element of a rotation matrix exceeds it
 _NANOSECONDS = 1e14  # a time above it is in nanoseconds
+_NUMBERED = ("q0 q1 q2 q3", "q1 q2 q3 q4")
+_ROTATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
+    *(
+        (names, {"rotation": "quaternion_wxyz", "form": "x, y, z, quaternion"})
+        for names in ("qw qx qy qz", "q0 qx qy qz")
+    ),
+    *((names, {"form": "x, y, z, quaternion"}) for names in _NUMBERED),
+    ("vx vy vz", {"rotation": "rotation_vector", "form": "x, y, z, rotation vector"}),
+    ("rx ry rz", {"form": "x, y, z, rx, ry, rz"}),
+    ("roll pitch yaw", {"usual": "euler_xyz", "vector": False, "form": "x, y, z, roll, pitch, yaw"}),
+    ("a b c", {"rotation": "euler_ZYX", "angles": "deg", "form": "x, y, z, KUKA A, B, C"}),
+    ("w p r", {"rotation": "euler_xyz", "angles": "deg", "form": "x, y, z, Fanuc W, P, R"}),
+    ("o a t", {"rotation": "euler_ZYZ", "angles": "deg", "form": "x, y, z, O, A, T"}),
+    ("e1 e2 e3", {"vector": False, "form": "x, y, z and three angles"}),
+)
+"""The columns of a rotation, and what they say of it, in the order in which they are sought."""
 
 
 def lists_of_text(text: str, name: str) -> list[Listing]:
@@ -354,53 +370,11 @@ def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...
     if not {"x", "y", "z"} <= set(at):
         raise DatasetError(f"'{name}' names no columns x, y, z; it has {', '.join(sorted(at))}.")
     p = take("x", "y", "z")
-    if {"qw", "qx", "qy", "qz"} <= set(at):
-        return listing_of(
-            name, p, take("qw", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more
-        )
-    if {"q0", "qx", "qy", "qz"} <= set(at):
-        return listing_of(
-            name, p, take("q0", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more
-        )
-    for numbered in (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")):
-        if set(numbered) <= set(at) and not {"rx", "ry", "rz"} <= set(at):
-            return listing_of(name, p, take(*numbered), form="x, y, z, quaternion", **more)
-    if {"vx", "vy", "vz"} <= set(at):
-        return listing_of(
-            name,
-            p,
-            take("vx", "vy", "vz"),
-            rotation="rotation_vector",
-            angles=angle,
-            form="x, y, z, rotation vector",
-            **more,
-        )
-    if {"rx", "ry", "rz"} <= set(at):
-        return listing_of(name, p, take("rx", "ry", "rz"), angles=angle, form="x, y, z, rx, ry, rz", **more)
-    if {"roll", "pitch", "yaw"} <= set(at):
-        return listing_of(
-            name,
-            p,
-            take("roll", "pitch", "yaw"),
-            angles=angle,
-            usual="euler_xyz",
-            vector=False,
-            form="x, y, z, roll, pitch, yaw",
-            **more,
-        )
-    for named, form, words in (
-        ("abc", "euler_ZYX", "KUKA A, B, C"),
-        ("wpr", "euler_xyz", "Fanuc W, P, R"),
-        ("oat", "euler_ZYZ", "O, A, T"),
-    ):
-        if set(named) <= set(at):
-            return listing_of(
-                name, p, take(*named), rotation=form, angles=angle or "deg", form=f"x, y, z, {words}", **more
-            )
-    if {"e1", "e2", "e3"} <= set(at):
-        return listing_of(
-            name, p, take("e1", "e2", "e3"), angles=angle, vector=False, form="x, y, z and three angles", **more
-        )
+    for words, stated in _ROTATIONS:
+        roles = words.split()
+        if set(roles) <= set(at) and not (words in _NUMBERED and {"rx", "ry", "rz"} <= set(at)):
+            angles = {} if roles[0].startswith("q") else {"angles": angle or stated.get("angles", "")}
+            return listing_of(name, p, take(*roles), **{**stated, **angles, **more})
     raise DatasetError(
         f"'{name}' has positions and no rotation that it names: add qw,qx,qy,qz, or rx,ry,rz, or roll,pitch,yaw. It names "
         f"{', '.join(sorted(at))}."

@@ -7,7 +7,7 @@ points of a scan share, is taken out by whitening with it rather than by unknown
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,16 +70,7 @@ class SphereData:
         keep = ~np.isin(np.arange(len(self.poses)), scans)
         q = None if self.q is None else self.q[keep]
         profiles = [p for p, kept in zip(self.profiles, keep, strict=True) if kept]
-        return SphereData(
-            poses=self.poses[keep],
-            profiles=profiles,
-            radius_m=self.radius_m,
-            touches=self.touches,
-            tip=self.tip,
-            arm=self.arm,
-            q=q,
-            touch_q=self.touch_q,
-        )
+        return replace(self, poses=self.poses[keep], profiles=profiles, q=q)
 
 
 def corrected(p: Floats, affine: Floats, origin: Floats) -> Floats:

@@ -144,17 +144,14 @@ def _crossings(profiles: Profiles, stamps: Array, scale: float, feature: str, si
     """Times (n,) s, points (n, 2) m at which the profiles cross the edge, and the number of profiles that do not show it."""
     kept, points, lost = [], [], 0
     for t, found in zip(stamps, profiles.points, strict=True):
-        profile = scale * found
+        at = scale * found
         try:
-            at = (
-                profile[0]
-                if len(profile) == 1
-                else extract_edge(profile, cast(Kind, feature), cast(Literal["left", "right"], side))[0]
-            )
+            if len(at) > 1:
+                at = extract_edge(at, cast(Kind, feature), cast(Literal["left", "right"], side))[0][None]
         except FeatureNotFound:
             lost += 1
             continue
         if np.isfinite(at).all() and np.isfinite(t):
             kept.append(float(t))
-            points.append(at)
+            points.append(at[0])
     return np.array(kept), np.array(points).reshape(-1, 2), lost
