@@ -55,12 +55,13 @@ def search_frame(
     near, pitch = max(pitches[0], down[0]), max(pitches[1], down[1])
     widest = [max(1, int(ring / (_ACROSS * p))) for p in (near, pitch, 2.0 * pitch)]
     # coarse first; where a part leaks over a shallow step at one scale or threshold, it ends there at another
-    scales = [(w, s) for s in _BEND_SIGMAS for w in sorted(set(widest), reverse=True)]
+    sizes = sorted(set(widest), reverse=True)
+    scales = [(w, s, False) for s in _BEND_SIGMAS for w in sizes] + [(w, _BEND_SIGMAS[0], True) for w in sizes]
     tried: list[tuple[Array, float]] = []
-    for wide, sigmas in scales:
+    for wide, sigmas, smooth in scales:
         best: Face | None = None
         step = (round(wide / along), round(wide / across))
-        for part in flat_parts(cloud[:: step[0], :: step[1]], standard, config, sigmas):
+        for part in flat_parts(cloud[:: step[0], :: step[1]], standard, config, sigmas, smooth):
             if any(
                 float(np.linalg.norm(part.center - c)) < 0.02 * standard.outer_m
                 and abs(part.radius - r) < 0.02 * standard.outer_m
@@ -89,7 +90,7 @@ def search_frame(
 
 def typical_pitches(cloud: Array) -> tuple[float, float] | None:
     """Distances (m) between neighbouring pixels on the nearest things and on nearer than middling ones; None where no two
-    neighbours were measured. Quantiles (5 and 25 %) over a few thousand of them."""
+    neighbours were measured. Quantiles (1 and 25 %) over a few thousand of them."""
     step = max(1, int(np.sqrt(cloud.shape[0] * cloud.shape[1] / 4000.0)))
     a, b = cloud[:-1:step, :-1:step], cloud[:-1:step, 1::step]
     h, w = min(a.shape[0], b.shape[0]), min(a.shape[1], b.shape[1])
@@ -97,7 +98,7 @@ def typical_pitches(cloud: Array) -> tuple[float, float] | None:
     d = d[np.isfinite(d) & (d > 0.0)]
     if len(d) < 5:
         return None
-    near, middle = np.quantile(d, [0.05, 0.25])
+    near, middle = np.quantile(d, [0.01, 0.25])
     return float(near), float(middle)
 
 
@@ -118,7 +119,11 @@ def window_about(cloud: Array, center: Array, radius: float, step: int | tuple[i
 
 
 def flat_parts(
-    grid: Array, standard: FlangeStandard, config: FlangeFitConfig, sigmas: float = _BEND_SIGMAS[0]
+    grid: Array,
+    standard: FlangeStandard,
+    config: FlangeFitConfig,
+    sigmas: float = _BEND_SIGMAS[0],
+    smooth: bool = False,
 ) -> Iterator[Part]:
     """Connected flat parts of a thinned scan (h, w, 3) whose size and outline could be the flange's, most likely first.
 
@@ -128,6 +133,8 @@ def flat_parts(
     z = np.ascontiguousarray(grid[..., 2], dtype=np.float32)
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.float32(1.0) / z
+        if smooth:  # noise hides the crease between a face and the wall below it
+            inverse = cv2.blur(inverse, (3, 3))
         bend_u = np.abs(inverse[1:-1, 2:] + inverse[1:-1, :-2] - 2.0 * inverse[1:-1, 1:-1])
         bend_v = np.abs(inverse[2:, 1:-1] + inverse[:-2, 1:-1] - 2.0 * inverse[1:-1, 1:-1])
         bend = np.maximum(bend_u, bend_v)

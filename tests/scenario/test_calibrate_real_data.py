@@ -32,12 +32,12 @@ pytestmark = needs(DATA)
 
 @pytest.fixture(scope="module")
 def aubo(tmp_path_factory: pytest.TempPathFactory) -> CalibrationReport:
-    return calibrate_dataset(AUBO, tmp_path_factory.mktemp("aubo") / "out", centres=True)
+    return calibrate_dataset(AUBO, tmp_path_factory.mktemp("aubo") / "out", centres=True, compare=True)
 
 
 @pytest.fixture(scope="module")
 def ur10e(tmp_path_factory: pytest.TempPathFactory) -> CalibrationReport:
-    return calibrate_dataset(UR10E, tmp_path_factory.mktemp("ur10e") / "out")
+    return calibrate_dataset(UR10E, tmp_path_factory.mktemp("ur10e") / "out", compare=True)
 
 
 def test_every_aubo_cloud_is_used_and_held_out_errors_beat_the_paper(aubo: CalibrationReport) -> None:

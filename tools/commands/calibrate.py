@@ -119,22 +119,27 @@ def calibrate(
             "Known rotation of the hole pattern about the flange axis; one to three scans are then enough.",
         ),
     ] = None,
+    compare: Annotated[
+        bool, switch("--compare", "Of a dataset: also run the published method (Algorithm 1, ICP) on the same scans.")
+    ] = False,
     limit_mm: LimitOption = None,
 ) -> Outcome | Mapping[str, object] | None:
     """Calibrate a scanner from a folder of flange scans and robot poses, or live in a scenario."""
     if (dataset is None) == (scenario is None):
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
     if scenario is not None:
-        if poses is not None or refine is not None or kinematics is not None:
-            raise typer.BadParameter("--poses, --refine and --kinematics are for a dataset; omit them with --scenario")
+        if poses is not None or refine is not None or kinematics is not None or compare:
+            raise typer.BadParameter(
+                "--poses, --refine, --kinematics and --compare are for a dataset; omit them with --scenario"
+            )
         if limit_mm is not None:
             raise typer.BadParameter("--limit-mm is for a dataset; a scenario states calibration.required_error_mm")
         return other_command("calibrate-live").body(call, scenario, robot=robot)
     assert dataset is not None
     if is_motion(dataset):
-        if poses is not None or axis_turn is not None or refine is not None:
+        if poses is not None or axis_turn is not None or refine is not None or compare:
             raise typer.BadParameter(
-                "--poses, --refine and --axis-turn are for scans at rest; omit them with a recording in motion"
+                "--poses, --refine, --axis-turn and --compare are for scans at rest; omit them with a recording in motion"
             )
         moving = other_command("calibrate-motion").body
         return moving(call, dataset, robot=robot, flange=flange, centres=centres, limit_mm=limit_mm)
@@ -151,6 +156,7 @@ def calibrate(
         poses=poses,
         refine=refine,
         kinematics=kinematics,
+        compare=compare,
         limit_mm=limit_mm,
     )
     rows = {} if report.algorithm1 is None else {"Algorithm 1": report.algorithm1.sentence}
@@ -178,6 +184,7 @@ def calibrate_dataset(
     poses: str | None = None,
     refine: str | None = None,
     kinematics: Path | None = None,
+    compare: bool = False,
     limit_mm: float | None = None,
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
@@ -187,8 +194,8 @@ def calibrate_dataset(
     flange axis; with it, one to three scans that show the holes are enough. ``poses`` ("FROM:TO", ids, either may be left
     out) takes the scans from one id to another, in the order of the dataset. ``refine``: "local" adds a field of what the calibration
     leaves, "joints" or "links" errors of the arm (beyond its factory calibration ``kinematics``), each applied where nested held-out
-    errors fall. A cloud that cannot be used is refused and
-    reported, as long as enough remain. Where five scans or more contradict each other only
+    errors fall. ``compare`` runs the published method on the
+    same scans, for the report. A cloud that cannot be used is refused and reported, as long as enough remain. Where five scans or more contradict each other only
     observations.csv is written, for `weldcal doctor`. ``limit_mm`` is the error, at 95 %, that the job allows.
 
     Raises:
@@ -264,8 +271,11 @@ def calibrate_dataset(
         if len(inliers) >= 6
         else np.full((1, 1), np.nan)
     )
-    tell("Algorithm 1 for comparison", 0.8)
-    algorithm1, verifier, icp = compare_algorithm1(observations, inliers, clouds, fits, standard, seed)
+    if compare:
+        tell("Algorithm 1 for comparison", 0.8)
+    algorithm1, verifier, icp = compare_algorithm1(
+        observations, inliers if compare else [], clouds, fits, standard, seed
+    )
     curve = convergence(inliers, verifier, orders=8, seed=seed)
     warnings = [*tcp, *estimate.warnings]
     if data.pairs and not any(p.has_orientation for p in data.pairs):
