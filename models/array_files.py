@@ -16,6 +16,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_IMAGE, MOST_ARRAYS, MOST_PIXELS, expansion_limit, opened, read_bytes
 
 _PNG = b"\x89PNG\r\n\x1a\n"
+_DEFLATED = 8 * 1032  # pixels of one bit in a byte of a PNG: deflate expands by 1032 at most
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG's markers that are followed by a height and width
 
@@ -54,6 +55,10 @@ def _decoded(path: Path, *, grey: bool) -> NDArray[Any]:
     if width * height > MOST_PIXELS:
         raise InputError(
             f"'{path.name}' has {width} by {height} pixels, more than {MOST_PIXELS}, the most that are read."
+        )
+    if content.startswith(_PNG) and width * height > _DEFLATED * len(content):
+        raise InputError(
+            f"'{path.name}' promises {width} by {height} pixels, more than {len(content)} bytes can hold. Save it again."
         )
     flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_UNCHANGED
     try:

@@ -1,5 +1,6 @@
 """Reads dataset.yaml and checks the tables of a dataset: rows, numbers, quaternions, units, clouds that repeat."""
 
+import math
 from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
@@ -36,6 +37,10 @@ REACH_M = (0.01, 10.0)
 def read_header(path: Path) -> DatasetHeader:
     """Contents of a dataset.yaml, checked. Raises DatasetError, one sentence that names the key."""
     if not path.exists():
+        if path.is_symlink():
+            raise DatasetError(
+                f"'{path.parent.name}' has a dataset.yaml that is a link to no file; replace or remove the link."
+            )
         raise DatasetError(
             f"'{path.parent.name}' has no dataset.yaml; add one with schema, robot, flange, scanner, configuration "
             "and units."
@@ -236,7 +241,7 @@ def row_numbers(row: dict[str, str], columns: tuple[str, ...], path: Path) -> li
 
 def unit_quaternion(wxyz: list[float], where: str) -> RotationMatrix:
     """The rotation of a unit quaternion (4,), wxyz. Raises DatasetError naming ``where``."""
-    norm = float(np.linalg.norm(wxyz))
+    norm = math.hypot(*wxyz)
     if not abs(norm - 1.0) < 1e-3:
         raise DatasetError(
             f"The quaternion of '{where}' has the length {norm:.4f}; a rotation needs length 1 (order qw, qx, qy, qz)."

@@ -147,7 +147,7 @@ def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
         )
     require_whole(folder)
     description = folder / "dataset.yaml"
-    bare = folder.is_file() or not description.exists()
+    bare = folder.is_file() or not (description.exists() or description.is_symlink())
     source = None if folder.is_file() else find_poses(folder)
     bag = find_bag(folder) if source is None else None
     if bare and (source is not None or bag is not None) and not (folder / "pairs.csv").exists():

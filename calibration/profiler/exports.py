@@ -31,7 +31,9 @@ _Z = re.compile(rf"(?i){_POINT_PREFIX}[_. ]?z")
 _SCAN = re.compile(
     r"(?i)(scan|profile?|frame|shot|measurement|messung|bild)([_. ]?(no|nr|num|number|id|index|count|counter)\.?)?|idx"
 )
-_TIME = re.compile(r"(?i)(time|timestamp|stamp|zeit|t)")
+_TIME = re.compile(r"(?i)(time|time_?stamp|stamp|zeit|zeitstempel|t)(?:[ _.]*[\[(]?(s|sec|ms|µs|μs|us|ns)[\])]?)?")
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Seconds of the units of time that an export may state."""
 _NUMBERED = re.compile(r"(?i)(profile?|z|height|h|scan|head [a-z])?[ _.]*\d+|profile?|height")
 _UNIT = re.compile(r"(.*?)[ _.]*(?<![a-zµμ])[\[(]?(m|mm|cm|µm|μm|um|inch)[\])]?")
 _KEYS = re.compile(r"(?i)(scan_?line|profiles?|points?|line|xz|data)")
@@ -53,7 +55,7 @@ class Profiles:
         form: a phrase for the reader.
         columns: the names of the columns that the file has, for messages.
         ids: a name for each profile, or empty.
-        times: a time for each profile (n) s, or None.
+        times: a time for each profile (n), or None; time_unit: its unit of SECONDS where the file states it, else empty.
         poses: the poses of the same table, one for each profile, or None.
         single: whether each profile is one point of a table without a number of the scan.
     """
@@ -65,6 +67,7 @@ class Profiles:
     columns: tuple[str, ...] = ()
     ids: tuple[str, ...] = ()
     times: Floats | None = None
+    time_unit: str = ""
     poses: Listing | None = None
     single: bool = False
 
@@ -130,7 +133,8 @@ def _with_header(blocks: list[Block], name: str) -> Profiles:
             f"The columns {header[ix]} and {header[iz]} of '{name}' state units that differ; give one unit."
         )
     scan = next((k for k, (h, _) in enumerate(plain) if k not in place and _SCAN.fullmatch(h)), None)
-    time = next((k for k, (h, _) in enumerate(plain) if k not in place and _TIME.fullmatch(h)), None)
+    clocks = {k: found for k, h in enumerate(header) if k not in place and (found := _TIME.fullmatch(h.strip()))}
+    time = next(iter(clocks), None)
     table = np.vstack([b.table for b in blocks])
     rest = [k for k in range(len(header)) if k not in (ix, iz, scan)]
     posed = _has_poses([header[k] for k in rest])
@@ -142,12 +146,15 @@ def _with_header(blocks: list[Block], name: str) -> Profiles:
         of = _numbered(table[:, scan])
     elif posed:
         of = _runs(table[:, [k for k in rest if k != time]])
+    elif time is not None:
+        table = table[np.isfinite(table[:, time])]
+        of = _numbered(table[:, time])
     else:
         of = np.zeros(len(table), int)
     if not len(table):
         raise InputError(f"'{name}' has a header and no row of numbers.")
     n = int(of.max()) + 1
-    first = np.array([np.flatnonzero(of == k)[0] for k in range(n)]) if n < len(table) else np.arange(n)
+    first = np.unique(of, return_index=True)[1]
     points = _without_empty(table[:, [ix, iz]])
     split = np.split(points[np.argsort(of, kind="stable")], np.cumsum(np.bincount(of, minlength=n))[:-1])
     ids = tuple(f"{table[k, scan]:.0f}" for k in first) if scan is not None else _captions(blocks)
@@ -159,7 +166,8 @@ def _with_header(blocks: list[Block], name: str) -> Profiles:
         )
     return Profiles(
         source=name, points=tuple(split), unit=unit, form="one row a point" if n == len(table) else f"{n} profiles, one row a point",
-        columns=header, ids=ids, times=None if time is None else table[first, time], poses=poses, single=scan is None and n == len(table) > 1,
+        columns=header, ids=ids, times=None if time is None else table[first, time], poses=poses,
+        time_unit=re.sub("[µμ]", "u", clocks[time][2] or "").lower().replace("sec", "s") if time is not None else "", single=scan is None and n == len(table) > 1,
     )  # fmt: skip
 
 
@@ -231,10 +239,10 @@ def _without_empty(points: Floats) -> Floats:
 
 
 def _empty(z: Floats) -> np.ndarray[Any, Any]:
-    """Heights that mean that nothing was measured: -99.9999 ... -99999.9999, and -2147483648 and its neighbours in raw integers."""
+    """Heights that mean that nothing was measured: -99.9999 ... -99999.9999, -10000, -100000, and -2147483648 and its neighbours in raw integers."""
     marks = np.zeros(z.shape, bool)
     for power in (2, 3, 4, 5):
-        mark = (z > -(10.0**power)) & (z <= -(10.0**power) + 2.5e-3)
+        mark = (z > -(10.0**power)) & (z <= -(10.0**power) + 2.5e-3) | ((power > 3) & (z == -(10.0**power)))
         marks |= mark
     return marks | (z < -2.1e9)
 
@@ -406,7 +414,9 @@ def joined(parts: list[Profiles], name: str) -> Profiles:
         raise InputError(
             f"The files of '{name}' state different units ({', '.join(sorted(u or 'none' for u in units))}); give one."
         )
+    times = [p.times for p in parts if p.times is not None]
     return replace(
-        parts[0], source=name, points=tuple(p.points[0] for p in parts), ids=tuple(Path(p.source).stem for p in parts), times=None, poses=None,
+        parts[0], source=name, points=tuple(p.points[0] for p in parts), ids=tuple(Path(p.source).stem for p in parts), poses=None,
+        times=np.concatenate(times) if len(times) == len(parts) else None,
         form=f"one file per profile, {parts[0].form}", single=False,
     )  # fmt: skip

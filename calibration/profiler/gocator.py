@@ -3,6 +3,7 @@
 import csv
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -58,13 +59,11 @@ def _sections(text: str, name: str) -> dict[str, list[list[str]]]:
     try:
         for row in csv.reader(re.split(r"\r\n|\n|\r", text.lstrip("\ufeff"))):
             row = [c.strip() for c in row]
-            while row and row[-1] == "":
-                row.pop()
-            if not row:
+            if not any(row):
                 continue
             if rows is None:
                 rows = found.setdefault(row[0], [])
-            elif len(row) == 1 and row[0].lower() == "end":
+            elif row[0].lower() == "end" and not any(row[1:]):
                 rows = None
             else:
                 rows.append(row)
@@ -76,11 +75,16 @@ def _sections(text: str, name: str) -> dict[str, list[list[str]]]:
     return found
 
 
+def _short(row: list[str]) -> list[str]:
+    """The row without empty cells at its end."""
+    return row[: max((k + 1 for k, c in enumerate(row) if c), default=0)]
+
+
 def _data(rows: list[list[str]], first: str) -> tuple[list[str], list[list[str]]]:
     """The header that begins with a word, and the rows below it."""
     for k, row in enumerate(rows):
         if row[0].lower() == first and "axis" in (c.lower() for c in row):
-            return row, rows[k + 1 :]
+            return _short(row), rows[k + 1 :]
     return [], []
 
 
@@ -93,17 +97,26 @@ def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
         )
     axis = lower.index("axis")
     last = len(header) - axis - 1
+    count = _column_count(rows)
+    if section.lower() == "profile" and count not in (None, last):
+        raise InputError(
+            f"The section {section} of '{name}' states {count} columns and names {last}: a decimal comma in its header, or a lost column. Export it "
+            "again with decimal points."
+        )
+    even = len({len(row) for row in data}) == 1  # rows that all end with a comma
     place = {word: lower.index(word) for word in ("source", "time") if word in lower}
     frames: dict[str, dict[str, list[str]]] = {}
     order: list[str] = []
     for row in data:
+        size = len(row)
+        row = _short(row)
         if len(row) <= axis:
             raise InputError(
                 f"A row of the section {section} of '{name}' ends before its column Axis: the file is cut off there."
             )
-        if len(row) > len(header):
+        if len(row) > len(header) or (size > len(header) and not even):
             raise InputError(
-                f"A row of the section {section} of '{name}' has {len(row)} cells, and its header {len(header)}; export it again."
+                f"A row of the section {section} of '{name}' has {size} cells, and its header {len(header)}; export it again."
             )
         frame = row[0]
         if frame not in frames:
@@ -137,8 +150,18 @@ def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
     )
 
 
+def _column_count(rows: list[list[str]]) -> int | None:
+    """The number of columns that a section states."""
+    for head, values in pairwise(rows):
+        stated = dict(zip((c.lower() for c in head), values, strict=False)).get("column count")
+        if stated is not None:
+            return int(stated) if stated.isdecimal() else None
+    return None
+
+
 def _surface(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
     """A surface of one frame: x in the first row, y in the first column, heights within."""
+    rows = [_short(row) for row in rows]
     widest = max((len(r) for r in rows), default=0)
     begin = next((k for k, r in enumerate(rows) if len(r) == widest and k > 1 and number_in(r[-1]) is not None), None)
     if begin is None or widest < 6 or len(rows) < begin + 2:

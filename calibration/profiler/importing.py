@@ -9,7 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.lists import ENDINGS, read_lists
+from weldcal.calibration.data.poses.lists import ENDINGS, lists_of_file, read_lists
 from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.data.poses.source import robot_list
@@ -61,7 +61,7 @@ def import_profiles(
         InputError: no profiles, no poses, or different numbers of both; the sentence names what was found.
     """
     try:
-        found, beside = _profiles(path, pitch_mm)
+        found, beside = profiles_of(path, pitch_mm)
     except InputError as problem:
         only = None if path.is_dir() or pitch_mm is not None else _poses_only(path)
         if only is None:
@@ -78,7 +78,7 @@ def import_profiles(
     if not len(rows):
         raise InputError(f"'{listing.name}' holds no pose for any of the {len(found)} profiles of '{found.source}'.")
     readings, words = _metric_poses(listing, rows, unit)
-    length = _profile_unit(found, unit)
+    length = profile_unit(found, unit)
     profiles = tuple(UNITS[length] * found.points[k] for k in kept)
     reading: dict[str, dict[str, object]] = {
         "profiles": {
@@ -104,7 +104,7 @@ def _poses_only(path: Path) -> Listing | None:
         return None
 
 
-def _profiles(path: Path, pitch_mm: float | None) -> tuple[Profiles, list[Path]]:
+def profiles_of(path: Path, pitch_mm: float | None = None) -> tuple[Profiles, list[Path]]:
     """The profiles of a file or folder, and the files that may hold the poses."""
     if not path.is_dir():
         return read_profiles(path, pitch_mm), _beside(path)
@@ -120,7 +120,7 @@ def _profiles(path: Path, pitch_mm: float | None) -> tuple[Profiles, list[Path]]
     files = [p for p in files if p not in set(poses) and p.suffix.lower() in (*TABLES, *TREES)]
     groups: dict[tuple[Path, str, str], list[Path]] = {}
     for p in files:
-        stem = re.sub(r"\d+", "", p.stem) if number_of(p.stem) is not None else p.stem
+        stem = re.sub(r" ?\(\d+\)$|\d+", "", p.stem)  # copies are "a.txt", "a (1).txt"
         groups.setdefault((p.parent, stem, p.suffix.lower()), []).append(p)
     if not groups:
         names = ", ".join(p.name for p in poses[:4]) or "no table"
@@ -137,7 +137,7 @@ def _profiles(path: Path, pitch_mm: float | None) -> tuple[Profiles, list[Path]]
                 continue
     if len(chosen) == 1:
         return read_profiles(chosen[0], pitch_mm), poses or rest
-    parts = [read_profiles(p, pitch_mm) for p in chosen]
+    parts = [_as_one(read_profiles(p, pitch_mm)) for p in chosen]
     many = next((p for p in parts if len(p) != 1), None)
     if many is not None:
         raise InputError(
@@ -148,6 +148,13 @@ def _profiles(path: Path, pitch_mm: float | None) -> tuple[Profiles, list[Path]]
     if len(lists) == len(parts):
         whole = replace(whole, poses=stacked([replace(one, ids=()) for one in lists], path.name, whole.ids))
     return whole, poses or rest
+
+
+def _as_one(found: Profiles) -> Profiles:
+    """The rows of one file, each with a time of its own, as one profile at the first time."""
+    if not found.single or found.times is None or found.poses is not None:
+        return found
+    return replace(found, points=(np.vstack(found.points),), ids=(), times=found.times[:1], single=False)
 
 
 def _is_pose_name(path: Path, folder: Path) -> bool:
@@ -195,7 +202,11 @@ def _poses(path: Path, found: Profiles, beside: Sequence[Path], stated: Path | N
                 f"{', '.join(p.name for p, _ in fitting)} each hold {len(found)} poses; name the file of the flange's with --poses FILE."
             )
     elif single:
-        return _listing(single, path.name)
+        try:
+            return _listing(single, path.name)
+        except InputError:
+            if any(_POSE_NAME.search(p.stem) or _POSE_NAME.search(p.parent.name) for p in single):
+                raise
     raise InputError(_no_poses(found))
 
 
@@ -212,8 +223,8 @@ def _no_poses(found: Profiles) -> str:
 
 def _listing(files: Sequence[Path], name: str) -> Listing:
     if len(files) == 1:
-        return robot_list(_lists(files[0]), files[0].name, PoseForm())
-    lists = [_lists(p) for p in files]
+        return robot_list(_lists(read_lists(files[0]), files[0]), files[0].name, PoseForm())
+    lists = [_lists(lists_of_file(p), p) for p in files]
     many = next((p for p, found in zip(files, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
     if many is not None:
         raise InputError(
@@ -224,8 +235,7 @@ def _listing(files: Sequence[Path], name: str) -> Listing:
     )
 
 
-def _lists(path: Path) -> list[Listing]:
-    lists = read_lists(path)
+def _lists(lists: list[Listing], path: Path) -> list[Listing]:
     if not lists:
         raise InputError(
             f"'{path.name}' holds no poses. Give a row for each profile, such as x_mm,y_mm,z_mm,qw,qx,qy,qz."
@@ -276,7 +286,7 @@ def _metric_poses(
     return tuple(metric), words
 
 
-def _profile_unit(found: Profiles, unit: str | None) -> str:
+def profile_unit(found: Profiles, unit: str | None) -> str:
     if found.unit:
         return found.unit
     if unit is not None:

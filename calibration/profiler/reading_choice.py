@@ -8,9 +8,11 @@ import numpy as np
 from weldcal.calibration.data.poses.readings import PoseReading
 from weldcal.calibration.errors import InconsistentData
 from weldcal.calibration.geometry.robust import f_quantile
-from weldcal.calibration.profiler.edge.joint import edge_joint
+from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.profiler.edge.joint import edge_optima
+from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.calibration.profiler.sphere.joint import sphere_joint
+from weldcal.calibration.profiler.sphere.joint import sphere_optima
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import WeldcalError
 
@@ -18,8 +20,7 @@ CHANCE = 1e-6
 """Chance that the right reading is rejected in favour of a wrong one."""
 _KEPT = 0.7  # share of the scans that must agree: the others may be outliers
 _FLOOR_M = 2e-6  # printed digits
-_WIDE_M = 0.5e-3  # sigmas with which readings are measured that the usual ones refuse
-_SIGMAS_M = (0.06e-3, _WIDE_M)
+_SIGMAS_M = (0.06e-3, 0.5e-3)  # of the robust loss of an edge, by which readings are compared
 _LARGEST_M = 1e-3  # residual of a reading that may be used
 _POINTS = 16  # points of a profile of the sphere that are compared
 _SAME_M, _SAME_RAD = 0.1e-3, 1e-3
@@ -67,7 +68,8 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
 
     Args:
         readings: the candidates, the usual one first.
-        fit: solves for the profiler's pose with the poses of a reading; raises WeldcalError where it refuses.
+        fit: solves for the profiler's pose with the poses of a reading. It also fits a motion that leaves a direction open: such a
+            motion is no evidence against a reading. It raises WeldcalError for poses that cannot be fitted at all.
         what: the target, for messages: sphere or edge.
 
     Raises:
@@ -131,15 +133,14 @@ def sphere_fit(profiles: Sequence[Floats], radius_m: float) -> Fit:
 
     def fit(poses: FlangePoses) -> ReadingFit:
         data = SphereData(poses=poses, profiles=thin, radius_m=radius_m)
-        try:
-            e = sphere_joint(data, "rigid")
-        except InconsistentData:
-            e = sphere_joint(data, "rigid", SphereSigmas(sensor_m=_WIDE_M, robot_m=_WIDE_M))
+        R, found = sphere_optima(data, SphereSigmas())[0]
+        R, p_FS, centre = exp_rotation(found.x[:3]) @ R, found.x[3:6], found.x[6:9]
         square = []
         for k, p in enumerate(thin):
-            at = e.points_F(p) @ poses.rotation[k].T + poses.translation[k]
-            square.append(float(np.mean((np.linalg.norm(at - e.center, axis=1) - radius_m) ** 2)))
-        return ReadingFit(np.array(square), 3, 9, e.rotation, e.translation)
+            p_F = np.column_stack([p[:, 0], np.zeros(len(p)), p[:, 1]]) @ R.T + p_FS
+            at = p_F @ poses.rotation[k].T + poses.translation[k]
+            square.append(float(np.mean((np.linalg.norm(at - centre, axis=1) - radius_m) ** 2)))
+        return ReadingFit(np.array(square), 3, 9, R, p_FS)
 
     return fit
 
@@ -148,19 +149,15 @@ def edge_fit(points: Floats) -> Fit:
     """The comparison of readings by points (n, 2) m of one edge, one for each pose."""
 
     def fit(poses: FlangePoses) -> ReadingFit:
-        for sigma in _SIGMAS_M:
-            try:
-                e = edge_joint(
-                    poses.rotation, poses.translation, points, sigma_robot_m=sigma, sigma_xz_m=np.full(2, sigma)
-                )
-                break
-            except InconsistentData:
-                if sigma == _SIGMAS_M[-1]:
-                    raise
-        p_S = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
-        p_F = p_S @ e.rotation.T + e.translation
-        away = np.einsum("nij,nj->ni", poses.rotation, p_F) + poses.translation - e.point
-        away -= np.outer(away @ e.direction, e.direction)
-        return ReadingFit((away**2).sum(axis=1), 2, 10, e.rotation, e.translation)
+        fits = [_of_edge(edge_optima(poses, points, s, np.full(2, s))[0][0], poses, points) for s in _SIGMAS_M]
+        return min(fits, key=lambda one: one.rms_m)
 
     return fit
+
+
+def _of_edge(e: EdgeState, poses: FlangePoses, points: Floats) -> ReadingFit:
+    p_S = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
+    p_F = p_S @ e.rotation.T + e.translation
+    away = np.einsum("nij,nj->ni", poses.rotation, p_F) + poses.translation - e.point
+    away -= np.outer(away @ e.direction, e.direction)
+    return ReadingFit((away**2).sum(axis=1), 2, 10, e.rotation, e.translation)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,28 +54,14 @@ class ProfilerRecord:
         method: str, e: ProfilerEstimate, figures: dict[str, Any], data_sha256: str, arm: DhArm | None = None
     ) -> ProfilerRecord:
         """Of an edge's or a sphere's estimate; arm, as it is drawn, only where its joints were corrected."""
+        plain = ProfilerRecord(
+            method=method, rotation=e.rotation, translation=e.translation, covariance=e.covariance, figures=figures, data_sha256=data_sha256
+        )  # fmt: skip
         if not isinstance(e, SphereEstimate):
-            return ProfilerRecord(
-                method=method,
-                rotation=e.rotation,
-                translation=e.translation,
-                covariance=e.covariance,
-                figures=figures,
-                data_sha256=data_sha256,
-            )
-        return ProfilerRecord(
-            method=method,
-            rotation=e.rotation,
-            translation=e.translation,
-            covariance=e.covariance,
-            affine=e.affine,
-            origin=e.origin,
-            tip=e.tip,
-            arm=None if arm is None else arm.changed(e.arm_errors.table),
-            offsets=e.arm_errors.offsets,
-            sag=e.arm_errors.sag,
-            figures=figures,
-            data_sha256=data_sha256,
+            return plain
+        table, errors = None if arm is None else arm.changed(e.arm_errors.table), e.arm_errors
+        return replace(
+            plain, affine=e.affine, origin=e.origin, tip=e.tip, arm=table, offsets=errors.offsets, sag=errors.sag
         )
 
     def points_F(self, points: Floats) -> Floats:

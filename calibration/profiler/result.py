@@ -24,6 +24,8 @@ class ProfilerEstimate:
         inliers: (n,) bool; rms_m: of the inliers' residuals; reduced_chi2: of the whitened ones, 1 where the stated
             sigmas are right.
         condition: least over largest singular value of the Jacobian with columns of unit length.
+        scans_chi2: reduced chi-square of what the points of a scan share, such as the robot's error: many points that agree within each
+            scan must not hide few scans that disagree.
     """
 
     rotation: Floats
@@ -34,6 +36,7 @@ class ProfilerEstimate:
     rms_m: float
     reduced_chi2: float
     condition: float
+    scans_chi2: float = 1.0
 
     @property
     def X_FS(self) -> RigidTransform:
@@ -53,13 +56,14 @@ def worst_direction(normal_matrix: Floats) -> str:
 
 
 def believed_covariance(estimate: ProfilerEstimate) -> Floats:
-    """Covariance (6, 6) of an estimate, scaled by the reduced chi-square where the residuals exceed the stated sigmas.
+    """Covariance (6, 6) of an estimate, scaled by the larger reduced chi-square where the residuals exceed the stated sigmas.
 
     Raises:
         DegenerateMotion: a direction is so open that this is no calibration, though the motion is not quite degenerate.
     """
-    chi2 = estimate.reduced_chi2
-    covariance = np.asarray(estimate.covariance * max(1.0, chi2 if np.isfinite(chi2) else 1.0))
+    covariance = np.asarray(
+        estimate.covariance * max(1.0, *np.nan_to_num([estimate.reduced_chi2, estimate.scans_chi2], posinf=1.0))
+    )
     unit = np.diag([LEVER_M] * 3 + [1.0] * 3)
     sigma = float(np.sqrt(np.linalg.eigvalsh(unit @ covariance @ unit)[-1]))
     if sigma > VAGUE_M:

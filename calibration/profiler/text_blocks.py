@@ -49,10 +49,16 @@ def separator_of(lines: list[str]) -> str:
 def cells_of(line: str, separator: str) -> list[str]:
     """The cells of a line, stripped, with decimal points."""
     plain = re.sub(r"\s+([\[(])", r"\1", line).split() if separator == " " else line.split(separator)
+    if separator not in line and len(words := line.split()) > 1 and all(map(_is_number, words)):
+        plain = words  # blanks in one line of a table with another mark
     cells = [c.strip().strip("\"'") for c in plain]
     if separator != ",":
         cells = [c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c) else c for c in cells]
     return cells
+
+
+def _is_number(word: str) -> bool:
+    return re.fullmatch(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?", word) is not None
 
 
 def number_in(cell: str) -> float | None:
@@ -75,6 +81,7 @@ def blocks_of(text: str, name: str) -> list[Block]:
     header: tuple[str, ...] = ()
     caption = ""
     rows: list[list[float]] = []
+    worded: set[int] = set()  # columns that hold words in the first row
     first = total = wide = 0
 
     def close() -> None:
@@ -114,6 +121,9 @@ def blocks_of(text: str, name: str) -> list[Block]:
         ):
             if not rows:
                 first, wide = number, size
+                worded = {k for k, v in enumerate(values) if v is None}
+            elif any(k in worded and v is not None and np.isfinite(v) for k, v in enumerate(values)):
+                raise InputError(f"'{name}', line {first}, holds words where numbers are needed; correct it.")
             if not header and size != wide:
                 raise InputError(f"'{name}', line {number}: {size} cells, and {wide} in the rows before it.")
             if rows and any(v is None and k < len(rows[0]) and np.isfinite(rows[0][k]) for k, v in enumerate(values)):

@@ -1,6 +1,7 @@
 """`weldcal profiler clock`: the offset from profiles of an edge, crossings or raw; what is missing is named."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -91,3 +92,86 @@ def test_missing_profiles_are_named(folder: Path) -> None:
     found = CliRunner().invoke(app, words)
     assert found.exit_code == 1
     assert "profiles.csv" in found.stderr
+
+
+def raw() -> tuple[Array, Array, Array]:
+    """Stamps (n,) s, x (n, m) and z (n, m) mm of raw profiles of a step at the crossings."""
+    t, points = crossings()
+    t, points = t[::3] + OFFSET_S, 1e3 * points[::3]
+    x = points[:, :1] + np.arange(-8.0, 8.0, 0.1) + 0.05
+    return t, x, points[:, 1:] + 30.0 * (x < points[:, :1])
+
+
+def gocator(folder: Path, t: Array, x: Array, z: Array) -> None:
+    """Times in microseconds."""
+    m = x.shape[1]
+    lines = [
+        "Info",
+        "CSV Version,Sensor Count",
+        "2,1",
+        "End",
+        "RawProfile",
+        "Frame Count,Column Count",
+        f"{len(t)},{m}",
+    ]
+    lines.append("Frame,Source,Time,Encoder,Z Encoder,Inputs,Exposure,Y,Axis," + ",".join(map(str, range(m))))
+    for k, (a, u, v) in enumerate(zip(t, x, z, strict=True)):
+        for axis, values in (("X", u), ("Z", v)):
+            lines.append(f"{k},0,{1e6 * a:.0f},0,0,0,300,0,{axis}," + ",".join(f"{b:.4f}" for b in values))
+    (folder / "export.csv").write_text("\n".join([*lines, "End"]) + "\n")
+
+
+def scancontrol(folder: Path, t: Array, x: Array, z: Array) -> None:
+    """One table with decimal commas and times in milliseconds."""
+    rows = ["Profile;Timestamp [ms];X [mm];Z [mm]"]
+    for k, (a, u, v) in enumerate(zip(t, x, z, strict=True)):
+        rows += [f"{k};{1e3 * a:.3f};{b:.4f};{c:.4f}".replace(".", ",") for b, c in zip(u, v, strict=True)]
+    (folder / "export.csv").write_text("\n".join(rows) + "\n")
+
+
+def heights(folder: Path, t: Array, x: Array, z: Array) -> None:
+    """A grid of heights with x in its first row, and the times in a file of their own."""
+    at = np.arange(x.min(), x.max(), 0.1)
+    rows = [np.interp(at, u, v, left=np.nan, right=np.nan) for u, v in zip(x, z, strict=True)]
+    text = [
+        ",".join(f"{a:.4f}" for a in at),
+        *(",".join("-99999.9999" if np.isnan(v) else f"{v:.4f}" for v in r) for r in rows),
+    ]
+    (folder / "export.csv").write_text("\n".join(text) + "\n")
+    (folder / "times.csv").write_text("time\n" + "\n".join(f"{a:.6f}" for a in t) + "\n")
+
+
+def one_file_each(folder: Path, t: Array, x: Array, z: Array) -> None:
+    (folder / "profiles").mkdir()
+    for k, (a, u, v) in enumerate(zip(t, x, z, strict=True)):
+        rows = [f"{a:.6f},{b:.4f},{c:.4f}" for b, c in zip(u, v, strict=True)]
+        (folder / "profiles" / f"profile{k + 1}.csv").write_text("time,X [mm],Z [mm]\n" + "\n".join(rows) + "\n")
+
+
+@pytest.mark.parametrize("write", [gocator, scancontrol, heights, one_file_each])
+def test_the_offset_of_exports(folder: Path, write: Callable[[Path, Array, Array, Array], None]) -> None:
+    write(folder, *raw())
+    found = run(folder)
+    assert found["clock_offset_ms"] == pytest.approx(1e3 * OFFSET_S, abs=1.0)
+    assert found["profiles"] > 60
+
+
+def test_an_export_without_times_is_refused_with_advice_that_works(folder: Path) -> None:
+    t, x, z = raw()
+    heights(folder, t, x, z)
+    times = (folder / "times.csv").read_text()
+    (folder / "times.csv").unlink()
+    assert "Write their times into times.csv" in refusal(folder)
+    (folder / "times.csv").write_text("\n".join(str(float(a) + 3600.0) for a in times.split()[1:]))
+    assert "Bring both to one clock" in refusal(folder)
+    (folder / "times.csv").write_text("\n".join(times.split()[1:-1]))
+    assert "Give one for each" in refusal(folder)
+    (folder / "times.csv").write_text("\n".join(times.split()[1:]))
+    assert run(folder)["clock_offset_ms"] == pytest.approx(1e3 * OFFSET_S, abs=1.0)
+
+
+def refusal(folder: Path) -> str:
+    words = ["profiler", "clock", str(folder), "--calibration", str(folder / "calibration"), "--unit", "mm"]
+    found = CliRunner().invoke(app, [*words, "--out", str(folder / "out")])
+    assert found.exit_code == 1, found.output
+    return " ".join(found.stderr.split())

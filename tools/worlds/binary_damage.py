@@ -11,7 +11,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from scipy.io import savemat
 
+from weldcal.calibration.data.poses.storage import matlab_arrays
 from weldcal.tools.worlds.text_damage import Damage, Rng, any_text
 
 _HUGE = ("0", "-1", "59", "61", "100000000", "5000000000", "99999999999999999999", "1.5", "x", "")
@@ -112,21 +114,8 @@ def npz(content: bytes, rng: Rng) -> Damage:
     if kind == 6:
         del members[name]
         return _zip(members, rng), False
-    if kind == 7 and value.dtype.kind == "f" and value.size:
-        value = value.copy()
-        value.reshape(-1)[int(rng.integers(value.size))] = _pick(rng, (np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0))
-    elif kind == 8:
-        value = np.asarray(
-            _pick(rng, (value[:0] if value.ndim else value, value.reshape(-1), value[None], value.T, np.zeros((2, 2))))
-        )
-    elif kind == 9:
-        value = (
-            value.astype(str(_pick(rng, ("U20", "S20", "f2", "i1", "c16", "bool", "u8"))), casting="unsafe")
-            if value.dtype.kind != "U"
-            else value
-        )
-    elif kind == 10 and value.ndim:
-        value = value[: len(value) - 1]
+    if 7 <= kind <= 10 and (changed := _changed(value, kind - 7, rng)) is not None:
+        value = changed
     else:
         flipped = bytearray(content)
         at = int(rng.integers(30, len(flipped)))
@@ -136,6 +125,48 @@ def npz(content: bytes, rng: Rng) -> Damage:
     np.save(stream, value)
     members[name] = stream.getvalue()
     return _zip(members, rng), False
+
+
+def _changed(value: np.ndarray, kind: int, rng: Rng) -> np.ndarray | None:
+    """Another number, shape or type, or the last row lost; None where the array has no such thing."""
+    if kind == 0 and value.dtype.kind == "f" and value.size:
+        value = value.copy()
+        value.reshape(-1)[int(rng.integers(value.size))] = _pick(rng, (np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0))
+        return value
+    if kind == 1:
+        shapes = (value[:0] if value.ndim else value, value.reshape(-1), value[None], value.T, np.zeros((2, 2)))
+        return np.asarray(_pick(rng, shapes))
+    if kind == 2 and value.dtype.kind not in "UO":
+        return value.astype(str(_pick(rng, ("U20", "S20", "f2", "i1", "c16", "bool", "u8"))), casting="unsafe")
+    return value[: len(value) - 1] if kind == 3 and value.ndim else None
+
+
+def matlab(content: bytes, rng: Rng) -> Damage:
+    """MATLAB arrays of other numbers, shapes, types and lengths, a variable lost or twice, or bytes of any kind."""
+    kind = int(rng.integers(7))
+    if kind == 6:
+        return any_bytes(content, rng)
+    arrays = matlab_arrays(content, "a.mat")
+    name = str(_pick(rng, list(arrays)))
+    if kind == 4:
+        del arrays[name]
+    elif kind == 5:
+        arrays[f"{name}{name}"] = arrays[name]
+    else:
+        value = arrays[name]
+        if isinstance(value, list):  # cells
+            cells = np.empty((1, len(value)), dtype=object)
+            for k, cell in enumerate(value):
+                changed = _changed(np.array(cell), kind, rng) if k == 0 else None
+                cells[0, k] = np.array(cell) if changed is None else changed
+            value = cells
+        else:
+            changed = _changed(value, kind, rng)
+            value = value if changed is None else changed
+        arrays[name] = value
+    stream = io.BytesIO()
+    savemat(stream, arrays)
+    return stream.getvalue(), False
 
 
 def npy(content: bytes, rng: Rng) -> Damage:
@@ -226,5 +257,5 @@ def image(content: bytes, rng: Rng) -> Damage:
 
 
 GRAMMARS: dict[str, Callable[[bytes, Rng], Damage]] = {
-    "bytes": any_bytes, "cloud": cloud, "npz": npz, "npy": npy, "image": image
+    "bytes": any_bytes, "cloud": cloud, "npz": npz, "npy": npy, "matlab": matlab, "image": image
 }  # fmt: skip

@@ -38,7 +38,10 @@ GOOD = (ACCEPTED, REFUSED)
 GRAMMARS = text_damage.GRAMMARS | binary_damage.GRAMMARS
 _PLACES = ("a pipe", "a folder", "a device", "a loop of links", "nothing")
 _ODD_PLACE = 0.02  # share of the cases in which no regular file is there
-_FEWER = ("hand-eye-folder",)  # a folder without one of its samples is right
+_MAY_BE_MISSING = (
+    "dataset",
+    "hand-eye-folder",
+)  # a folder without dataset.yaml, or without one of its samples, is right
 _UNITS = 0.05  # and in which a dataset's unit is exchanged
 _EXAMPLES = 40  # different ones of each reader
 _LONGEST = 1010  # characters of a refusal
@@ -167,7 +170,7 @@ READERS = (
     Reader("hand-eye-captions", "text", "poses.txt", pose_examples.captions, _pairs("poses.txt")),
     Reader("hand-eye-documents", "text", "set/robot.yaml", pose_examples.documents, _pairs("set")),
     Reader("hand-eye-nested", "json", "pairs.json", pose_examples.nested, _pairs("pairs.json")),
-    Reader("hand-eye-matlab", "bytes", "pairs.mat", pose_examples.matlab, _pairs("pairs.mat")),
+    Reader("hand-eye-matlab", "matlab", "pairs.mat", pose_examples.matlab, _pairs("pairs.mat")),
     Reader("hand-eye-folder", "json", "set/sample_3.json", pose_examples.folder, _pairs("set")),
     Reader("ply-grid", "cloud", "a.ply", cloud_examples.ply_grid, _cloud("a.ply"), finite=False),
     Reader("ply-lists", "cloud", "a.ply", cloud_examples.ply_lists, _cloud("a.ply"), finite=False),
@@ -206,7 +209,8 @@ def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, s
     rng = np.random.default_rng((seed, number, case))
     files = _example(number, seed, case % _EXAMPLES)
     if rng.random() < _ODD_PLACE:
-        return files, files, reader.name not in _FEWER, str(rng.choice(_PLACES))
+        place = str(rng.choice(_PLACES))
+        return files, files, place != "nothing" or reader.name not in _MAY_BE_MISSING, place
     content = files[reader.target]
     if reader.target == "dataset.yaml" and rng.random() < _UNITS:
         swapped = content.replace(

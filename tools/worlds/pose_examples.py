@@ -93,7 +93,10 @@ def nested(rng: Rng) -> Files:
         v = Rotation.from_matrix(X[:3, :3]).as_rotvec()
         angle = float(np.linalg.norm(v))
         if kind == 0:
-            return {"rotation": {"axis": (v / angle).tolist(), "angle": angle}, "translation": X[:3, 3].tolist()}
+            return {
+                "rotation": {"axis": (v / angle if angle else np.eye(3)[2]).tolist(), "angle": angle},
+                "translation": X[:3, 3].tolist(),
+            }
         return X.tolist() if kind == 1 else {"rvec": v.tolist(), "tvec": X[:3, 3].tolist()}
 
     kinds = rng.integers(0, 3, 2)

@@ -82,8 +82,9 @@ def column_values(path: Path, content: bytes, n: int, record: int, columns: list
             f"The file {path.name} is truncated: {n} points are promised and {len(content) // record} are there."
         )
     out = np.empty((n, len(columns)))
-    for k, (at, kind) in enumerate(columns):
-        out[:, k] = np.ndarray(n, kind, content, at, strides=(record,))
+    with np.errstate(invalid="ignore"):  # the processor flags the conversion of some patterns of NaN, which stay NaN
+        for k, (at, kind) in enumerate(columns):
+            out[:, k] = np.ndarray(n, kind, content, at, strides=(record,))
     return out
 
 

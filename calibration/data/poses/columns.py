@@ -4,92 +4,24 @@ import re
 from dataclasses import dataclass
 
 IDS = (
-    "id",
-    "name",
-    "pose",
-    "scan",
-    "file",
-    "filename",
-    "image",
-    "cloud",
-    "label",
-    "index",
-    "nr",
-    "no",
-    "sample",
-    "frame",
-    "#",
-    "point",
-    "idx",
-)
+    "id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no", "sample", "frame", "#", "point", "idx",
+)  # fmt: skip
 TIMES = (
-    "time",
-    "%time",
-    "timestamp",
-    "stamp",
-    "t",
-    "time_s",
-    "header.stamp",
-    "sec",
-    "secs",
-    "timestamp_s",
-    "time_ns",
-    "timestamp_ns",
-)
+    "time", "%time", "timestamp", "stamp", "t", "time_s", "header.stamp", "sec", "secs", "timestamp_s", "time_ns", "timestamp_ns",
+)  # fmt: skip
 _POSITION = {
-    "position",
-    "pos",
-    "translation",
-    "trans",
-    "t",
-    "p",
-    "tvec",
-    "xyz",
-    "location",
-    "origin",
-    "linear",
-    "coord",
-}
+    "position", "pos", "translation", "trans", "t", "p", "tvec", "xyz", "location", "origin", "linear", "coord",
+}  # fmt: skip
 _ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad"}
 _VECTOR = {"rvec", "rotvec", "rv", "axisangle", "aa", "rodrigues"}
 _QUATERNION = {"quat", "quaternion", "q"}
 _FILLERS = {"field", "pose", "transform", "transforms0", "vector", "tcp", "data", "actual", "x1"}
 _OWNERS = (
-    "robot",
-    "camera",
-    "cam",
-    "hand",
-    "eye",
-    "ee",
-    "base",
-    "flange",
-    "target",
-    "marker",
-    "board",
-    "gripper",
-    "tool",
-)
+    "robot", "camera", "cam", "hand", "eye", "ee", "base", "flange", "target", "marker", "board", "gripper", "tool",
+)  # fmt: skip
 _WHOLE = {
-    "qw",
-    "qx",
-    "qy",
-    "qz",
-    "q0",
-    "q1",
-    "q2",
-    "q3",
-    "q4",
-    "roll",
-    "pitch",
-    "yaw",
-    "a",
-    "b",
-    "c",
-    "w",
-    "p",
-    "r",
-    "o",
-}
+    "qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o",
+}  # fmt: skip
 _EULER_WORDS = (
     ("alpha", "beta", "gamma"),
     ("phi", "theta", "psi"),

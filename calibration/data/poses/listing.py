@@ -44,10 +44,20 @@ class Listing:
 
     @cached_property
     def readings(self) -> tuple[PoseReading, ...]:
-        """All readings of the list, the usual one first; rows that are left out are identities."""
+        """All readings of the list, the usual one first; rows that are left out are identities.
+
+        Raises:
+            DatasetError: the numbers contradict what is stated, with the position before and after the rotation.
+        """
         found: list[PoseReading] = []
+        problem: DatasetError | None = None
         for one in self.numbers:
-            found += readings(one)
+            try:
+                found += readings(one)
+            except DatasetError as why:
+                problem = problem or why
+        if problem is not None and not found:
+            raise problem
         return tuple(found)
 
     @property
@@ -211,6 +221,7 @@ def _of_matrices(M: Array) -> Iterator[tuple[int, Array, Array, None]]:
 
 def _orthonormal(R: Array) -> bool:
     R = R[np.isfinite(R).all(axis=(1, 2)) & (np.abs(R).max(axis=(1, 2)) > 0.0)]
+    R = np.clip(R, -10.0, 10.0)  # the squares of larger numbers may overflow, and are none of a rotation either
     return (
         bool(len(R)) and float(np.median(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)))) <= _ORTHONORMAL
     )
@@ -220,6 +231,14 @@ def _unit(q: Array) -> bool:
     length = np.linalg.norm(q, axis=1)
     length = length[np.isfinite(length) & (length > 0.0)]
     return bool(len(length)) and float(np.median(np.abs(length - 1.0))) <= _UNIT_LENGTH
+
+
+def require_pose(lists: list[Listing]) -> list[Listing]:
+    """The lists. Raises DatasetError where one pose alone is missing: it may be one of many files, and is left out there."""
+    for one in lists:
+        if len(one.left_out) == len(one):
+            raise DatasetError(f"'{one.name}' holds no pose: {one.left_out[0][1]}")
+    return lists
 
 
 def _listing(
@@ -237,7 +256,7 @@ def _listing(
             f"'{name}' holds {n:,} poses, and at most {MOST_POSES:,} are read. Keep one for each scan or picture: the pose at its time."
         )
     left_out = _without_pose(meanings)
-    if len(left_out) == n:
+    if len(left_out) == n > 1:
         raise DatasetError(f"'{name}' holds no pose: {left_out[0][1]}")
     rows = [row for row, _ in left_out]
     numbers = []

@@ -10,44 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.listing import Listing, listing_of_array
+from weldcal.calibration.data.poses.listing import Listing, listing_of_array, require_pose
 from weldcal.calibration.data.poses.names import last_key, natural, number_of, whose
-from weldcal.calibration.data.poses.storage import read_tree, tree_of_text
+from weldcal.calibration.data.poses.storage import matlab_arrays, read_tree, tree_of_text
 from weldcal.calibration.data.poses.text import lists_of_text
 from weldcal.calibration.data.poses.trees import lists_of_tree, stacked
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.array_files import read_npy, read_npz
 from weldcal.models.errors import InputError
-from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_text, require_few_lines
+from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_bytes, read_text, require_few_lines
 
 TEXT = (
-    ".csv",
-    ".txt",
-    ".tsv",
-    ".script",
-    ".urscript",
-    ".dat",
-    ".src",
-    ".ls",
-    ".mod",
-    ".prg",
-    ".tum",
-    ".log",
-    ".asc",
-    ".urp",
-    ".sys",
-    ".jbi",
-    ".dtx",
-    ".as",
-    ".py",
-    ".m",
-    ".drl",
-    ".lua",
-    ".pnt",
-    ".pos",
-    ".jsonl",
-    ".out",
-)
+    ".csv", ".txt", ".tsv", ".script", ".urscript", ".dat", ".src", ".ls", ".mod", ".prg", ".tum", ".log", ".asc", ".urp", ".sys", ".jbi",
+    ".dtx", ".as", ".py", ".m", ".drl", ".lua", ".pnt", ".pos", ".jsonl", ".out",
+)  # fmt: skip
 TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib", ".rob")
 ARRAYS = (".npy", ".npz", ".mat", ".xlsx")
 ENDINGS = (*TEXT, *TREES, *ARRAYS)
@@ -68,6 +44,15 @@ def read_lists(path: Path) -> list[Listing]:
     Raises:
         DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
     """
+    return require_pose(lists_of_file(path))
+
+
+def lists_of_file(path: Path) -> list[Listing]:
+    """Every list of poses of one of many files: a single pose may be missing there, and is left out.
+
+    Raises:
+        DatasetError: the file cannot be read, or holds no poses; the sentence says what to change.
+    """
     try:
         file_size(path)
         ending = path.suffix.lower()
@@ -75,8 +60,8 @@ def read_lists(path: Path) -> list[Listing]:
             return lists_of_tree(dict(read_npz(path)), path.name)
         if ending == ".npy":
             return [listing_of_array(path.name, _numbers(path, read_npy(path)))]
-        if ending == ".mat":
-            return lists_of_tree(_matlab(path), path.name)
+        if ending == ".mat" and not _is_text(path):
+            return lists_of_tree(matlab_arrays(read_bytes(path, LARGEST_DOCUMENT), path.name), path.name)
         if ending == ".xlsx":
             return _workbook(path)
         if ending in TREES:
@@ -145,12 +130,18 @@ def _numbered_folders(folder: Path) -> frozenset[Path]:
 
 
 def _may_hold_poses(path: Path) -> bool:
-    return (
-        path.is_file()
-        and path.suffix.lower() in ENDINGS
-        and path.name.lower() not in _OWN
-        and not path.name.startswith((".", "_"))
-    )
+    """Whether a file's name is that of poses. Raises DatasetError where another thing than a file or a folder has such a name."""
+    named = path.suffix.lower() in ENDINGS and path.name.lower() not in _OWN and not path.name.startswith((".", "_"))
+    if named and not path.is_file() and (not path.is_dir() or _one_of_files(path)):
+        raise DatasetError(f"'{path.name}' is no file that can be read; replace it by a file, or remove it.")
+    return named and path.is_file()
+
+
+def _one_of_files(folder: Path) -> bool:
+    """Whether a folder has the name of one of several numbered files beside it."""
+    stem = re.sub(r"\d+$", "", folder.stem)
+    alike = (p for p in folder.parent.glob(f"*{folder.suffix}") if re.sub(r"\d+$", "", p.stem) == stem and p.is_file())
+    return stem != folder.stem and next(alike, None) is not None
 
 
 def _group(files: list[Path], label: str) -> list[Listing]:
@@ -158,7 +149,7 @@ def _group(files: list[Path], label: str) -> list[Listing]:
     prefix = f"{label}/" if label else ""
     if len(files) == 1:
         return [_renamed(one, prefix) for one in read_lists(files[0])]
-    lists = [read_lists(path) for path in files]
+    lists = [lists_of_file(path) for path in files]
     many = next((p for p, found in zip(files, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
     alike = len({p.name for p in files}) == 1 and len(files) > 1  # the same file in each of several folders
     ids = tuple((p.parent.name if alike else p.stem) for p in files)
@@ -202,6 +193,9 @@ def two_lists(
     Raises:
         DatasetError: a stated name is in none or several lists, or the names do not tell which list is whose.
     """
+    many = [one for one in lists if len(one) > 1]
+    if robot is None and camera is None and len(many) > 1:
+        lists = many  # a pose alone beside lists is a result
     known = ", ".join(repr(one.name) for one in lists[:8]) or "none"
     chosen: dict[str, Listing] = {}
     for who, key in (("robot", robot), ("camera", camera)):
@@ -303,26 +297,10 @@ def _numbers(path: Path, value: Any) -> Any:
     return value.astype(float)
 
 
-def _matlab(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat
-
-    try:
-        found = loadmat(path, simplify_cells=True)
-    except NotImplementedError as problem:
-        raise DatasetError(f"'{path.name}' is a MATLAB 7.3 file: save it with save('{path.name}', '-v7').") from problem
-    except Exception as problem:  # scipy raises many kinds for a damaged file
-        raise DatasetError(f"'{path.name}' cannot be read as a MATLAB file ({type(problem).__name__}).") from problem
-    return {k: _cells(v) for k, v in found.items() if not k.startswith("__")}
-
-
-def _cells(value: Any) -> Any:
-    """Cell arrays of MATLAB as lists."""
-    if isinstance(value, dict):
-        return {str(k): _cells(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        items = [_cells(v) for v in value.ravel()]
-        return [v.tolist() if isinstance(v, np.ndarray) else v for v in items]
-    return value
+def _is_text(path: Path) -> bool:
+    """Whether a .mat file is a table of numbers, as MATLAB's save -ascii writes it."""
+    with path.open("rb") as stream:
+        return re.fullmatch(rb"[\s\d.eE+,;-]+", stream.read(128)) is not None
 
 
 def _workbook(path: Path) -> list[Listing]:

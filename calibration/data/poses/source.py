@@ -10,7 +10,7 @@ from weldcal.calibration.data.poses.columns import columns_of
 from weldcal.calibration.data.poses.form import PoseList
 from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import ENDINGS as READ
-from weldcal.calibration.data.poses.lists import read_lists
+from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
 from weldcal.calibration.data.poses.names import BASES, FLANGES, natural, number_of, whose
 from weldcal.calibration.data.poses.readings import pick
 from weldcal.calibration.data.poses.trees import stacked
@@ -93,7 +93,7 @@ def _files(folder: Path) -> list[Path]:
 def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
     """The poses of a file, or of one file per pose. Raises DatasetError, one sentence that says what to change."""
     if isinstance(source, tuple):
-        lists = [read_lists(path) for path in source]
+        lists = [lists_of_file(path) for path in source]
         many = next((p for p, found in zip(source, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
         if many is not None:
             raise DatasetError(

@@ -4,6 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import PurePath
 from typing import Any
 
@@ -25,6 +26,22 @@ _COMMENT = ("#", "%", "//", "!", ";")
 _BEYOND = 1e300  # a number of so many digits that it has no value
 _COSINE = 1.1  # no element of a rotation matrix exceeds it
 _NANOSECONDS = 1e14  # a time above it is in nanoseconds
+_NUMBERED = ("q0 q1 q2 q3", "q1 q2 q3 q4")
+_ROTATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
+    *(
+        (names, {"rotation": "quaternion_wxyz", "form": "x, y, z, quaternion"})
+        for names in ("qw qx qy qz", "q0 qx qy qz")
+    ),
+    *((names, {"form": "x, y, z, quaternion"}) for names in _NUMBERED),
+    ("vx vy vz", {"rotation": "rotation_vector", "form": "x, y, z, rotation vector"}),
+    ("rx ry rz", {"form": "x, y, z, rx, ry, rz"}),
+    ("roll pitch yaw", {"usual": "euler_xyz", "vector": False, "form": "x, y, z, roll, pitch, yaw"}),
+    ("a b c", {"rotation": "euler_ZYX", "angles": "deg", "form": "x, y, z, KUKA A, B, C"}),
+    ("w p r", {"rotation": "euler_xyz", "angles": "deg", "form": "x, y, z, Fanuc W, P, R"}),
+    ("o a t", {"rotation": "euler_ZYZ", "angles": "deg", "form": "x, y, z, O, A, T"}),
+    ("e1 e2 e3", {"vector": False, "form": "x, y, z and three angles"}),
+)
+"""The columns of a rotation, and what they say of it, in the order in which they are sought."""
 
 
 def lists_of_text(text: str, name: str) -> list[Listing]:
@@ -84,6 +101,8 @@ def _numbers(text: str, name: str) -> list[Listing]:
     if header is not None:
         return _table(*_whole_header(lines, header), name)
     rows = [line for line in lines if line.numeric >= 3]
+    if len(lines) in (6, 7, 12, 16) and all(line.numeric == 1 == len(line.cells) for line in lines):
+        rows = [_Line(lines[0].number, [line.cells[0] for line in lines])]  # a number a line
     if not rows:
         raise DatasetError(
             f"'{name}' holds no poses: no row of it has numbers. A table of poses has columns x,y,z with qw,qx,qy,qz or rx,ry,rz, or 6, 7 or "
@@ -109,6 +128,17 @@ def _numbers(text: str, name: str) -> list[Listing]:
         return [
             _bare([row[k : k + half] for row in plain], f"{name}, columns {k + 1} to {k + half}, {who}", ids)
             for k, who in ((0, "robot"), (half, "camera"))
+        ]
+    gap = next((k for k, (a, b) in enumerate(pairwise(rows), 1) if k == len(rows) // 2 and b.number > a.number + 1), 0)
+    if (
+        gap
+        and 2 * gap == len(rows) >= 6
+        and len(plain[0]) in (6, 7, 12, 16)
+        and rows[-1].number - rows[gap].number == gap - 1 == rows[gap - 1].number - rows[0].number
+    ):
+        return [  # two blocks of as many rows, the robot's first
+            _bare(mine, f"{name}, lines {of[0].number} to {of[-1].number}, {who}", ())
+            for mine, of, who in ((plain[:gap], rows[:gap], "robot"), (plain[gap:], rows[gap:], "camera"))
         ]
     return [_bare(plain, name, ids)]
 
@@ -173,7 +203,10 @@ def _bare(rows: list[list[float]], name: str, ids: tuple[str, ...]) -> Listing:
     n = len(rows[0])
     uneven = next((k for k, row in enumerate(rows) if len(row) != n), None)
     if uneven is not None:
-        raise DatasetError(f"'{name}' has {n} numbers in its first row and {len(rows[uneven])} in row {uneven + 1}.")
+        raise DatasetError(
+            f"'{name}' has {n} numbers in its first row and {len(rows[uneven])} in row {uneven + 1}. Remove the rows that hold no pose, such as a "
+            "result below the poses."
+        )
     table = np.array(rows)
     if n == 4 and len(table) % 4 and len(table) % 3 == 0:
         table = table.reshape(-1, 12)
@@ -337,53 +370,11 @@ def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...
     if not {"x", "y", "z"} <= set(at):
         raise DatasetError(f"'{name}' names no columns x, y, z; it has {', '.join(sorted(at))}.")
     p = take("x", "y", "z")
-    if {"qw", "qx", "qy", "qz"} <= set(at):
-        return listing_of(
-            name, p, take("qw", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more
-        )
-    if {"q0", "qx", "qy", "qz"} <= set(at):
-        return listing_of(
-            name, p, take("q0", "qx", "qy", "qz"), rotation="quaternion_wxyz", form="x, y, z, quaternion", **more
-        )
-    for numbered in (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4")):
-        if set(numbered) <= set(at) and not {"rx", "ry", "rz"} <= set(at):
-            return listing_of(name, p, take(*numbered), form="x, y, z, quaternion", **more)
-    if {"vx", "vy", "vz"} <= set(at):
-        return listing_of(
-            name,
-            p,
-            take("vx", "vy", "vz"),
-            rotation="rotation_vector",
-            angles=angle,
-            form="x, y, z, rotation vector",
-            **more,
-        )
-    if {"rx", "ry", "rz"} <= set(at):
-        return listing_of(name, p, take("rx", "ry", "rz"), angles=angle, form="x, y, z, rx, ry, rz", **more)
-    if {"roll", "pitch", "yaw"} <= set(at):
-        return listing_of(
-            name,
-            p,
-            take("roll", "pitch", "yaw"),
-            angles=angle,
-            usual="euler_xyz",
-            vector=False,
-            form="x, y, z, roll, pitch, yaw",
-            **more,
-        )
-    for named, form, words in (
-        ("abc", "euler_ZYX", "KUKA A, B, C"),
-        ("wpr", "euler_xyz", "Fanuc W, P, R"),
-        ("oat", "euler_ZYZ", "O, A, T"),
-    ):
-        if set(named) <= set(at):
-            return listing_of(
-                name, p, take(*named), rotation=form, angles=angle or "deg", form=f"x, y, z, {words}", **more
-            )
-    if {"e1", "e2", "e3"} <= set(at):
-        return listing_of(
-            name, p, take("e1", "e2", "e3"), angles=angle, vector=False, form="x, y, z and three angles", **more
-        )
+    for words, stated in _ROTATIONS:
+        roles = words.split()
+        if set(roles) <= set(at) and not (words in _NUMBERED and {"rx", "ry", "rz"} <= set(at)):
+            angles = {} if roles[0].startswith("q") else {"angles": angle or stated.get("angles", "")}
+            return listing_of(name, p, take(*roles), **{**stated, **angles, **more})
     raise DatasetError(
         f"'{name}' has positions and no rotation that it names: add qw,qx,qy,qz, or rx,ry,rz, or roll,pitch,yaw. It names "
         f"{', '.join(sorted(at))}."

@@ -20,7 +20,7 @@ _PARTNERS = {
     "orientations": "positions", "orientation": "position", "r": "t", "q": "t",
 }  # fmt: skip
 _NO_POSES = re.compile(
-    r"(?i)^(q|joints?|joint_.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(camera|intrinsic|projection|rectif)\w*matrix|.*(coeffs?|distortion)|covariance.*)$"
+    r"(?i)^(q|joint.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(camera|intrinsic|projection|rectif)\w*matrix|.*(coeffs?|distortion)|covariance.*)$"
 )
 _VECTOR = re.compile(r"(?i)(rvec|rotvec|rotation_?vector|axis_?angle|rodrigues)")
 _QUATERNION = re.compile(r"(?i)(^q$|quat|rotation|^ori|wxyz|xyzw)")
@@ -129,13 +129,19 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
     columns, _ = columns_of(list(flat))
     direct = [n for n in flat if len({c.prefix for c in columns}) <= 1 or not columns]
     if len(columns) >= 6 and direct and len({c.prefix for c in columns}) == 1:
-        yield from table_lists(list(flat), np.array([list(flat.values())]), label)
         roots = {list(flat)[c.index].partition(".")[0] for c in columns}
-        node = {
+        beside = {
             k: v for k, v in node.items() if str(k).lower() not in roots and isinstance(v, Mapping | list | np.ndarray)
         }
-        if len(roots) > 1:  # the whole mapping is the pose
-            return
+        if len(roots) > 1:  # the whole mapping is the pose, but for matrices beside it
+            beside = {k: v for k, v in beside.items() if (a := _array(v)) is not None and a.size in (12, 16)}
+            keys = [str(k) for k, v in node.items() if isinstance(v, list) and _flat({k: v})]
+            stem = re.sub(
+                "_?(r|t|rot|trans)?(vec|rotation|translation|position|orientation)$", "", min(keys, default="")
+            )
+            label = f"{label}, {stem}" if beside and len(stem) > 1 else label
+        yield from table_lists(list(flat), np.array([list(flat.values())]), label)
+        node = beside
     used = set()
     for listing, keys in _joined(node, name, at):
         used |= keys
@@ -188,19 +194,20 @@ def stacked(lists: list[Listing], name: str, ids: tuple[str, ...] = ()) -> Listi
     first = lists[0].numbers[0]
     if any(one.numbers[0].kind != first.kind for one in lists):
         raise DatasetError(f"'{name}' holds poses in different forms; write all in one.")
-    bad = [k for k, one in enumerate(lists) if one.left_out]
+    bad = {k: why for k, one in enumerate(lists) for _, why in one.left_out}
     units = {one.unit for one in lists}
     found = []
     # six numbers may begin with the position or with the rotation
     for k in range(min(len(one.numbers) for one in lists)):
         p = np.concatenate([one.numbers[k].p for one in lists])
         r = np.concatenate([one.numbers[k].r for one in lists])
-        p[bad] = np.nan
+        p[list(bad)] = np.nan
         found.append(listing_of(
             name, p, r, rotation=first.rotation, angles=first.angles, usual=first.usual, vector=first.vector, ids=ids,
             unit=lists[0].unit if len(units) == 1 else "", form=lists[0].form,
         ))  # fmt: skip
-    return replace(found[0], numbers=tuple(n for one in found for n in one.numbers))
+    left_out = tuple((k, bad.get(k, why)) for k, why in found[0].left_out)
+    return replace(found[0], numbers=tuple(n for one in found for n in one.numbers), left_out=left_out)
 
 
 def _joined(node: Mapping[Any, Any], name: str, at: str) -> Iterator[tuple[Listing, set[str]]]:
@@ -292,7 +299,7 @@ def _axis_angle(value: Mapping[Any, Any], path: str) -> dict[str, float]:
         return {}
     size = float(np.linalg.norm(axis))
     parent = f"{path.rpartition('.')[0]}."
-    vector = float(angle) * axis / (size if size > 0.0 else 1.0)
+    vector = as_number(angle) * axis / (size if size > 0.0 else 1.0)
     return dict(zip((f"{parent}rvec_{a}".lstrip(".") for a in "xyz"), map(float, vector), strict=True))
 
 

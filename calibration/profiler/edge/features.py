@@ -104,10 +104,10 @@ def _apex(p: Floats, pitch: float) -> tuple[Floats, Floats]:
 
 def _robust_line(x: Floats, z: Floats) -> tuple[float, float, float, int]:
     """z = a + b x by Tukey's weights: a, b, sigma of a sample, number of samples that count."""
-    slopes = (z[None, :] - z[:, None])[np.triu_indices(len(x), 1)] / (x[None, :] - x[:, None])[
-        np.triu_indices(len(x), 1)
-    ]
-    b = float(np.median(slopes[np.isfinite(slopes)]))
+    pairs = np.triu_indices(len(x), 1)
+    across = (x[None, :] - x[:, None])[pairs]
+    slopes = (z[None, :] - z[:, None])[pairs][across != 0.0] / across[across != 0.0]
+    b = float(np.median(slopes)) if len(slopes) else 0.0
     a = float(np.median(z - b * x))
     weight: NDArray[np.float64] = np.ones(len(x))
     # a sensor that rounds makes half of the residuals of a level line equal: their median says nothing below its step

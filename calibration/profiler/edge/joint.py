@@ -79,17 +79,28 @@ def edge_joint(
         raise InputError(
             "The sigmas of a profile point [x, z] must be two positive numbers, and the robot's not negative."
         )
+    fits = edge_optima(poses, p, sigma_robot_m, sigmas, init)
+    state, cost = fits[0]
+    estimate = _estimate(state, poses, p, sigma_robot_m, sigmas)
+    _refuse_rivals(estimate, [other for other, its in fits if CAUCHY**2 * (its - cost) < RIVAL**2])
+    return estimate
+
+
+def edge_optima(
+    poses: FlangePoses, p: Floats, sigma_robot_m: float, sigmas: Floats, init: EdgeState | None = None
+) -> list[tuple[EdgeState, float]]:
+    """The optima of a robust loss from the 24 orientations of a cube, or the one from ``init``, and their costs, best first.
+
+    Raises:
+        TooFewTranslations: fewer than six poses.
+    """
     if len(poses) < MINIMUM_POSES:
         raise TooFewTranslations(
             f"{len(poses)} poses of the edge are too few: take at least {MINIMUM_POSES}, all different."
         )
     some = np.unique(np.linspace(0, len(poses) - 1, STARTING_POSES).round().astype(int))
     starts = [init] if init is not None else edge_starts(poses[some], p[some])
-    fits = [_fitted(start, poses, p, sigma_robot_m, sigmas) for start in starts]
-    state, cost = min(fits, key=lambda fit: fit[1])
-    estimate = _estimate(state, poses, p, sigma_robot_m, sigmas)
-    _refuse_rivals(estimate, [other for other, its in fits if CAUCHY**2 * (its - cost) < RIVAL**2])
-    return estimate
+    return sorted((_fitted(start, poses, p, sigma_robot_m, sigmas) for start in starts), key=lambda fit: fit[1])
 
 
 def _refuse_rivals(estimate: EdgeEstimate, others: list[EdgeState]) -> None:

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import OptimizeResult
 
 from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.geometry.se3 import exp_rotation
@@ -91,13 +92,14 @@ def sphere_joint(
         R, result = problem.solved(init.rotation, init.translation, _started(init, data, layout))
         about = _turned(R, result.x)
     else:
-        rigid = Problem(data, Layout(tip=layout.tip, affine=False, joints=False), s)
-        starts = sphere_starts(data.poses, problem.profiles, data.radius_m)
-        found = [rigid.solved(R, t, np.concatenate([np.zeros(6), c, np.zeros(3 * layout.tip)])) for R, t, c in starts]
-        R, result = min(found, key=lambda one: float(one[1].cost))
+        found = sphere_optima(data, s)
+        R, result = found[0]
         about = _turned(R, result.x)
-        # soft_l1's cost is half of chi-square where residuals are small
-        rivals = [_turned(one[0], one[1].x) for one in found if 2.0 * float(one[1].cost - result.cost) < RIVAL**2]
+        # soft_l1's cost is half of chi-square where residuals are small; sigmas that are too small exaggerate differences
+        excess = max(1.0, 2.0 * float(result.cost) / max(len(result.fun) - len(result.x), 1))
+        rivals = [
+            _turned(one[0], one[1].x) for one in found if 2.0 * float(one[1].cost - result.cost) < RIVAL**2 * excess
+        ]
         if layout.size > len(result.x):
             x = np.zeros(layout.size)
             x[: 9 + 3 * layout.tip] = result.x
@@ -108,6 +110,20 @@ def sphere_joint(
     if not wrong or len(wrong) > MOST_WRONG * n or n - len(wrong) < MINIMUM_POSES:
         return estimate
     return replace(sphere_joint(data.without(*wrong), model, sigmas, init=estimate), wrong_poses=wrong)
+
+
+def sphere_optima(data: SphereData, sigmas: SphereSigmas) -> list[tuple[Floats, OptimizeResult]]:
+    """The optima of the rigid model from the 24 orientations of a cube, best first: a rotation R_FS (3, 3), and the solution about it.
+
+    Raises:
+        InputError, TooFewTranslations: as sphere_joint.
+    """
+    _check(data, "rigid")
+    layout = Layout(tip=data.touches is not None, affine=False, joints=False)
+    problem = Problem(data, layout, sigmas)
+    starts = sphere_starts(data.poses, problem.profiles, data.radius_m)
+    found = [problem.solved(R, t, np.concatenate([np.zeros(6), c, np.zeros(3 * layout.tip)])) for R, t, c in starts]
+    return sorted(found, key=lambda one: float(one[1].cost))
 
 
 def _started(init: SphereEstimate, data: SphereData, layout: Layout) -> Floats:
@@ -263,6 +279,7 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
         inliers=np.abs(r[:m]) < 5.0,
         rms_m=float(np.sqrt(np.mean(distance**2))),
         reduced_chi2=float(r @ r / freedom),
+        scans_chi2=(problem.shared(r) + float(r[m:] @ r[m:])) / max(3 * len(problem.count) + len(felt) - 9, 1),
         condition=condition,
         center=np.asarray(c),
         tip=None if problem.data.tip is None else problem.data.tip + tip,

@@ -7,7 +7,7 @@ points of a scan share, is taken out by whitening with it rather than by unknown
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,16 +70,7 @@ class SphereData:
         keep = ~np.isin(np.arange(len(self.poses)), scans)
         q = None if self.q is None else self.q[keep]
         profiles = [p for p, kept in zip(self.profiles, keep, strict=True) if kept]
-        return SphereData(
-            poses=self.poses[keep],
-            profiles=profiles,
-            radius_m=self.radius_m,
-            touches=self.touches,
-            tip=self.tip,
-            arm=self.arm,
-            q=q,
-            touch_q=self.touch_q,
-        )
+        return replace(self, poses=self.poses[keep], profiles=profiles, q=q)
 
 
 def corrected(p: Floats, affine: Floats, origin: Floats) -> Floats:
@@ -244,6 +235,12 @@ class Problem:
             out[start : start + n] = part - U @ (less[:, None] * (U.T @ part))
             start += n
         return np.asarray(out)
+
+    def shared(self, r: Floats) -> float:
+        """Sum of squares of what the whitened residuals (m,) of each scan share with an error of the robot's position."""
+        ends = np.cumsum(self.count)
+        parts = zip(self._whiten or [], ends - self.count, ends, strict=False)
+        return float(sum(np.sum((U.T @ r[a:b]) ** 2) for (U, _), a, b in parts))
 
     def derivatives(self, x: Floats) -> Floats:
         """Jacobian of `residual`."""

@@ -7,6 +7,7 @@ import numpy as np
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.start import cube_rotations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, times_own, turned
+from weldcal.calibration.profiler.sphere.arc import fit_circle
 
 POINTS = 7  # of each profile
 ITERATIONS = 80
@@ -26,10 +27,8 @@ def sphere_starts(
     R_BF, p_BF = poses.rotation[of], poses.translation[of]
     R = cube_rotations()
     m = len(R)
-    t, damping = np.zeros((m, 3)), np.full(m, 1e-2)
-    at = times_own(p_S @ np.swapaxes(R, 1, 2), np.swapaxes(R_BF, 1, 2)) + p_BF
-    c = at.mean(axis=1)
-    cost = np.full(m, np.inf)
+    t, c = _translations(poses, profiles, R, radius_m)
+    damping = np.full(m, 1e-2)
     r, J = _linearised(R_BF, p_BF, R, t, c, p_S, radius_m)
     cost = _cost(r)
     for _ in range(ITERATIONS):
@@ -60,6 +59,22 @@ def sphere_starts(
         if len(chosen) == KEPT:
             break
     return [(R[k], t[k], c[k]) for k in chosen]
+
+
+def _translations(poses: FlangePoses, profiles: Sequence[Floats], R: Floats, radius_m: float) -> tuple[Floats, Floats]:
+    """p_FS (m, 3) and the sphere's centre in B (m, 3) for rotations R_FS (m, 3, 3), by linear least squares.
+
+    The sphere's centre in S is taken as that of the profile's circle: its distance from the scan plane, unknown in sign, is left out.
+    From p_FS = 0 the search ended in another optimum in up to half of the sets of six scans.
+    """
+    circles = np.array([fit_circle(p)[0] for p in profiles])
+    means = np.array([p.mean(axis=0) for p in profiles])
+    x, z = np.where(circles[:, 2:] < 1.05 * radius_m, circles[:, :2], means).T
+    c_F = np.column_stack([x, np.zeros(len(x)), z]) @ np.swapaxes(R, 1, 2)
+    moved = times_own(c_F, np.swapaxes(poses.rotation, 1, 2)) + poses.translation
+    A = np.concatenate([poses.rotation, np.tile(-np.eye(3), (len(poses), 1, 1))], axis=2).reshape(-1, 6)
+    found = -moved.reshape(len(R), -1) @ np.linalg.pinv(A).T
+    return np.asarray(found[:, :3]), np.asarray(found[:, 3:])
 
 
 def _scale(r: Floats) -> Floats:

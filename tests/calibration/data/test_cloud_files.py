@@ -154,3 +154,12 @@ def test_a_header_of_as_many_columns_says_that_commas_separate_whole_numbers(tmp
 def test_text_that_can_be_read_in_two_ways_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
     found = reason(tmp_path / "a.csv", text.encode())
     assert sentence in found, found
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_every_pattern_of_nan_is_a_missing_point(tmp_path: Path) -> None:
+    content = ply()
+    (tmp_path / "a.ply").write_bytes(content)
+    whole = len(read_cloud(tmp_path / "a.ply"))
+    (tmp_path / "a.ply").write_bytes(content[:-4] + bytes([1, 0, 0xA0, 0x7F]))  # a signalling NaN
+    assert len(read_cloud(tmp_path / "a.ply")) == whole - 1

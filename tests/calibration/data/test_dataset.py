@@ -315,3 +315,22 @@ def test_half_a_quaternion_of_a_pair_is_refused(tmp_path: Path) -> None:
     (tmp_path / "pairs.csv").write_text("\n".join([header, *rows]))
     with pytest.raises(DatasetError, match="lacks base_qy of '0'"):
         load_dataset(tmp_path)
+
+
+def test_a_link_to_no_file_is_no_missing_description(folder: Path) -> None:
+    (folder / "dataset.yaml").unlink()
+    load_dataset(folder)
+    (folder / "dataset.yaml").symlink_to("gone.yaml")
+    with pytest.raises(DatasetError, match="replace or remove the link"):
+        load_dataset(folder)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_quaternion_of_huge_numbers_is_refused_by_its_length(folder: Path) -> None:
+    change(
+        folder / "dataset.yaml",
+        "schema: 1",
+        "schema: 1\nscanner_guess: {xyz: [0, 0, 1], wxyz: [1.0e+308, 0, 0, 0], radius_m: 0.1}",
+    )
+    with pytest.raises(DatasetError, match="length"):
+        load_dataset(folder)

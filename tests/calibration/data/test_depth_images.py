@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import zlib
 from pathlib import Path
 
 import cv2
@@ -192,3 +193,12 @@ def test_an_image_that_promises_too_many_pixels_is_refused(tmp_path: Path) -> No
     (tmp_path / "a.tif").write_bytes(content)
     with pytest.raises(CloudError, match="60000 by 60000 pixels, more than"):
         read_cloud(tmp_path / "a.tif")
+
+
+def test_a_png_whose_bytes_cannot_hold_its_pixels_is_refused_at_once(tmp_path: Path) -> None:
+    image(tmp_path / "a.png", DEPTH.astype(np.uint16))
+    content = (tmp_path / "a.png").read_bytes()
+    chunk = b"IHDR" + (9_000).to_bytes(4, "big") + (9_000).to_bytes(4, "big") + content[24:29]
+    (tmp_path / "a.png").write_bytes(content[:12] + chunk + zlib.crc32(chunk).to_bytes(4, "big") + content[33:])
+    with pytest.raises(CloudError, match=r"promises 9000 by 9000 pixels, more than \d+ bytes can hold"):
+        read_cloud(tmp_path / "a.png")

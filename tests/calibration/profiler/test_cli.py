@@ -160,6 +160,10 @@ def test_a_groove_is_mapped_with_what_was_calibrated(tmp_path: Path) -> None:
         (("edge", "p.npz", "--unit", "m"), "Give --unit mm"),
         (("edge", "e.csv", "--method", "best"), "joint or paper"),
         (("edge", "e.csv", "--feature", "bar"), "no profiles"),
+        (
+            ("edge", "flat.csv", "--feature", "step"),
+            "None of the 8 profiles shows the feature step with its near face on the left. Try --side right",
+        ),
         (("edge", "e.csv", "--sigma-x", "0"), "must be positive"),
         (("edge", "bad.csv"), "has the columns a, b: no x and z of profile points. Name them px_mm and pz_mm"),
         (("edge", "word.csv"), "not a number"),
@@ -179,6 +183,8 @@ def test_a_mistake_is_named_in_one_sentence_and_nothing_is_written(
     Path("bad.csv").write_text("a,b\n1,2\n")
     Path("word.csv").write_text("x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad\n1,two,3,0,0,0\n")
     edge_csv(Path("e.csv"))
+    level = [f"{k},{100 * k},0,500,1,0,0,0,{0.1 * j:.1f},200" for k in range(8) for j in range(60)]
+    Path("flat.csv").write_text("scan,x_mm,y_mm,z_mm,qw,qx,qy,qz,px_mm,pz_mm\n" + "\n".join(level) + "\n")
     code, text = called(*words, "--out", "out")
     assert code == 1
     assert sentence in text
@@ -225,7 +231,7 @@ def test_points_of_three_numbers_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_direction_that_is_open_by_centimetres_is_refused() -> None:
-    vague = SimpleNamespace(reduced_chi2=1.0, covariance=np.diag([1e-6] * 3 + [1e-8, 1e-8, 0.4**2]))
+    vague = SimpleNamespace(reduced_chi2=1.0, scans_chi2=1.0, covariance=np.diag([1e-6] * 3 + [1e-8, 1e-8, 0.4**2]))
     with pytest.raises(
         InputError, match=r"translation along \(0.00, 0.00, 1.00\) of the flange almost open \(one sigma 400 mm\)"
     ):

@@ -7,27 +7,32 @@ import numpy as np
 import typer
 
 from weldcal.calibration.data.motion_dataset import read_stream
-from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import FeatureNotFound
 from weldcal.calibration.motion.line_clock import offset_from_line
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
+from weldcal.calibration.profiler.exports import SECONDS, TABLES, TREES, UNITS, Profiles
+from weldcal.calibration.profiler.importing import profile_unit, profiles_of
 from weldcal.calibration.profiler.record import load_record
+from weldcal.calibration.profiler.text_blocks import blocks_of
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.files import read_text
 from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.commands.profiler.result import PitchOption
 from weldcal.tools.report.files import write_json
 
-_COLUMNS = ("time", "x", "z")
 _KINDS, _SIDES = ("bar", "step", "apex"), ("left", "right")
-_UNITS = {"m": 1.0, "mm": 1e-3}
+_STREAM, _TIMES = "stream.csv", "times.csv"
+_NEAR_S = 0.5  # offset of the clocks that is searched
+_SHARE = 0.01  # of the stream that the profiles last at least: seconds that are read as milliseconds last 0.002 of it at most
 
 
 @command("profiler clock", short_help="Find a profiler's clock from a straight edge.")
 def clock(
     call: Call,
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="stream.csv of the robot and profiles.csv (time,x,z).")
+        Path, typer.Argument(metavar="FOLDER", help="stream.csv of the robot, and the profiles with a time each.")
     ],
     calibration: Annotated[Path, option("--calibration", "RESULT", "Result folder of edge, sphere or compensate.")],
     robot: Annotated[str, option("--arm", "NAME", "The arm of a stream of joint angles.")] = "",
@@ -36,31 +41,40 @@ def clock(
         str, option("--feature", "KIND", "Where a time has many rows, the edge in them: bar, step or apex.")
     ] = "bar",
     side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
+    pitch: PitchOption = None,
 ) -> Outcome:
     """Find the offset of a profiler's clock while the arm weaves across one straight edge: capture = stamp - offset."""
     out = call.folder("profiler", folder.resolve().name)
-    return Outcome(find_clock(folder, calibration, out, robot=robot, unit=unit, feature=feature, side=side))
+    return Outcome(
+        find_clock(folder, calibration, out, robot=robot, unit=unit, feature=feature, side=side, pitch_mm=pitch)
+    )
 
 
 def find_clock(
-    folder: Path, calibration: Path, out: Path, *, robot: str = "", unit: str = "m", feature: str = "bar", side: str = "left"
+    folder: Path, calibration: Path, out: Path, *, robot: str = "", unit: str = "m", feature: str = "bar", side: str = "left",
+    pitch_mm: float | None = None,
 ) -> dict[str, object]:  # fmt: skip
     """Find the offset of a profiler's clock and write clock.json to ``out``.
 
-    ``folder`` holds stream.csv (as a recording in motion) and profiles.csv with time,x,z: one row per time is the point at which the
-    profile crosses the edge, many rows are a raw profile, in which the ``feature`` at the ``side`` is found.
+    ``folder`` holds stream.csv (as a recording in motion) and the profiles: profiles.csv with time,x,z, the export of an instrument, or a
+    folder with one file per profile. Of a profile of many points the ``feature`` at the ``side`` is found; one point is the crossing.
+    times.csv gives the time of each profile where the export holds none. ``pitch_mm``: of an export with heights only.
     Raises InputError: the files cannot be used; TooFewPoses, UndeterminedPoses: the motion does not show the offset.
     """
-    if unit not in _UNITS:
+    if unit not in ("m", "mm"):
         raise InputError(f"The unit '{unit}' is not known; write m or mm.")
     if feature not in _KINDS or side not in _SIDES:
         raise InputError(f"The feature is one of {', '.join(_KINDS)}, and the side left or right.")
     record = load_record(calibration)
-    stream, said = read_stream(folder / "stream.csv", robot=robot, unit=unit)
-    time, points, lost = _crossings(folder / "profiles.csv", _UNITS[unit], feature, side)
+    source = _source(folder, {calibration.resolve(), out.resolve()})
+    stream, said = read_stream(folder / _STREAM, robot=robot, unit=unit)
+    profiles = profiles_of(source, pitch_mm)[0]
+    motion = ContinuousMotion(stream)
+    stamps, time_unit = _stamps(folder, profiles, motion)
+    time, points, lost = _crossings(profiles, stamps, UNITS[profile_unit(profiles, unit)], feature, side)
     if record.arm is not None:
         said.append("The calibration corrects the arm's joints; the stream's poses are used as they are.")
-    found = offset_from_line(time, record.points_F(points), np.eye(4), ContinuousMotion(stream))
+    found = offset_from_line(time, record.points_F(points), np.eye(4), motion)
     result: dict[str, object] = {
         "state": "done",
         "clock_offset_ms": 1e3 * found.offset_s,
@@ -68,6 +82,7 @@ def find_clock(
         "rms_mm": 1e3 * found.rms_m,
         "rms_before_mm": 1e3 * found.before_m,
         "profiles": len(time),
+        "reading": {"file": profiles.source, "form": profiles.form, "time_unit": time_unit},
         "without_feature": lost,
         "edge": {"point": found.point.tolist(), "direction": found.direction.tolist()},
         "warnings": said,
@@ -76,33 +91,67 @@ def find_clock(
     return result | {"written_to": str(out)}
 
 
-def _crossings(path: Path, scale: float, feature: str, side: str) -> tuple[Array, Array, int]:
-    """Times (n,) s, points (n, 2) m at which the profiles cross the edge, and the number of profiles that do not show it."""
-    if not path.is_file():
-        raise InputError(f"There is no '{path}'; give a table with the columns {','.join(_COLUMNS)}.")
-    names, rows = read_rows(path)
-    if not set(_COLUMNS) <= set(names):
-        raise InputError(f"'{path.name}' has the columns {','.join(names)[:80]}; it needs {','.join(_COLUMNS)}.")
-    try:
-        table = np.array([[float(row[c] or "nan") for c in _COLUMNS] for row in rows]).reshape(-1, 3)
-    except ValueError:
-        raise InputError(f"'{path.name}' holds words where numbers are needed; correct it.") from None
-    table = table[np.isfinite(table[:, 0])]
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    times, first, counts = np.unique(table[:, 0], return_index=True, return_counts=True)
-    kept, points, lost = [], [], 0
-    for t, begin, n in zip(times, first, counts, strict=True):
-        profile = scale * table[begin : begin + n, 1:]
-        try:
-            at = (
-                profile[0]
-                if n == 1
-                else extract_edge(profile, cast(Kind, feature), cast(Literal["left", "right"], side))[0]
+def _source(folder: Path, skip: set[Path]) -> Path:
+    """The file or folder of the profiles: profiles.csv, or the only other one beside stream.csv."""
+    plain = folder / "profiles.csv"
+    found = [plain] if plain.exists() else []
+    if not found and folder.is_dir():
+        found = [
+            p for p in sorted(folder.iterdir())
+            if p.name not in (_STREAM, _TIMES) and p.resolve() not in skip and not p.name.startswith((".", "_"))
+            and (p.suffix.lower() in (*TABLES, *TREES) if p.is_file() else any(q.suffix.lower() in (*TABLES, *TREES) for q in p.iterdir()))
+        ]  # fmt: skip
+    if len(found) == 1:
+        return found[0]
+    if found:
+        names = ", ".join(p.name for p in found[:4])
+        raise InputError(f"'{folder}' holds {names}. Keep one of them beside stream.csv, or name it profiles.csv.")
+    raise InputError(
+        f"There is no '{plain}'. Give a table with the columns time,x,z, or put an export of the profiler or a folder of profiles there."
+    )
+
+
+def _stamps(folder: Path, profiles: Profiles, motion: ContinuousMotion) -> tuple[Array, str]:
+    """The times (n,) s of the profiles, and their unit: the stated one, or the one in which half of them lie in the robot's stream."""
+    times, stated = profiles.times, profiles.time_unit
+    if (folder / _TIMES).is_file():
+        blocks = blocks_of(read_text(folder / _TIMES), _TIMES)
+        times, stated = np.concatenate([b.table[:, 0] for b in blocks]) if blocks else np.zeros(0), ""
+        if len(times) != len(profiles):
+            raise InputError(
+                f"'{_TIMES}' holds {len(times)} times and '{profiles.source}' {len(profiles)} profiles. Give one for each."
             )
+    if times is None:
+        raise InputError(
+            f"'{profiles.source}' ({profiles.form}) holds {len(profiles)} profiles and no time of each. Write their times into {_TIMES} in the "
+            "same folder, a row each in the order of the profiles, or give profiles.csv with the columns time,x,z."
+        )
+    if stated:
+        return SECONDS[stated] * times, stated
+    begin, end = motion.span[0] - _NEAR_S, motion.span[1] + _NEAR_S
+    for unit, scale in SECONDS.items():
+        inside = np.count_nonzero((scale * times >= begin) & (scale * times <= end)) >= 0.5 * len(times)
+        if inside and scale * float(np.nanmax(times) - np.nanmin(times)) >= _SHARE * (end - begin):
+            return scale * times, unit
+    raise InputError(
+        f"The profiles' times run from {np.nanmin(times):.10g} to {np.nanmax(times):.10g}, and the robot's stream from {motion.span[0]:.10g} to "
+        f"{motion.span[1]:.10g} s. Bring both to one clock within {_NEAR_S:g} s: add a constant to the times, and write them into {_TIMES}, a row for each "
+        "profile."
+    )
+
+
+def _crossings(profiles: Profiles, stamps: Array, scale: float, feature: str, side: str) -> tuple[Array, Array, int]:
+    """Times (n,) s, points (n, 2) m at which the profiles cross the edge, and the number of profiles that do not show it."""
+    kept, points, lost = [], [], 0
+    for t, found in zip(stamps, profiles.points, strict=True):
+        at = scale * found
+        try:
+            if len(at) > 1:
+                at = extract_edge(at, cast(Kind, feature), cast(Literal["left", "right"], side))[0][None]
         except FeatureNotFound:
             lost += 1
             continue
-        if np.isfinite(at).all():
+        if np.isfinite(at).all() and np.isfinite(t):
             kept.append(float(t))
-            points.append(at)
+            points.append(at[0])
     return np.array(kept), np.array(points).reshape(-1, 2), lost

@@ -131,6 +131,12 @@ def calibrate_edge(
     poses = cast(FlangePoses, file.poses())
     points, lost = edge_points(file, feature, side)
     keep = np.asarray(np.isfinite(points).all(axis=1), bool)
+    if feature and len(keep) and not keep.any():
+        other = ", ".join(f"--feature {kind}" for kind in FEATURES if kind != feature)
+        raise InputError(
+            f"None of the {len(keep)} profiles shows the feature {feature} with its near face on the {side}. "
+            f"Try --side {'right' if side == 'left' else 'left'}, or {other}."
+        )
     check_number(poses, points.shape, "profile points [x, z]", (2,))
     poses, points = poses[keep], points[keep]
     found: dict[str, Any] = {"scans": len(keep), "without_feature": lost}
