@@ -20,6 +20,7 @@ _SECTORS = 24
 _COARSEST = 0.25  # pitch between points over the hole's diameter above which a hole has no edge
 _COUNTERSINK_M = 0.0013  # a hole shows the end of its countersink, so much wider than the thread at most
 _THIN_M = 0.00025  # of the face about its plane: what lies lower is countersink or thread
+_PHASES = 12  # that are tried
 _OFF_M = 0.0004  # from its place in the pattern: such a hole is a dent or a gap in the scan
 
 
@@ -56,8 +57,8 @@ class HolePattern:
 def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> HolePattern | None:
     """Find the hole pattern in the face of a fitted flange; None where fewer than four of its holes are seen well.
 
-    ``points_C`` (N, 3) or (H, W, 3) m. The phase is where the pattern's discs hold the fewest points of the face; each
-    hole's rim is a circle, with one radius for all threads in the end, and the pattern is a similarity of the centres
+    ``points_C`` (N, 3) or (H, W, 3) m. The phase is where the pattern's discs hold the fewest points of the face and have
+    rims: slots are as empty as holes. Each hole's rim is a circle, with one radius for all threads in the end, and the pattern is a similarity of the centres
     (Umeyama 1991 in the plane). Deterministic.
     """
     angles = np.array([*standard.hole_angles_rad, *([standard.pin_angle_rad] if standard.pin_m > 0.0 else [])])
@@ -71,37 +72,16 @@ def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Hol
     pitch = float(np.sqrt(np.pi * solid / xy.shape[1]))
     if pitch > _COARSEST * standard.hole_m:
         return None
-    phase = _phase(xy, angles, standard)
-    if phase is None:
+    found: list[tuple[NDArray[np.intp], NDArray[np.complex128], Array, complex, complex]] = []
+    for phase in _phases(xy, angles, standard):
+        placed = _placed(xy, angles, phase, standard, pitch)
+        found += [] if placed is None else [placed]
+        if placed is not None and len(placed[0]) == len(angles):
+            break
+    if not found:
         return None
+    seen, z, covariances, start, gain = max(found, key=lambda p: len(p[0]))
     place = 0.5 * standard.pitch_circle_m
-    nominal = 0.5 * np.array([standard.hole_m] * standard.n_holes + [standard.pin_m] * (len(angles) - standard.n_holes))
-    seen, z = np.arange(len(angles)), np.zeros(0, dtype=complex)
-    covariances = np.zeros((0, 2, 2))
-    start, gain = 0j, complex(place * np.exp(1j * phase))
-    near = _about(xy, start + gain * np.exp(1j * angles), nominal)
-    threads: float | None = None
-    for k in range(3):
-        expected = start + gain * np.exp(1j * angles)
-        found = _holes(near, expected, nominal, standard.n_holes, pitch, threads, passes=3 if k == 0 else 2)
-        if len(found) < _LEAST_HOLES:
-            return None
-        seen, z = np.array(list(found)), np.array([complex(*c.center) for c in found.values()])
-        radii, covariances = (
-            np.array([c.radius for c in found.values()]),
-            np.array([c.covariance[:2, :2] for c in found.values()]),
-        )
-        start, gain = _similarity(z, angles[seen])
-        while True:  # the worst goes first: it drags the others off their places
-            off = np.abs(z - start - gain * np.exp(1j * angles[seen]))
-            worst = int(np.argmax(off))
-            if off[worst] < _OFF_M:
-                break
-            if len(seen) == _LEAST_HOLES:
-                return None
-            seen, z, radii, covariances = (np.delete(a, worst, axis=0) for a in (seen, z, radii, covariances))
-            start, gain = _similarity(z, angles[seen])
-        threads = float(np.median(radii[seen < standard.n_holes]))
     off = z - start - gain * np.exp(1j * angles[seen])
     turn_sigma = _turn_sigma(off, gain, angles[seen], covariances)
     others = _other_turns(xy, start, gain, standard, seen, pitch)
@@ -151,8 +131,39 @@ def _face(points: Array, fit: FlangeFit, standard: FlangeStandard, axes: Array) 
     return np.array([x[on], y[on]])
 
 
-def _phase(xy: Array, angles: Array, standard: FlangeStandard) -> float | None:
-    """Rotation (rad) of the standard's pattern, in the plane's axes, at which its holes are emptiest; None without one."""
+def _placed(
+    xy: Array, angles: Array, phase: float, standard: FlangeStandard, pitch: float
+) -> tuple[NDArray[np.intp], NDArray[np.complex128], Array, complex, complex] | None:
+    """The holes at a phase (rad): which ones, their centres, covariances (k, 2, 2) m^2, shift and gain of the pattern; None where
+    fewer than four have a rim at their places."""
+    nominal = 0.5 * np.array([standard.hole_m] * standard.n_holes + [standard.pin_m] * (len(angles) - standard.n_holes))
+    start, gain = 0j, complex(0.5 * standard.pitch_circle_m * np.exp(1j * phase))
+    near = _about(xy, start + gain * np.exp(1j * angles), nominal)
+    threads: float | None = None
+    for k in range(3):
+        expected = start + gain * np.exp(1j * angles)
+        found = _holes(near, expected, nominal, standard.n_holes, pitch, threads, passes=3 if k == 0 else 2)
+        if len(found) < _LEAST_HOLES:
+            return None
+        seen, z = np.array(list(found)), np.array([complex(*c.center) for c in found.values()])
+        radii = np.array([c.radius for c in found.values()])
+        covariances = np.array([c.covariance[:2, :2] for c in found.values()])
+        start, gain = _similarity(z, angles[seen])
+        while True:  # the worst goes first: it drags the others off their places
+            off = np.abs(z - start - gain * np.exp(1j * angles[seen]))
+            worst = int(np.argmax(off))
+            if off[worst] < _OFF_M:
+                break
+            if len(seen) == _LEAST_HOLES:
+                return None
+            seen, z, radii, covariances = (np.delete(a, worst, axis=0) for a in (seen, z, radii, covariances))
+            start, gain = _similarity(z, angles[seen])
+        threads = float(np.median(radii[seen < standard.n_holes]))
+    return seen, z, covariances, start, gain
+
+
+def _phases(xy: Array, angles: Array, standard: FlangeStandard) -> list[float]:
+    """Rotations (rad) of the standard's pattern, in the plane's axes, at which its holes are emptiest, the emptiest first."""
     place, disc = 0.5 * standard.pitch_circle_m, 0.35 * standard.hole_m
     rho = np.sqrt(xy[0] * xy[0] + xy[1] * xy[1])
     ring = np.flatnonzero(np.abs(rho - place) < disc)
@@ -166,14 +177,20 @@ def _phase(xy: Array, angles: Array, standard: FlangeStandard) -> float | None:
     at_hole = (np.arange(360)[None] + np.round(np.degrees(angles)).astype(int)[:, None]) % 360
     # a plugged hole counts as face, however dense its plug
     total = np.minimum(count, np.median(count))[at_hole].sum(axis=0)
-    best = int(np.argmin(total))
     # a face without holes, or too thin a scan of one, has no phase that stands out
-    if total[best] > 0.25 * float(np.median(total)) or float(np.median(count)) < 10.0:
-        return None
-    # the counts are zero over a stretch of phases: its middle, along the circle
-    low = np.nonzero(total <= total[best] + 0.02 * float(np.median(total)))[0]
-    low = low[np.abs((low - best + 180) % 360 - 180) < 8]
-    return float(np.radians(best + np.mean((low - best + 180) % 360 - 180)))
+    limit = 0.6 * float(np.median(total))
+    if float(np.median(count)) < 10.0:
+        return []
+    phases: list[float] = []
+    left = total.copy()
+    while len(phases) < _PHASES and left.min() <= limit:
+        best = int(np.argmin(left))
+        # the counts are zero over a stretch of phases: its middle, along the circle
+        low = np.nonzero(left <= total[best] + 0.02 * float(np.median(total)))[0]
+        low = low[np.abs((low - best + 180) % 360 - 180) < 8]
+        phases.append(float(np.radians(best + np.mean((low - best + 180) % 360 - 180))))
+        left[np.abs((np.arange(360) - best + 180) % 360 - 180) < 8] = np.inf
+    return phases
 
 
 def _other_turns(

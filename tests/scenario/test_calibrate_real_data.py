@@ -295,6 +295,14 @@ def test_one_to_three_scans_calibrate_and_say_what_their_figures_rest_on(
     assert 1e3 * float(np.median(position_errors(report.result.X_BC, rest))) < limit_mm
 
 
+def test_one_scan_of_a_flange_with_slots_is_calibrated(tmp_path: Path) -> None:
+    report = calibrate_dataset(DATA / "franka_phoxi_m", tmp_path / "out", axis_turn_deg=0.0)
+    pattern = report.patterns["pose04"]
+    assert pattern.turn_known
+    assert pattern.rms_m < 2e-4
+    assert abs(pattern.ratio - 1.0) < 0.01
+
+
 def _as_seen(aubo: CalibrationReport) -> list[Observation]:
     """The sightings of all scans without a correction of the scanner."""
     X_BR = {o.id: o.X_BR for o in aubo.observations}

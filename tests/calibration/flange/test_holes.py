@@ -59,6 +59,21 @@ def test_the_pitch_circle_measures_the_scale(scale: float) -> None:
     assert pattern.ratio == pytest.approx(scale, abs=4.0 * RATIO_SIGMA)
 
 
+@pytest.mark.parametrize("yaw_deg", [0.0, 33.0, -140.0])
+def test_slots_between_the_threads_are_no_holes(yaw_deg: float) -> None:
+    """Three slots as deep as the face is wide, on the pitch circle between threads: emptier than the holes themselves."""
+    points, X_CR = _scan(STANDARD, yaw_deg)
+    d = (X_CR.inverse() @ points.T).T
+    rho, angle = np.hypot(d[:, 0], d[:, 1]), np.degrees(np.arctan2(d[:, 1], d[:, 0]))
+    slot = np.any([np.abs((angle - a + 180.0) % 360.0 - 180.0) < 26.0 for a in (0.0, 180.0, 270.0)], axis=0)
+    points = points[~(slot & (rho > 0.0205) & (rho < 0.0285))]
+    pattern = find_holes(points, fit_flange(points, STANDARD), STANDARD)
+    assert pattern is not None
+    assert pattern.turn_known
+    error = (X_CR.rotation().inverse() @ pattern.X_CR.rotation()).ToAngleAxis().angle()
+    assert np.degrees(error) < np.degrees(4.0 * RATIO_SIGMA) + 0.02
+
+
 def test_one_plugged_hole_leaves_the_pattern_and_two_do_not() -> None:
     points, X_CR = _scan(STANDARD, 75.0)
     fit = fit_flange(points, STANDARD)
