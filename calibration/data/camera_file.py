@@ -1,8 +1,8 @@
-"""Read a camera's matrix and distortion from the files that ROS, OpenCV, Kalibr, EuRoC, ViSP and RealSense users have."""
+"""Read a camera's matrix and distortion from the files that ROS, OpenCV, Kalibr, EuRoC, ViSP, Open3D, BOP and RealSense users have."""
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,9 @@ from weldcal.models.documents import as_number
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, LARGEST_NUMBER, read_text
 
-_MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "mtx", "m1", "m", "cammatrix", "intrinsic", "intrinsics", "kmatrix")
+_MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "camk", "mtx", "m1", "m", "cammatrix", "intrinsic", "intrinsics", "kmatrix", "matrix")  # fmt: skip
 _DISTORTION = ("distortioncoefficients", "distortioncoeffs", "distortion", "distcoeffs", "distcoeff", "dist", "d", "d1", "coeffs", "distcoefs", "kc")  # fmt: skip
-_NUMBERS = (("fx", "fu", "px"), ("fy", "fv", "py"), ("cx", "ppx", "u0", "pu"), ("cy", "ppy", "v0", "pv"))
+_NUMBERS = (("fx", "fu", "px", "focalx"), ("fy", "fv", "py", "focaly"), ("cx", "ppx", "u0", "pu", "centerx"), ("cy", "ppy", "v0", "pv", "centery"))  # fmt: skip
 _FISHEYE = ("equidistant", "fisheye", "kannala", "omni", "thin_prism", "eucm", "fov")
 _COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients that OpenCV knows
 _NEEDED = "give camera_matrix (or K) and distortion_coefficients, as ROS and OpenCV write them, or fx, fy, cx and cy in pixels"
@@ -32,11 +32,13 @@ class CameraFile:
         K: camera matrix (3, 3), px; the centre of the first pixel at (0, 0).
         distortion: OpenCV's coefficients k1, k2, p1, p2, k3 ..., 5 or more.
         size: width and height of its pictures, px; None where the file does not state it.
+        model: the file's words for its lens.
     """
 
     K: Array
     distortion: Array
     size: tuple[int, int] | None
+    model: str = ""
 
 
 def read_camera(path: Path) -> CameraFile:
@@ -45,43 +47,56 @@ def read_camera(path: Path) -> CameraFile:
     Raises:
         DatasetError: the file cannot be read, states no camera, or a lens model that OpenCV's pinhole model does not include.
     """
-    tree = _tree(path)
-    for node in _nodes(tree):
-        found = _camera(node, path.name)
-        if found is not None:
-            return found
-    raise DatasetError(f"'{path.name}' states no camera that can be read: {_NEEDED}.")
+    try:
+        found = find_camera(path)
+    except InputError as problem:
+        raise DatasetError(str(problem)) from problem
+    if found is None:
+        raise DatasetError(f"'{path.name}' states no camera that can be read: {_NEEDED}.")
+    name, K, dist = path.name, found.K, found.distortion
+    if any(word in found.model for word in _FISHEYE):
+        raise DatasetError(
+            f"'{name}' states the lens model '{found.model.strip()}'; pinhole cameras with radial and tangential distortion are read: calibrate "
+            "the camera with OpenCV's calibrateCamera, or leave the file out and let the camera be estimated."
+        )
+    if dist.size not in _COUNTS:
+        raise DatasetError(
+            f"'{name}' holds {dist.size} distortion coefficients; OpenCV knows {', '.join(map(str, _COUNTS))}."
+        )
+    if not (np.abs([*K.ravel(), *dist]) <= LARGEST_NUMBER).all() or min(K[0, 0], K[1, 1]) <= 1.0:
+        raise DatasetError(f"'{name}' holds a focal length that is no number of pixels above 1; {_NEEDED}.")
+    return replace(found, distortion=np.append(dist, 0.0) if dist.size == 4 else dist)
+
+
+def find_camera(path: Path) -> CameraFile | None:
+    """The camera of a file as it is stated, not checked; None where it states none. Raises InputError where it cannot be read."""
+    return next((found for node in _nodes(_tree(path)) if (found := _camera(node)) is not None), None)
 
 
 def _tree(path: Path) -> Any:
     ending = path.suffix.lower()
-    try:
-        if ending == ".npz":
-            return dict(read_npz(path))
-        if ending == ".npy":
-            return {"K": read_npy(path)}
-        if ending in (".txt", ".csv", ".dat"):
-            words = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", read_text(path, LARGEST_DOCUMENT))
-            values = np.array([float(w) for w in words])
-            if len(values) >= 9 and values[8] == 1.0 and not values[[3, 6, 7]].any():
-                return (
-                    {"K": values[:9].reshape(3, 3), "D": values[9:]} if len(values) > 9 else {"K": values.reshape(3, 3)}
-                )
-            raise DatasetError(f"'{path.name}' does not begin with the nine numbers of a camera matrix: {_NEEDED}.")
+    if ending == ".npz":
+        return dict(read_npz(path))
+    if ending == ".npy":
+        return {"K": read_npy(path)}
+    if ending not in (".txt", ".csv", ".dat"):
         return read_tree(path)
-    except DatasetError:
-        raise
-    except InputError as problem:
-        raise DatasetError(str(problem)) from problem
+    words = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", read_text(path, LARGEST_DOCUMENT))
+    values = np.array([float(w) for w in words])
+    if len(values) in (4, 12, 16):
+        return {"intrinsics": values}
+    return {"K": values[:9], "D": values[9:]} if len(values) > 9 else {"K": values}
 
 
-def _nodes(tree: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
-    """Every mapping of a tree, the outer ones first."""
-    if isinstance(tree, Mapping):
-        yield tree
-    if depth < 5 and isinstance(tree, Mapping | list):
-        for one in tree.values() if isinstance(tree, Mapping) else tree:
-            yield from _nodes(one, depth + 1)
+def _nodes(tree: Any) -> Iterator[Mapping[str, Any]]:
+    """The mappings of a tree, the outer ones first."""
+    level = [tree]
+    while level:
+        yield from (node for node in level if isinstance(node, Mapping))
+        parts = (
+            node.values() if isinstance(node, Mapping) else node if isinstance(node, list) else () for node in level
+        )
+        level = [v for values in parts for v in values if isinstance(v, Mapping | list)]
 
 
 def _plain(node: Mapping[str, Any]) -> dict[str, Any]:
@@ -100,45 +115,33 @@ def _values(value: Any) -> Array | None:
     return found if found.size and np.isfinite(found).all() else None
 
 
-def _camera(node: Mapping[str, Any], name: str) -> CameraFile | None:
+def _camera(node: Mapping[str, Any]) -> CameraFile | None:
     plain = _plain(node)
-    K = None
+    numbers = [next((as_number(plain[k]) for k in keys if k in plain), np.nan) for keys in _NUMBERS]
     for key in _MATRIX:
         values = _values(plain.get(key))
-        if values is not None and values.size == 9:
-            K = values.reshape(3, 3)
-            K = K if K[2, 2] == 1.0 and K[2, 0] == 0.0 else K.T
-        elif values is not None and values.size == 4 and key == "intrinsics":  # Kalibr and EuRoC: fx, fy, cx, cy
-            K = np.array([[values[0], 0.0, values[2]], [0.0, values[1], values[3]], [0.0, 0.0, 1.0]])
-        if K is not None:
+        if values is None:
+            continue
+        if values.size == 4 and key.startswith("intrinsic"):  # Kalibr and EuRoC: fx, fy, cx, cy
+            numbers = values.tolist()
             break
-    if K is None:
-        numbers = [next((as_number(plain[k]) for k in keys if k in plain), np.nan) for keys in _NUMBERS]
-        if not np.isfinite(numbers).all():
-            return None
-        K = np.array([[numbers[0], 0.0, numbers[2]], [0.0, numbers[1], numbers[3]], [0.0, 0.0, 1.0]])
-    model = " ".join(
-        str(plain.get(k, "")) for k in ("distortionmodel", "cameramodel", "model", "projectionmodel")
-    ).lower()
-    if any(word in model for word in _FISHEYE):
-        raise DatasetError(
-            f"'{name}' states the lens model '{model.strip()}'; pinhole cameras with radial and tangential distortion are read: calibrate the "
-            "camera with OpenCV's calibrateCamera, or leave the file out and let the camera be estimated."
-        )
+        if values.size in (9, 12, 16):
+            K = values.reshape({9: (3, 3), 12: (3, 4), 16: (4, 4)}[values.size])[:3, :3]
+            K = K.T if K[2, 0] > 1.0 and K[0, 2] == 0.0 else K  # column by column, as Open3D writes it
+            if K[2, 2] == 1.0 and K[1, 0] == 0.0 == K[2, 0] == K[2, 1]:
+                numbers = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+                break
+    if not np.isfinite(numbers).all():
+        return None
+    fx, fy, cx, cy = numbers
+    model = " ".join(str(plain.get(k, "")) for k in ("distortionmodel", "cameramodel", "model", "projectionmodel"))
     dist = next((v for key in _DISTORTION if (v := _values(plain.get(key))) is not None), None)
     if dist is None:
         named = [as_number(plain.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2", "k3")]
         if plain.get("kud") is not None:  # ViSP: u = u0 + px x (1 + kud r2)
             named[0] = as_number(plain["kud"])
         dist = np.array([v if np.isfinite(v) else 0.0 for v in named])
-    if dist.size not in _COUNTS:
-        raise DatasetError(
-            f"'{name}' holds {dist.size} distortion coefficients; OpenCV knows {', '.join(map(str, _COUNTS))}."
-        )
-    dist = np.append(dist, 0.0) if dist.size == 4 else dist
-    if not (np.abs([*K.ravel(), *dist]) <= LARGEST_NUMBER).all() or min(K[0, 0], K[1, 1]) <= 1.0:
-        raise DatasetError(f"'{name}' holds a focal length that is no number of pixels above 1; {_NEEDED}.")
-    return CameraFile(K, dist, _size(plain))
+    return CameraFile(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), dist, _size(plain), model.lower())
 
 
 def _size(plain: Mapping[str, Any]) -> tuple[int, int] | None:

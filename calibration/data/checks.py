@@ -10,9 +10,9 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RotationMatrix
 
+from weldcal.calibration.data.cloud_files.depth import checked_intrinsics
 from weldcal.calibration.data.cloud_files.form import VIEWPOINTS
 from weldcal.calibration.data.cloud_files.grid import measured
-from weldcal.calibration.data.cloud_files.intrinsics import checked_intrinsics
 from weldcal.calibration.data.clouds import CloudError, CloudForm, read_cloud
 from weldcal.calibration.data.header import DatasetHeader, Feature, PoseForm, ScannerGuess, Units
 from weldcal.calibration.data.poses.names import mounting_name
@@ -138,8 +138,9 @@ def to_metres(points: Array, unit: str, name: str) -> Array:
     Raises CloudError.
     """
     points = measured(points, name)
-    finite = points[np.isfinite(points[..., 2])]
-    distance = float(np.median(np.linalg.norm(finite[:: 1 + len(finite) // _SAMPLE], axis=1)))
+    finite = np.flatnonzero(np.isfinite(points[..., 2]))
+    some = points.reshape(-1, points.shape[-1])[finite[:: 1 + len(finite) // _SAMPLE]]
+    distance = float(np.median(np.linalg.norm(some, axis=1)))
     if unit == AUTO:
         unit = "mm" if distance > REACH_M[1] else "m"
     points *= UNITS[unit]

@@ -13,13 +13,14 @@ from weldcal.calibration.data.cloud_files.depth import (
     back_projected,
     camera_of,
     check_pixels,
+    checked_intrinsics,
     depth_points,
+    intrinsics_of,
     is_depth_array,
     read_depth_image,
 )
 from weldcal.calibration.data.cloud_files.form import CloudForm
 from weldcal.calibration.data.cloud_files.grid import measured
-from weldcal.calibration.data.cloud_files.intrinsics import checked_intrinsics, intrinsics_of
 from weldcal.calibration.data.cloud_files.pcd import read_pcd
 from weldcal.calibration.data.cloud_files.ply import read_ply
 from weldcal.models.array_files import read_npy, read_npz

@@ -3,17 +3,11 @@
 Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the Bayesian
 information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a size that matters. The
 thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its false alarms are counted on.
-
-With the flange's centre at the origin of its frame, a wrong rotation moves no centre; it shows only between the faces' normals and
-the poses' z axes. Then R_BC follows from the centres, and each misreading is judged by the normals.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.doctor.case import Case
 from weldcal.calibration.doctor.fit import NU, Fit, fit
@@ -27,7 +21,7 @@ from weldcal.calibration.doctor.readings import (
     mixed_units,
 )  # fmt: skip
 from weldcal.calibration.geometry.robust import f_tail
-from weldcal.calibration.geometry.se3 import log_rotation, pose
+from weldcal.calibration.geometry.se3 import log_rotation
 from weldcal.models.arrays import Array
 
 _GROSS = 6.0  # spreads of a scan's distance beyond which it disagrees
@@ -174,72 +168,12 @@ def installation(case: Case, one: Fit) -> Finding | None:
     return Finding("robot in another installation", float(min(10.0 * (off / case.guess_radius) ** 2, 400.0)), numbers)
 
 
-_FIT_RAD = 0.02  # normals agree with a reading
 _WRONG_RAD = 0.05  # normals disagree with the poses as they are
-_SAME = 3.0  # a mirrored scan must bring the residuals down by this factor
-_Order = Literal["xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ"]
-_ORDERS: tuple[_Order, ...] = ("xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ")
-
-
-@dataclass(frozen=True, eq=False)
-class Misread:
-    """A way of misreading rotations or scans: the cause, its words, the corrected case and its fit."""
-
-    cause: str
-    words: str
-    case: Case
-    fit: Fit
-
-
-def misread_rotations(case: Case, null: Fit) -> Misread | None:
-    """The misreading that explains why normals disagree with the poses while the centres agree; None where there is none."""
-    seen = np.asarray(np.isfinite(case.m).all(axis=1))
-    if seen.sum() < 5:
-        return None
-    by_centres = fit(case, normals=False)
-    u = case.m[seen] @ by_centres.R[0].T
-    if by_centres.rms > 3e-3 or _off(u, case.z[seen]) < _WRONG_RAD:
-        return None
-    best: tuple[float, str, Array] | None = None
-    for words, R in _readings(case.X_BF[:, :3, :3]):
-        off = _off(u, (R @ case.X_FR[:3, :3])[seen][:, :, 2])
-        if off < _FIT_RAD and (best is None or off < best[0]):
-            best = off, words, R
-    if best is None:
-        return None
-    other = case.with_poses(pose(best[2], case.X_BF[:, :3, 3]))
-    return Misread("wrong rotation convention", best[1], other, fit(other))
 
 
 def _off(u: Array, z: Array) -> float:
     """Median angle (rad) between two lists of directions."""
     return float(np.median(np.arctan2(np.linalg.norm(np.cross(u, z), axis=1), (u * z).sum(axis=1))))
-
-
-def _readings(R: Array) -> Iterator[tuple[str, Array]]:
-    turn = Rotation.from_matrix(R)
-    for read in _ORDERS:
-        angles = turn.as_euler(read)
-        for order in _ORDERS:
-            if order != read:
-                words = f"the rotations are Euler angles in the order {order}, and they were read in the order {read}"
-                yield words, np.asarray(Rotation.from_euler(order, angles).as_matrix())
-        yield (
-            f"the rotations are rotation vectors, and they were read as Euler angles in the order {read}",
-            np.asarray(Rotation.from_rotvec(angles).as_matrix()),
-        )
-        yield (
-            f"the rotations are Euler angles in the order {read}, and they were read as rotation vectors",
-            np.asarray(Rotation.from_euler(read, turn.as_rotvec()).as_matrix()),
-        )
-        yield (
-            "the angles are radians, and they were read as degrees",
-            np.asarray(Rotation.from_euler(read, np.degrees(angles)).as_matrix()),
-        )
-    yield (
-        "the angles are radians, and they were read as degrees",
-        np.asarray(Rotation.from_rotvec(np.degrees(turn.as_rotvec())).as_matrix()),
-    )
 
 
 def rotations_disagree(case: Case) -> dict[str, float] | None:
@@ -252,35 +186,6 @@ def rotations_disagree(case: Case) -> dict[str, float] | None:
     if by_centres.rms > 3e-3 or off < _WRONG_RAD:
         return None
     return {"centres_mm": 1e3 * by_centres.rms, "normals_deg": float(np.degrees(off))}
-
-
-def mirrored(case: Case, null: Fit) -> Misread | None:
-    """The case with the scanner's x axis turned round, where only that fits; one mirror stands for all, the others are turned ones."""
-    flip = np.array([-1.0, 1.0, 1.0])
-    other = replace(case, c=case.c * flip, m=case.m * flip)
-    one = fit(other)
-    if null.rms < _SAME * max(one.rms, 3e-4):
-        return None
-    return Misread(
-        "scanner axes mirrored", "the scanner's frame is left-handed: one of its axes is mirrored", other, one
-    )
-
-
-def reordered(case: Case, null: Fit) -> Misread | None:
-    """The case with scans and poses paired in another order: backwards, or as names sort as text ("10" before "2")."""
-    n = case.n
-    text = np.array(sorted(range(n), key=lambda k: str(k + 1)))
-    back = np.argsort(text)
-    for words, order in (
-        ("the scans stand in the reverse order of the poses", np.arange(n)[::-1]),
-        ("the scans are sorted as text (1, 10, 11, 2) and the poses by number", text),
-        ("the poses are sorted as text (1, 10, 11, 2) and the scans by number", back),
-    ):
-        other = case.with_poses(case.X_BF[order])
-        one = fit(other)
-        if null.rms > _SAME * max(one.rms, 3e-4):
-            return Misread("scans and poses in different orders", words, other, one)
-    return None
 
 
 THRESHOLDS = {
@@ -351,13 +256,7 @@ def diagnose(case: Case) -> Diagnosis:
     models = _ranked(case, null)
     winner = next((m for m in models if _named(m, null)), None)
     if wrong:
-        plain = fit(bare)
-        reading = (
-            best_reading(bare, plain)
-            or misread_rotations(bare, plain)
-            or mirrored(bare, plain)
-            or reordered(bare, plain)
-        )
+        reading = best_reading(bare, fit(bare))
         rival = winner.bic if winner is not None else null.bic
         if reading is not None and reading.fit.bic / reading.case.n < rival / case.n:
             causes.append(

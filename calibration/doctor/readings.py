@@ -1,7 +1,8 @@
-"""Tries the ways in which a list of poses is misread: the quaternion's order, the inverse, a mixed unit, scans against poses."""
+"""Tries the ways in which poses and scans are misread: rotations, the inverse, a mirrored scanner, the order of rows, units."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,8 @@ _WITHIN = 0.5  # of the logarithm of a unit's factor: a TCP or a quaternion's or
 _REACH_M = (0.02, 9.0)
 FEWEST = 5
 LOOKS_WRONG_M, LOOKS_WRONG_RAD = 3e-3, 0.03  # residuals of no arm and scanner that work
+_Order = Literal["xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ"]
+_ORDERS: tuple[_Order, ...] = ("xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ")
 _LEAST_GAIN = 3.0  # a reading must bring the residuals down by this factor: nothing less is a misreading
 
 
@@ -30,40 +33,58 @@ class Reading:
     fit: Fit
 
 
-def _turned(case: Case, R: Array) -> Case:
-    return case.with_poses(pose(R, case.X_BF[:, :3, 3]))
+def _rotations(R: Array) -> Iterator[tuple[str, str, Array]]:
+    """Other rotations (n, 3, 3) that the same numbers may mean: cause, words, rotations."""
+    turn = Rotation.from_matrix(R)
+    yield "poses inverted", "the rotations are transposed", np.swapaxes(R, 1, 2)
+    for first, order, other in ((True, "x, y, z, w", "w, x, y, z"), (False, "w, x, y, z", "x, y, z, w")):
+        q = Rotation.from_quat(turn.as_quat(scalar_first=first), scalar_first=not first)
+        words = f"the quaternions' order is ({order}), and they were read as ({other})"
+        yield "wrong quaternion order", words, np.asarray(q.as_matrix())
+    vector = turn.as_rotvec()
+    found = [("angles are radians, and they were read as degrees", Rotation.from_rotvec(np.degrees(vector)))]
+    for read in _ORDERS:
+        angles = turn.as_euler(read)
+        name = f"Euler angles in the order {read}"
+        found += [
+            (
+                f"rotations are Euler angles in the order {order}, and they were read in the order {read}",
+                Rotation.from_euler(order, angles),
+            )
+            for order in _ORDERS
+            if order != read
+        ]
+        found += [
+            (f"rotations are rotation vectors, and they were read as {name}", Rotation.from_rotvec(angles)),
+            (f"rotations are {name}, and they were read as rotation vectors", Rotation.from_euler(read, vector)),
+            ("angles are radians, and they were read as degrees", Rotation.from_euler(read, np.degrees(angles))),
+        ]
+    for words, other_turn in found:
+        yield "wrong rotation convention", f"the {words}", np.asarray(other_turn.as_matrix())
 
 
-def _other_order(case: Case) -> Case:
-    """The poses as if (x, y, z, w) had been taken for (w, x, y, z)."""
-    wxyz = Rotation.from_matrix(case.X_BF[:, :3, :3]).as_quat(scalar_first=True)
-    return _turned(case, np.asarray(Rotation.from_quat(wxyz, scalar_first=False).as_matrix()))
-
-
-def _other_order_back(case: Case) -> Case:
-    """The poses as if (w, x, y, z) had been taken for (x, y, z, w)."""
-    xyzw = Rotation.from_matrix(case.X_BF[:, :3, :3]).as_quat(scalar_first=False)
-    return _turned(case, np.asarray(Rotation.from_quat(xyzw, scalar_first=True).as_matrix()))
-
-
-def _vector_as_euler(case: Case) -> Case:
-    turn = Rotation.from_matrix(case.X_BF[:, :3, :3])
-    return _turned(case, np.asarray(Rotation.from_euler("xyz", turn.as_rotvec()).as_matrix()))
-
-
-def _euler_as_vector(case: Case) -> Case:
-    turn = Rotation.from_matrix(case.X_BF[:, :3, :3])
-    return _turned(case, np.asarray(Rotation.from_rotvec(turn.as_euler("xyz")).as_matrix()))
-
-
-READINGS: dict[str, tuple[str, Callable[[Case], Case]]] = {
-    "the quaternions' order is (x, y, z, w), and they were read as (w, x, y, z)": ("wrong quaternion order", _other_order),
-    "the quaternions' order is (w, x, y, z), and they were read as (x, y, z, w)": ("wrong quaternion order", _other_order_back),
-    "the poses are the base in the flange, the inverse of what is expected": ("poses inverted", lambda c: c.with_poses(inverse(c.X_BF))),
-    "the rotations are transposed": ("poses inverted", lambda c: _turned(c, np.swapaxes(c.X_BF[:, :3, :3], 1, 2))),
-    "the rotations are roll, pitch and yaw, and they were read as rotation vectors": ("wrong rotation convention", _vector_as_euler),
-    "the rotations are rotation vectors, and they were read as roll, pitch and yaw": ("wrong rotation convention", _euler_as_vector),
-}  # fmt: skip
+def _misreadings(case: Case) -> Iterator[tuple[str, str, Case, Case]]:
+    """Cause, words, the scans as given, and the same scans in another reading."""
+    for cause, words, R in _rotations(case.X_BF[:, :3, :3]):
+        yield cause, words, case, case.with_poses(pose(R, case.X_BF[:, :3, 3]))
+    words = "the poses are the base in the flange, the inverse of what is expected"
+    yield "poses inverted", words, case, case.with_poses(inverse(case.X_BF))
+    flip = np.array([-1.0, 1.0, 1.0])  # one mirror stands for all: the others are turned ones
+    words = "the scanner's frame is left-handed: one of its axes is mirrored"
+    yield "scanner axes mirrored", words, case, replace(case, c=case.c * flip, m=case.m * flip)
+    text = np.array(sorted(range(case.n), key=lambda k: str(k + 1)))
+    for words, order in (
+        ("the scans stand in the reverse order of the poses", np.arange(case.n)[::-1]),
+        ("the scans are sorted as text (1, 10, 11, 2) and the poses by number", text),
+        ("the poses are sorted as text (1, 10, 11, 2) and the scans by number", np.argsort(text)),
+    ):
+        yield "scans and poses in different orders", words, case, case.with_poses(case.X_BF[order])
+    if case.n > 6:
+        for shift, words in ((1, "before"), (-1, "after")):
+            rows = np.arange(max(shift, 0), case.n + min(shift, 0))
+            inside = case.pick(rows)
+            words = f"each scan belongs to the pose {words} its own"
+            yield "scans and poses shifted by one", words, inside, inside.with_poses(case.X_BF[rows - shift])
 
 
 def looks_wrong(one: Fit) -> bool:
@@ -75,19 +96,11 @@ def looks_wrong(one: Fit) -> bool:
 def best_reading(case: Case, null: Fit) -> Reading | None:
     """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's; else None."""
     found: list[Reading] = []
-    for words, (cause, change) in READINGS.items():
-        other = change(case)
-        found.append(Reading(cause, words, other, fit(other)))
-    for shift in (1, -1):
-        if case.n > 6:
-            inside = case.pick(np.arange(1, case.n) if shift == 1 else np.arange(case.n - 1))
-            X = case.X_BF[:-1] if shift == 1 else case.X_BF[1:]
-            moved = inside.with_poses(X)
-            words = f"each scan belongs to the pose {'before' if shift == 1 else 'after'} its own"
-            one = fit(moved)
-            # one scan fewer: compared on the same scans
-            if fit(inside).bic - one.bic > 0.0:
-                found.append(Reading("scans and poses shifted by one", words, moved, one))
+    for cause, words, given, other in _misreadings(case):
+        one = fit(other)
+        # with a scan fewer it is compared on the same scans
+        if given is case or fit(given).bic > one.bic:
+            found.append(Reading(cause, words, other, one))
     found = [r for r in found if not looks_wrong(r.fit)]
     found.sort(key=lambda r: r.fit.bic / r.case.n)
     best = found[0] if found else None

@@ -74,7 +74,7 @@ def _basis(ray: Array, middle: Array) -> Array | None:
     if np.mean(np.abs(steps - np.rint(steps)).max(axis=1) < _INSIDE) < _MOST:
         return None
     fit = np.rint(steps)
-    basis = np.linalg.lstsq(fit, d, rcond=None)[0]
+    basis = np.asarray(np.linalg.lstsq(fit, d, rcond=None)[0], dtype=float)
     along = np.abs(basis[:, 0])
     basis = basis[np.argsort(-along, kind="stable")]
     return np.asarray(basis * np.sign([[basis[0, 0]], [basis[1, 1]]]))
@@ -121,7 +121,7 @@ def _indices(ray: Array, basis: Array) -> NDArray[np.intp] | None:
                 index = np.rint(found)
                 if np.mean(np.abs(found - index).max(axis=1) < _INSIDE) < _MOST:
                     break
-                return index.astype(np.intp)
+                return np.asarray(index, dtype=np.intp)
     return None
 
 
@@ -137,7 +137,7 @@ def is_thinned(grid: Array) -> bool:
     count = np.count_nonzero(known)
     beside = np.count_nonzero(known[:, 1:] & known[:, :-1])
     below = np.count_nonzero(known[1:] & known[:-1])
-    return count > 0 and min(beside, below) < _THINNED * count
+    return bool(count > 0 and min(beside, below) < _THINNED * count)
 
 
 def interpolated(grid: Array) -> Array:

@@ -134,7 +134,7 @@ def flat_parts(
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.float32(1.0) / z
         if smooth:  # noise hides the crease between a face and the wall below it
-            inverse = cv2.blur(inverse, (3, 3))
+            inverse = np.asarray(cv2.blur(inverse, (3, 3)), dtype=np.float32)
         bend_u = np.abs(inverse[1:-1, 2:] + inverse[1:-1, :-2] - 2.0 * inverse[1:-1, 1:-1])
         bend_v = np.abs(inverse[2:, 1:-1] + inverse[:-2, 1:-1] - 2.0 * inverse[1:-1, 1:-1])
         bend = np.maximum(bend_u, bend_v)

@@ -304,7 +304,8 @@ def _labelled(
         at, xy = at[seen], xy[seen]
     if w.measured is not None:
         # an edge against nothing has a label on one side only, which would pull it
-        at, xy = (a[w.measured.ravel()[at]] for a in (at, xy))
+        kept = w.measured.ravel()[at]
+        at, xy = at[kept], xy[kept]
         on = w.face.ravel()[at]
         sector = _sector(xy[:, 0] - start.center[0], xy[:, 1] - start.center[1], _LABEL_SECTORS)
         both = (
@@ -346,7 +347,7 @@ def _face(
     said = core & (w.known | np.isfinite(w.z))
     spacing = pitch
     if w.measured is not None:
-        spacing *= float(np.sqrt(count / max(np.count_nonzero(ring & w.face & w.measured), 1)))
+        spacing *= float(np.sqrt(count / max(int(np.count_nonzero(ring & w.face & w.measured)), 1)))
     measured = Measured(
         plane=plane,
         outer=outer,

@@ -18,6 +18,8 @@ from weldcal.models.arrays import Array
 Flags = NDArray[np.bool_]
 
 _GATE = 8.0  # sigma per axis, as in the eye-on-base solver: only gross outliers go
+_AGREEING = 0.6  # share of the poses that a trimmed fit keeps: the others may be outliers
+_SUSPECT = 2.0  # sigma per axis of a residual that makes a trimmed fit worth its time
 _WORST_SHARE = 0.1  # of the extent: residuals beyond it are no calibration
 _WORST_TURN_RAD = 0.2
 _SUBSETS = 60
@@ -76,6 +78,7 @@ def solve(
     apart. ``pose_only``: without covariance and scores, where only the poses are wanted. Raises InconsistentPoses where no rigid poses explain enough observations.
     """
     state, name = _start(problem, known, seed, starts)
+    state = _concentrated(problem, state)
     w, d = residuals(problem, state)
     keep = _gate(problem, w, d)
     base: Fit | None = None
@@ -142,6 +145,38 @@ def solve(
         )
     scores = {k: _rms(s) for k, s in squares.items()}
     return Choice(state, 0.5 * (covariance + covariance.T), best, _said(agreed), name, scores)
+
+
+def _concentrated(problem: Problem, state: State) -> State:
+    """The state of the poses that agree best, where some may be outliers: few outliers of few poses hide in the noise that they cause.
+
+    Least trimmed squares by concentration steps (Rousseeuw and Van Driessen 1999). Poses with less than three numbers for each unknown
+    are not trimmed.
+    """
+    n, kept, begin, least = len(problem), None, state, np.inf
+    most = int(np.ceil(_AGREEING * n))
+    if not problem.all_full or problem.tied or 6 * most < 3 * problem.size:
+        return state
+    for _ in range(10):
+        w, d = residuals(problem, state)
+        noise = noise_of(problem, w, d, np.ones(n, dtype=bool))
+        size = np.column_stack([(w**2).sum(axis=1) / noise.rotation, (d**2).sum(axis=1) / noise.translation])
+        if kept is None and (size < 3.0 * _SUSPECT**2).all():
+            return state
+        # the median of all poses must fall, or the start was the better one
+        spread = noise.rotation * noise.translation
+        if kept is not None and spread > least:
+            return begin
+        least = spread if kept is None else least
+        rows = np.sort(np.argsort(size.sum(axis=1), kind="stable")[:most])
+        if kept is not None and np.array_equal(rows, kept):
+            break
+        kept = rows
+        keep = np.isin(np.arange(n), rows)
+        state = fit(
+            problem, state, noise=noise, loss=Loss.SQUARES, keep=keep, tolerance=1e-2, leave_one_out=False
+        ).state
+    return state
 
 
 def _gate(problem: Problem, w: Array, d: Array) -> Flags:

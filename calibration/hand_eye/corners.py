@@ -34,10 +34,10 @@ class CornerRefinement:
     sentence: str
 
 
-def poses_from_corners(pairs: PosePairs, shift_px: Array) -> Array:
+def poses_from_corners(pairs: PosePairs, shift_px: Array, least: int = 6) -> Array:
     """Poses (n, 4, 4) of the board in the camera that reproject best, the principal point moved by ``shift_px``.
 
-    Raises DatasetError where the file has no corners, fewer than six in an image, or arrays that do not belong together.
+    Raises DatasetError where the file has no corners, fewer than ``least`` in an image, or arrays that do not belong together.
     """
     if pairs.img is None or pairs.obj is None or pairs.K is None:
         raise DatasetError(f"'{pairs.source}' holds no corners (img, obj, K): omit --corners.")
@@ -54,8 +54,8 @@ def poses_from_corners(pairs: PosePairs, shift_px: Array) -> Array:
     out = np.empty_like(pairs.camera)
     for i, X in enumerate(pairs.camera):
         seen = np.isfinite(pairs.img[i]).all(axis=1)
-        if int(seen.sum()) < 6:
-            raise DatasetError(f"Image {i} of '{pairs.source}' has only {int(seen.sum())} corners; 6 are needed.")
+        if int(seen.sum()) < least:
+            raise DatasetError(f"Image {i} of '{pairs.source}' has only {int(seen.sum())} corners; {least} are needed.")
         start = cv2.Rodrigues(X[:3, :3])[0]
         turn, shift = cv2.solvePnPRefineLM(pairs.obj[seen], pairs.img[i][seen], K, dist, start.copy(), X[:3, 3:].copy())
         out[i] = pose(np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64), np.asarray(shift, dtype=np.float64)[:, 0])

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, nearest_rotation, pose
 from weldcal.calibration.hand_eye.problem import Problem, full_problem, residuals
@@ -59,13 +60,22 @@ def opencv_solve(method: str, F: Array, G: Array) -> tuple[Array, Array] | None:
     return X, pose(nearest_rotation(M[:, :3, :3].sum(axis=0)), M[:, :3, 3].mean(axis=0))
 
 
-def opencv_held_out(method: str, F: Array, G: Array, folds: int = 5, most: int | None = None) -> HandEyeHeldOut:
+def opencv_held_out(
+    method: str,
+    F: Array,
+    G: Array,
+    folds: int = 5,
+    most: int | None = None,
+    observation: NDArray[np.int64] | None = None,
+) -> HandEyeHeldOut:
     """Held-out errors of one of METHODS on the folds that weldcal uses; NaN where a fold gave no answer.
 
+    ``observation``: of each sample, as weldcal's result has it.
     ``most``: fit each fold to so many of its poses at most, evenly spaced; calibrateHandEye holds all pairs of poses in memory.
     """
     n = len(F)
-    observation = one_per_pose(full_problem(F, G)).observation
+    if observation is None:
+        observation = one_per_pose(full_problem(F, G)).observation
     label = fold_labels(int(observation.max()) + 1, folds)[observation]
     out = HandEyeHeldOut(np.full(n, np.nan), np.full(n, np.nan))
     for k in range(folds):

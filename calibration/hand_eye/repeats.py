@@ -6,19 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from weldcal.calibration.geometry.se3 import inverse, log_rotation, mean_of
-from weldcal.calibration.hand_eye.problem import Problem
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse, log_rotation, mean_of
+from weldcal.calibration.hand_eye.choice import CANDIDATES, solve
+from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.models.arrays import Array
+from weldcal.models.errors import WeldcalError
 
 SAME_RAD = 5e-4
 """Angle up to which two robot poses are one."""
 SAME_SHARE = 5e-4
 """Distance up to which two robot poses are one, as a share of the extent of the motion."""
-_MANY, _MOSTLY = 40, 0.5
-"""Of more poses, of which fewer than this share are repeated, the samples are of a recorded motion: its pauses are no repeats. Chosen on two
-recorded arms (81 and 198 poses, 6 % and 1 % repeated); poses that an operator takes are tens."""
-_GROSS = 8.0  # sigma of a repeat, from the medians: a repeat beyond it is not averaged with the others
-_MEDIAN_CHI2_3 = 2.366  # of a chi-square of three numbers
+_GROSS = 8.0  # sigma of a sample: a repeat beyond it is not averaged with the others
 
 
 @dataclass(frozen=True)
@@ -37,22 +35,41 @@ class Repeats:
     agrees: NDArray[np.bool_]
 
 
-def one_per_pose(problem: Problem, *, join: bool = True) -> Repeats:
+@dataclass(frozen=True)
+class _Noise:
+    """Variances per axis of one sample, and the point ``centre`` (3,) of the target where they hold."""
+
+    rotation: float
+    translation: float
+    centre: Array
+
+
+def one_per_pose(problem: Problem, known: State = (IDENTITY, IDENTITY, IDENTITY), *, join: bool = True) -> Repeats:
     """Join the samples at one robot pose into one observation.
 
     An error of the robot or of the camera at that pose is the same in each repeat, so that repeats do not average it. Poses and
-    measurements are averaged on SE(3). A recorded motion with pauses, motions, points and normals stay as they are.
+    measurements are averaged on SE(3). The noise of a sample, which holds that error and the repeat's own, is the most that repeats may
+    vary by. Motions, points and normals stay as they are.
     """
     n = len(problem)
     alone = Repeats(problem, np.arange(n), np.ones(n, dtype=bool))
     if not join or problem.tied or n < 2 or not problem.all_full:
         return alone
     place = _places(problem)
-    count = np.bincount(place)
-    recorded = len(count) > _MANY and float((count > 1).mean()) < _MOSTLY
-    if len(count) == n or recorded:
+    if int(place.max()) == n - 1:
         return alone
-    return _joined(problem, *_without_gross(problem, place))
+    noise = _noise(problem.pick(np.unique(place, return_index=True)[1]), known)
+    return _joined(problem, *_without_gross(problem, place, noise), noise)
+
+
+def _noise(problem: Problem, known: State) -> _Noise:
+    """The noise of one sample of each pose; infinite where no solution is found."""
+    try:
+        found = solve(problem, known, candidates=CANDIDATES[:1], pose_only=True).fit
+    except WeldcalError:
+        return _Noise(np.inf, np.inf, np.zeros(3))
+    own = np.zeros(6) if problem.covariance is None else problem.covariance.diagonal(axis1=1, axis2=2).max(axis=0)
+    return _Noise(found.noise.rotation + own[:3].max(), found.noise.translation + own[3:].max(), found.centre)
 
 
 def _places(problem: Problem) -> NDArray[np.int64]:
@@ -83,22 +100,21 @@ def _places(problem: Problem) -> NDArray[np.int64]:
     return place
 
 
-def _without_gross(problem: Problem, place: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _without_gross(
+    problem: Problem, place: NDArray[np.int64], noise: _Noise
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """The numbers (n,) of the observations, and whether each sample agrees with its like.
 
     Of three repeats or more, one that disagrees grossly with the others is wrong. Of two, nobody knows which: each is an observation.
     """
-    squares = np.zeros((len(place), 2))
-    repeated = np.flatnonzero(np.bincount(place) > 1)
-    groups = [np.flatnonzero(place == k) for k in repeated]
-    for rows in groups:
+    gross = np.zeros(len(place), dtype=bool)
+    for k in np.flatnonzero(np.bincount(place) > 1):
+        rows = np.flatnonzero(place == k)
         middle = _most_central(problem.G[rows], problem.extent)
-        w, d = _deviation(problem.G[rows[middle]], problem.G[rows])
-        squares[rows] = np.column_stack([(w**2).sum(axis=1), (d**2).sum(axis=1)])
-    own = np.concatenate(groups)
-    sigma = np.median(squares[own], axis=0) / _MEDIAN_CHI2_3
-    sigma = np.where(sigma > 0.0, sigma, squares[own].mean(axis=0))
-    gross = (squares > 3.0 * _GROSS**2 * np.maximum(sigma, 1e-300)).any(axis=1)
+        w, d = _deviation(problem.G[rows[middle]], problem.G[rows], noise.centre)
+        # the difference of two samples
+        size = np.maximum((w**2).sum(axis=1) / noise.rotation, (d**2).sum(axis=1) / noise.translation) / 2.0
+        gross[rows] = size > 3.0 * _GROSS**2
     agreeing = np.bincount(place, weights=~gross)[place]
     lone = gross & (agreeing < 2)
     out = place.copy()
@@ -113,18 +129,18 @@ def _most_central(G: Array, extent: float) -> int:
     some = np.unique(np.linspace(0, len(G) - 1, min(len(G), 30)).round().astype(int))
     cost = []
     for k in some:
-        w, d = _deviation(G[k], G[some])
+        w, d = _deviation(G[k], G[some], np.zeros(3))
         cost.append(float(np.median((w**2).sum(axis=1) + (d**2).sum(axis=1) / extent**2)))
     return int(some[int(np.argmin(cost))])
 
 
-def _deviation(middle: Array, G: Array) -> tuple[Array, Array]:
-    """Rotations (n, 3) rad and displacements (n, 3) of poses from one, in its axes."""
+def _deviation(middle: Array, G: Array, centre: Array) -> tuple[Array, Array]:
+    """Rotations (n, 3) rad of poses from one, and displacements (n, 3) of a point of the target, in its axes."""
     D = inverse(middle) @ G
-    return log_rotation(D[:, :3, :3]), D[:, :3, 3]
+    return log_rotation(D[:, :3, :3]), D[:, :3, 3] + (D[:, :3, :3] - np.eye(3)) @ centre
 
 
-def _joined(problem: Problem, place: NDArray[np.int64], agrees: NDArray[np.bool_]) -> Repeats:
+def _joined(problem: Problem, place: NDArray[np.int64], agrees: NDArray[np.bool_], noise: _Noise) -> Repeats:
     used = np.flatnonzero(agrees)
     first = used[np.unique(place[used], return_index=True)[1]]
     count = np.bincount(place[used])
@@ -134,17 +150,22 @@ def _joined(problem: Problem, place: NDArray[np.int64], agrees: NDArray[np.bool_
         rows = used[place[used] == k]
         for name, X in out.items():
             X[k] = mean_of(list(getattr(problem, name)[rows]))
-        w, d = _deviation(out["G"][k], problem.G[rows])
+        w, d = _deviation(out["G"][k], problem.G[rows], noise.centre)
         turned.append(w)
         shifted.append(d)
-    covariance = _own(problem.pick(used), place[used], count, turned, shifted)
+    covariance = _own(problem.pick(used), place[used], count, turned, shifted, noise)
     m = len(first)
     joined = replace(problem, **out, full=np.ones(m, dtype=bool), normal=np.zeros(m, dtype=bool), covariance=covariance)
     return Repeats(joined, place, agrees)
 
 
 def _own(
-    problem: Problem, place: NDArray[np.int64], count: NDArray[np.int64], turned: list[Array], shifted: list[Array]
+    problem: Problem,
+    place: NDArray[np.int64],
+    count: NDArray[np.int64],
+    turned: list[Array],
+    shifted: list[Array],
+    noise: _Noise,
 ) -> Array | None:
     """Covariances (m, 6, 6) of the means beyond what all share; None where all are repeated alike.
 
@@ -160,14 +181,8 @@ def _own(
         return None
     w, d = np.concatenate(turned), np.concatenate(shifted)
     free = 3.0 * float((count[count > 1] - 1).sum())
-    # a board errs about its middle, not about the origin of its frame
-    lever = np.zeros((len(w), 3, 3))
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        lever[:, i, j], lever[:, i, k] = -w[:, k], w[:, j]
-    centre = np.linalg.lstsq(lever.reshape(-1, 3), -d.reshape(-1), rcond=1e-9)[0]
-    d = d + lever @ centre
     C = np.zeros((m, 6, 6))
     axes = np.arange(3)
-    C[:, axes, axes] = more[:, None] * float((w**2).sum()) / free
-    C[:, axes + 3, axes + 3] = more[:, None] * float((d**2).sum()) / free
+    C[:, axes, axes] = more[:, None] * min(float((w**2).sum()) / free, noise.rotation)
+    C[:, axes + 3, axes + 3] = more[:, None] * min(float((d**2).sum()) / free, noise.translation)
     return C

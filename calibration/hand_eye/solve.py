@@ -206,7 +206,7 @@ def solve_problem(
     config = config or HandEyeConfig()
     labels = labels or {}
     diverse = check_poses(problem, allow_coplanar=config.allow_coplanar)
-    samples, repeats = problem, one_per_pose(problem, join=config.join_repeats)
+    samples, repeats = problem, one_per_pose(problem, known, join=config.join_repeats)
     problem, observation = repeats.problem, repeats.observation
     choice = solve(
         problem,

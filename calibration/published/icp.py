@@ -218,6 +218,8 @@ def make_verification(
 def face_cloud(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Array:
     """The points (N, 3) m of the fitted face and its chamfers, without what lies in front, behind or around."""
     flat = np.asarray(points_C, dtype=float).reshape(-1, 3)
+    # most of a cloud is far from the face's plane; NaN is nowhere near
+    flat = flat[np.abs((flat - fit.center_C) @ fit.normal_C) < 2.0 * standard.chamfer_m + 0.002]
     flat = flat[np.isfinite(flat).all(axis=1)]
     d = flat - fit.center_C
     height = d @ fit.normal_C

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.cell.board import PAPERS, Board, board_sheet, tag_sheet
+from weldcal.tools.commands.cell.board import PAPERS, Board, board_sheet, described_sheet, tag_sheet
 from weldcal.welding.finger.deformation import TagModel
 
 DPI = 600
@@ -106,6 +106,14 @@ def test_the_squares_of_a_board_have_their_size(board: Board, paper: str) -> Non
     assert middle[0] == pytest.approx(0.5 * page.width_mm, abs=0.05)
 
 
+def test_a_wide_board_is_printed_across_the_page() -> None:
+    board = parse_board("chessboard:9x6:20")
+    page = Page(described_sheet(board, "A4").pdf())
+    assert (page.width_mm, page.height_mm) == pytest.approx((297.0, 210.0), abs=0.01)
+    found = find_board(page.picture, board).reshape(6, 9, 2) / PIXELS_PER_MM
+    assert np.linalg.norm(np.diff(found, axis=1), axis=2) == pytest.approx(20.0, abs=0.05)
+
+
 def test_a_tag_has_its_size_and_its_number() -> None:
     tags = [TagModel("4X4_50", number, 0.0125) for number in (7, 7, 31)]
     page = Page(tag_sheet(tags, "letter").pdf())
@@ -125,7 +133,7 @@ def test_the_line_to_measure_is_100_mm_long_and_says_so() -> None:
     lengths = [np.hypot(x1 - x0, y1 - y0) for x0, y0, x1, y1 in page.lines]
     assert max(lengths) == pytest.approx(100.0, abs=1e-3)
     assert "This line is 100 mm long" in page.text
-    assert "squares 4 mm, markers 3 mm" in page.text
+    assert "--board charuco:8x6:4:3:4X4_50" in page.text
 
 
 @pytest.mark.parametrize(

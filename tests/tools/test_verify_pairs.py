@@ -12,13 +12,16 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import weldcal
+from tests.calibration.hand_eye import rendering as draw
 from tests.calibration.hand_eye.stated_forms import FORMS, truth, write
-from tests.documents.scans import write_scans
+from tests.documents.scans import X_BC, write_scans
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.hand_eye.pairs.judging import judge_pose
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig
+from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
+from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.commands.verify_pairs import verify_on_pairs
 from weldcal.tools.report.verify_pairs import CANNOT_TELL, PairsReport
 
@@ -216,3 +219,43 @@ def test_kalibr_states_the_body_in_the_camera_and_the_inverse_is_named(tmp_path:
     ).verdict
     assert found.verdict == "do not use"
     assert found.reason.startswith("The inverse of RESULT fits: 0.")
+
+
+def test_a_result_is_judged_on_pictures_of_a_board(tmp_path: Path) -> None:
+    """Rendered pictures: the true pose is used; one that is 6 mm off is not, and the command that solves anew runs as printed."""
+    drawing = draw.draw_chessboard(9, 6, 20)
+    world = draw.world(drawing, 7, 12)
+    shots = tmp_path / "shots"
+    draw.write_pictures(shots, drawing, world, 7, sub=2)
+    draw.write_robot(shots / "robot.csv", world.robot)
+    call = ["verify", "", str(shots), "--board", "chessboard:9x6:20", "--json", "--out", ""]
+    found = {}
+    for name, X in (("right", world.X), ("wrong", moved(world.X, 6.0, 1))):
+        call[1], call[-1] = str(write("matrix txt", X, tmp_path)), str(tmp_path / name)
+        done = CliRunner().invoke(app, call)
+        found[name] = done.exit_code, json.loads(done.stdout.splitlines()[-1])["verdict"]
+    assert found == {"right": (0, "use it"), "wrong": (1, "do not use")}
+    page = (tmp_path / "wrong" / "report.html").read_text()
+    assert "--mounting eye_in_hand --board chessboard:9x6:20" in page
+
+
+@pytest.mark.parametrize("form", ["URDF", "quaternion wxyz first", "matrix txt"])
+def test_a_pose_of_any_file_is_judged_on_scans(form: str, tmp_path: Path) -> None:
+    """The errors at the flange are those of the written pose: none beyond the noise where it is the truth, and 5 mm where it is that far off."""
+    data = write_scans(tmp_path / "scans", 4, 0)
+    medians = {}
+    for mm in (0.0, 5.0):
+        path = write(form, moved(np.asarray(X_BC.GetAsMatrix4()), mm, 3), tmp_path)
+        out = tmp_path / f"verified_{mm:.0f}"
+        done = CliRunner().invoke(app, ["verify", str(path), str(data), "--limit-mm", "1", "--json", "--out", str(out)])
+        found = json.loads(done.stdout.splitlines()[-1])
+        assert done.exit_code == (1 if mm else 0), done.output
+        medians[mm] = found["position_error_mm"]["median"]
+    assert medians[0.0] < 0.5
+    assert medians[5.0] == pytest.approx(5.0, abs=0.5)
+
+
+def test_a_camera_on_the_flange_is_not_judged_on_scans_of_the_flange(tmp_path: Path) -> None:
+    path = write("easy_handeye", truth(1), tmp_path)
+    with pytest.raises(InputError, match=r"camera on the flange.*--board"):
+        verify_dataset(path, write_scans(tmp_path / "scans", 2, 0), tmp_path / "out")

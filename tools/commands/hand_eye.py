@@ -20,7 +20,7 @@ from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_co
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
-from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
+from weldcal.calibration.hand_eye.mistakes import explain_outliers, likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
@@ -116,19 +116,7 @@ def ax_xb(
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = XB for the camera's pose. With poses, the target's pose is estimated too, so that each counts once."""
-    stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
-    return _solve(
-        "ax-xb",
-        call,
-        file,
-        mounting=mounting,
-        unit=unit,
-        motions=motions,
-        limit_mm=limit_mm,
-        stated=stated,
-        board=board,
-        intrinsics=intrinsics,
-    )
+    return _solve("ax-xb", **locals())
 
 
 @command("hand-eye ax-yb", short_help="Solve AX = YB for the poses of camera and target.")
@@ -164,22 +152,7 @@ def ax_yb(
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""
-    return _solve(
-        "ax-yb",
-        call,
-        file,
-        mounting=mounting,
-        unit=unit,
-        corners=corners,
-        robot=robot,
-        camera=camera,
-        refine=refine,
-        kinematics=kinematics,
-        limit_mm=limit_mm,
-        stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form),
-        board=board,
-        intrinsics=intrinsics,
-    )
+    return _solve("ax-yb", **locals())
 
 
 def stated_forms(
@@ -201,17 +174,28 @@ def axb_ycz(
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Solve AXB = YCZ for camera, second base and target: one robot carries the camera, another the target."""
-    return _solve("axb-ycz", call, file, mounting=mounting, unit=unit, robot=robot, camera=camera, limit_mm=limit_mm)
+    return _solve("axb-ycz", **locals())
 
 
-def _solve(equation: str, call: Call, file: Path, **options: Any) -> Outcome:
+def _solve(
+    equation: str,
+    call: Call,
+    file: Path,
+    robot_poses: str | None = None,
+    camera_poses: str | None = None,
+    robot_form: str | None = None,
+    camera_form: str | None = None,
+    **options: Any,
+) -> Outcome:
+    """Solve with the options of a command, as they were given."""
 
     def say(sentence: str) -> None:
         if not call.json:
             typer.echo(sentence)
 
     folder = call.folder("hand-eye", file.resolve().stem)
-    report = run_hand_eye(equation, file, folder, seed=call.seed, say=say, **options)
+    stated = stated_forms(robot_poses, camera_poses, robot_form, camera_form)
+    report = run_hand_eye(equation, file, folder, seed=call.seed, stated=stated, say=say, **options)
     return Outcome(report.summary(), text=report.text(), first=report.first)
 
 
@@ -445,15 +429,17 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     try:
         result = solve_problem(problem, config=config, equation=mounting.equation, labels=mounting.labels)
     except (InconsistentPoses, UndeterminedPoses) as e:
-        mistake = likely_mistake(pairs, None, config)
+        mistake = likely_mistake(pairs)
         if mistake is None:
             raise
         raise InconsistentPoses(mistake) from e
-    mistake = likely_mistake(pairs, result, config)
+    mistake = likely_mistake(pairs)
     if mistake is not None:
         raise InconsistentPoses(mistake)
     scale = scale_warning(problem, result)
-    return result if scale is None else replace(result, warnings=(*result.warnings, scale))
+    return replace(
+        result, warnings=(*result.warnings, *explain_outliers(pairs, result), *([] if scale is None else [scale]))
+    )
 
 
 def solve_arrays(
@@ -488,7 +474,9 @@ def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
     rows = [MethodRow("weldcal", ours.held_out.rms_deg, 1e3 * ours.held_out.rms_translation)]
     if problem.free == (True, True, False):
         for m in METHODS:
-            held = opencv_held_out(m, problem.F, problem.G, most=most_compared(len(problem.F)))
+            held = opencv_held_out(
+                m, problem.F, problem.G, most=most_compared(len(problem.F)), observation=ours.observation
+            )
             whole = bool(np.isfinite(held.translation).all())
             rows.append(
                 MethodRow(

@@ -10,12 +10,14 @@ import typer
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.data.results import CalibrationResult, load_result
+from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, load_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
+from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.hand_eye.solve import as_transform
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.local_field import field_from_document
 from weldcal.calibration.refinement.stated_arm import joint_angles, shared_error
@@ -25,8 +27,10 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outcome, command, option
 from weldcal.tools.commands.hand_eye import (
+    BoardOption,
     CameraFormOption,
     CameraPosesOption,
+    IntrinsicsOption,
     MountingOption,
     RobotFormOption,
     RobotPosesOption,
@@ -64,13 +68,13 @@ def verify(
     result: Annotated[
         Path,
         typer.Argument(
-            help="A result folder, or its calibration.yaml; for pairs any file with a pose (docs/hand_eye.md)."
+            help="A result folder, its calibration.yaml, or any file with a camera's pose (docs/hand_eye.md)."
         ),
     ],
     dataset: Annotated[
         Path | None,
         typer.Argument(
-            help="Scans: a folder with poses and clouds, or pairs.csv. Or pairs of poses, as hand-eye reads (docs/datasets.md)."
+            help="Scans: a folder with poses and clouds, or pairs.csv. Or pairs of poses or pictures, as hand-eye reads (docs/datasets.md)."
         ),
     ] = None,
     touch: Annotated[
@@ -105,7 +109,7 @@ def verify(
         ),
     ] = None,
     pose: Annotated[
-        str | None, option("--pose", "NAME", "With pairs: the key of the pose, where the file of RESULT holds several.")
+        str | None, option("--pose", "NAME", "The key of the pose, where the file of RESULT holds several.")
     ] = None,
     mounting: MountingOption = None,
     unit: UnitOption = None,
@@ -113,10 +117,13 @@ def verify(
     camera_poses: CameraPosesOption = None,
     robot_form: RobotFormOption = None,
     camera_form: CameraFormOption = None,
+    board: BoardOption = None,
+    intrinsics: IntrinsicsOption = None,
 ) -> Outcome:
-    """Verify a calibration on scans or pairs of poses that it did not use: a verdict, and the error of each.
+    """Verify a calibration on scans, pairs of poses or pictures that it did not use: a verdict, and the error of each.
 
-    Scans of the flange give position error and tilt at the flange. Pairs of robot and camera poses give the error of any stated pose of a camera.
+    Scans of the flange give position error and tilt at the flange. Pairs of robot and camera poses, or pictures of a board
+    (--board), give the error of any stated pose of a camera.
     With --touch or --scenario: by points that the tip touched, each against the stated 95 % region. The exit code is 1 where the verdict is "do not use".
     """
     if sum(given is not None for given in (dataset, touch, scenario)) != 1:
@@ -129,13 +136,13 @@ def verify(
         assert touch is not None
         return _by_touch(call, result, touch)
     of_pairs = {
-        "--pose": pose, "--mounting": mounting, "--unit": unit, "--robot-poses": robot_poses, "--camera-poses": camera_poses,
-        "--robot-form": robot_form, "--camera-form": camera_form,
+        "--mounting": mounting, "--unit": unit, "--robot-poses": robot_poses, "--camera-poses": camera_poses,
+        "--robot-form": robot_form, "--camera-form": camera_form, "--intrinsics": intrinsics,
     }  # fmt: skip
-    if not holds_scans(dataset):
+    if board is not None or not holds_scans(dataset):
         paired = verify_on_pairs(
             result, dataset, call.folder("verify", dataset.resolve().stem), mounting=mounting, unit=unit, pose=pose, limit_mm=limit_mm,
-            stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form), seed=call.seed,
+            board=board, intrinsics=intrinsics, stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form), seed=call.seed,
         )  # fmt: skip
         settled = paired.verdict
         return Outcome(
@@ -154,6 +161,7 @@ def verify(
         progress=call.progress,
         correct_scanner=scanner_correction,
         limit_mm=limit_mm,
+        pose=pose,
     )
     verdict, summary = report.verdict, report.summary()
     return Outcome(
@@ -210,13 +218,14 @@ def verify_dataset(
     progress: Progress | None = None,
     correct_scanner: bool = True,
     limit_mm: float | None = None,
+    pose: str | None = None,
 ) -> VerifyReport:
-    """Verify a calibration (its folder or calibration.yaml) on a dataset folder; write verification.json and report.html.
+    """Verify a calibration (its folder or calibration.yaml, or any file with a pose) on a dataset folder; write verification.json and report.html.
 
     Errors are taken at the flange centre, in the base, after the result's scanner correction. A scan in which no flange
     is found is named and not used. Without ``correct_scanner`` the result's correction is not applied. ``flange``
     overrides dataset.yaml; the fits follow ``seed``. ``limit_mm`` of the new scans' median replaces the one that follows from what
-    the calibration states. Nothing is written unless at least one scan can be used.
+    the calibration states. ``pose`` names the pose in a file of several. Nothing is written unless at least one scan can be used.
 
     Raises:
         InputError: the result, the dataset or the output folder cannot be used.
@@ -226,14 +235,15 @@ def verify_dataset(
         raise InputError(f"The limit must be a positive number of millimetres, not {limit_mm:g}.")
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the verification.")
-    calibration = load_result(Path(result))
+    calibrations, read_as = _calibrations(Path(result), pose)
+    calibration = calibrations[0]
     correction = correction_from_document(calibration.scanner_correction) if correct_scanner else None
     data = load_dataset(Path(dataset), robot=calibration.robot)
     standard = get_flange(flange or data.header.flange or calibration.flange)
     seen = see_flanges(
         data,
         standard,
-        X_BC=calibration.X_BC,
+        X_BC=calibration.X_BC if len(calibrations) == 1 else None,
         holes=False,
         seed=seed,
         tell=lambda fraction: tell("fitting flanges", 0.9 * fraction),
@@ -242,6 +252,7 @@ def verify_dataset(
     if not seen.observations:
         first, reason = seen.refused[0]
         raise InputError(f"None of the {len(seen.refused)} scans can be used. Reason for the first, {first}: {reason}")
+    calibration = min(calibrations, key=lambda one: float(np.median(position_errors(one.X_BC, seen.observations))))
     arm_used, moved, shared = _with_kinematics(Path(result), calibration, data, seen.observations, correction)
     seen = replace(seen, observations=moved)
     observations = tuple(o if correction is None else corrected_observation(correction, o) for o in seen.observations)
@@ -266,6 +277,7 @@ def verify_dataset(
     diagnostics = [*differences, *gross, *uncorrected, *_alike(data, observations)]
     verdict = _verdict([poses[k] for k in new], limit_mm, source, diagnostics)
     warnings = (
+        *read_as,
         *uncorrected,
         *(f"{id} was not used: {reason}" for id, reason in seen.refused),
         *differences,
@@ -291,6 +303,30 @@ def verify_dataset(
     write_atomic(Path(out) / "verification.json", json.dumps(report.summary(), indent=2, allow_nan=False) + "\n")
     tell("done", 1.0)
     return report
+
+
+def _calibrations(path: Path, pose: str | None) -> tuple[list[CalibrationResult], tuple[str, ...]]:
+    """What `calibrate` wrote; or the camera's pose in another file in every reading that its numbers allow, and a sentence that names it."""
+    try:
+        return [load_result(path)], ()
+    except InputError:
+        if not path.exists() or (
+            (path / RESULT_FILE if path.is_dir() else path).name == RESULT_FILE and not (path / HAND_EYE_FILE).is_file()
+        ):
+            raise
+    given = read_stated_pose(path, pose)
+    if given.mounting not in (None, "eye_on_base"):
+        raise InputError(
+            f"'{given.name}' is the pose of a camera on the flange, which does not scan its own flange: give pairs of poses or pictures "
+            "(--board) in place of scans."
+        )
+    covariance = np.zeros((6, 6)) if given.covariance is None else given.covariance
+    found = [
+        CalibrationResult(X_BC=as_transform(one.X), covariance=covariance, held_out_mm={}, tilt_deg={}, poses=())
+        for one in given.readings
+    ]
+    best = f", the reading of {len(found)} that fits these scans best" if len(found) > 1 else ""
+    return found, (f"RESULT is {given.form} in {given.unit}{best}. It states no errors of scans.",)
 
 
 def _with_kinematics(

@@ -1,6 +1,7 @@
-"""`weldcal verify RESULT PAIRS`: judges any file with a camera's pose on pairs of robot and camera poses."""
+"""`weldcal verify RESULT PAIRS`: judges any file with a camera's pose on pairs of robot and camera poses, or on pictures of a board."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,10 @@ from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pairs.judging import Judgement, judge_pose
-from weldcal.calibration.hand_eye.solve import HandEyeConfig
+from weldcal.calibration.hand_eye.pictures.boards import parse_board
+from weldcal.calibration.hand_eye.pictures.sets import read_pictures
+from weldcal.calibration.hand_eye.pictures.solution import solve_pictures
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic
 from weldcal.tools.commands.hand_eye import digest, problem_of_pairs
@@ -55,6 +59,8 @@ def verify_on_pairs(
     stated: StatedForms | None = None,
     pose: str | None = None,
     limit_mm: float | None = None,
+    board: str | None = None,
+    intrinsics: Path | None = None,
     seed: int = 0,
 ) -> PairsReport:
     """Judge the pose in a file on pairs; write verification.json and report.html to ``out`` (None: nothing is written).
@@ -66,6 +72,7 @@ def verify_on_pairs(
         unit, stated: how the pairs are written, as with `hand-eye`.
         pose: key of the pose, where the result's file holds several.
         limit_mm: error at the target that the job allows.
+        board, intrinsics: the board in the pictures of the folder ``pairs``, and the file of their camera.
 
     Raises:
         InputError: a file cannot be read; InconsistentPoses: the pairs contradict each other.
@@ -74,7 +81,18 @@ def verify_on_pairs(
         raise InputError(f"The limit must be a positive number of millimetres, not {limit_mm:g}.")
     given = read_stated_pose(Path(result), pose)
     config = HandEyeConfig(seed=seed)
-    read, reading, found = _judged(given, Path(pairs), mounting, unit, stated or StatedForms(), config)
+    forms = stated or StatedForms()
+
+    def read_in(mode: str | None) -> tuple[PosePairs, HandEyeResult | None]:
+        if board is None:
+            return read_pairs(Path(pairs), mounting=mode, length=unit, stated=forms), None
+        what = parse_board(board)
+        shots = read_pictures(Path(pairs), what, mounting=mode, unit=unit, stated=forms, camera=intrinsics)
+        # an estimated camera moves all pictures alike: only the adjustment of the corners knows by how much
+        new, found, _ = solve_pictures(shots, lambda found: solve_problem(problem_of_pairs(found), config=config))
+        return found, new
+
+    read, reading, found = _judged(given, Path(pairs), mounting, read_in, config)
     one = given.readings[reading]
     words = f"{given.form}, {one.words}" if len(given.readings) > 1 else given.form
     words += f" in {given.unit}"
@@ -93,6 +111,7 @@ def verify_on_pairs(
         reading=read.reading,
         notes=read.notes,
         mounting_stated=given.mounting,
+        board=board or "",
     )
     if out is not None:
         write_atomic(out / "report.html", verify_pairs_report(report))
@@ -102,18 +121,22 @@ def verify_on_pairs(
 
 
 def _judged(
-    given: StatedPose, path: Path, mounting: str | None, unit: str | None, stated: StatedForms, config: HandEyeConfig
+    given: StatedPose,
+    path: Path,
+    mounting: str | None,
+    read_in: Callable[[str | None], tuple[PosePairs, HandEyeResult | None]],
+    config: HandEyeConfig,
 ) -> tuple[PosePairs, int, Judgement]:
     """The pairs, the reading of the pose and its judgement, in the stated mounting or else in the one in which the pose fits."""
 
     def judged(mode: str | None) -> tuple[PosePairs, int, Judgement]:
-        pairs = read_pairs(path, mounting=mode, length=unit, stated=stated)
+        pairs, new = read_in(mode)
         if pairs.mode not in _MOUNTINGS:
             raise DatasetError(
                 f"'{path.name}' is {pairs.mode}; verify judges the mountings {' and '.join(_MOUNTINGS)}."
             )
         reading, found = judge_pose(
-            problem_of_pairs(pairs), [one.X for one in given.readings], given.covariance, config
+            problem_of_pairs(pairs), [one.X for one in given.readings], given.covariance, config, new
         )
         return pairs, reading, found
 

@@ -78,10 +78,7 @@ class HandEyeReport:
         for k, X in r.poses.items():
             out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": r.covariance[k]}
         if self.streams is not None:
-            out |= {
-                "clock_offset_ms": 1e3 * self.streams.offset_s,
-                "clock_offset_sigma_ms": 1e3 * self.streams.sigma_s,
-            }
+            out |= {"clock_offset_ms": 1e3 * self.streams.offset_s, "clock_offset_sigma_ms": 1e3 * self.streams.sigma_s}
         pictures = {} if self.pictures is None else _of_pictures(self.pictures)
         return (
             out

@@ -30,6 +30,7 @@ class PairsReport:
         limit_mm: the error that the job allows, or None.
         reading, notes: how the pairs were understood.
         mounting_stated: the mounting that the result names, or None.
+        board: the board, where the pairs are pictures of it.
     """
 
     judgement: Judgement
@@ -43,6 +44,7 @@ class PairsReport:
     reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     mounting_stated: str | None = None
+    board: str = ""
 
     @property
     def verdict(self) -> Verdict:
@@ -120,13 +122,16 @@ class PairsReport:
 
     def _next(self) -> Next:
         v = self.verdict.verdict
-        solve = f"weldcal hand-eye ax-yb {self.pairs} --mounting {self.mounting.name}"
+        board = f" --board {self.board}" if self.board else ""
+        solve = f"weldcal hand-eye ax-yb {self.pairs} --mounting {self.mounting.name}{board}"
         if v == USE:
             return Next("Use RESULT. Verify again after work at the robot or the camera.")
         if v == DO_NOT and self.judgement.other is not None:
             return Next("Correct RESULT as the verdict says, and verify it again.")
         if v in (DO_NOT, CARE):
             return Next("Solve from these pairs, and verify the new result on pairs that it did not use.", solve)
+        if v == NONE:
+            return Next("Record new pairs, and verify with them.")
         return Next("Record pairs with larger and more varied turns of the robot, and verify with them.")
 
     def summary(self) -> dict[str, object]:

@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.io import savemat
@@ -165,7 +165,7 @@ def matlab(content: bytes, rng: Rng) -> Damage:
             value = value if changed is None else changed
         arrays[name] = value
     stream = io.BytesIO()
-    savemat(stream, arrays)
+    savemat(cast(Any, stream), arrays)  # takes a stream, too; its stub does not say so
     return stream.getvalue(), False
 
 

@@ -1,18 +1,14 @@
-"""Turns depth images (PNG, TIFF, NPY) and depth maps of NPZ files into organised points by the camera's intrinsics."""
+"""Turns depth images (PNG, TIFF, NPY) and depth maps of NPZ files into organised points by the camera's intrinsics, which a file beside them may state."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from weldcal.calibration.data.camera_file import find_camera
 from weldcal.calibration.data.cloud_files.body import CloudError
 from weldcal.calibration.data.cloud_files.form import CloudForm
-from weldcal.calibration.data.cloud_files.intrinsics import (
-    Intrinsics,
-    checked_intrinsics,
-    find_intrinsics,
-    intrinsics_of,
-)
 from weldcal.models.array_files import npy_shape, png_depth, read_raw_image
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -21,6 +17,99 @@ from weldcal.models.files import MOST_POINTS, expansion_limit, file_size
 IMAGES = (".png", ".tif", ".tiff")
 """Endings of depth images."""
 _PIXEL_BITS = 16
+_STEMS = (
+    "camera_info", "depth_camera_info", "depth_intrinsics", "intrinsics", "intrinsic", "camera_intrinsics", "camera_intrinsic",
+    "camera-intrinsics", "intrinsic_depth", "camera_matrix", "camera", "depth_camera", "depth", "k", "cam_k", "camchain", "scene_camera",
+)  # fmt: skip
+_TREES = (".yaml", ".yml", ".json", ".xml")
+_TEXTS = (".txt", ".csv")
+_ADVICE = "write 'intrinsics: {fx: ..., fy: ..., cx: ..., cy: ...}' (pixels) into dataset.yaml"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intrinsics:
+    """A camera as its file states it.
+
+    Attributes:
+        values: fx, fy, cx, cy, pixels.
+        source: the file.
+        size: width and height of the images, pixels; 0 where the file does not say.
+        straight: whether no lens distortion is stated.
+    """
+
+    values: tuple[float, float, float, float]
+    source: Path
+    size: tuple[int, int] = (0, 0)
+    straight: bool = True
+
+
+def is_camera_file(path: Path) -> bool:
+    """Whether a file's name says that it holds a camera's intrinsics."""
+    return path.stem.lower() in _STEMS and path.suffix.lower() in (*_TREES, *_TEXTS)
+
+
+def find_intrinsics(*folders: Path) -> Intrinsics | None:
+    """The camera of the first of these folders that holds a file of one; None where none does.
+
+    Raises:
+        CloudError: a file of that name cannot be read, or holds no intrinsics.
+    """
+    for folder in dict.fromkeys(folders):
+        files = {p.name.lower(): p for p in sorted(folder.iterdir()) if p.is_file()} if folder.is_dir() else {}
+        for stem in _STEMS:
+            for ending in (*_TREES, *_TEXTS):
+                path = files.get(stem + ending)
+                if path is not None and (found := _stated(path)) is not None:
+                    return found
+    return None
+
+
+def checked_intrinsics(values: tuple[float, ...], source: str) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy where they can be a camera's. Raises CloudError."""
+    fx, fy, cx, cy = values
+    if not (np.isfinite(values).all() and min(fx, fy) > 0.0 and max(map(abs, values)) < 1e6):
+        raise CloudError(
+            f"The intrinsics in {source} are not usable (fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}): focal lengths are positive, in pixels."
+        )
+    return fx, fy, cx, cy
+
+
+def intrinsics_of(found: Intrinsics | None, shape: tuple[int, int], name: str) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy for a depth image (height, width).
+
+    Raises:
+        CloudError: no camera is known, its images have another size, or a lens distortion. The sentence says what to write where.
+    """
+    height, width = shape
+    if found is None:
+        raise CloudError(
+            f"{name} is a depth image of {width} x {height} pixels, and its camera's intrinsics are not known: {_ADVICE}, or put the "
+            "camera's file (camera_info.yaml of ROS, OpenCV or Kalibr) beside the images."
+        )
+    if found.size not in ((0, 0), (width, height)):
+        raise CloudError(
+            f"{name} has {width} x {height} pixels, and {found.source.name} states a camera of {found.size[0]} x {found.size[1]}: give the "
+            f"camera of the depth images, or {_ADVICE}."
+        )
+    if not found.straight:
+        raise CloudError(
+            f"{found.source.name} states a lens distortion, and points follow from rectified depth images only: where {name} is rectified, "
+            f"{_ADVICE}."
+        )
+    return found.values
+
+
+def _stated(path: Path) -> Intrinsics | None:
+    """The camera in a file; None where it holds none."""
+    try:
+        found = find_camera(path)
+    except InputError as problem:
+        raise CloudError(str(problem)) from problem
+    if found is None:
+        return None
+    K, straight = found.K, not found.distortion.any()
+    values = checked_intrinsics((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), path.name)
+    return Intrinsics(values=values, source=path, size=found.size or (0, 0), straight=straight)
 
 
 def may_be_depth(path: Path) -> bool:

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from weldcal.calibration.data.cloud_files.depth import IMAGES, may_be_depth
-from weldcal.calibration.data.cloud_files.intrinsics import is_camera_file
+from weldcal.calibration.data.cloud_files.depth import IMAGES, is_camera_file, may_be_depth
 from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES, cloud_id, ending_of
 from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.errors import DatasetError

@@ -142,9 +142,9 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
             label = f"{label}, {stem}" if beside and len(stem) > 1 else label
         yield from table_lists(list(flat), np.array([list(flat.values())]), label)
         node = beside
-    used = set()
-    for listing, keys in _joined(node, name, at):
-        used |= keys
+    used: set[str] = set()
+    for listing, joined in _joined(node, name, at):
+        used |= joined
         yield listing
     singles: list[tuple[str, Listing]] = []
     for key, value in node.items():

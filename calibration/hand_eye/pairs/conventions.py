@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
 from weldcal.calibration.geometry.robust import f_quantile
-from weldcal.calibration.geometry.se3 import inverse, nearest_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, nearest_rotation
 from weldcal.models.arrays import Array
 
 CHANCE = 1e-6
@@ -18,12 +18,13 @@ UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
 _PAIRS = 400  # relative motions that are compared
 _KEPT = 0.7  # share of the poses that must agree: the others may be outliers
 _ROTATION_FLOOR = 2e-6  # rad: six printed digits
-_POSITION_FLOOR = 1e-6  # share of the motion's extent: six printed digits
+_POSITION_FLOOR = 1e-6  # share of the positions: six printed digits
 _AGREE = 0.1  # of the motion: beyond it there is no agreement that deserves the name
 _SAME_SCALE = 0.02
 _NEAR_UNIT = 0.08  # of the logarithm of a factor: attenuation by noise of short motions
 _MOST = 160  # pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
 _SURE_TURN = 2.8  # rad
+_ONE_AXIS = 0.1  # share of the turns off the main axis below which rotations do not determine X about it
 _STEPS = 6
 _TRIAL_STEPS = 2
 
@@ -222,14 +223,17 @@ def agreements(
         some = _worth_solving(rotation / turn, np.array(changes), _limit(dof, len(tried)))
         tried, changes = [tried[k] for k in some], [changes[k] for k in some]
         F, G, RX, RY, turn, rotation = (one[some] for one in (F, G, RX, RY, turn, rotation))
+    RX, RY = _about_one_axis(F, G, RX, RY, kept)
     turned = (F[..., :3, :3] @ (G[..., :3, 3] @ np.swapaxes(RX, 1, 2))[..., None])[..., 0]
     tX, tY, scale, d, sigma = _translation(F, turned, kept, None)
     # a negative scale is no solution: without its sign the positions do not fit
-    units = [_nearest_unit(abs(float(s))) for s in scale]
-    fixed = np.array([abs(float(s)) if u is None else u for s, u in zip(scale, units, strict=True)])
+    scale = np.maximum(np.abs(scale), 1e-12)
+    units = [_nearest_unit(float(s)) for s in scale]
+    fixed = np.array([s if u is None else u for s, u in zip(scale, units, strict=True)])
     tX, tY, _, d, _ = _translation(F, turned, kept, fixed)
     position = np.sqrt(_trimmed(np.linalg.norm(d, axis=2), kept))
     extent = np.sqrt(F[..., :3, 3].var(axis=1).sum(axis=1)) + 1e-12
+    digits = _POSITION_FLOOR * np.sqrt((F[..., :3, 3] ** 2).sum(axis=2).mean(axis=1)) + 1e-18
     found = []
     for k, (one, other) in enumerate(tried):
         X, Y = np.eye(4), np.eye(4)
@@ -237,12 +241,12 @@ def agreements(
         agreement = Agreement(
             robot=one,
             camera=other,
-            scale=max(abs(float(scale[k])), 1e-12),
-            scale_sigma=float(sigma[k] / max(abs(float(scale[k])), 1e-12)),
+            scale=float(scale[k]),
+            scale_sigma=float(sigma[k] / scale[k]),
             unit_scale=units[k],
             rotation=float(rotation[k]),
             turn=float(turn[k]),
-            position=float(position[k]) + _POSITION_FLOOR * float(extent[k]),
+            position=float(position[k] + digits[k]),
             extent=float(extent[k]),
             X=X,
             Y=Y,
@@ -319,6 +323,36 @@ def _starts(F: Array, G: Array) -> list[Array]:
     usable = (np.linalg.norm(p, axis=2) < _SURE_TURN) & (np.linalg.norm(q, axis=2) < _SURE_TURN)
     vectors_ = np.swapaxes(p * usable[..., None], 1, 2) @ q
     return [nearest_rotation(linear), nearest_rotation(vectors_ + 1e-9 * np.eye(3))]
+
+
+def _about_one_axis(F: Array, G: Array, RX: Array, RY: Array, kept: int) -> tuple[Array, Array]:
+    """R_X and R_Y turned about the robot's axis where it turns about one only: rotations leave that angle open, and positions fix it.
+
+    F X G = Y is linear in t_X, t_Y and, with v = R_X t_G and the axis a, in the factors of v along a, of v across a, and of a x v.
+    """
+    mean = nearest_rotation(F[..., :3, :3].sum(axis=1))
+    turns = log_rotation((np.swapaxes(mean, 1, 2)[:, None] @ F[..., :3, :3]).reshape(-1, 3, 3)).reshape(*F.shape[:2], 3)
+    spread, axes = np.linalg.svd(turns, full_matrices=False)[1:]
+    RX, RY = RX.copy(), RY.copy()
+    for k in np.flatnonzero(spread[:, 1] < _ONE_AXIS * spread[:, 0]):
+        R, a, v = F[k, :, :3, :3], axes[k, 0], G[k, :, :3, 3] @ RX[k].T
+        along = (v @ a)[:, None] * a
+        parts = [(R @ u[..., None]) for u in (along, v - along, np.cross(a, v))]
+        A = np.concatenate([R, np.broadcast_to(-np.eye(3), R.shape), *parts], axis=2)
+        size = np.maximum(np.abs(A).max(axis=(0, 1)), 1e-30)
+        weight = np.ones(len(R))
+        for _ in range(_STEPS):
+            some = np.sqrt(weight)[:, None]
+            x = (
+                np.linalg.lstsq(
+                    (A / size * some[..., None]).reshape(-1, 9), -(F[k, :, :3, 3] * some).reshape(-1), 1e-9
+                )[0]
+                / size
+            )
+            weight = _weights(np.linalg.norm(A @ x + F[k, :, :3, 3], axis=1)[None], kept)[0]
+        RX[k] = exp_rotation(a * np.arctan2(x[8], x[7])) @ RX[k]
+        RY[k] = nearest_rotation((weight[:, None, None] * (R @ RX[k] @ G[k, :, :3, :3])).sum(axis=0))
+    return RX, RY
 
 
 def _pairs(n: int, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -21,9 +21,11 @@ _MILLIMETRES_FROM, _METRES_TO = 80.0, 10.0  # median distances of a robot's pose
 _NEAREST_M = 0.02
 FARTHEST_M = 20.0
 """Median distance of a robot's poses from its base beyond which the unit is wrong."""
-_SCALE_SIGMA = 4.0
+SCALE_SIGMA = 4.0
+"""A ratio of lengths is known where this many of its standard deviations are below LEAST_SCALE."""
 _OTHER_UNIT = 0.1  # of the logarithm: how near a factor must be to that of another unit than the robot's
-_LEAST_SCALE = 0.2  # of the logarithm: a factor that is nearer to a unit is a matter of the result, which names it
+LEAST_SCALE = 0.2
+"""Of the logarithm of a factor on lengths: a factor that is nearer to a unit is a matter of the result, which names it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +100,7 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
     _check_motion(a[0], robot, "robot")
     _check_motion(b[0], camera, "camera")
     known = stated.decide and mounting in ("eye_in_hand", "eye_on_base")
-    decision, shift = _decided(a, b, mounting == "eye_in_hand", n) if known else (None, 0)
+    decision, shift = decided(a, b, mounting == "eye_in_hand", n) if known else (None, 0)
     if decision is None:
         A, B = a[0], b[0]
         if len(a) > 1 or len(b) > 1:
@@ -192,7 +194,7 @@ def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
         )
 
 
-def _decided(a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int) -> tuple[Decision | None, int]:
+def decided(a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int) -> tuple[Decision | None, int]:
     """The decision, and by how many rows the camera's list is shifted; None where the data decide nothing."""
     if n < _FEWEST:
         return None, 0
@@ -324,11 +326,11 @@ def _units(
             f"The robot positions of '{source}' have a median of {median * unit_r:.3g} m from the base, in {words[0]}; correct --unit."
         )
     ratio = None
-    if best is not None and best.agrees and best.scale_sigma * _SCALE_SIGMA < _LEAST_SCALE:
+    if best is not None and best.agrees and best.scale_sigma * SCALE_SIGMA < LEAST_SCALE:
         ratio = best.scale * unit_r  # metres per camera unit
     if not words[1]:
         words[1] = _camera_unit(ratio, words[0], B, source)
-    elif ratio is not None and abs(np.log(ratio / UNITS[words[1]])) > _LEAST_SCALE:
+    elif ratio is not None and abs(np.log(ratio / UNITS[words[1]])) > LEAST_SCALE:
         _refuse_scale(ratio, words[1], source)
     return (unit_r, words[0]), (UNITS[words[1]], words[1])
 
@@ -339,7 +341,7 @@ def _camera_unit(ratio: float | None, robot: str, B: PoseReading, source: str) -
         return "mm" if far > _MILLIMETRES_FROM else "m" if far <= _METRES_TO else robot
     near = min(UNITS, key=lambda u: abs(np.log(ratio / UNITS[u])))
     # a factor near that of another unit may be the size of a square: 28.5 mm are no inch
-    if abs(np.log(ratio / UNITS[near])) > (_LEAST_SCALE if near == robot else _OTHER_UNIT):
+    if abs(np.log(ratio / UNITS[near])) > (LEAST_SCALE if near == robot else _OTHER_UNIT):
         _refuse_scale(ratio, "m", source)
     return near
 

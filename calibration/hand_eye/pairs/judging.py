@@ -99,7 +99,11 @@ class Judgement:
 
 
 def judge_pose(
-    problem: Problem, forms: list[Array], covariance: Array | None = None, config: HandEyeConfig | None = None
+    problem: Problem,
+    forms: list[Array],
+    covariance: Array | None = None,
+    config: HandEyeConfig | None = None,
+    new: HandEyeResult | None = None,
 ) -> tuple[int, Judgement]:
     """Judge a stated X of F X G = Y; of several readings of one pose, the one that the pairs contradict least.
 
@@ -112,12 +116,13 @@ def judge_pose(
         problem: full poses, X and Y free.
         forms: readings (4, 4) of the stated X in metres, the usual one first.
         covariance: (6, 6) of the stated pose, or None.
+        new: the solution of these pairs, where more is known than their poses; else it is solved from them.
 
     Returns:
         Index of the reading, and its judgement.
     """
     try:
-        new = solve_problem(problem, config=config)
+        new = new or solve_problem(problem, config=config)
     except WeldcalError as problem_:
         k = min(range(len(forms)), key=lambda k: _spread(problem, forms[k]))
         return k, _residuals_only(problem, forms[k], np.ones(len(problem), dtype=bool), str(problem_))

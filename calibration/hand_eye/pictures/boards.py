@@ -33,10 +33,14 @@ EXAMPLES = {
     "tags": "tags:4x3:40:10:4X4_50 (4 x 3 tags of 40 mm, gaps of 10 mm)",
 }
 _LARGEST_MM, _MOST = 5000.0, 60
-_DETECT_PX = 1400  # a chessboard is searched at this width, and its corners refined in the whole picture
+_LARGE_PX = 1750  # beyond it a chessboard is searched in reduced pictures first
+_REDUCED_PX = (700, 1400)
 _SHARPEN = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 0.002)
 _DICTIONARIES = {name[5:]: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
-_STRAIGHT_PX = 100.0  # length of a tag's side up to which the lens leaves it straight
+SIDE = np.linspace(0.12, 0.88, 25)
+"""Places along a tag's side where its edge is measured."""
+_CURVED_PX = 100.0  # length of a tag's side from which on its curvature can be measured
+_USUAL = "4X4_1000 5X5_1000 6X6_1000 7X7_1000 ARUCO_ORIGINAL APRILTAG_36h11 APRILTAG_25h9"  # dictionaries in use
 _TRIED = 8  # pictures that show which layout a board has, or what there is in place of it
 
 
@@ -52,6 +56,7 @@ class Board:
         dictionary: name of the markers' dictionary, or empty.
         id: number of the tag (kind tag).
         layout: 1 for OpenCV's ChArUco layout before 4.6; for tags the order of the numbers and the first corner, see ``layouts``.
+        radius: of circles, m, as the pictures show it; 0 until then.
     """
 
     kind: str
@@ -62,6 +67,7 @@ class Board:
     dictionary: str = ""
     id: int = 0
     layout: int = 0
+    radius: float = 0.0
 
     def __str__(self) -> str:
         """The string that describes the board."""
@@ -215,7 +221,7 @@ def find_board(grey: Grey, board: Board) -> Array:
     elif board.kind in ("tag", "tags"):
         found = _tags(grey, board)
     else:
-        found = _circles(grey, board)
+        found = find_circles(grey, board)[0]
     return none if found is None else found
 
 
@@ -258,21 +264,17 @@ def _right_handed(points: Array, columns: int, rows: int) -> bool:
 
 def _chessboard(grey: Grey, board: Board) -> Array | None:
     size = (board.columns, board.rows)
-    scale = min(1.0, _DETECT_PX / max(grey.shape))
-    points: Array | None = None
-    if scale < 0.8:
-        points = _search(_smaller(grey, scale), size)
-        if points is not None:
-            points = (points + 0.5) / scale - 0.5
-            gap = float(np.linalg.norm(np.diff(points.reshape(board.rows, board.columns, 2), axis=1), axis=2).min())
-            half = int(np.clip(0.3 * gap, 3, 15))
-            rough = np.ascontiguousarray(points[:, None], dtype=np.float32)
-            fine = cv2.cornerSubPix(grey, rough, (half, half), (-1, -1), _SHARPEN)
-            points = np.asarray(fine, dtype=float)[:, 0]
-    if points is None:
-        points = _search(grey, size)
-    if points is None:
+    width, plain = max(grey.shape), cv2.CALIB_CB_NORMALIZE_IMAGE
+    ways = [(1.0, plain), (1.0, plain | cv2.CALIB_CB_ACCURACY)]
+    if width > _LARGE_PX:
+        ways = [(min(px / width, 1.0), plain) for px in (*_REDUCED_PX, width)]
+    if (rough := next((found for way in ways if (found := _search(grey, size, *way)) is not None), None)) is None:
         return None
+    there = rough.reshape(board.rows, board.columns, 2)
+    gap = min(float(np.linalg.norm(np.diff(there, axis=k), axis=2).min()) for k in (0, 1))
+    half = int(np.clip(0.3 * gap, 3, 15))
+    fine = cv2.cornerSubPix(grey, np.ascontiguousarray(rough[:, None], np.float32), (half, half), (-1, -1), _SHARPEN)
+    points = np.asarray(fine, dtype=float)[:, 0]
     grid = points.reshape(board.rows, board.columns, 2)
     if not _right_handed(points, board.columns, board.rows):
         grid = grid[:, ::-1]
@@ -289,9 +291,10 @@ def _smaller(grey: Grey, scale: float) -> Grey:
     return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _search(grey: Grey, size: tuple[int, int]) -> Array | None:
-    found, points = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY)
-    return np.asarray(points, dtype=float)[:, 0] if found else None
+def _search(grey: Grey, size: tuple[int, int], scale: float, flags: int) -> Array | None:
+    """Corners (m, 2) px of a chessboard that is searched in a picture reduced by ``scale``, in pixels of the whole one."""
+    found, points = cv2.findChessboardCornersSB(_smaller(grey, scale), size, flags=flags)
+    return (np.asarray(points, dtype=float)[:, 0] + 0.5) / scale - 0.5 if found else None
 
 
 def _dark(grey: Grey, grid: Array) -> bool:
@@ -328,13 +331,15 @@ def _charuco(grey: Grey, board: Board) -> Array | None:
 def _markers(grey: Grey, board: Board) -> dict[int, Array]:
     """Corners (4, 2) px of every marker of the board's dictionary by its number; where the border is two cells wide, of that kind."""
     found: dict[int, Array] = {}
-    for border in (1, 2):
-        detector = cv2.aruco.ArucoDetector(dictionary(board.dictionary), _parameters(markerBorderBits=border))
+    near = {"minMarkerDistanceRate": 0.02}  # of tags whose edge is near that of the paper
+    for more, border in (({}, 1), ({}, 2), (near, 1)):
+        if len(found) >= len(board.ids):
+            break
+        detector = cv2.aruco.ArucoDetector(dictionary(board.dictionary), _parameters(markerBorderBits=border, **more))
         corners, ids, _ = detector.detectMarkers(grey)
         if ids is not None and len(ids) > len(found):
-            found = {
-                int(k): np.asarray(c, dtype=float).reshape(4, 2) for c, k in zip(corners, ids.ravel(), strict=True)
-            }
+            places = np.asarray(corners, dtype=float).reshape(-1, 4, 2)
+            found = {int(k): corner for k, corner in zip(ids.ravel(), places, strict=True)}
     return found
 
 
@@ -342,7 +347,7 @@ def _by_sides(grey: Grey, corners: Array) -> Array:
     """Corners (4, 2) px as the meets of lines along the sides: a corner alone is pulled inwards by the picture's blur."""
     side = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     reach = float(np.clip(0.06 * side.min(), 2.0, 5.0))
-    s, t = np.linspace(-reach, reach, int(8 * reach) | 1), np.linspace(0.12, 0.88, 25)
+    s, t = np.linspace(-reach, reach, int(8 * reach) | 1), SIDE
     lines = []
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         along = (b - a) / np.linalg.norm(b - a)
@@ -358,20 +363,33 @@ def _by_sides(grey: Grey, corners: Array) -> Array:
             return corners
         place = (slope @ s)[strong] / total[strong]
         keep = np.ones(len(place), dtype=bool)
-        degree = 2 if np.linalg.norm(b - a) > _STRAIGHT_PX else 1  # a lens bends the sides
+        degree = degree_of(a, b)
         for _ in range(3):
             curve = np.polyfit(t[strong][keep], place[keep], degree)
             off = np.abs(np.polyval(curve, t[strong]) - place)
             keep = off <= max(3.0 * float(np.median(off)), 0.05)
-        tangents = []
-        for e in (0.0, 1.0):
-            foot = a + e * (b - a) + np.polyval(curve, e) * out
-            ahead = foot + (b - a) + np.polyval(np.polyder(curve), e) * out
-            tangents.append(np.cross([*foot, 1.0], [*ahead, 1.0]))
-        lines.append(tangents)
-    meets = np.array([np.cross(lines[k - 1][1], lines[k][0]) for k in range(4)])
-    refined = meets[:, :2] / meets[:, 2:]
-    return refined if float(np.linalg.norm(refined - corners, axis=1).max()) < reach else corners
+        lines.append(tangents(a, b, curve))
+    fine = meets(lines)
+    return fine if float(np.linalg.norm(fine - corners, axis=1).max()) < reach else corners
+
+
+def degree_of(a: Array, b: Array) -> int:
+    """Degree of the curve that is fitted to a tag's side from a to b px, which a lens bends."""
+    return 2 if np.linalg.norm(b - a) > _CURVED_PX else 1
+
+
+def tangents(a: Array, b: Array, curve: Array) -> list[Array]:
+    """Lines (3,) along the ends of a tag's side from a to b px, which is ``curve`` (a polynomial of 0 to 1) px outside of its chord."""
+    out = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
+    feet = [a + e * (b - a) + np.polyval(curve, e) * out for e in (0.0, 1.0)]
+    ways = [b - a + np.polyval(np.polyder(curve), e) * out for e in (0.0, 1.0)]
+    return [np.cross([*foot, 1.0], [*(foot + way), 1.0]) for foot, way in zip(feet, ways, strict=True)]
+
+
+def meets(lines: Sequence[list[Array]]) -> Array:
+    """Corners (4, 2) px of a tag from the lines along the ends of its sides."""
+    found = np.array([np.cross(lines[k - 1][1], lines[k][0]) for k in range(4)])
+    return np.asarray(found[:, :2] / found[:, 2:])
 
 
 def _placed(found: dict[int, Array], board: Board) -> Array | None:
@@ -388,24 +406,30 @@ def _tags(grey: Grey, board: Board) -> Array | None:
     return _placed(found, board)
 
 
-def _circles(grey: Grey, board: Board) -> Array | None:
+def find_circles(grey: Grey, board: Board) -> tuple[Array | None, float]:
+    """Centroids (m, 2) px of a board's circles, and the circles' radius, m; None and NaN where they are not found."""
     kind = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
-    size = (board.columns, board.rows)
-    for colour in (0, 255):
-        points = None
-        for scale in (min(1.0, 1000.0 / max(grey.shape)), 1.0):
-            small = _smaller(grey, scale)
-            detector = _blobs(small, colour)
-            for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
-                found, points = cv2.findCirclesGrid(small, size, flags=flags, blobDetector=detector)
-                if found:
-                    break
+    size, scales = (board.columns, board.rows), {min(1.0, 1000.0 / max(grey.shape)), 1.0}
+    for colour, scale in ((c, s) for c in (0, 255) for s in sorted(scales)):
+        small = _smaller(grey, scale)
+        detector = _blobs(small, colour)
+        for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
+            found, points = cv2.findCirclesGrid(small, size, flags=flags, blobDetector=detector)
             if found:
-                centres = (np.asarray(points, dtype=float)[:, 0] + 0.5) / scale - 0.5
-                return _in_order(_centres(grey, centres, colour), board)
-            if scale == 1.0:
-                break
-    return None
+                rough = (np.asarray(points, dtype=float)[:, 0] + 0.5) / scale - 0.5
+                centres, areas = _centres(grey, rough, colour)
+                order = _in_order(centres, board)
+                return centres[order], _radius(centres[order], areas[order], board)
+    return None, np.nan
+
+
+def _radius(centres: Array, areas: Array, board: Board) -> float:
+    """Radius m of a board's circles from their areas px^2, by the homography of their centres."""
+    H: Any = cv2.findHomography(board.points[:, :2], centres)[0]
+    if H is None:
+        return np.nan
+    w = np.column_stack([board.points[:, :2], np.ones(len(centres))]) @ H[2]
+    return float(np.sqrt(np.nanmedian(areas * np.abs(w) ** 3) / (np.pi * abs(np.linalg.det(H)))))
 
 
 def _blobs(grey: Grey, colour: int) -> Any:
@@ -421,11 +445,11 @@ def _blobs(grey: Grey, colour: int) -> Any:
     return opencv.SimpleBlobDetector_create(settings)
 
 
-def _centres(grey: Grey, points: Array, colour: int) -> Array:
-    """Centroids (m, 2) px of the contrast of circles in the whole picture."""
+def _centres(grey: Grey, points: Array, colour: int) -> tuple[Array, Array]:
+    """Centroids (m, 2) px of the contrast of circles in the whole picture, and their areas (m,) px^2, NaN where they are not clear."""
     far = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(far, np.inf)
-    out = points.copy()
+    out, areas = points.copy(), np.full(len(points), np.nan)
     for k, (u, v) in enumerate(points):
         half = int(np.ceil(0.5 * far[k].min()))
         x0, y0 = max(round(u) - half, 0), max(round(v) - half, 0)
@@ -440,20 +464,20 @@ def _centres(grey: Grey, points: Array, colour: int) -> Array:
             y, x = np.mgrid[: window.shape[0], : window.shape[1]]
             centre = np.array([x0 + (weight * x).sum() / weight.sum(), y0 + (weight * y).sum() / weight.sum()])
             if float(np.linalg.norm(centre - points[k])) < 0.25 * half:
-                out[k] = centre
-    return out
+                out[k], areas[k] = centre, weight.sum() / (high - low)
+    return out, areas
 
 
-def _in_order(points: Array, board: Board) -> Array:
-    if _right_handed(points, board.columns, board.rows):
-        return points
-    grid = points.reshape(board.rows, board.columns, 2)
-    grid = grid[:, ::-1] if board.kind == "circles" else grid[::-1]
-    return np.asarray(grid.reshape(-1, 2))
+def _in_order(points: Array, board: Board) -> NDArray[np.int64]:
+    """The order (m,) in which points that OpenCV found are the board's."""
+    order = np.arange(len(points)).reshape(board.rows, board.columns)
+    if not _right_handed(points, board.columns, board.rows):
+        order = order[:, ::-1] if board.kind == "circles" else order[::-1]
+    return order.ravel()
 
 
 def what_is_there(greys: Sequence[Grey], board: Board) -> str:
-    """What the first pictures show in place of the board: a sentence, or empty where nothing is known."""
+    """What the first pictures show in place of the board, or empty where nothing is known."""
     for grey in greys[:_TRIED]:
         if board.kind in ("charuco", "tag", "tags"):
             markers = _markers(grey, board)
@@ -461,21 +485,12 @@ def what_is_there(greys: Sequence[Grey], board: Board) -> str:
                 ids = ", ".join(str(k) for k in sorted(markers)[:12])
                 what = "" if board.kind != "charuco" else " and the squares do not fit them"
                 return f"markers of {board.dictionary} were found ({ids}){what}"
-            for name in (
-                "4X4_1000",
-                "5X5_1000",
-                "6X6_1000",
-                "7X7_1000",
-                "ARUCO_ORIGINAL",
-                "APRILTAG_36h11",
-                "APRILTAG_25h9",
-            ):
+            for name in _USUAL.split():
                 markers = _markers(grey, replace(board, dictionary=name))
                 if len(markers) > 1 or (board.kind == "tag" and markers):
                     ids = ", ".join(str(k) for k in sorted(markers)[:12])
                     return f"markers of {name} were found ({ids}), none of {board.dictionary}"
-        scale = min(1.0, _DETECT_PX / max(grey.shape))
-        small = _smaller(grey, scale)
+        small = _smaller(grey, min(1.0, _REDUCED_PX[-1] / max(grey.shape)))
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
         found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
         if found and meta is not None:

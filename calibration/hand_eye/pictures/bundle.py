@@ -125,13 +125,7 @@ class _Adjustment:
             return r, r, r
         jac = np.asarray(jac, dtype=float).reshape(len(k), 2, -1)
         D = jac[:, :, 3:6] @ RX.T
-        parts = [
-            jac[:, :, 6:][:, :, self.free],
-            D @ skew(v),
-            -D,
-            -(D @ chain) @ skew(y),
-            D @ chain,
-        ]
+        parts = [jac[:, :, 6:][:, :, self.free], D @ skew(v), -D, -(D @ chain) @ skew(y), D @ chain]
         own = D @ to_noise
         return r, np.concatenate(parts, axis=2), np.concatenate([-own @ skew(turned), own], axis=2)
 
@@ -223,19 +217,10 @@ def adjust(
     square = (r**2).sum(axis=1)
     rms = np.array([np.sqrt(square[a:b].mean()) for a, b in zip(work.bounds[:-1], work.bounds[1:], strict=True)])
     return Bundle(
-        X=state.X,
-        Y=state.Y,
-        K=state.K,
-        distortion=state.dist,
-        covariance=covariance,
-        camera_sigma=np.sqrt(np.diag(S)[: len(free)]),
-        sigma_px=px,
-        sigma_rad=rad,
-        sigma_m=m,
-        rms_px=rms,
-        off=state.off,
+        X=state.X, Y=state.Y, K=state.K, distortion=state.dist, covariance=covariance,
+        camera_sigma=np.sqrt(np.diag(S)[: len(free)]), sigma_px=px, sigma_rad=rad, sigma_m=m, rms_px=rms, off=state.off,
         degrees_of_freedom=dof,
-    )
+    )  # fmt: skip
 
 
 def _moved(sigma: float, square: float, least: float) -> float:

@@ -1,5 +1,6 @@
-"""Search a board in pictures, and estimate the camera from what was found."""
+"""Find the pictures and the camera file of a folder, search a board in them, and estimate the camera from what was found."""
 
+import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -9,20 +10,42 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.data.camera_file import CameraFile
+from weldcal.calibration.data.camera_file import CameraFile, read_camera
+from weldcal.calibration.data.poses.names import natural, number_of
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
-from weldcal.calibration.hand_eye.pictures.boards import EXAMPLES, Board, find_board, what_is_there, with_layout
-from weldcal.calibration.hand_eye.pictures.files import load_grey
+from weldcal.calibration.hand_eye.pictures.boards import (
+    EXAMPLES,
+    SIDE,
+    Board,
+    degree_of,
+    find_board,
+    find_circles,
+    meets,
+    tangents,
+    what_is_there,
+    with_layout,
+)
 from weldcal.models.arrays import Array
 
+ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+_OTHER = re.compile(
+    r"(?i)(depth|disparity|mask|detected|corners|result|output|annotated|debug|visuali[sz]ation|overlay|undistort|rectified)"
+)
+_CAMERA = re.compile(
+    r"(?i)^(camera|cam|camera_?info|camera_?(params?|parameters|matrix|calib\w*|intrinsics?)|camchain.*|.*intrinsics?.*|.*ost|calibration|calib"
+    r"|sensor|param|params)$"
+)
+_CAMERA_ENDINGS = (".yaml", ".yml", ".xml", ".json", ".txt", ".npz")
 FEWEST = 4
 """Pictures with the board that are needed."""
 GROSS = 4.0
 """Times the median error of a picture, beyond which it does not fit the camera."""
 _K3_LEVEL = 0.999  # at which a third radial coefficient is no chance
 _THUMBNAIL_PX = 240
+_RING = 32  # points of a circle, or of a tag's side, that is projected
+_CENTRED = 2  # corrections of the points, each with the camera that the one before gave
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,6 +74,84 @@ class Picture:
         return int(np.isfinite(self.points[:, 0]).sum())
 
 
+def picture_files(folder: Path, named: str | None = None) -> list[Path]:
+    """The pictures of one kind in a folder, two levels deep, in the natural order of their names.
+
+    Args:
+        named: part of the path of the right ones, where the user states it.
+
+    Raises:
+        DatasetError: there are none, or several kinds.
+    """
+    groups: dict[tuple[Path, str, str], list[Path]] = {}
+    for path in sorted(p for pattern in ("*", "*/*", "*/*/*") for p in folder.glob(pattern)):
+        inside = path.relative_to(folder).as_posix()
+        if path.suffix.lower() not in ENDINGS or not path.is_file() or path.name.startswith((".", "_")):
+            continue
+        if named is not None and named not in inside:
+            continue
+        stem = re.sub(r"\d+$", "", path.stem) if number_of(path.stem) is not None else ""
+        groups.setdefault((path.parent, stem, path.suffix.lower()), []).append(path)
+    wanted = [g for g in groups.values() if named is not None or not _OTHER.search(g[0].relative_to(folder).as_posix())]
+    if not wanted:
+        raise DatasetError(
+            f"'{folder.name}' holds no pictures ({', '.join(ENDINGS)}); put them beside the robot's poses."
+        )
+    by_place: dict[tuple[Path, str], list[list[Path]]] = {}
+    for (parent, stem, _), files in groups.items():
+        if files in wanted:
+            by_place.setdefault((parent, stem), []).append(files)
+    # beside a picture, a TIFF of the same name is a depth image
+    kinds = [min(g, key=lambda f: (f[0].suffix.lower() in (".tif", ".tiff"), -len(f))) for g in by_place.values()]
+    most = max(len(k) for k in kinds)
+    kinds = [k for k in kinds if 2 * len(k) > most]
+    if len(kinds) > 1 and len({k[0].parent for k in kinds}) == 1 and all(len(k) == 1 for k in kinds):
+        kinds = [[k[0] for k in kinds]]
+    if len(kinds) > 1:
+        colour = [
+            k for k in kinds if re.search(r"(?i)(rgb|colou?r|left|image|img)", k[0].relative_to(folder).as_posix())
+        ]
+        kinds = colour if len(colour) == 1 else kinds
+    if len(kinds) > 1:
+        names = ", ".join(repr(k[0].relative_to(folder).as_posix()) for k in kinds[:4])
+        raise DatasetError(
+            f"'{folder.name}' holds several kinds of pictures ({names}): name the right ones with --camera-poses, by a part of their path."
+        )
+    return sorted(kinds[0], key=lambda p: natural(p.name))
+
+
+def camera_in(folder: Path) -> tuple[Path, CameraFile] | None:
+    """The file of a folder that is named as a camera's and states one, or None."""
+    found = [p for pattern in ("*", "*/*") for p in sorted(folder.glob(pattern)) if p.is_file()]
+    for path in found:
+        if path.suffix.lower() in _CAMERA_ENDINGS and _CAMERA.match(path.stem):
+            try:
+                return path, read_camera(path)
+            except DatasetError:
+                continue
+    return None
+
+
+def load_grey(path: Path) -> NDArray[np.uint8] | None:
+    """A picture in 8 bits of grey; None where it cannot be read."""
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError:
+        return None
+    if not data.size:
+        return None
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        return None
+    if image is None:
+        return None
+    if image.dtype != np.uint8:
+        low, high = np.percentile(image, [0.5, 99.5])
+        image = np.clip((image.astype(float) - low) * 255.0 / max(float(high - low), 1.0), 0, 255).astype(np.uint8)
+    return np.asarray(image, dtype=np.uint8)
+
+
 def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, list[Picture]]:
     """The board in every picture, on two threads.
 
@@ -62,6 +163,8 @@ def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, li
     )
     board = with_layout(some, board)
 
+    radii: list[float] = []
+
     def one(path: Path) -> Picture:
         grey = load_grey(path)
         none = np.full((len(board.points), 2), np.nan)
@@ -69,7 +172,12 @@ def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, li
             return Picture(
                 name=path.name, points=none, size=(0, 0), thumbnail=b"", why="It cannot be read as a picture."
             )
-        points = find_board(grey, board)
+        if board.kind in ("circles", "acircles"):
+            found, radius = find_circles(grey, board)
+            points = none if found is None else found
+            radii.append(radius)
+        else:
+            points = find_board(grey, board)
         least = 4 if board.kind == "tag" else min(8, len(board.points))
         why = ""
         if int(np.isfinite(points[:, 0]).sum()) < least:
@@ -78,10 +186,10 @@ def find_in(files: Sequence[Path], board: Board, source: str) -> tuple[Board, li
             name=path.name, points=points, size=grey.shape[::-1], thumbnail=_thumbnail(grey, points), why=why
         )
 
-    before = cv2.getNumThreads()
     with ThreadPoolExecutor(max_workers=2) as pool:
         pictures = list(pool.map(one, files))
-    cv2.setNumThreads(before)
+    if np.isfinite(radii).any():
+        board = replace(board, radius=float(np.nanmedian(radii)))
     n = sum(not p.why for p in pictures)
     if n < FEWEST:
         some = [g for g in (load_grey(files[k]) for k in spread(len(files), 6)) if g is not None]
@@ -129,7 +237,23 @@ def sized(picture: Picture, size: tuple[int, int]) -> Picture:
 def estimate_camera(
     pictures: list[Picture], board: Board, size: tuple[int, int], file: CameraFile | None, named: str | bool
 ) -> tuple[Array, Array, NDArray[np.int64], list[Picture]]:
-    """Camera matrix, distortion, which of their numbers are free, and the pictures, those that do not fit left out."""
+    """Camera matrix, distortion, which of their numbers are free, and the pictures, those that do not fit left out.
+
+    Points become pictures of the board's points, see ``offsets``.
+    """
+    measured = [p.points for p in pictures]
+    K, dist, free, pictures = _estimate(pictures, board, size, file, named)
+    for _ in range(_CENTRED if board.radius > 0.0 or board.kind in ("tag", "tags") else 0):
+        for k, picture in enumerate(pictures):
+            if not picture.why and (found := solutions(picture.points, board, K, dist)):
+                pictures[k] = replace(picture, points=measured[k] - offsets(board, found[0][1], K, dist))
+        K, dist, free, pictures = _estimate(pictures, board, size, file, named)
+    return K, dist, free, pictures
+
+
+def _estimate(
+    pictures: list[Picture], board: Board, size: tuple[int, int], file: CameraFile | None, named: str | bool
+) -> tuple[Array, Array, NDArray[np.int64], list[Picture]]:
     if file is not None:
         if file.size is not None and file.size != size:
             raise DatasetError(
@@ -162,7 +286,7 @@ def estimate_camera(
         for k, e in zip(np.array(kept)[bad], error[bad], strict=True):
             pictures[k] = replace(pictures[k], why=f"Its points do not fit the camera of the others ({e:.1f} px).")
     K, dist = np.asarray(found[1], dtype=float), np.ravel(np.asarray(found[2], dtype=float))[:5]
-    free = np.array([0, 1, 2, 3, 4, 5] if few else [0, 1, 2, 3, 4, 5, 6, 7])
+    free = np.arange(8)
     if not few:
         more = cv2.calibrateCamera(obj, img, size, K.copy(), dist.copy(), flags=cv2.CALIB_USE_INTRINSIC_GUESS)
         numbers = 2.0 * sum(len(o) for o in obj)
@@ -175,6 +299,50 @@ def estimate_camera(
             "some pictures, or give the camera with --intrinsics FILE."
         )
     return K, dist, free.astype(np.int64), pictures
+
+
+def offsets(board: Board, C: Array, K: Array, dist: Array) -> Array:
+    """Points (m, 2) px as they are measured without noise, less the pictures of the board's points.
+
+    The picture of a circle is no circle about the picture of its centre. Straight lines along a tag's sides, which the lens bends, meet
+    beside the picture of its corner.
+
+    Args:
+        board: circles with their radius, or tags; other boards have none.
+        C: its pose in the camera (4, 4).
+        K, dist: the camera.
+    """
+    true = _projected(board.points, C, K, dist)
+    if board.radius > 0.0:
+        turn = np.linspace(0.0, 2.0 * np.pi, _RING, endpoint=False)
+        ring = board.radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(_RING)], axis=1)
+        a = _projected(board.points[:, None] + ring, C, K, dist) - true[:, None]
+        b = np.roll(a, -1, axis=1)
+        double = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]  # twice the area of a triangle
+        return np.asarray((double[..., None] * (a + b)).sum(axis=1) / (3.0 * double.sum(axis=1))[:, None])
+    if board.kind not in ("tag", "tags"):
+        return np.zeros_like(true)
+    corners = board.points.reshape(-1, 4, 3)
+    along = np.linspace(0.0, 1.0, _RING)[:, None] * (np.roll(corners, -1, axis=1) - corners)[:, :, None]
+    sides = _projected(corners[:, :, None] + along, C, K, dist)
+    measured = []
+    for tag in sides:
+        lines = []
+        for uv in tag:
+            chord = uv[-1] - uv[0]
+            t = (uv - uv[0]) @ chord / (chord @ chord)
+            outside = (uv - uv[0]) @ [chord[1], -chord[0]] / np.linalg.norm(chord)
+            curve = np.polyfit(SIDE, np.interp(SIDE, t, outside), degree_of(uv[0], uv[-1]))
+            lines.append(tangents(uv[0], uv[-1], curve))
+        measured.append(meets(lines))
+    return np.concatenate(measured) - true
+
+
+def _projected(points: Array, C: Array, K: Array, dist: Array) -> Array:
+    """Pixels (..., 2) of points (..., 3) of the board."""
+    flat = np.ascontiguousarray(points.reshape(-1, 3))
+    uv = cv2.projectPoints(flat, cv2.Rodrigues(C[:3, :3])[0], C[:3, 3], K, dist)[0]
+    return np.asarray(uv, dtype=float).reshape(*points.shape[:-1], 2)
 
 
 def solutions(points: Array, board: Board, K: Array, dist: Array) -> list[tuple[float, Array]]:

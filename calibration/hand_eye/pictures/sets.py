@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.data.camera_file import read_camera
+from weldcal.calibration.data.camera_file import CameraFile, read_camera
 from weldcal.calibration.data.poses.listing import Listing, listing_of
 from weldcal.calibration.data.poses.lists import folder_lists, together
 from weldcal.calibration.data.poses.names import mounting_name, number_of, whose
@@ -17,13 +17,14 @@ from weldcal.calibration.hand_eye.pairs.conventions import UNITS
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
 from weldcal.calibration.hand_eye.pictures.boards import Board
-from weldcal.calibration.hand_eye.pictures.files import camera_in, picture_files
 from weldcal.calibration.hand_eye.pictures.search import (
     FEWEST,
     Picture,
+    camera_in,
     common_size,
     estimate_camera,
     find_in,
+    picture_files,
     sized,
     solutions,
     spread,
@@ -94,13 +95,42 @@ def read_pictures(
     skip = frozenset() if stated_camera is None else frozenset({stated_camera[0]})
     robot = _robot(folder, stated, skip, unit)
     board, pictures = find_in(files, board, folder.name)
+    return picture_set(pictures, board, robot, mode, folder.name, stated=stated, camera=stated_camera, named=camera)
+
+
+def picture_set(
+    pictures: list[Picture],
+    board: Board,
+    robot: Listing,
+    mode: str,
+    source: str,
+    *,
+    stated: StatedForms | None = None,
+    camera: tuple[Path, CameraFile] | None = None,
+    named: Path | None = None,
+) -> PictureSet:
+    """Pictures in which the board was searched, with the robot's poses.
+
+    Args:
+        pictures: all of them, in their order.
+        board: with its layout.
+        robot: the robot's poses.
+        mode: eye_in_hand or eye_on_base.
+        source: name of the data.
+        stated: what the user states of the robot's poses.
+        camera: the file that states the camera, and what it states.
+        named: the file, where the user named it.
+
+    Raises:
+        as ``read_pictures``.
+    """
     size = common_size(pictures)
     pictures = [sized(p, size) for p in pictures]
-    file = None if stated_camera is None else stated_camera[1]
-    K, dist, free, pictures = estimate_camera(pictures, board, size, file, camera is not None and camera.name)
+    file = None if camera is None else camera[1]
+    K, dist, free, pictures = estimate_camera(pictures, board, size, file, named is not None and named.name)
     return _paired(
-        files=files, pictures=pictures, board=board, robot=robot, mode=mode, stated=stated, source=folder.name, K=K, dist=dist, free=free,
-        camera="" if stated_camera is None or len(free) else stated_camera[0].name,
+        pictures=pictures, board=board, robot=robot, mode=mode, stated=stated or StatedForms(), source=source, K=K, dist=dist, free=free,
+        camera="" if camera is None or len(free) else camera[0].name,
     )  # fmt: skip
 
 
@@ -132,7 +162,6 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
 
 def _paired(
     *,
-    files: list[Path],
     pictures: list[Picture],
     board: Board,
     robot: Listing,
@@ -153,7 +182,7 @@ def _paired(
                 C[k] = found[0][1]
             else:
                 pictures[k] = replace(picture, why="Its points give no pose of the board.")
-    name = f"{files[0].name} ... {files[-1].name}"
+    name = f"{pictures[0].name} ... {pictures[-1].name}"
     labels = np.zeros(len(pictures), dtype=np.int64)
     stated = replace(stated, robot_poses=robot.name, camera_poses=name, unit=None, camera_known=True)
     problem: InconsistentPoses | DatasetError | None = None
@@ -191,18 +220,10 @@ def _set(
         p if p.why or k in paired else replace(p, why="No robot pose belongs to it.") for k, p in enumerate(turned)
     ]
     pairs = PosePairs(
-        source=source,
-        robot=found.robot,
-        camera=found.camera,
-        mode=mode,
-        img=np.stack([turned[k].points for k in rows]),
-        obj=board.points,
-        K=K,
-        dist=dist,
-        reading=found.reading,
-        notes=found.notes,
-        ids=tuple(turned[k].name for k in rows),
-    )
+        source=source, robot=found.robot, camera=found.camera, mode=mode,
+        img=np.stack([turned[k].points for k in rows]), obj=board.points, K=K, dist=dist, reading=found.reading,
+        notes=found.notes, ids=tuple(turned[k].name for k in rows),
+    )  # fmt: skip
     return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=camera, free=free)
 
 

@@ -3,19 +3,17 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
+from weldcal.calibration.geometry.se3 import inverse
+from weldcal.calibration.hand_eye.corners import poses_from_corners
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pictures.boards import Board
 from weldcal.calibration.hand_eye.pictures.bundle import Bundle, Corners, adjust
 from weldcal.calibration.hand_eye.pictures.search import FEWEST, GROSS, Picture, solutions
 from weldcal.calibration.hand_eye.pictures.sets import PictureSet, angles
-from weldcal.calibration.hand_eye.solve import HandEyeResult
-from weldcal.models.arrays import Array
+from weldcal.calibration.hand_eye.solve import HandEyeResult, as_transform
 
 _CHANGED_PX = 1.3  # a second solution may have at most so many times the reprojection error of the first
 
@@ -88,7 +86,8 @@ def solve_pictures(
             break
         keep[np.flatnonzero(keep)[bad]] = False
     if len(data.free):
-        pairs = _reprojected(replace(pairs, K=bundle.K, dist=bundle.distortion), data.board)
+        pairs = replace(pairs, K=bundle.K, dist=bundle.distortion)
+        pairs = replace(pairs, camera=poses_from_corners(pairs, np.zeros(2), least=4))
         result = solve(pairs)
     pictures = list(data.pictures)
     errors = np.full(len(keep), np.nan)
@@ -103,26 +102,16 @@ def solve_pictures(
     weight = np.isfinite(pairs.img[keep][..., 0]).sum(axis=1) if pairs.img is not None else np.ones(int(keep.sum()))
     total = float(np.sqrt((weight * bundle.rms_px**2).sum() / weight.sum()))
     found = PictureResult(
-        board=data.board,
-        pictures=tuple(pictures),
-        bundle=bundle,
-        camera=data.camera,
-        free=data.free,
+        board=data.board, pictures=tuple(pictures), bundle=bundle, camera=data.camera, free=data.free,
         reprojection_px=total,
-    )
+    )  # fmt: skip
     if not result.unobservable:
         result = replace(
-            result,
-            poses={"X": _transform(bundle.X), "Y": _transform(bundle.Y)},
+            result, poses={"X": as_transform(bundle.X), "Y": as_transform(bundle.Y)},
             covariance={"X": bundle.covariance[:6, :6], "Y": bundle.covariance[6:, 6:]},
-            joint_covariance=bundle.covariance,
-            degrees_of_freedom=bundle.degrees_of_freedom,
-        )
+            joint_covariance=bundle.covariance, degrees_of_freedom=bundle.degrees_of_freedom,
+        )  # fmt: skip
     return replace(result, inliers=keep), pairs, found
-
-
-def _transform(X: Array) -> RigidTransform:
-    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
 
 
 def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], data: PictureSet) -> Bundle:
@@ -130,18 +119,10 @@ def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], 
     assert pairs.K is not None
     assert pairs.dist is not None
     return adjust(
-        Corners(
-            robot=pairs.robot[keep], img=pairs.img[keep], obj=data.board.points, eye_in_hand=pairs.mode == "eye_in_hand"
-        ),
-        np.asarray(result.X.GetAsMatrix4()),
-        np.asarray(result.Y.GetAsMatrix4()),
-        pairs.K,
-        pairs.dist,
-        free=data.free,
-        sigma_px=0.3,
-        sigma_rad=result.sigma_rotation_rad,
-        sigma_m=result.sigma_translation,
-    )
+        Corners(robot=pairs.robot[keep], img=pairs.img[keep], obj=data.board.points, eye_in_hand=pairs.mode == "eye_in_hand"),
+        np.asarray(result.X.GetAsMatrix4()), np.asarray(result.Y.GetAsMatrix4()), pairs.K, pairs.dist, free=data.free,
+        sigma_px=0.3, sigma_rad=result.sigma_rotation_rad, sigma_m=result.sigma_translation,
+    )  # fmt: skip
 
 
 def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[PosePairs, bool]:
@@ -165,23 +146,3 @@ def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[Pos
         if min(off) < 0.5 * now and now > 0.05:
             camera[i], img[i], changed = best[1], picture[best[2]], True
     return replace(pairs, camera=camera, img=img), changed
-
-
-def _reprojected(pairs: PosePairs, board: Board) -> PosePairs:
-    """The pairs with the boards' poses under their camera, each the solution nearest to the present one."""
-    assert pairs.img is not None
-    assert pairs.K is not None
-    assert pairs.dist is not None
-    camera = pairs.camera.copy()
-    for i, picture in enumerate(pairs.img):
-        seen = np.isfinite(picture[:, 0])
-        w, t = cv2.solvePnPRefineLM(
-            board.points[seen],
-            picture[seen],
-            pairs.K,
-            pairs.dist,
-            cv2.Rodrigues(camera[i, :3, :3])[0],
-            camera[i, :3, 3:].copy(),
-        )
-        camera[i] = pose(exp_rotation(np.ravel(w)), np.ravel(t))
-    return replace(pairs, camera=camera)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from weldcal.calibration.data.camera_file import read_camera
 from weldcal.calibration.data.clouds import CloudError, read_cloud
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.errors import DatasetError
@@ -108,6 +109,14 @@ def test_a_file_of_the_camera_beside_the_images_is_read(tmp_path: Path, name: st
     data = load_dataset(folder)
     assert np.allclose(data.cloud("a"), TRUTH, atol=1e-6, equal_nan=True)
     assert any(name in key for key in data.hashes)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_pictures_take_the_camera_of_the_same_files(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(FILES[name])
+    found = read_camera(tmp_path / name)
+    assert found.K.tolist() == np.reshape(K, (3, 3)).tolist()
+    assert not found.distortion.any()
 
 
 @pytest.mark.parametrize(

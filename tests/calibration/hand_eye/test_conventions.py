@@ -64,6 +64,24 @@ def test_the_right_reading_of_both_lists_is_found(seed: int) -> None:
     ) == found.best.X
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_turns_about_one_axis_select_a_reading(seed: int) -> None:
+    """A SCARA arm: rotations leave the angle of X about the axis open, and the positions fix it."""
+    rng = np.random.default_rng(seed)
+    A, _, X = world(rng, 14, degrees=0.0, mm=0.0)
+    A[:, :3, :3] = Rotation.from_rotvec(rng.uniform(-1.2, 1.2, (14, 1)) * [0.0, 0.0, 1.0]).as_matrix() @ A[0, :3, :3]
+    B = np.linalg.inv(X) @ np.linalg.inv(A) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    B[:, :3, 3] += rng.normal(size=(14, 3)) * 3e-4
+    B[:, :3, :3] = B[:, :3, :3] @ Rotation.from_rotvec(rng.normal(size=(14, 3)) * 1e-3).as_matrix()
+    turn, other = (Rotation.from_matrix(one[:, :3, :3]) for one in (A, B))
+    robot = PoseNumbers(source="a", p=A[:, :3, 3], r=turn.as_quat(scalar_first=False))
+    camera = PoseNumbers(source="b", p=1e3 * B[:, :3, 3], r=other.as_rotvec(degrees=True))
+    found = decide(readings(robot), readings(camera), eye_in_hand=True)
+    assert found.determined
+    assert found.best.agrees
+    assert (found.best.robot.form, found.best.camera.form) == ("quaternion_xyzw", "rotation_vector,deg")
+
+
 def test_few_noisy_poses_do_not_select_a_reading() -> None:
     """A wrong reading must never be used: where the noise hides the difference, several are left."""
     rng = np.random.default_rng(5)

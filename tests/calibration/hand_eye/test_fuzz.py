@@ -50,8 +50,7 @@ def test_a_camera_that_hardly_moves_is_no_mistake_in_units() -> None:
     F = inverse(pose(R, np.zeros((8, 3))) @ pose(np.eye(3), np.array([0.3, 0.0, 0.6])))
     X, Y = random_poses(2, rng)
     G = inverse(F @ X) @ Y @ random_poses(8, rng, 2e-4, 1e-3)
-    result = solve_problem(full_problem(F, G), config=QUICK)
-    assert likely_mistake(pairs_of(F, G), result, QUICK) is None
+    assert likely_mistake(pairs_of(F, G)) is None
 
 
 def test_a_target_of_another_size_is_told_and_a_right_one_is_not() -> None:
@@ -70,6 +69,6 @@ def test_a_target_of_another_size_is_told_and_a_right_one_is_not() -> None:
 def test_samples_that_are_one_apart_are_told() -> None:
     F, G, _, _ = eye_in_hand(25, np.random.default_rng(5), np.radians(0.05), 2e-4)
     late = replace(pairs_of(F, G), robot=F[1:], camera=G[:-1])
-    said = likely_mistake(late, None, QUICK)
+    said = likely_mistake(late)
     assert said is not None
     assert "one sample earlier" in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,9 +20,9 @@ from weldcal.calibration.hand_eye.choice import CANDIDATES
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pictures import search as picture_search
-from weldcal.calibration.hand_eye.pictures.boards import Board, find_board, parse_board, with_layout
+from weldcal.calibration.hand_eye.pictures.boards import Board, find_board, find_circles, parse_board, with_layout
 from weldcal.calibration.hand_eye.pictures.bundle import Corners, adjust
-from weldcal.calibration.hand_eye.pictures.files import picture_files
+from weldcal.calibration.hand_eye.pictures.search import picture_files
 from weldcal.calibration.hand_eye.pictures.sets import read_pictures
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
@@ -121,6 +122,76 @@ def test_every_kind_of_board_is_found_where_it_was_drawn(text: str) -> None:
         assert np.isfinite(found).all()
         error = min(float(np.linalg.norm(found[order] - truth, axis=1).max()) for order in board.symmetries)
         assert error < 0.6
+
+
+@pytest.mark.parametrize("small", [False, True])
+def test_a_large_picture_is_searched_in_a_small_one(small: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three times as large, or a part of the whole: corners of a tenth of a pixel, and no search that samples the picture up."""
+    drawing, calls = BOARDS["chessboard:9x6:20"], []
+    C = draw.world(drawing, 0, 1).camera[0]
+    picture = draw.render(drawing, C, np.random.default_rng(0), sub=3)
+    truth = draw.project(np.c_[1e-3 * drawing.points, np.zeros(len(drawing.points))], C)
+    if small:
+        whole = np.full((2048, 2448), 110, np.uint8)
+        whole[900:1380, 300:940] = picture
+        picture, truth = whole, truth + np.array([300.0, 900.0])
+    else:
+        picture = cv2.resize(picture, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+        truth = 3.0 * (truth + 0.5) - 0.5
+    search = cv2.findChessboardCornersSB
+
+    def counted(grey: np.ndarray, size: tuple[int, int], flags: int) -> tuple[bool, np.ndarray]:
+        calls.append((grey.shape[1], bool(flags & cv2.CALIB_CB_ACCURACY)))
+        return search(grey, size, flags=flags)
+
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", counted)
+    found = find_board(picture, parse_board("chessboard:9x6:20"))
+    assert np.sqrt(((found - truth) ** 2).mean()) < (0.03 if small else 0.15)
+    assert calls[0] == (700, False)
+    assert not any(up for _, up in calls)
+
+
+@pytest.mark.parametrize("text", ["circles:7x5:20", "circles:6x4:20", "acircles:4x11:12"])
+def test_centroids_of_circles_become_their_centres(text: str) -> None:
+    """The pictures of the drawn circles' centres, by the lens equation, are met five times better than by the centroids."""
+    drawing, board = BOARDS[text], parse_board(text)
+    C = draw.world(drawing, 1, 1).camera[0]
+    found, radius = find_circles(draw.render(drawing, C, np.random.default_rng(0), sub=5), board)
+    assert found is not None
+    truth = draw.project(np.c_[1e-3 * drawing.points, np.zeros(len(drawing.points))], C)
+    off = found[min(board.symmetries, key=lambda order: float(np.abs(found[order] - truth).max()))] - truth
+    left = off - picture_search.offsets(replace(board, radius=radius), C, draw.K, draw.DIST)
+    assert radius == pytest.approx((0.45 if board.kind == "acircles" else 0.25) * board.size, rel=0.01)
+    assert np.sqrt((left**2).mean()) < 0.2 * np.sqrt((off**2).mean())
+
+
+def test_sides_that_the_lens_bends_meet_where_they_were_drawn() -> None:
+    """The tags of a picture are shifted away from its middle by bent sides; with the offsets taken off they are not."""
+    text = "tags:4x3:30:10:4X4_50"
+    drawing, board = BOARDS[text], parse_board(text)
+    before, after = [], []
+    for seed in range(3):
+        C = draw.world(drawing, seed, 1).camera[0]
+        truth = draw.project(np.c_[1e-3 * drawing.points, np.zeros(len(drawing.points))], C)
+        off = find_board(draw.render(drawing, C, np.random.default_rng(seed), sub=5), board) - truth
+        away = truth - draw.K[:2, 2]
+        for to, one in ((before, off), (after, off - picture_search.offsets(board, C, draw.K, draw.DIST))):
+            to.append((one * away).sum() / (away**2).sum())
+    assert np.mean(before) > 1.2e-4
+    assert abs(np.mean(after)) < 0.3e-4
+
+
+@pytest.mark.parametrize("text", ["circles:7x5:20", "tags:4x3:30:10:4X4_50"])
+def test_a_camera_is_estimated_from_points_with_offsets(text: str) -> None:
+    """Exact points with their offsets added: the camera and the pictures of the points are found as they are without offsets."""
+    board = replace(parse_board(text), radius=0.009 if text[0] == "c" else 0.0)
+    views = draw.world(BOARDS[text], 4, 12).camera
+    points = [draw.project(board.points, C) for C in views]
+    measured = [p + picture_search.offsets(board, C, draw.K, draw.DIST) for p, C in zip(points, views, strict=True)]
+    pictures = [picture_search.Picture(name="", points=p, size=draw.SIZE, thumbnail=b"") for p in measured]
+    K, _, _, corrected = picture_search.estimate_camera(pictures, board, draw.SIZE, None, False)
+    assert np.abs(K - draw.K).max() < 0.02
+    assert max(float(np.abs(p.points - q).max()) for p, q in zip(corrected, points, strict=True)) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -397,11 +468,11 @@ def test_a_folder_without_robot_poses_says_what_to_add(chess: tuple[Path, draw.W
 
 
 def test_the_stated_region_of_the_corners_holds_the_truth_as_often_as_it_says() -> None:
-    """On corners of 40 worlds with errors of the robot, and X no worse than the best method of OpenCV on the same corners."""
+    """On corners of 120 worlds with errors of the robot, and X no worse than the best method of OpenCV on the same corners."""
     drawing = BOARDS["chessboard:9x6:20"]
     obj = np.c_[1e-3 * drawing.points, np.zeros(len(drawing.points))]
     inside, squares, ours, theirs = [], [], [], []
-    for seed in range(40):
+    for seed in range(120):
         rng = np.random.default_rng(seed)
         found = draw.world(drawing, seed, 14, deg=0.05, mm=0.3, eye_in_hand=bool(seed % 2))
         img = np.array([draw.project(obj, C) for C in found.camera]) + rng.normal(0.0, 0.15, (14, len(obj), 2))
@@ -433,7 +504,8 @@ def test_the_stated_region_of_the_corners_holds_the_truth_as_often_as_it_says() 
             _, t = cv2.calibrateHandEye(B[:, :3, :3], B[:, :3, 3], turns, shifts, method=method)
             best = min(best, float(np.linalg.norm(np.ravel(t) - found.X[:3, 3])))
         theirs.append(best)
-    assert 0.85 <= np.mean(inside) <= 1.0
-    assert 0.8 < np.mean(squares) < 1.35
+    # 2.5 standard deviations of 120 draws about 95 % and about the mean of F(6, 30 to 60), 1.03 to 1.07
+    assert 0.90 <= np.mean(inside) <= 0.995
+    assert 0.90 < np.mean(squares) < 1.20
     # even against the method that happens to be best in each world
     assert np.sqrt(np.mean(np.square(ours))) <= 1.05 * np.sqrt(np.mean(np.square(theirs)))

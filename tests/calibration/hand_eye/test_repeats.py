@@ -33,7 +33,7 @@ def solved(F: Array, G: Array, folds: int = 0) -> HandEyeResult:
     return solve_problem(full_problem(F, G), config=HandEyeConfig(folds=folds))
 
 
-@pytest.mark.parametrize("counts", [[8] * 8, [1, 1, 1, 1, 1, 25, 4, 2, 2, 1]])
+@pytest.mark.parametrize("counts", [[8] * 8, [1, 1, 1, 1, 1, 25, 4, 2, 2, 1], [1] * 40 + [30] * 4])
 def test_the_covariance_is_right_whatever_the_repeats(counts: list[int]) -> None:
     """The squared error over the covariance is 1 for each unknown. Its spread over a run is 0.75 at most (six unknowns of 13 degrees of
     freedom), so that the mean of 30 runs lies within 0.4 with 99.7 %; counted as independent, 8 x 8 samples give 4.7."""
@@ -73,6 +73,18 @@ def test_a_wrong_repeat_is_excluded_alone() -> None:
     result = solved(F, G, folds=5)
     assert np.flatnonzero(~result.inliers).tolist() == [17]
     assert result.normalised_error("X", RigidTransform(X)) < result.region(0.999)
+
+
+def test_repeats_that_vary_more_than_other_samples_are_used() -> None:
+    """Three samples at one of 40 poses with errors 2.5 times those of the others, as of a pause in a recorded motion."""
+    for seed in range(10):
+        F, G, X, _ = repeated(seed, [1] * 39 + [3], shot=0.0)
+        G[39:] = G[39:] @ noise(3, np.random.default_rng(100 + seed), 2.5 * TURN, 2.5 * SHIFT)
+        result = solved(F, G)
+        assert result.inliers.all()
+        # at least a third of the variance is common; estimated to 30 %
+        assert result.sigma_translation > 0.7 * SHIFT / np.sqrt(3.0)
+        assert result.normalised_error("X", RigidTransform(X)) < result.region(0.9999)
 
 
 def test_poses_that_differ_are_no_repeats() -> None:

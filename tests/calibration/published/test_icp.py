@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,14 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.published.icp import CentreVerification, Verification, icp_error, make_verification, sight
+from weldcal.calibration.published.icp import (
+    CentreVerification,
+    Verification,
+    face_cloud,
+    icp_error,
+    make_verification,
+    sight,
+)
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange
 
@@ -86,3 +94,18 @@ def test_a_pair_without_a_cloud_gives_its_centre_error_only() -> None:
 def test_an_empty_verification_cloud_is_refused() -> None:
     with pytest.raises(InputError, match="at least 100 valid points"):
         make_verification(np.full((500, 3), np.nan), X_BR, STANDARD)
+
+
+def test_the_face_is_what_lies_within_its_rim_and_chamfers() -> None:
+    """Each point alone, by its height over the face and its distance from the axis; missing points are no face."""
+    rng = np.random.default_rng(4)
+    standard = get_flange("iso9409-1-50-4-m6")
+    X = RigidTransform(RollPitchYaw(2.9, 0.2, 0.4), [0.05, -0.02, 0.6])
+    local = rng.uniform(-1.0, 1.0, (20_000, 3)) * [0.05, 0.05, 0.006]
+    inside = np.hypot(local[:, 0], local[:, 1]) < 0.5 * standard.outer_m + 0.001
+    inside &= (local[:, 2] < 0.001) & (local[:, 2] > -2.0 * standard.chamfer_m)
+    cloud = (local @ X.rotation().matrix().T + X.translation()).reshape(100, 200, 3)
+    cloud[::9] = np.nan
+    inside = inside.reshape(100, 200) & np.isfinite(cloud[..., 0])
+    fit = SimpleNamespace(center_C=X.translation(), normal_C=X.rotation().matrix()[:, 2])
+    assert np.array_equal(face_cloud(cloud, fit, standard), cloud[inside])  # type: ignore[arg-type]

@@ -81,6 +81,7 @@ class Sheet:
     lines: list[Rectangle] = field(default_factory=list)
     texts: list[tuple[float, float, float, str]] = field(default_factory=list)
     discs: list[tuple[float, float, float]] = field(default_factory=list)  # x, y and radius of black discs
+    origin: tuple[float, float] = (0.0, 0.0)  # of the frame of the board that it shows
 
     def marker(self, cells: np.ndarray, x: float, y: float, side: float) -> None:
         """A marker with its lower left corner at x, y; `cells` (n, n) is 1 where it is white, its first row on top."""
@@ -179,25 +180,8 @@ class Board:
 
 def board_sheet(board: Board, paper: str) -> Sheet:
     """The board in the middle of a page. Raises InputError where it does not fit."""
-    sheet = _page(paper)
-    width, height = board.columns * board.square_mm, board.rows * board.square_mm
-    _require_room(sheet, width, height, paper)
-    x0, y1 = 0.5 * (sheet.width - width), 0.5 * (sheet.height + FOOT_MM + height)
-    found, with_marker = board.opencv(), set()
-    for corners, marker in zip(found.getObjPoints(), np.ravel(found.getIds()), strict=True):
-        left, top = 1e3 * np.asarray(corners).min(axis=0)[:2]  # OpenCV counts y down from the board's upper edge
-        with_marker.add((int(left // board.square_mm), int(top // board.square_mm)))
-        cells = tag_cells(TagModel(board.dictionary, int(marker)))
-        sheet.marker(cells, x0 + left, y1 - top - board.marker_mm, board.marker_mm)
-    for column in range(board.columns):
-        for row in range(board.rows):
-            if (column, row) not in with_marker:
-                corner = (x0 + column * board.square_mm, y1 - (row + 1) * board.square_mm)
-                sheet.black.append((*corner, board.square_mm, board.square_mm))
-    sheet.ruler(
-        f"ChArUco {board.columns} x {board.rows}, squares {board.square_mm:g} mm, markers {board.marker_mm:g} mm"
-    )
-    return sheet
+    sizes = f"{board.square_mm:.12g}:{board.marker_mm:.12g}:{board.dictionary}"
+    return described_sheet(parse_board(f"charuco:{board.columns}x{board.rows}:{sizes}"), paper)
 
 
 def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
@@ -209,9 +193,16 @@ def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
     outside = {"chessboard": size, "circles": 0.25 * size, "acircles": 0.5 * size, "charuco": size}.get(board.kind, 0.0)
     low, high = points.min(axis=0) - outside, points.max(axis=0) + outside
     width, height = (float(v) for v in high - low)
+    side = Sheet(width=sheet.height, height=sheet.width)
+    if (
+        sheet.width - 2.0 * MARGIN_MM < width <= side.width - 2.0 * MARGIN_MM
+        and height <= side.height - 2.0 * MARGIN_MM - FOOT_MM
+    ):
+        sheet = side
     _require_room(sheet, width, height, paper)
     x0 = 0.5 * (sheet.width - width) - low[0]
     y0 = 0.5 * (sheet.height + FOOT_MM + height) + low[1]  # of the board's origin, y up
+    sheet.origin = (x0, y0)
     if board.kind in ("chessboard", "charuco"):
         columns, rows = (
             (board.columns + 1, board.rows + 1) if board.kind == "chessboard" else (board.columns, board.rows)

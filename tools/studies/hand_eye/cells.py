@@ -59,8 +59,7 @@ CELLS = Study(
     options=FARM,
 )
 def hand_eye_cells(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Number of cells of each kind.", min=1)] = 40,
+    call: Call, runs: Annotated[int, option("--runs", "N", "Number of cells of each kind.", min=1)] = 40
 ) -> Outcome:
     """Compare held-out errors with OpenCV's best on simulated cells with a wrong camera matrix, a wrong robot, or both."""
     seeds = range(call.seed, call.seed + runs)
