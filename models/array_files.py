@@ -56,9 +56,11 @@ def _decoded(path: Path, *, grey: bool) -> NDArray[Any]:
         raise InputError(
             f"'{path.name}' has {width} by {height} pixels, more than {MOST_PIXELS}, the most that are read."
         )
-    if content.startswith(_PNG) and width * height > _DEFLATED * len(content):
+    if content.startswith(_PNG) and (
+        max(width, 1) * max(height, 1) > _DEFLATED * len(content) or not _whole_png(content)
+    ):
         raise InputError(
-            f"'{path.name}' promises {width} by {height} pixels, more than {len(content)} bytes can hold. Save it again."
+            f"'{path.name}' is damaged: it promises {width} by {height} pixels, more than {len(content)} bytes can hold, or is cut off."
         )
     flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_UNCHANGED
     try:
@@ -68,6 +70,14 @@ def _decoded(path: Path, *, grey: bool) -> NDArray[Any]:
     if picture is None:
         raise InputError(f"'{path.name}' is not a readable image.")
     return np.asarray(picture)
+
+
+def _whole_png(content: bytes) -> bool:
+    """Whether no part of a PNG is longer than what follows: OpenCV makes space for it before it reads."""
+    at = len(_PNG)
+    while at + 8 <= len(content):
+        at += 12 + struct.unpack_from(">I", content, at)[0]
+    return at <= len(content)
 
 
 def _size(content: bytes) -> tuple[int, int]:

@@ -154,6 +154,8 @@ def resolve_files(config: Any, folder: Path) -> None:
             if dc.is_dataclass(item):
                 resolve_files(item, folder)
         named = field.metadata.get("file") or (field.name.endswith("preset") and is_scanner_file(str(value)))
+        if named and value and not isinstance(value, str | Path):
+            raise InputError(f"The scenario's key {field.name} names a file, not {str(value)[:20]}; give its path.")
         if named and value and not Path(value).is_absolute() and (folder / value).exists():
             setattr(config, field.name, str(folder / value))
 

@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.published.algorithm1 import COST_AXES
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.robots import get_robot
 from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
@@ -236,6 +237,8 @@ class Scenario:
         """The welding tool from its file; None for pen and none. Raises InputError where the file is no tool's."""
         if not self.welds:
             return None
+        if isinstance(self.tool, ToolFile) and not isinstance(self.tool.file, str):
+            raise InputError("The scenario's tool is welding, pen, none or {file: my_tool.yaml}.")
         return load_tool(Path(self.tool.file) if isinstance(self.tool, ToolFile) else WELDING)
 
     def feature_standard(self) -> FlangeStandard:

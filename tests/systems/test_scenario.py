@@ -602,3 +602,10 @@ def test_a_base_that_cannot_be_used_is_named(tmp_path: Path, text: str, named: s
 def test_an_unknown_key_is_answered_with_the_nearest_known_one(overrides: str, named: str) -> None:
     with pytest.raises(InputError, match=named):
         load_scenario("s_groove", overrides)
+
+
+@pytest.mark.parametrize("tool", ["0", "7", ""])
+def test_a_tool_that_is_a_number_is_refused(tmp_path: Path, tool: str) -> None:
+    (tmp_path / "cell.yaml").write_text(f"tool: {tool}\n")
+    with pytest.raises(InputError, match=r"tool is welding|names a file, not 7|cannot be read"):
+        load_scenario(str(tmp_path / "cell.yaml"))

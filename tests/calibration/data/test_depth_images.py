@@ -202,3 +202,7 @@ def test_a_png_whose_bytes_cannot_hold_its_pixels_is_refused_at_once(tmp_path: P
     (tmp_path / "a.png").write_bytes(content[:12] + chunk + zlib.crc32(chunk).to_bytes(4, "big") + content[33:])
     with pytest.raises(CloudError, match=r"promises 9000 by 9000 pixels, more than \d+ bytes can hold"):
         read_cloud(tmp_path / "a.png")
+    long = content.replace(content[33:37], b"\x7f" + content[34:37], 1)
+    (tmp_path / "a.png").write_bytes(long)
+    with pytest.raises(CloudError, match="is damaged"):
+        read_cloud(tmp_path / "a.png")
