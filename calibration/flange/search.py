@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -13,6 +14,8 @@ from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.flange.window import measure_window
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
+
+_Noise = Literal["of all", "by depth", "smoothed"]
 
 _ACROSS = 7.0  # thinned pixels across the flat ring: fewer do not keep it in one piece between its holes
 _BEND_M = 2.5e-4  # least depth by which three neighbours must bend to be no plane, above the scan's own noise
@@ -56,12 +59,14 @@ def search_frame(
     widest = [max(1, int(ring / (_ACROSS * p))) for p in (near, pitch, 2.0 * pitch)]
     # coarse first; where a part leaks over a shallow step at one scale or threshold, it ends there at another
     sizes = sorted(set(widest), reverse=True)
-    scales = [(w, s, False) for s in _BEND_SIGMAS for w in sizes] + [(w, _BEND_SIGMAS[0], True) for w in sizes]
+    noises: tuple[_Noise, ...] = ("of all", "by depth")
+    scales = [(w, s, n) for n in noises for s in _BEND_SIGMAS for w in sizes]
+    scales += [(w, _BEND_SIGMAS[0], "smoothed") for w in sizes]
     tried: list[tuple[Array, float]] = []
-    for wide, sigmas, smooth in scales:
+    for wide, sigmas, noise in scales:
         best: Face | None = None
         step = (round(wide / along), round(wide / across))
-        for part in flat_parts(cloud[:: step[0], :: step[1]], standard, config, sigmas, smooth):
+        for part in flat_parts(cloud[:: step[0], :: step[1]], standard, config, sigmas, noise):
             if any(
                 float(np.linalg.norm(part.center - c)) < 0.02 * standard.outer_m
                 and abs(part.radius - r) < 0.02 * standard.outer_m
@@ -123,7 +128,7 @@ def flat_parts(
     standard: FlangeStandard,
     config: FlangeFitConfig,
     sigmas: float = _BEND_SIGMAS[0],
-    smooth: bool = False,
+    noise: _Noise = "of all",
 ) -> Iterator[Part]:
     """Connected flat parts of a thinned scan (h, w, 3) whose size and outline could be the flange's, most likely first.
 
@@ -133,16 +138,16 @@ def flat_parts(
     z = np.ascontiguousarray(grid[..., 2], dtype=np.float32)
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.float32(1.0) / z
-        if smooth:  # noise hides the crease between a face and the wall below it
+        if noise == "smoothed":  # noise hides the crease between a face and the wall below it
             inverse = np.asarray(cv2.blur(inverse, (3, 3)), dtype=np.float32)
         bend_u = np.abs(inverse[1:-1, 2:] + inverse[1:-1, :-2] - 2.0 * inverse[1:-1, 1:-1])
         bend_v = np.abs(inverse[2:, 1:-1] + inverse[:-2, 1:-1] - 2.0 * inverse[1:-1, 1:-1])
         bend = np.maximum(bend_u, bend_v)
     if np.count_nonzero(np.isfinite(bend)) < 20:
         return
-    noise = _noise_by_depth(bend, inverse[1:-1, 1:-1])
+    sigma = _noise(bend, inverse[1:-1, 1:-1], by_depth=noise != "of all")
     with np.errstate(invalid="ignore"):
-        flat = (bend < np.maximum(_BEND_M * np.square(inverse[1:-1, 1:-1]), sigmas * noise)).astype(np.uint8)
+        flat = (bend < np.maximum(_BEND_M * np.square(inverse[1:-1, 1:-1]), sigmas * sigma)).astype(np.uint8)
     _count, labels, stats, _centroids = cv2.connectedComponentsWithStats(flat, connectivity=4, ltype=cv2.CV_32S)
     parts: list[Part] = []
     for k in _likeliest(labels, stats, z, grid, standard):
@@ -156,9 +161,9 @@ def flat_parts(
     yield from sorted(parts, key=lambda p: p.misfit)
 
 
-def _noise_by_depth(bend: NDArray[np.float32], inverse: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Noise (h, w) of the bend at each pixel: what the lower third of the pixels of about its depth shows, most of a scan being
-    smooth. A floor far behind the flange has another noise than the flange."""
+def _noise(bend: NDArray[np.float32], inverse: NDArray[np.float32], *, by_depth: bool) -> NDArray[np.float32]:
+    """Noise (h, w) of the bend at each pixel: what the lower third of all pixels, or of those of about its depth, shows, most of a
+    scan being smooth. A floor far behind the flange may have another noise in inverse depth than the flange."""
     with np.errstate(invalid="ignore", divide="ignore"):
         layer = np.rint(_LAYERS * np.log(np.abs(inverse)))
     known = np.isfinite(bend) & np.isfinite(layer)
@@ -167,7 +172,7 @@ def _noise_by_depth(bend: NDArray[np.float32], inverse: NDArray[np.float32]) -> 
     value, of = bend.ravel()[at], layer.ravel()[at]
     whole = np.partition(value, len(value) // 3)[len(value) // 3]
     table = np.full(int(layer.max()) + 1, whole, dtype=np.float32)
-    for k in np.unique(of):
+    for k in np.unique(of) if by_depth else ():
         mine = value[of == k]
         if len(mine) >= _LAYER_LEAST:
             table[k] = np.partition(mine, len(mine) // 3)[len(mine) // 3]
