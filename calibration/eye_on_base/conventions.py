@@ -15,6 +15,7 @@ CHANCE = 1e-6
 """Chance that the right reading is rejected in favour of a wrong one."""
 FEWEST = 5
 _KEPT = 0.7  # share of the scans that must agree: the others may be outliers
+_OUTLYING = 4.0  # medians of the scans' residuals: without one beyond, all of them count
 _LEVER_M = 0.1  # weight of a normal against a centre: an error of 0.1 rad counts as 10 mm
 _NORMAL_FLOOR, _CENTRE_FLOOR_M = 2e-5, 2e-6  # printed digits
 _AGREE_RAD, _AGREE_SHARE = (
@@ -27,10 +28,11 @@ _STEPS = 4
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanAgreement:
-    """How well the scans agree with a reading: rms angle of the normals (rad) and distance of the centres (m), the spread of the centres (m),
-    R_BC and p_BC, and whether a list is changed beyond what is stated."""
+    """How well the scans agree with a reading: rms angle of the normals (rad) and distance of the centres (m) of so many scans that are no
+    outliers, the spread of the centres (m), R_BC and p_BC, and whether a list is changed beyond what is stated."""
 
     reading: PoseReading
+    scans: int
     normal: float
     centre: float
     spread: float
@@ -50,8 +52,9 @@ def choose_reading(
     """The reading of the flange poses with which the scans agree, and a sentence about it; None where the usual one stands.
 
     Centres of the feature in the base do not depend on the notation of rotations, its normals do. For each reading the rigid X_BC that
-    fits centres and normals best leaves residuals with about 2 n degrees of freedom each; a reading whose residuals exceed those of the best
-    by more than the quantile of F(2 n - 6, 2 n - 6) for CHANCE is rejected.
+    fits centres and normals best leaves residuals of normals with at least 2 m - 3 degrees of freedom, m of the n scans being no outliers,
+    and more of centres; a reading whose residuals exceed those of the best by more than the quantile of F(2 m - 3, 2 m - 3) for CHANCE is
+    rejected.
 
     Args:
         readings: poses X_BF (N, 4, 4) in metres, the usual reading first.
@@ -72,9 +75,9 @@ def choose_reading(
         for change in CHANGES
         if change != "left_handed"
     ]
-    dof = max(2 * n - 6, 3)
-    limit = float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * len(tried + changes)), dof, dof)))
     best = min(tried + changes, key=_cost)
+    dof = max(2 * best.scans - 3, 3)
+    limit = float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * len(tried + changes)), dof, dof)))
     if best.changed:
         plain = min(tried, key=_cost)
         if plain.agrees and not _rejected(plain, best, limit):
@@ -143,8 +146,11 @@ def _fit(reading: PoseReading, rows: Array, p_CR: Array, n_C: Array, X_FR: Array
         size = np.hypot(off / _LEVER_M, tilt)
         cut = np.sort(size)[kept - 1] + 1e-9
         weight = np.minimum(1.0, (1.5 * cut / np.maximum(size, 1e-12)) ** 2)
+    if size.max() < _OUTLYING * np.median(size):
+        kept = n
     return ScanAgreement(
         reading=reading,
+        scans=kept,
         normal=float(np.sqrt((np.sort(tilt)[:kept] ** 2).mean())) + _NORMAL_FLOOR,
         centre=float(np.sqrt((np.sort(off)[:kept] ** 2).mean())) + _CENTRE_FLOOR_M,
         spread=float(np.sqrt(p_B.var(axis=0).sum())) + 1e-9,
