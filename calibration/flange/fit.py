@@ -1,6 +1,6 @@
 """Finds a flange in a scan: the plane of its face and the centre of its concentric edges."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,8 @@ class FlangeFit:
     ``center_C`` (3,) centre of the concentric edges in the face plane; ``normal_C`` (3,) outward, towards the scanner;
     ``center_covariance`` (3, 3) m^2 and ``normal_sigma`` rad (per axis) cover the noise of this scan, not the scanner's
     systematic error; ``outer_radius_m`` and ``bore_radius_m`` are the edges of the flat face (None where not seen);
-    ``coverage`` is the share 0..1 of the outer edge that was seen. ``plane_rms_m``, ``outer_rms_m`` and ``bore_rms_m`` are
+    ``coverage`` is the share 0..1 of the outer edge that was seen, ``on_grid``
+    whether it was measured on a pixel grid. ``plane_rms_m``, ``outer_rms_m`` and ``bore_rms_m`` are
     the residuals of each feature, ``rim_rms_m`` of both edges together.
     """
 
@@ -62,6 +63,7 @@ class FlangeFit:
     coverage: float
     outer_rms_m: float = float("nan")
     bore_rms_m: float | None = None
+    on_grid: bool = True
 
 
 def fit_flange(
@@ -75,8 +77,8 @@ def fit_flange(
 
     The method follows from what is given, fastest first; where one finds nothing or doubts its result, the next one decides.
     Organised scans: tracking within 3 mm of a guess that has a normal, a fit of the window about that guess, a search of the
-    guess's surroundings; without a guess a search of the whole scan. Unordered clouds: a fit that takes the points for the
-    flange's own, a search about the guess, or of every separate body of about the flange's size.
+    guess's surroundings; without a guess a search of the whole scan. Unordered clouds: the same on the
+    sensor's rebuilt grid; where it cannot be rebuilt, a search about the guess, or of every separate body of about the flange's size.
 
     ``guess`` limits the search; a FlangeFit of the scan before is a guess, too. Deterministic for ``config.seed``. Raises
     FlangeNotFound with the reason: nothing there, no plane, wrong size (also millimetres taken for metres), too little of the
@@ -110,9 +112,12 @@ def _unordered(
         if found is not None:
             return found
     points = cloud[np.isfinite(cloud).all(axis=1)].astype(float)
-    if guess is None:
-        return _search(points, standard, config, refusal)
-    return _find(near(points, guess.center_C, guess.radius_m), standard, guess, config, refusal)
+    if guess is not None:
+        points = near(points, guess.center_C, guess.radius_m)
+    search = (
+        _search(points, standard, config, refusal) if guess is None else _find(points, standard, guess, config, refusal)
+    )
+    return None if search is None else replace(search, on_grid=False)
 
 
 def _organised(

@@ -287,6 +287,12 @@ def calibrate_dataset(
             "The poses hardly differ in orientation, so they cannot show a TCP that is set at the robot: it would shift X_BC by its own "
             "length, and no figure here would tell. Check that the TCP is zero, or tilt the flange in some poses."
         )
+    loose = [id for id, fit in fits.items() if not fit.on_grid]
+    if loose:
+        warnings.append(
+            f"{len(loose)} of {len(fits)} clouds have no pixel grid that could be rebuilt ({', '.join(loose[:3])}): fused, thinned, or not in "
+            "the scanner's frame. Their centres are two to three times less precise; export single scans as the scanner takes them."
+        )
     if refined is not None:
         warnings.append(refined.sentence)
     if scanner is not None and scanner.worth_saying:

@@ -25,6 +25,7 @@ def errors() -> dict[str, np.ndarray]:
         cloud = scan(X_CR, rng, CAMERA)
         for name, points in forms(cloud, rng, X_CR[:3, 3]).items():
             fit = fit_flange(points, STANDARD)  # none is refused: every scan shows the face
+            assert fit.on_grid
             e = fit.center_C - X_CR[:3, 3]
             nees = float(e @ np.linalg.solve(fit.center_covariance, e)) / 3.0
             found.setdefault(name, []).append((float(np.linalg.norm(e)), nees))
@@ -76,4 +77,5 @@ def test_a_fused_cloud_is_measured_without_a_grid() -> None:
     points = points[np.abs(points - X_CR[:3, 3]).max(axis=1) < 0.06]
     assert rebuild_grid(points) is None
     fit = fit_flange(points, STANDARD)
+    assert not fit.on_grid
     assert float(np.linalg.norm(fit.center_C - X_CR[:3, 3])) < 4e-4
