@@ -23,7 +23,7 @@ _FILLED = 0.4  # share of the bore's core that must not be face
 _HOLLOW = 0.7  # share of the ring between the edges that must be face; its holes take up to a seventh of it
 _FULL = 0.85  # and must be where the bore's edge itself was not found
 _SLOTTED = 0.4  # and where the face shows all round both edges: slots between them take half of it on some arms
-_ALL_ROUND = 0.9
+_ALL_ROUND = 0.9  # of the directions
 _MIXED, _MOST_MIXED = 1.5, 0.2  # pitches, and at most this share of the ring
 
 

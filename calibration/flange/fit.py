@@ -22,7 +22,7 @@ __all__ = ["FlangeFit", "FlangeFitConfig", "FlangeGuess", "FlangeNotFound", "fit
 
 
 _STEP_M = 0.003  # gap between points that separates two bodies
-_MAX_ISLANDS = 40
+_MAX_ISLANDS = 40  # bodies that are tried, largest first
 _GOOD_COVERAGE = 0.8  # a face seen this well, with its bore, ends the search
 _WARP = 0.2  # and so much of that along the normal: a scanner's warp tilts a half more than it tilts the whole
 _TRACKED_RADIUS = 0.7  # of the flange's diameter: about the fit of the scan before

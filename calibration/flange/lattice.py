@@ -12,7 +12,7 @@ _FIT = 3_000  # points that fix the polynomial
 _INSIDE = 0.25  # of a cell: how far a point may lie from its pixel's ray
 _MOST = 0.97  # share of the points that must lie so close
 _DOUBLE = 0.01  # share of the pixels that may have two points: more are two views, or noise
-_CELLS = 60_000_000
+_CELLS = 60_000_000  # the largest grid: six times the pixels of the largest scanner in use
 _THINNED = 0.5  # a scan with fewer neighbours of its pixels
 _STEP_M = 0.003  # depth per pixel at which one body ends before another
 

@@ -1,4 +1,4 @@
-"""Words for what the doctor finds: each cause with its evidence and its remedy, and the report of `weldcal doctor`."""
+"""Writes what the doctor finds: each cause with its evidence and the next step, and the report of `weldcal doctor`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
