@@ -13,14 +13,12 @@ from scipy.stats import chi
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.eye_on_base.nested import calibrate_by_choice, mean_interval, nested_errors
+from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
-from weldcal.calibration.eye_on_base.scanner_fit import from_holes, from_motion
-from weldcal.calibration.eye_on_base.self_calibration import held_out_errors
+from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
+from weldcal.calibration.eye_on_base.validation import mean_interval, position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.refinement.local_field import choose_local
@@ -90,12 +88,17 @@ def study_ingredients(folder: Path, seed: int = 0, progress: Progress = no_progr
     progress("hole circle alone", 0.6)
     if from_holes(good, patterns) is not None:
         rows.append(_holes_alone(good, patterns, seed))
-    names = ("scale and gradient, hole circle and motion", "and bends of order 2", "and bends of order 3")
-    for order, name in enumerate(names, 1):
-        progress(name, 0.55 + 0.12 * order)
-        position, tilt = held_out_errors(good, patterns, seed, order)
-        sigma = from_motion(good, patterns, seed=seed, order=order, usual=True).sigma_position_m
-        rows.append(Ingredient(name, position, tilt, _floor(sigma)))
+    progress("scanner corrected", 0.7)
+    estimate, _ = estimate_jointly(good, patterns, config=SolveConfig(seed=seed))
+    errors = estimate.held_out
+    rows.append(
+        Ingredient(
+            "scanner corrected, hole circle and motion",
+            errors.position_m,
+            errors.tilt_rad,
+            _floor(estimate.sigma_position_m),
+        )
+    )
     return rows
 
 
@@ -178,10 +181,7 @@ def _calibrated(
     if len(used) < ENOUGH:
         alone = len(used) == 1
         return calibrate_from_few(used, patterns, turn if alone else None, seed=seed).X_BC, ScannerCorrection()
-    rigid = estimate_eye_on_base(used, SolveConfig(seed=seed, allow_coplanar=True))
-    scanner, _, estimate = apply_self_calibration(used, rigid, patterns, seed=seed, nested=False)
-    accepted = None if scanner is None else scanner.accepted
-    return estimate.X_BC, ScannerCorrection() if accepted is None else accepted
+    return solve_jointly(used, patterns, seed=seed)
 
 
 LEAST_HALVES = 16
@@ -208,14 +208,16 @@ def study_halves(
         order = np.random.default_rng([seed, k]).permutation(len(good))
         ours, others = ([good[i] for i in part] for part in (order[:half], order[half:]))
         try:
-            X_BC, correction = calibrate_by_choice(ours, patterns, seed=seed)
+            X_BC, correction = solve_jointly(ours, patterns, seed=seed)
             new_scans = [corrected_observation(correction, o) for o in others]
             if local:
                 choice = choose_local(ours, patterns, X_BC, correction, seed=seed)
                 errors = choice.local_m if choice.accepted else choice.plain_m
                 new_scans = choice.field.applied(X_BC, new_scans) if choice.accepted else new_scans
             else:
-                errors, _ = nested_errors(ours, patterns, seed=seed)
+                errors = estimate_jointly(ours, patterns, config=SolveConfig(seed=seed, allow_coplanar=True))[
+                    0
+                ].held_out.position_m
         except InputError:
             skipped += 1
             continue
