@@ -192,7 +192,7 @@ def honesty(
     return HONESTY.measured({"all": {"studies": [vars(s) for s in studies]}}, folder).outcome()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Stated:
     """Of ``runs`` worlds of one class (scans, largest error of the scanner m, rms error of the arm m, with a local field or plain): mean
     error (m) of 60 new scans each, and how many times that is stated (nested held-out errors, both means over the worlds)."""
@@ -219,7 +219,16 @@ def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: b
             seen = refined.field.applied(found.estimate.X_BC, seen)
         true.append(float(np.mean(position_errors(found.estimate.X_BC, seen))))
         stated.append(float(np.nanmean(found.estimate.held_out.position_m[found.estimate.inliers])))
-    return Stated(poses, warp_m, arm_m, local, runs, float(np.mean(true)), float(np.mean(stated) / np.mean(true)))
+    ratio = float(np.mean(stated) / np.mean(true))
+    return Stated(
+        poses=poses,
+        warp_m=warp_m,
+        arm_m=arm_m,
+        local=local,
+        runs=runs,
+        true_m=float(np.mean(true)),
+        stated_over_true=ratio,
+    )
 
 
 def _stated_rows(f: Figures) -> Iterable[Row]:
