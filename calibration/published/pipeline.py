@@ -11,14 +11,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.calibration.published.algorithm1 import (
-    Algorithm1State,
-    Cost,
-    algorithm1_start,
-    algorithm1_step,
-    translation_cost,
-)
-from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
+from weldcal.calibration.published.icp import FAILED, VerificationError
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
@@ -288,16 +281,6 @@ def published_pairs(circles: Mapping[str, PublishedCircle], poses: Mapping[str, 
 def all_pairs(pairs: Sequence[Observation]) -> RigidTransform:
     """Eq. (10)-(12) on every pair, without weights or outlier rejection: Table 1's calibration."""
     return fit_rigid(np.array([o.p_BR for o in pairs]), np.array([o.p_CR for o in pairs]))
-
-
-def run_published(
-    pairs: Sequence[Observation], verifier: Verifier, parameters: PublishedParameters, cost: Cost = translation_cost
-) -> Algorithm1State:
-    """Algorithm 1 over pairs in the order given, as printed (a new pair may replace more than one of the four)."""
-    state = algorithm1_start(parameters.e_required, parameters.k_max)
-    for o in pairs:
-        state = algorithm1_step(state, o, verifier, cost, as_printed=True)
-    return state
 
 
 def at_flange(error: VerificationError, X_BC: RigidTransform, X_BF: RigidTransform) -> Array:

@@ -102,7 +102,11 @@ class _Copy:
         except subprocess.TimeoutExpired:
             return False, f"did not end within {limit_s:.0f} s"
         failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-        said = failed[-1].rpartition("::")[2] if failed else (done.stdout.splitlines() or done.stderr.splitlines() or ["no output"])[-1]
+        said = (
+            failed[-1].rpartition("::")[2]
+            if failed
+            else (done.stdout.splitlines() or done.stderr.splitlines() or ["no output"])[-1]
+        )
         return {0: True, 1: False}.get(done.returncode), said
 
     def verdict(self, mutation: Mutation, limit_s: float) -> tuple[str, str]:

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.calibration.flange.face import face_points
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.few_poses import axis_turn, estimate_from_whole_poses
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
-from weldcal.models.flanges import face_points, get_flange
+from weldcal.models.flanges import get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.1, 0.5), [-0.6, -0.2, 1.3])

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.calibration.flange.face import face_points
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm1_step, axes_cost, work_radius_cost
+from weldcal.calibration.published.algorithm1 import (
+    algorithm1_start,
+    algorithm1_step,
+    axes_cost,
+    translation_cost,
+    work_radius_cost,
+)
 from weldcal.calibration.published.icp import VerificationError
 from weldcal.calibration.published.pipeline import (
     CircleParameters,
@@ -21,12 +28,11 @@ from weldcal.calibration.published.pipeline import (
     find_centres,
     published_model,
     published_pairs,
-    run_published,
     search_circle,
     segment_flange,
 )
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import face_points, get_flange
+from weldcal.models.flanges import get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
@@ -155,7 +161,9 @@ def test_the_pipeline_runs_as_a_whole_and_compensation_flatters_its_own_pose() -
         unit_m=1.0,
     )
     assert verifier(all_pairs(pairs)).found
-    state = run_published([pairs[i] for i in np.random.default_rng(0).permutation(7)], verifier, parameters)
+    state = algorithm1_start(parameters.e_required, parameters.k_max)
+    for i in np.random.default_rng(0).permutation(7):
+        state = algorithm1_step(state, pairs[i], verifier, translation_cost, as_printed=True)
     assert state.X_BC is not None
     assert state.cost <= state.history[0][1]
     assert "s7" not in {o.id for o in state.pool}

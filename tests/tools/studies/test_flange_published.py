@@ -10,6 +10,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
+from tests.calibration.flange.face import face_points
 from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
@@ -18,7 +19,7 @@ from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm1_step
 from weldcal.calibration.published.icp import COMPONENTS, VerificationError
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import face_points, get_flange
+from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.flange.published.clouds import METHODS, study_clouds
 from weldcal.tools.studies.flange.published.command import find_datasets, title
