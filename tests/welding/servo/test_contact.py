@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.welding.servo.contact import contact_lost, freshness, progress_at, with_progress
+from weldcal.welding.seam.curve import SeamFrame
+from weldcal.welding.servo.contact import contact_lost, freshness, progress_at, with_frame, with_progress
 from weldcal.welding.servo.settings import ServoConfig
-from weldcal.welding.servo.state import WeldingState
+from weldcal.welding.servo.state import DeflectionSample, ServoSample, WeldingState
 
 DT = 0.008
 
@@ -49,3 +51,16 @@ def test_both_springs_unload_at_a_loss_of_contact() -> None:
     both = WeldingState(proven=True, delta_n=0.01 - drop, delta_axial=0.01 - drop)
     assert not contact_lost(before, one, config)
     assert contact_lost(before, both, config)
+
+
+def test_a_tip_pushed_back_and_up_is_deflected_to_the_left_and_axially() -> None:
+    """The tool presses to the left and down; the wall holds the tip 0.4 mm to the right of its rest and 0.3 mm above it."""
+    x, y, z = np.eye(3)
+    seam = SeamFrame(np.zeros(3), x, y, z, 0.0)
+    X_BT = RigidTransform(RollPitchYaw(0.0, 0.0, 0.5), [0.4, 0.1, 0.2])
+    off_T = X_BT.rotation().matrix().T @ np.array([0.0, -0.4e-3, 0.3e-3])
+    frame = DeflectionSample(0.1, X_BT, off_T, True)
+    state = with_frame(WeldingState(), ServoSample(0.1, X_BT, frame), seam, ServoConfig())
+    assert (state.delta_n, state.delta_axial) == pytest.approx((0.4e-3, 0.3e-3))
+    assert state.measurement is not None
+    np.testing.assert_allclose(state.measurement.point, [0.4, 0.1 - 0.4e-3, 0.2 + 0.3e-3])
