@@ -76,14 +76,17 @@ def test_half_a_face_is_as_far_off_in_it_as_stated() -> None:
     assert 0.6 < np.mean(found) < 1.6
 
 
-def test_a_whole_face_is_as_high_as_stated() -> None:
-    found = []
+def test_a_whole_face_is_as_high_and_as_level_as_stated() -> None:
+    found, tilt = [], []
     for fit, X_CR in _fits(60, half=False):
         assert fit.coverage > 0.9
         e, C = _in_face(fit, X_CR)
         found.append(e[2] ** 2 / C[2, 2])
-    # 60 degrees of freedom: 18 %
+        lean = X_CR[:3, :2].T @ fit.normal_C
+        tilt.append(lean @ lean / 2.0 / fit.normal_sigma**2)
+    # 60 and 120 degrees of freedom: 18 and 13 %
     assert 0.5 < np.mean(found) < 1.7
+    assert 0.6 < np.mean(tilt) < 1.5
 
 
 def _drilled(rng: np.random.Generator, off_m: float) -> tuple[Array, float]:
