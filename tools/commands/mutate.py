@@ -102,11 +102,8 @@ class _Copy:
         except subprocess.TimeoutExpired:
             return False, f"did not end within {limit_s:.0f} s"
         failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-        said = (
-            failed[-1].rpartition("::")[2]
-            if failed
-            else (done.stdout.splitlines() or done.stderr.splitlines() or ["no output"])[-1]
-        )
+        last = (done.stdout.splitlines() or done.stderr.splitlines() or ["no output"])[-1]
+        said = failed[-1].rpartition("::")[2] if failed else last
         return {0: True, 1: False}.get(done.returncode), said
 
     def verdict(self, mutation: Mutation, limit_s: float) -> tuple[str, str]:
@@ -149,16 +146,19 @@ def run_mutations(
 
         groups = tuple(dict.fromkeys(mutation.tests for mutation in mutations))
         with ThreadPoolExecutor(jobs, initializer=copy_project) as pool:
-            took: dict[tuple[str, ...], float] = {}
-            for tests, seconds in zip(groups, pool.map(unmutated, groups), strict=True):
-                took[tests] = seconds
-                progress(f"without a mutation: {tests[0]}", len(took) / (len(groups) + len(mutations)))
-            waiting = {
-                pool.submit(lambda m: here.copy.verdict(m, _LEAST_S + 2.0 * took[m.tests]), m): m for m in mutations
-            }
-            for count, done in enumerate(as_completed(waiting), len(groups) + 1):
-                progress(waiting[done].reason, count / (len(groups) + len(mutations)))
-                yield waiting[done], *done.result()
+            try:
+                took: dict[tuple[str, ...], float] = {}
+                for tests, seconds in zip(groups, pool.map(unmutated, groups), strict=True):
+                    took[tests] = seconds
+                    progress(f"without a mutation: {tests[0]}", len(took) / (len(groups) + len(mutations)))
+                waiting = {
+                    pool.submit(lambda m: here.copy.verdict(m, _LEAST_S + 2.0 * took[m.tests]), m): m for m in mutations
+                }
+                for count, done in enumerate(as_completed(waiting), len(groups) + 1):
+                    progress(waiting[done].reason, count / (len(groups) + len(mutations)))
+                    yield waiting[done], *done.result()
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)  # an interrupt does not wait for the rest
 
 
 @command("mutate", short_help="Change formulas one by one; tests must fail.", hidden=True, common=LOOK)
