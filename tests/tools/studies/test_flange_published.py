@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +33,7 @@ from weldcal.tools.studies.flange.published.pairs import (
     study_kinect,
     study_pairs,
 )
+from weldcal.tools.studies.flange.published.report import table1_rows
 from weldcal.tools.studies.flange.published.simulation import (
     X_BC_TRUE,
     algorithm1_batch,
@@ -198,3 +201,12 @@ def test_without_data_the_simulated_parts_are_reported(tmp_path: Path) -> None:
     assert "No data folder was given" in table
     assert "only the simulated" in table
     assert {p.name for p in (tmp_path / "o/figures").iterdir()} == {"costs.svg", "fig9_noise.svg", "fig10_steps.svg"}
+
+
+def test_table_1_names_pairs_that_hold_no_stored_runs() -> None:
+    """Pairs of the UR5 are judged further down, so Table 1 does not call them absent."""
+    study: Any = SimpleNamespace(pairs=(SimpleNamespace(title="UR5 & PhoXi M", table1=None),), clouds=())
+    rows = [row[0] for row in table1_rows(study)]
+    below = {name: rows[rows.index(f"{name}, paper") + 1] for name in ("UR5 & PhoXi M", "AUBO i5 & PhoXi S")}
+    assert below["UR5 & PhoXi M"] == "  pairs without stored runs"
+    assert below["AUBO i5 & PhoXi S"] == "  no data of it here"
