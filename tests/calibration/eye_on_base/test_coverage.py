@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.calibration.eye_on_base.few_poses import calibrate_from_few
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 
 R_BC = Rotation.from_euler("xyz", [3.0, 0.2, 0.7])
@@ -115,3 +118,33 @@ def test_scans_that_state_a_sharper_normal_count_for_more() -> None:
         silent.append(estimate_eye_on_base([Observation(o.id, o.X_BR, o.p_CR, o.n_C) for o in known], QUICK))
     turns = [float(np.sqrt(np.mean([error(e)[:3] @ error(e)[:3] for e in group]))) for group in (told, silent)]
     assert turns[0] < 0.8 * turns[1]
+
+
+SPREAD_M, TILT_RAD = 1.5e-4, 1.2e-3  # of robot and scanner together, as on the recorded arms
+TURN = np.radians(0.9)  # of the drilled pattern about the axis, stated to 0.1 degrees
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_whole_poses_of_usual_cells_err_as_stated(n: int) -> None:
+    """Scans with holes: 0.15 mm and 1.2 mrad per axis of robot and scanner, and one error of the stated turn for all scans."""
+    found = []
+    for seed in range(150):
+        rng = np.random.default_rng([4, n, seed])
+        observations, patterns = [], {}
+        for o in scans(n, rng, 0.0):
+            R_BR = Rotation.from_matrix(o.X_BR.rotation().matrix())
+            p_C = R_BC.inv().apply(o.p_BR - P_BC) + SPREAD_M * rng.normal(size=3)
+            R_CR = (
+                R_BC.inv() * R_BR * Rotation.from_euler("z", TURN) * Rotation.from_rotvec(TILT_RAD * rng.normal(size=3))
+            )
+            X_CR = RigidTransform(RotationMatrix(R_CR.as_matrix()), p_C)
+            observations.append(Observation(o.id, o.X_BR, p_C, X_CR.rotation().matrix()[:, 2]))
+            patterns[o.id] = HolePattern(
+                holes_C=np.zeros((5, 3)), angles_rad=np.zeros(5), center_C=p_C, X_CR=X_CR, ratio=1.0, rms_m=1e-6
+            )
+        stated = TURN + np.radians(0.1) * rng.normal()
+        estimate = calibrate_from_few(observations, patterns, stated)
+        e = error(estimate)
+        found.append(float(e @ np.linalg.solve(estimate.covariance, e)) / 6.0)
+    # 900 degrees of freedom: 5 %
+    assert 0.75 < np.mean(found) < 1.3
