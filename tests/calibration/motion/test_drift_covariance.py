@@ -40,7 +40,7 @@ def _field(rng: np.random.Generator, centers: Array, normals: Array) -> Array:
     return np.asarray(root @ rng.normal(size=(len(x), 5)) * np.repeat([FIELD_M, FIELD_RAD], [3, 2]))
 
 
-def _world(seed: int, turn: Array, shift: Array) -> tuple[DriftTest, Rows, Rotation, Array]:
+def _world(seed: int, turn: Array, shift: Array, noise: float = 1.0) -> tuple[DriftTest, Rows, Rotation, Array]:
     """A calibration with an error of the size that it states, its frames, and the scanner's pose after it moved at half time."""
     rng = np.random.default_rng([5, seed])
     t = FRAME_S * np.arange(FRAMES)
@@ -62,7 +62,7 @@ def _world(seed: int, turn: Array, shift: Array) -> tuple[DriftTest, Rows, Rotat
         p_C, n_C, np.tile(CENTRE_M**2 * np.eye(3), (FRAMES, 1, 1)), np.full(FRAMES, TILT_RAD),
     )  # fmt: skip
     rows = replace(rows, residuals=rows.residuals + _field(rng, rows.centers, rows.normals))
-    test = DriftTest(_pose(R_hat, p_hat), covariance, PIVOT, noise=FrameNoise())
+    test = DriftTest(_pose(R_hat, p_hat), covariance, PIVOT, noise=FrameNoise(noise, noise))
     return test, rows, R_after, p_after
 
 
@@ -72,20 +72,34 @@ def _error(X: RigidTransform, R: Rotation, p: Array) -> Array:
     return np.concatenate([turn.as_rotvec(), X.translation() - p])
 
 
-@pytest.fixture(scope="module")
-def moved() -> Moved:
-    """Cells whose scanner turns by a milliradian and shifts by half a millimetre."""
+def _moved(cells: int, noise: float = 1.0) -> Moved:
+    """Cells whose scanner turns by a milliradian and shifts by half a millimetre; ``noise`` is the share of it that is stated."""
     found = []
-    for seed in range(14):
+    for seed in range(cells):
         rng = np.random.default_rng([6, seed])
         turn, shift = (s * v / np.linalg.norm(v) for s, v in zip((1e-3, 5e-4), rng.normal(size=(2, 3)), strict=True))
-        test, rows, R, p = _world(seed, turn, shift)
+        test, rows, R, p = _world(seed, turn, shift, noise)
         for k in range(0, FRAMES, 10):
             test.update(rows.part(slice(k, k + 10)))
         test.finish()
         assert [e.kind for e in test.events] == [MOVED]
         found.append((test, test.events[0], turn, shift, R, p))
     return found
+
+
+def _squares(moved: Moved) -> list[float]:
+    """Normalised squared errors of the moves; a simpler move has no covariance of the part that it leaves out."""
+    square = []
+    for _, event, turn, shift, _, _ in moved:
+        e = np.concatenate([event.rotation_rad - turn, event.translation_m - shift])
+        if event.model == "both":
+            square.append(float(e @ np.linalg.solve(event.covariance, e)) / 6.0)
+    return square
+
+
+@pytest.fixture(scope="module")
+def moved() -> Moved:
+    return _moved(14)
 
 
 def test_the_pose_after_a_move_is_as_far_off_as_stated(moved: Moved) -> None:
@@ -99,13 +113,16 @@ def test_the_pose_after_a_move_is_as_far_off_as_stated(moved: Moved) -> None:
 
 
 def test_the_move_is_as_far_off_as_stated(moved: Moved) -> None:
-    square = []
-    for _, event, turn, shift, _, _ in moved:
-        e = np.concatenate([event.rotation_rad - turn, event.translation_m - shift])
-        if event.model == "both":  # a simpler move has no covariance of the part that it leaves out
-            square.append(float(e @ np.linalg.solve(event.covariance, e)) / 6.0)
+    square = _squares(moved)
     assert len(square) > 7
     assert 0.4 < np.mean(square) < 1.7
+
+
+def test_a_noise_that_is_understated_widens_the_move() -> None:
+    """Frames four times as noisy as their fits state: the innovations say so."""
+    square = _squares(_moved(8, 0.25))
+    assert len(square) > 3
+    assert np.mean(square) < 2.5
 
 
 def test_a_turn_about_the_scanner_shifts_it_nowhere() -> None:
