@@ -21,7 +21,10 @@ Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
 
 def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
     """Distances (n,) m between the flange centres by the calibration and by the robot."""
-    return np.array([float(np.linalg.norm(X_BC @ o.p_CR - o.p_BR)) for o in observations])
+    if not observations:
+        return np.zeros(0)
+    centres, places = np.array([o.p_CR for o in observations]), np.array([o.p_BR for o in observations])
+    return np.asarray(np.linalg.norm(centres @ X_BC.rotation().matrix().T + X_BC.translation() - places, axis=1))
 
 
 def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
@@ -60,7 +63,8 @@ def k_fold(
         order = rng.permutation(n)
         for f in range(folds):
             test = order[f::folds]
-            train = [observations[i] for i in range(n) if i not in set(test.tolist())]
+            held = set(test.tolist())
+            train = [o for i, o in enumerate(observations) if i not in held]
             try:
                 X, correction = (
                     (estimate_eye_on_base(train, plain).X_BC, ScannerCorrection()) if solve is None else solve(train)
