@@ -91,6 +91,7 @@ def run_mounting(name: str, seed: int, kind: str, folder: str = "") -> Mapping[s
         report, truth, device = _light(name, world, kind), world.truth, world.device
     r, p = report.result, work_point(report.scene)
     assert r is not None
+    assert device is not None
     seen = device.measured(p)
     e = r.place(seen) - truth["X"] @ p
     return {
