@@ -67,7 +67,7 @@ def hand_moves(
         if found is not None:
             near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
             q.append(near)
-    return closed_moves(np.array(q)), X_FC, X_BT
+    return closed_moves(np.array(q), linear=False), X_FC, X_BT
 
 
 @pytest.fixture(scope="module")
