@@ -15,6 +15,7 @@ from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
+from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
 from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
@@ -213,16 +214,22 @@ def calibrate_dataset(
         data = data.between(poses)
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
+    start: ArmStart | None = None
+    if len(seen.observations) < ENOUGH and seen.refused and not data.pairs and data.header.scanner_guess is None:
+        tell("comparing the visible arm", 0.7)
+        seen, start = see_with_arm(data, seen, standard, robot or data.header.robot, seed=seed)
     data = seen.data or data
     observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
     few = len(observations) < ENOUGH
     tcp: tuple[str, ...] = ()
     with examined_where_refused(Path(out), data, seen, standard, seed):
-        _enough(observations, refused)
+        _enough(observations, refused, start)
         tell("solving", 0.7)
         if few:
             turn = None if axis_turn_deg is None else float(np.radians(axis_turn_deg))
             estimate = calibrate_from_few(observations, seen.patterns, turn, seed=seed)
+            if start is not None:
+                tcp = (start.agreement(estimate.X_BC, np.array([o.p_BR for o in observations])),)
         else:
             config = SolveConfig(seed=seed, allow_coplanar=bool(fits))
             X_FR = None if data.pairs else data.X_FR
@@ -396,21 +403,23 @@ def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
     return []
 
 
-def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:
-    """Requires one usable scan, and four where others were refused (then more can be taken).
+def _enough(observations: list[Observation], refused: list[tuple[str, str]], start: ArmStart | None) -> None:
+    """Requires one usable scan; where others were refused, four (then more can be taken), or two that the visible arm confirms.
 
     Raises:
         InputError, TooFewPoses: there are fewer.
     """
     n = len(observations)
+    arm = "" if start is None else f" {start.sentence}"
     if n == 0:
         same = len({r for _, r in refused}) == 1 and len(refused) > 1
         which = "every cloud" if same else f"the first, {refused[0][0]}"
-        raise InputError(f"None of the {len(refused)} clouds can be used. Reason for {which}: {refused[0][1]}")
-    if n < ENOUGH and refused:
+        raise InputError(f"None of the {len(refused)} clouds can be used. Reason for {which}: {refused[0][1]}{arm}")
+    confirmed = start is not None and start.accepted and n > 1
+    if n < ENOUGH and refused and not confirmed:
         names = "; ".join(f"{i}: {t}" for i, t in refused[:3])
         raise TooFewPoses(
-            f"Only {n} usable poses remain of {n + len(refused)}; at least {ENOUGH} are needed. Refused: {names}"
+            f"Only {n} usable poses remain of {n + len(refused)}; at least {ENOUGH} are needed. Refused: {names}{arm}"
         )
 
 

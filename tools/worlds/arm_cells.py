@@ -1,5 +1,7 @@
 """Makes cells whose flange is small, far or hidden: an arm of drawn housings, a second arm, a table and clutter, by rays."""
 
+import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,14 +10,15 @@ import numpy as np
 import open3d as o3d
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.data.header import DatasetHeader, Units
-from weldcal.models.arms.chain import Chain, chain_inverse, load_chain
+from weldcal.calibration.eye_on_base.arm_start import arm_shape, find_arm
+from weldcal.models.arms.chain import Chain, chain_frames, chain_inverse, load_chain
 from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.arms.link_mesh import link_solids
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh, merge, revolve
+from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.report.files import csv_text
 
 ARMS = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "aubo_i5", "franka_fr3")
@@ -23,8 +26,46 @@ REACH_M = {"ur3e": 0.5, "ur5e": 0.85, "ur10e": 1.3, "ur16e": 0.9, "ur20": 1.75, 
 FLANGES = {"ur20": "iso9409-1-80-6-m8"}
 WIDTH, HEIGHT, FOCAL = 640, 480, 640.0  # pixels
 SCANS = 8
-_TUBES = {"aubo_i5": (0.062, 0.062, 0.05, 0.045, 0.04, 0.04), "franka_fr3": (0.06,) * 4 + (0.055, 0.05, 0.042)}
-"""Radii (m) of the housings of arms without drawings, joint by joint."""
+START_M, RIGHT_M = 0.06, 0.003  # largest error at the work point of a right start, and of a right calibration
+START_SCANS = 3
+_DRAWN: dict[str, list[tuple[int, str, tuple[float, float], float, float, float]]] = {
+    "aubo_i5": [
+        (0, "z", (0.0, 0.0), 0.0, 0.05, 0.085),
+        (1, "z", (0.0, 0.0), -0.078, 0.072, 0.06),
+        (2, "z", (0.0, 0.0), -0.059, 0.102, 0.061),
+        (2, "z", (0.408, 0.0), -0.059, 0.102, 0.061),
+        (2, "x", (0.0, 0.022), 0.0, 0.408, 0.057),
+        (3, "z", (0.0, 0.0), 0.042, 0.14, 0.057),
+        (3, "x", (0.0, 0.1), 0.0, 0.376, 0.038),
+        (3, "z", (0.376, 0.0), 0.042, 0.162, 0.039),
+        (4, "z", (0.0, 0.0), -0.048, 0.039, 0.039),
+        (4, "y", (0.0, 0.0), -0.06, 0.06, 0.038),
+        (5, "z", (0.0, 0.0), -0.048, 0.039, 0.039),
+        (5, "y", (0.0, 0.0), -0.056, 0.06, 0.038),
+        (6, "z", (0.0, 0.0), -0.04, -0.012, 0.037),
+    ],
+    "franka_fr3": [
+        (0, "z", (-0.03, 0.0), 0.0, 0.14, 0.09),
+        (1, "z", (0.0, 0.0), -0.192, 0.05, 0.055),
+        (1, "y", (0.0, 0.0), -0.129, 0.055, 0.055),
+        (2, "z", (0.0, 0.0), -0.05, 0.129, 0.055),
+        (2, "y", (0.0, 0.0), -0.194, 0.05, 0.055),
+        (3, "z", (0.0, 0.0), -0.121, 0.05, 0.055),
+        (3, "x", (0.0, 0.0), 0.0, 0.0825, 0.055),
+        (3, "y", (0.0, 0.0825), -0.055, 0.111, 0.055),
+        (4, "z", (0.0, 0.0), -0.055, 0.111, 0.055),
+        (4, "x", (0.0, 0.0), -0.0825, 0.0, 0.055),
+        (4, "y", (0.0, -0.0825), -0.05, 0.124, 0.055),
+        (5, "z", (0.0, 0.0), -0.264, -0.17, 0.055),
+        (5, "z", (0.0, 0.07), -0.19, 0.04, 0.055),
+        (5, "y", (0.0, 0.0), 0.0, 0.07, 0.05),
+        (6, "x", (0.0, 0.0), -0.048, 0.132, 0.046),
+        (6, "y", (0.0, 0.088), -0.05, 0.082, 0.044),
+        (7, "z", (0.0, 0.0), 0.052, 0.095, 0.044),
+        (7, "z", (0.045, 0.045), 0.06, 0.1, 0.03),
+    ],
+}
+"""Cylinders of arms without drawings: link, axis, the line's place in the other two coordinates (z, x for y), from, to, radius, m."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,11 +82,7 @@ class ArmCell:
 
 def _frames(chain: Chain, q: Array) -> list[Array]:
     """Poses (4, 4) of base, links and flange in B."""
-    frames = [np.eye(4)]
-    for X, angle in zip(chain.stack, q, strict=True):
-        turn = np.eye(4)
-        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        frames.append(frames[-1] @ X @ turn)
+    frames = [np.eye(4), *chain_frames(chain, q)]
     return [*frames, frames[-1] @ chain.X_LF]
 
 
@@ -69,16 +106,13 @@ def arm_links(name: str, rng: np.random.Generator) -> list[TriMesh]:
         arm = load_arm(name)
         links = [merge(*link_solids(arm, k)) for k in range(chain.n + 1)]
     else:
-        radii = _TUBES[name]
-        links = [_tube(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.07]), 0.09)]
-        for k, r in enumerate(radii):
-            end = chain.stack[k + 1][:3, 3] if k + 1 < chain.n else chain.X_LF[:3, 3] - np.array([0.0, 0.0, 0.012])
-            last = k + 1 == chain.n
-            low, high = (-0.055, -0.012 + chain.X_LF[2, 3]) if last else (-1.0 * r, 1.0 * r)
-            parts = [_tube(np.array([0.0, 0.0, low]), np.array([0.0, 0.0, high]), r)]
-            if float(np.linalg.norm(end)) > 0.03 and not last:
-                parts.append(_tube(np.zeros(3), end, 0.9 * r))
-            links.append(merge(*parts))
+        parts: list[list[TriMesh]] = [[] for _ in range(chain.n + 1)]
+        for k, axis, (u, v), low, high, radius in _DRAWN[name]:
+            order = {"x": (0, 1, 2), "y": (1, 2, 0), "z": (2, 0, 1)}[axis]
+            a, b = np.zeros(3), np.zeros(3)
+            a[list(order)], b[list(order)] = (low, u, v), (high, u, v)
+            parts[k].append(_tube(a, b, radius))
+        links = [merge(*some) for some in parts]
     out = []
     for k, mesh in enumerate(links):
         middle = mesh.vertices.mean(axis=0)
@@ -118,12 +152,14 @@ def clutter(reach: float, clear: Array, rng: np.random.Generator) -> TriMesh:
         high = rng.uniform(0.03, 0.12)
         if rng.random() < 0.5:
             size = np.array([*rng.uniform(0.05, 0.3, 2), high])
-            parts.append(_box(size, RigidTransform(turn, p + [0.0, 0.0, 0.5 * high])))
+            parts.append(_box(size, RigidTransform(turn, p + np.array([0.0, 0.0, 0.5 * high]))))
         else:
-            parts.append(_tube(p, p + [0.0, 0.0, high], rng.uniform(0.025, 0.06)))
+            parts.append(_tube(p, p + np.array([0.0, 0.0, high]), rng.uniform(0.025, 0.06)))
     if rng.random() < 0.3:
         angle = rng.uniform(0, 2 * np.pi)
-        at = RigidTransform(RotationMatrix.MakeZRotation(angle), 1.4 * reach * np.array([np.cos(angle), np.sin(angle), 0.3]))
+        at = RigidTransform(
+            RotationMatrix.MakeZRotation(angle), 1.4 * reach * np.array([np.cos(angle), np.sin(angle), 0.3])
+        )
         parts.append(_box(np.array([0.03, 3.0 * reach, 2.0]), at))
     return merge(*parts)
 
@@ -177,7 +213,9 @@ def arm_cell(seed: int, scans: int = SCANS) -> ArmCell:
         other = arm_links(name, rng)
         q = rng.uniform(np.maximum(chain.position_lower, -np.pi), np.minimum(chain.position_upper, np.pi))
         X = np.eye(4)
-        X[:3, 3] = work + rng.normal(size=3) * [0.2, 0.2, 0.0] + reach * np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        X[:3, 3] = (
+            work + rng.normal(size=3) * [0.2, 0.2, 0.0] + reach * np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        )
         X[2, 3] = 0.0
         still = merge(still, posed(other, flange, [X @ f for f in _frames(chain, q)]))
     seen_share, sigma = rng.uniform(0.5, 1.0), rng.uniform(0.1, 0.5) * 1e-3
@@ -204,13 +242,11 @@ def arm_cell(seed: int, scans: int = SCANS) -> ArmCell:
         joints.append(q)
         poses.append(RigidTransform(RotationMatrix.ProjectToRotationMatrix(frames[-1][:3, :3]), frames[-1][:3, 3]))
         clouds.append(render(merge(posed(links, flange, frames), still), X_BC, rng, sigma))
-    return ArmCell(
-        arm=name, flange=designation, X_BC=X_BC, X_BF=tuple(poses), q=np.array(joints), clouds=tuple(clouds)
-    )
+    return ArmCell(arm=name, flange=designation, X_BC=X_BC, X_BF=tuple(poses), q=np.array(joints), clouds=tuple(clouds))
 
 
-def cell_dataset(cell: ArmCell, folder: Path, *, joints: bool = True) -> Dataset:
-    """The cell's scans written as a dataset without a guess, and read again; clouds stay in memory as unordered points."""
+def write_cell(cell: ArmCell, folder: Path, *, joints: bool = True) -> None:
+    """Write the cell's scans as a dataset without a guess, with its joint angles or without."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"q{k + 1}" for k in range(cell.q.shape[1])] if joints else []
     rows = []
@@ -224,4 +260,38 @@ def cell_dataset(cell: ArmCell, folder: Path, *, joints: bool = True) -> Dataset
     (folder / "clouds").mkdir(exist_ok=True)
     for k, cloud in enumerate(cell.clouds):
         np.savez(folder / "clouds" / f"p{k:02d}.npz", points=cloud.astype(np.float32))
-    return load_dataset(folder)
+
+
+def calibrate_cell(seed: int) -> Mapping[str, object]:
+    """The cell of a seed calibrated without a guess, and the start from three of its scans: "right", "wrong" or "refused" each."""
+    cell = arm_cell(seed)
+    work = np.mean([X.translation() for X in cell.X_BF], axis=0)
+
+    def error(X_BC: RigidTransform) -> float:
+        return float(np.linalg.norm(X_BC @ (cell.X_BC.inverse() @ work) - work))
+
+    found: dict[str, object] = {
+        "arm": cell.arm,
+        "start": "refused",
+        "calibration": "refused",
+        "by_arm": False,
+        "mm": None,
+    }
+    arm = load_chain(cell.arm)
+    start = find_arm(cell.clouds[:START_SCANS], [arm_shape(arm, q) for q in cell.q[:START_SCANS]])
+    if start is not None:
+        off = error(start.X_BC)
+        found |= {"start_mm": 1e3 * off, "explained": start.explained, "seen_through": start.seen_through}
+        found["lead"] = start.score - start.next_best
+        if start.accepted:
+            found["start"] = "right" if off < START_M else "wrong"
+    with tempfile.TemporaryDirectory() as folder:
+        write_cell(cell, Path(folder) / "cell")
+        try:
+            report = calibrate_dataset(Path(folder) / "cell", Path(folder) / "out")
+        except InputError as reason:
+            return found | {"reason": str(reason)[:300]}
+    off = error(report.result.X_BC)
+    by_arm = any("visible arm agrees" in text for text in report.result.warnings)
+    verdict = "right" if off < RIGHT_M else "wrong"
+    return found | {"calibration": verdict, "mm": 1e3 * off, "by_arm": by_arm, "scans": len(report.observations)}

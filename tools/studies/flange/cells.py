@@ -10,6 +10,7 @@ import typer
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, statistics
+from weldcal.tools.worlds.arm_cells import calibrate_cell
 from weldcal.tools.worlds.light_runs import LightRuns, study_light_runs
 from weldcal.tools.worlds.wrong_arm import Found, judged, station, study_station
 
@@ -105,3 +106,42 @@ def imperfect(
     folder = IMPERFECT.folder(call)
     found = study_light_runs(load_scenario(scenario), runs, seed=call.seed, progress=call.progress)
     return IMPERFECT.measured({"all": _imperfect(found)}, folder).outcome()
+
+
+def _start_figures(results: Results) -> Figures:
+    found = list(results.values())
+    counts = {
+        what: {
+            verdict: sum(r.get(what, "failed") == verdict for r in found)
+            for verdict in ("right", "refused", "wrong", "failed")
+        }
+        for what in ("start", "calibration")
+    }
+    without = sum(r.get("calibration") == "right" and not r["by_arm"] for r in found)
+    error = statistics((r["start_mm"] for r in found if r.get("start") == "right"), "median", "p95")
+    return {"cells": len(found), **counts, "right_without_arm": without, "start_mm": error}
+
+
+def _start_rows(f: Figures) -> Iterable[Row]:
+    for what in ("start", "calibration"):
+        yield what, "{right} right, {refused} refused, {wrong} wrong".format(**f[what])
+    yield "right without the arm", f"{f['right_without_arm']} of {f['cells']}"
+    yield "error of a start at the work point", "{median:.0f} mm median, {p95:.0f} mm 95 %".format(**f["start_mm"])
+
+
+START = Study(
+    name="flange-start",
+    what="Ray-cast cells of seven arms with a small, far or hidden flange, calibrated without a guess; the start is from three scans.",
+    case=calibrate_cell,
+    figures=_start_figures,
+    header=("", "found"),
+    rows=_start_rows,
+)
+
+
+@command("benchmark flange-start", short_help="Calibrate cells whose flange is small, far or hidden.", hidden=True)
+def start(
+    call: Call, cells: Annotated[int, option("--cells", "N", "Number of cells; the arms take turns.", min=1)] = 200
+) -> Outcome:
+    """Calibrate ray-cast cells with a small, far or hidden flange without a guess, and start from the visible arm in three scans."""
+    return START.outcome(call, {f"cell {s}": {"seed": s} for s in range(call.seed, call.seed + cells)})
