@@ -11,9 +11,10 @@ from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.data.header import ScannerGuess
-from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
+from weldcal.calibration.flange.fit import FlangeGuess
+from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.refinement.stated_arm import joint_angles
 from weldcal.models.arms.chain import Chain, chain_capsules, chain_frames, known_chains, load_chain
@@ -35,12 +36,10 @@ _KEPT, _REFINED = 250, 12  # hypotheses of a scan that all scans judge, and of t
 _SCANS = 8  # that are compared with the arm, at most
 _GUESS_M, _GUESS_RAD = 0.06, 0.35  # how far flange and start may lie apart
 _JOINTS_M = 0.03  # between the stated flange and the one that the joints lead to: more is another arm, or a TCP
+_FACE_M, _FACE_POINTS = 0.0025, 60  # half a face's thickness in a noisy scan, and the fewest points on it
 _SAME_M, _SAME_RAD = 0.08, 0.25  # hypotheses that are the same
-_EXPLAINED, _SEEN_THROUGH, _MARGIN = (
-    0.72,
-    0.12,
-    0.04,
-)  # of an accepted start: least and largest shares, lead over the next
+_EXPLAINED, _SEEN_THROUGH = 0.72, 0.12  # of an accepted start: the least share of points, the largest of surface
+_MARGIN = 0.04  # and its lead over the next
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,33 +101,60 @@ class ArmStart:
 def see_with_arm(
     data: Dataset, seen: FlangeObservations, standard: FlangeStandard, robot: str, *, seed: int = 0
 ) -> tuple[FlangeObservations, ArmStart | None]:
-    """The flanges of scans, looked for where the visible arm puts them; as they were seen where the arm decides nothing.
-
-    A flange farther from there than 60 mm or 20 degrees is another thing and is refused.
-    """
+    """The flanges of scans, looked for where the visible arm puts them; as they were seen where the arm decides nothing."""
     start = start_from_arm(data, robot, seed=seed)
     if start is None or not start.accepted:
         return seen, start
-    q = start.X_BC.rotation().ToQuaternion().wxyz()
-    guess = ScannerGuess(xyz=[*start.X_BC.translation()], wxyz=[*q], radius_m=_GUESS_M)
-    led = replace(data, header=replace(data.header, scanner_guess=guess))
-    again = see_flanges(led, standard, seed=seed)
-    good, refused = [], list(again.refused)
-    for o in again.observations:
-        X = led.guess(o.id)
-        assert X is not None
-        assert o.n_C is not None
-        off = float(np.linalg.norm(X.translation() - o.p_CR))
-        tilt = float(np.arccos(np.clip(X.rotation().matrix()[:, 2] @ o.n_C, -1.0, 1.0)))
-        if off < _GUESS_M and tilt < _GUESS_RAD:
-            good.append(o)
-        else:
-            refused.append((o.id, f"The flange found lies {1e3 * off:.0f} mm from where the visible arm puts it."))
-    kept = {o.id for o in good}
-    parts = ({id: v for id, v in part.items() if id in kept} for part in (again.fits, again.patterns, again.clouds))
-    fits, patterns, clouds = parts
-    plain = replace(again.data or data, header=data.header)
-    return FlangeObservations(tuple(good), fits, patterns, clouds, tuple(refused), plain), start  # type: ignore[arg-type]
+    guesses, refused = {}, list(data.refused)
+    for id in data.clouds:
+        try:
+            points = np.asarray(data.cloud(id), dtype=float).reshape(-1, 3)
+            guesses[id] = face_guess(points, start.X_BC.InvertAndCompose(data.poses[id] @ data.X_FR), standard)
+        except (CloudError, FlangeNotFound) as e:
+            refused.append((id, e.reason))
+    shown = replace(data, clouds={id: data.clouds[id] for id in guesses}, refused=tuple(refused))
+    again = see_flanges(shown, standard, guesses=guesses, seed=seed)
+    return replace(again, data=replace(again.data or data, clouds=data.clouds, refused=data.refused)), start
+
+
+def face_guess(points: Array, X_CR: RigidTransform, standard: FlangeStandard) -> FlangeGuess:
+    """Where the flange's face is in a cloud (N, 3) m, to a millimetre or two, from a pose X_CR that is right to some centimetres.
+
+    The face is where most points lie on the ring, and fewest in the bore and just outside, on a plane
+    along the expected axis; plane and place are found in turns.
+
+    Raises:
+        FlangeNotFound: no face is there.
+    """
+    outer, bore = standard.outer_radius_m, standard.bore_radius_m
+    center, normal = X_CR.translation(), X_CR.rotation().matrix()[:, 2]
+    near = points[((points - center) ** 2).sum(axis=1) < (outer + 0.04) ** 2]  # NaN is not near
+    for reach, step, levels in (
+        (0.024, 0.002, np.arange(-0.03, 0.0301, 0.001)),
+        *[(0.008, 0.001, np.arange(-4, 5) * 1e-3)] * 2,
+    ):
+        axes = np.column_stack(plane_axes(normal))
+        height, xy = (near - center) @ normal, (near - center) @ axes
+        shift = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1e-9, step)] * 2), axis=-1).reshape(-1, 2)
+        best, move = 0.0, None
+        for level in levels:
+            on = xy[np.abs(height - level) < _FACE_M]
+            few = on[:: max(1, len(on) // 300)]
+            rho = np.hypot(few[:, 0] - shift[:, :1], few[:, 1] - shift[:, 1:])
+            value = np.where(
+                rho > outer + 0.012, 0.0, np.where(rho > outer, -1.0, np.where(rho > bore, 1.0, -0.7))
+            ).sum(axis=1)
+            k = int(np.argmax(value))
+            if len(on) >= _FACE_POINTS and value[k] * len(on) / len(few) > best:
+                best, move = float(value[k]) * len(on) / len(few), axes @ shift[k] + level * normal
+        if move is None:
+            raise FlangeNotFound("No face of the flange is where the visible arm puts it: it is turned away or hidden.")
+        center = center + move
+        face = near[(np.abs((near - center) @ normal) < _FACE_M) & (((near - center) ** 2).sum(axis=1) < outer**2)]
+        plane = np.linalg.eigh(np.cov(face.T))[1][:, 0]
+        normal = plane if float(plane @ normal) > 0.0 else -plane
+        center = center + normal * float(normal @ (face.mean(axis=0) - center))
+    return FlangeGuess(center, outer + 0.01, normal)
 
 
 def start_from_arm(data: Dataset, robot: str, *, seed: int = 0) -> ArmStart | None:

@@ -1,6 +1,6 @@
 """Fits the flange in every cloud of a dataset, with the reasons of refused scans, and decides how its poses are to be read."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,15 +55,16 @@ def see_flanges(
     standard: FlangeStandard,
     *,
     X_BC: RigidTransform | None = None,
+    guesses: Mapping[str, FlangeGuess] | None = None,
     holes: bool = True,
     seed: int = 0,
     tell: Callable[[float], None] = lambda fraction: None,
 ) -> FlangeObservations:
     """Fit the flange in every cloud of a dataset, or use its pairs as they are.
 
-    ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole. Without
-    ``holes`` no hole pattern is looked for. Deterministic for ``seed``. ``tell`` is told the fraction done. A damaged file
-    is refused with its reason, as is a scan that shows no flange.
+    ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole.
+    ``guesses`` says it scan by scan instead. Without ``holes`` no hole pattern is looked for. Deterministic for ``seed``.
+    ``tell`` is told the fraction done. A damaged file is refused with its reason, as is a scan that shows no flange.
     """
     if data.pairs:
         return FlangeObservations(
@@ -78,7 +79,8 @@ def see_flanges(
         tell(k / len(data.clouds))
         try:
             points = data.cloud(id)
-            fit = _fit(points, standard, _guess(data, id, standard, X_BC), seed, whole=X_BC is not None)
+            guess = _guess(data, id, standard, X_BC) if guesses is None else guesses[id]
+            fit = _fit(points, standard, guess, seed, whole=X_BC is not None)
         except (CloudError, FlangeNotFound) as e:
             refused.append((id, e.reason))
             continue

@@ -228,12 +228,12 @@ def calibrate_dataset(
         if few:
             turn = None if axis_turn_deg is None else float(np.radians(axis_turn_deg))
             estimate = calibrate_from_few(observations, seen.patterns, turn, seed=seed)
-            if start is not None:
-                tcp = (start.agreement(estimate.X_BC, np.array([o.p_BR for o in observations])),)
         else:
             config = SolveConfig(seed=seed, allow_coplanar=bool(fits))
             X_FR = None if data.pairs else data.X_FR
             estimate, tcp = estimate_consistent(observations, config, X_FR, 0.5 * standard.outer_m)
+        if start is not None:
+            tcp = (*tcp, start.agreement(estimate.X_BC, np.array([o.p_BR for o in observations])))
     tell("estimating the scanner correction", 0.72)
     rigid = estimate
     scanner, corrected, estimate = apply_self_calibration(
