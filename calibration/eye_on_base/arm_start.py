@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +11,12 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.clouds import CloudError
-from weldcal.calibration.data.dataset import Dataset
+from weldcal.calibration.data.dataset import Dataset, joint_angles
 from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
 from weldcal.calibration.flange.fit import FlangeGuess
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.refinement.stated_arm import joint_angles
 from weldcal.models.arms.chain import Chain, chain_capsules, chain_frames, known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import known_arms, load_arm
@@ -348,7 +348,7 @@ def _normals(points: Array, cloud: Array) -> Array:
     return np.asarray(np.where(((n * points).sum(axis=1) > 0.0)[:, None], -n, n))
 
 
-def _arm_field(shape: ArmShape, rng: np.random.Generator) -> dict[str, Array]:
+def _arm_field(shape: ArmShape, rng: np.random.Generator) -> dict[str, Any]:
     """Samples of the surface of an arm, and its distances on a grid."""
     samples, outward = [], []
     for (a, b), r in zip(shape.ends, shape.radii, strict=True):
@@ -428,7 +428,7 @@ def _refine(X: Array, views: Sequence[_View]) -> tuple[Array, float]:
             w = np.square(np.clip(1.0 - np.square(r / (2.0 * scale)), 0.0, None))
             H += (J * w[:, None]).T @ J
             g += J.T @ (w * r)
-        step = -np.linalg.solve(H, g)
+        step = np.asarray(-np.linalg.solve(H, g), dtype=np.float64)
         step[:6] *= min(1.0, 0.2 / max(float(np.linalg.norm(step[:3])), 1e-12))
         X[:3, :3] = exp_rotation(step[:3]) @ X[:3, :3]
         X[:3, 3] += step[3:6]

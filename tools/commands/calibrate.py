@@ -11,7 +11,7 @@ import typer
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.checks import is_motion
-from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
@@ -34,7 +34,7 @@ from weldcal.calibration.refinement.refined import (
     refine_arm,
     refine_locally,
 )
-from weldcal.calibration.refinement.stated_arm import joint_angles, require_joint_angles
+from weldcal.calibration.refinement.stated_arm import require_joint_angles
 from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms

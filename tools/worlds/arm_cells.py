@@ -120,13 +120,13 @@ def arm_links(name: str, rng: np.random.Generator) -> list[TriMesh]:
         v = middle + (mesh.vertices - middle) * wide
         mesh = TriMesh(v, mesh.triangles)
         if 2 <= k <= 3 and rng.random() < 0.5:  # a hose along the arm
-            along = np.ptp(v, axis=0)
-            axis, off = int(np.argmax(along)), rng.normal(size=3)
-            off[axis] = 0.0
-            off *= (0.5 * np.sort(along)[0] + 0.015) / np.linalg.norm(off)
-            a, b = middle + off, middle + off
-            a[axis], b[axis] = v[:, axis].min(), v[:, axis].max()
-            mesh = merge(mesh, _tube(a, b, 0.012))
+            extent = np.ptp(v, axis=0)
+            way, off = int(np.argmax(extent)), rng.normal(size=3)
+            off[way] = 0.0
+            off *= (0.5 * np.sort(extent)[0] + 0.015) / np.linalg.norm(off)
+            low_end, high_end = middle + off, middle + off
+            low_end[way], high_end[way] = v[:, way].min(), v[:, way].max()
+            mesh = merge(mesh, _tube(low_end, high_end, 0.012))
         out.append(mesh)
     return out
 
@@ -185,7 +185,7 @@ def render(mesh: TriMesh, X_BC: RigidTransform, rng: np.random.Generator, sigma:
     blobs = cv2.GaussianBlur(rng.normal(size=z.shape), (0, 0), 6.0)
     z[blobs < np.quantile(blobs, rng.uniform(0.0, 0.06))] = np.nan
     z[rng.random(z.shape) < 0.01] = np.nan
-    return rays_C * z[..., None]
+    return np.asarray(rays_C * z[..., None])
 
 
 def arm_cell(seed: int, scans: int = SCANS) -> ArmCell:
@@ -231,15 +231,15 @@ def arm_cell(seed: int, scans: int = SCANS) -> ArmCell:
         side = np.cross(towards, rng.normal(size=3))
         z = np.cos(np.radians(tilt)) * towards + np.sin(np.radians(tilt)) * side / np.linalg.norm(side)
         turn = RotationMatrix.MakeFromOneVector(z, 2) @ RotationMatrix.MakeZRotation(rng.uniform(0, 2 * np.pi))
-        q = chain_inverse(chain, RigidTransform(turn, p), near=joints[-1] if joints else None, seed=seed + tries)
+        found = chain_inverse(chain, RigidTransform(turn, p), near=joints[-1] if joints else None, seed=seed + tries)
         if tries > 300:
             return arm_cell(seed + 100_000 * 7)
-        if q is None:
+        if found is None:
             continue
-        frames = _frames(chain, q)
+        frames = _frames(chain, found)
         if min(float(f[2, 3]) for f in frames[2:]) < 0.08:
             continue
-        joints.append(q)
+        joints.append(found)
         poses.append(RigidTransform(RotationMatrix.ProjectToRotationMatrix(frames[-1][:3, :3]), frames[-1][:3, 3]))
         clouds.append(render(merge(posed(links, flange, frames), still), X_BC, rng, sigma))
     return ArmCell(arm=name, flange=designation, X_BC=X_BC, X_BF=tuple(poses), q=np.array(joints), clouds=tuple(clouds))
