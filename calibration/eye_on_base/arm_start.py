@@ -32,6 +32,7 @@ _ANCHORS, _TURNS = (48, 90), 24  # points of a scan, of the arm's surface, and t
 _ROUGH_M, _FINE_M = 0.045, 0.02  # how far a point may lie from a capsule: as hypothesis, and refined
 _THROUGH_M = 0.06  # a surface that the scanner sees through by so much is not there
 _FACING = 0.4  # cosine of the slant up to which a surface counts: a silhouette is not known so well
+_MANY = 20_000  # poses
 _KEPT, _REFINED = 250, 12  # hypotheses of a scan that all scans judge, and of these that are refined
 _SCANS = 8  # that are compared with the arm, at most
 _GUESS_M, _GUESS_RAD = 0.06, 0.35  # how far flange and start may lie apart
@@ -290,8 +291,8 @@ class _View:
         )
 
     def on_arm(self, X: Array) -> Array:
-        """Share (n,) of the points that lie on the arm, roughly."""
-        some = self.points[:80]
+        """Share (n,) of the points that lie on the arm, roughly; of fewer points where there are many poses."""
+        some = self.points[: 40 if len(X) > _MANY else 120]
         parts = [(np.abs(self.near(X[k : k + 2000], some)) < _ROUGH_M).mean(axis=1) for k in range(0, len(X), 2000)]
         return np.concatenate(parts)
 
@@ -301,6 +302,8 @@ def _views(clouds: Sequence[Array], shapes: Sequence[ArmShape], rng: np.random.G
     for cloud in clouds:
         points = np.asarray(cloud, dtype=float).reshape(-1, 3)
         flat.append(points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0.05)])
+    if not sum(map(len, flat)):
+        return []
     rays = [p[:, :2] / p[:, 2:] for p in flat]
     some = np.vstack([r[:: max(1, len(r) // 5000)] for r in rays])
     low, high = np.quantile(some, 0.001, axis=0), np.quantile(some, 0.999, axis=0)

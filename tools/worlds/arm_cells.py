@@ -140,8 +140,8 @@ def posed(links: list[TriMesh], flange: TriMesh, frames: list[Array]) -> TriMesh
     return merge(*(_placed(m, X) for m, X in zip(links, frames[:-1], strict=True)), _placed(flange, frames[-1]))
 
 
-def clutter(reach: float, clear: Array, rng: np.random.Generator) -> TriMesh:
-    """A table, a wall, boxes, cans and discs of a flange's size on it; none within 0.2 m of B or above ``clear`` (3,) m."""
+def clutter(reach: float, eye: Array, rng: np.random.Generator) -> TriMesh:
+    """A table, boxes, cans and discs of a flange's size on it, none within 0.2 m of B, and a wall that hides nothing from ``eye`` (3,) m."""
     table = _box(np.array([3.0 * reach, 3.0 * reach, 0.04]), RigidTransform([0.0, 0.0, -0.02 - rng.uniform(0.0, 0.05)]))
     parts = [table]
     for _ in range(int(rng.integers(3, 9))):
@@ -155,11 +155,10 @@ def clutter(reach: float, clear: Array, rng: np.random.Generator) -> TriMesh:
             parts.append(_box(size, RigidTransform(turn, p + np.array([0.0, 0.0, 0.5 * high]))))
         else:
             parts.append(_tube(p, p + np.array([0.0, 0.0, high]), rng.uniform(0.025, 0.06)))
-    if rng.random() < 0.3:
-        angle = rng.uniform(0, 2 * np.pi)
-        at = RigidTransform(
-            RotationMatrix.MakeZRotation(angle), 1.4 * reach * np.array([np.cos(angle), np.sin(angle), 0.3])
-        )
+    if rng.random() < 0.3:  # beyond the base as the scanner looks at it
+        angle = float(np.arctan2(-eye[1], -eye[0])) + rng.uniform(-0.6, 0.6)
+        away = 1.4 * reach * np.array([np.cos(angle), np.sin(angle), 0.3])
+        at = RigidTransform(RotationMatrix.MakeZRotation(angle), away)
         parts.append(_box(np.array([0.03, 3.0 * reach, 2.0]), at))
     return merge(*parts)
 
@@ -208,7 +207,7 @@ def arm_cell(seed: int, scans: int = SCANS) -> ArmCell:
     z = work - eye + rng.normal(size=3) * 0.05
     R = RotationMatrix.MakeFromOneVector(z, 2) @ RotationMatrix.MakeZRotation(rng.uniform(0, 2 * np.pi))
     X_BC = RigidTransform(R, eye)
-    still = clutter(reach, work, rng)
+    still = clutter(reach, eye, rng)
     if rng.random() < 0.5:
         other = arm_links(name, rng)
         q = rng.uniform(np.maximum(chain.position_lower, -np.pi), np.minimum(chain.position_upper, np.pi))

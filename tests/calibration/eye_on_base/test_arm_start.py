@@ -64,6 +64,7 @@ def test_scans_without_an_arm_are_no_start() -> None:
     arm = load_chain(one.arm)
     still = [one.clouds[0]] * 3
     assert find_arm(still, [arm_shape(arm, q) for q in one.q[:3]]) is None
+    assert find_arm([np.full((4, 4, 3), np.nan)], [arm_shape(arm, one.q[0])]) is None
 
 
 def test_three_far_flanges_are_enough_beside_the_arm(tmp_path: Path) -> None:
