@@ -262,7 +262,8 @@ def write_cell(cell: ArmCell, folder: Path, *, joints: bool = True) -> None:
 
 
 def calibrate_cell(seed: int) -> Mapping[str, object]:
-    """The cell of a seed calibrated without a guess, and the start from three of its scans: "right", "wrong" or "refused" each."""
+    """The cell of a seed calibrated without a guess, and the start from three of its scans: "right", "wrong" or
+    "refused" each; "alone" is what it is without the arm."""
     cell = arm_cell(seed)
     work = np.mean([X.translation() for X in cell.X_BF], axis=0)
 
@@ -273,7 +274,6 @@ def calibrate_cell(seed: int) -> Mapping[str, object]:
         "arm": cell.arm,
         "start": "refused",
         "calibration": "refused",
-        "by_arm": False,
         "mm": None,
     }
     arm = load_chain(cell.arm)
@@ -289,8 +289,9 @@ def calibrate_cell(seed: int) -> Mapping[str, object]:
         try:
             report = calibrate_dataset(Path(folder) / "cell", Path(folder) / "out")
         except InputError as reason:
-            return found | {"reason": str(reason)[:300]}
+            return found | {"alone": "refused", "reason": str(reason)[:300]}
     off = error(report.result.X_BC)
     by_arm = any("visible arm agrees" in text for text in report.result.warnings)
     verdict = "right" if off < RIGHT_M else "wrong"
-    return found | {"calibration": verdict, "mm": 1e3 * off, "by_arm": by_arm, "scans": len(report.observations)}
+    found |= {"mm": 1e3 * off, "scans": len(report.observations)}
+    return found | {"calibration": verdict, "alone": "refused" if by_arm else verdict}

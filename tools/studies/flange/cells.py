@@ -1,5 +1,6 @@
 """Calibrations of simulated cells without rendering: arms with errors of their own, and an imperfect scanner and arm."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Annotated
@@ -110,23 +111,14 @@ def imperfect(
 
 def _start_figures(results: Results) -> Figures:
     found = list(results.values())
-    counts = {
-        what: {
-            verdict: sum(r.get(what, "failed") == verdict for r in found)
-            for verdict in ("right", "refused", "wrong", "failed")
-        }
-        for what in ("start", "calibration")
-    }
-    without = sum(r.get("calibration") == "right" and not r["by_arm"] for r in found)
-    error = statistics((r["start_mm"] for r in found if r.get("start") == "right"), "median", "p95")
-    return {"cells": len(found), **counts, "right_without_arm": without, "start_mm": error}
+    counts: Figures = {k: Counter(str(r.get(k, "failed")) for r in found) for k in ("start", "calibration", "alone")}
+    return {"cells": len(found), **counts, "start_mm": statistics(r.get("start_mm", np.nan) for r in found)}
 
 
 def _start_rows(f: Figures) -> Iterable[Row]:
-    for what in ("start", "calibration"):
-        yield what, "{right} right, {refused} refused, {wrong} wrong".format(**f[what])
-    yield "right without the arm", f"{f['right_without_arm']} of {f['cells']}"
-    yield "error of a start at the work point", "{median:.0f} mm median, {p95:.0f} mm 95 %".format(**f["start_mm"])
+    for k, what in (("start", "start"), ("calibration", "calibration"), ("alone", "without the arm")):
+        yield what, ", ".join(f"{n} {verdict}" for verdict, n in sorted(f[k].items()))
+    yield "error of all starts at the work point", "{median:.0f} mm median, {p95:.0f} mm 95 %".format(**f["start_mm"])
 
 
 START = Study(
@@ -140,8 +132,6 @@ START = Study(
 
 
 @command("benchmark flange-start", short_help="Calibrate cells whose flange is small, far or hidden.", hidden=True)
-def start(
-    call: Call, cells: Annotated[int, option("--cells", "N", "Number of cells; the arms take turns.", min=1)] = 200
-) -> Outcome:
+def start(call: Call, cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 200) -> Outcome:
     """Calibrate ray-cast cells with a small, far or hidden flange without a guess, and start from the visible arm in three scans."""
-    return START.outcome(call, {f"cell {s}": {"seed": s} for s in range(call.seed, call.seed + cells)})
+    return START.outcome(call, {f"cell {call.seed + k}": {"seed": call.seed + k} for k in range(cells)})
