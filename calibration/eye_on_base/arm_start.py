@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, joint_angles
-from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
+from weldcal.calibration.errors import DatasetError, FlangeNotFound, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
 from weldcal.calibration.flange.fit import FlangeGuess
 from weldcal.calibration.flange.rim import plane_axes
@@ -34,7 +34,8 @@ _THROUGH_M = 0.06  # a surface that the scanner sees through by so much is not t
 _FACING = 0.4  # cosine of the slant up to which a surface counts: a silhouette is not known so well
 _MANY = 20_000  # poses
 _KEPT, _REFINED = 250, 12  # hypotheses of a scan that all scans judge, and of these that are refined
-_SCANS = 8  # that are compared with the arm, at most
+_SCANS, _SCANS_BRANCHES = 8, 3  # that are compared with the arm, at most, and where its joint angles are not recorded
+_DENSE = 400_000  # points of a scan that are looked at
 _GUESS_M, _GUESS_RAD = 0.06, 0.35  # how far flange and start may lie apart
 _JOINTS_M = 0.03  # between the stated flange and the one that the joints lead to: more is another arm, or a TCP
 _FACE_M, _FACE_POINTS = 0.0025, 60  # half a face's thickness in a noisy scan, and the fewest points on it
@@ -166,27 +167,40 @@ def start_from_arm(data: Dataset, robot: str, *, seed: int = 0) -> ArmStart | No
     if robot not in known_chains():
         return None
     arm, ids = load_chain(robot), list(data.clouds)
+    recorded = _recorded(data, arm, ids)
+    most = _SCANS if recorded else _SCANS_BRANCHES
     clouds: dict[str, Array] = {}
-    for id in ids[:: -(-len(ids) // _SCANS)]:
+    for id in ids[:: max(1, -(-len(ids) // most))]:
         try:
             clouds[id] = data.cloud(id)
         except CloudError:
             continue
-    found = [
-        find_arm(list(clouds.values()), [arm_shape(arm, q) for q in angles], seed=seed)
-        for angles in _angles(data, arm, list(clouds))
-    ]
-    return max((start for start in found if start is not None), key=lambda start: start.score, default=None)
+    best: ArmStart | None = None
+    for angles in [[recorded[id] for id in clouds]] if recorded else _branches(data, arm, list(clouds)):
+        start = find_arm(list(clouds.values()), [arm_shape(arm, q) for q in angles], seed=seed)
+        if start is not None and (best is None or start.score > best.score):
+            best = start
+        if best is not None and best.accepted:
+            break
+    return best
 
 
-def _angles(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
-    """Joint angles of the scans: as recorded, else each branch of the inverse kinematics followed from scan to scan."""
-    recorded = joint_angles(data, ids, arm.n)
+def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
+    """Recorded joint angles (n,) rad by scan; none where there are none, or where they lead elsewhere than the stated poses."""
+    try:
+        q = joint_angles(data, ids, arm.n)
+    except DatasetError:
+        return {}
+    if q is None:
+        return {}
+    reached = [(chain_frames(arm, one)[-1] @ arm.X_LF)[:3, 3] for one in q]
+    off = max(float(np.linalg.norm(p - data.poses[id].translation())) for p, id in zip(reached, ids, strict=True))
+    return dict(zip(ids, q, strict=True)) if off < _JOINTS_M else {}
+
+
+def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
+    """Joint angles of the scans for each branch of the inverse kinematics of a Universal Robots arm, followed from scan to scan."""
     poses = [data.poses[id] for id in ids]
-    if recorded is not None:
-        reached = [(chain_frames(arm, q)[-1] @ arm.X_LF)[:3, 3] for q in recorded]
-        off = max(float(np.linalg.norm(p - X.translation())) for p, X in zip(reached, poses, strict=True))
-        return [list(recorded)] if off < _JOINTS_M else []
     if arm.name not in known_arms() or not ids:
         return []
     model, out = load_arm(arm.name), []
@@ -194,8 +208,8 @@ def _angles(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
         row: list[Array | None] = [first]
         for X in poses[1:]:
             row.append(None if row[-1] is None else nearest_solution(model, X, row[-1]))
-        out.append(row)
-    return [[q for q in row if q is not None] for row in out if row[-1] is not None]
+        out.append([q for q in row if q is not None])
+    return [row for row in out if len(row) == len(ids)]
 
 
 def arm_shape(arm: Chain, q: Array) -> ArmShape:
@@ -301,6 +315,7 @@ def _views(clouds: Sequence[Array], shapes: Sequence[ArmShape], rng: np.random.G
     flat = []
     for cloud in clouds:
         points = np.asarray(cloud, dtype=float).reshape(-1, 3)
+        points = points[:: max(1, len(points) // _DENSE)]
         flat.append(points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0.05)])
     if not sum(map(len, flat)):
         return []
