@@ -140,3 +140,21 @@ def test_the_face_is_found_from_a_pose_two_centimetres_off() -> None:
     assert np.linalg.norm(guess.center_C - X_CR.translation()) < 0.003
     with pytest.raises(FlangeNotFound, match="turned away or hidden"):
         face_guess(one.clouds[0].reshape(-1, 3) + 1.0, X_CR, standard)
+
+
+def test_the_bore_places_half_a_face() -> None:
+    standard = get_flange("iso9409-1-50-4-m6")
+    x, y = (g.ravel() for g in np.meshgrid(*[np.arange(-0.04, 0.04, 0.001)] * 2))
+    rho = np.hypot(x, y)
+    half = (rho < standard.outer_radius_m) & (rho > standard.bore_radius_m) & (x > 0.0)
+    points = np.column_stack([x, y, np.full(len(x), 1.0)])[half]
+    X_CR = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [-0.01, 0.005, 1.01])
+    assert np.linalg.norm(face_guess(points, X_CR, standard).center_C - [0.0, 0.0, 1.0]) < 0.003
+
+
+def test_an_arm_that_is_seen_through_is_no_start() -> None:
+    sure = ArmStart(RigidTransform(), 0.9, 0.05, 0.85, 0.1)
+    assert sure.accepted
+    for other in ({"explained": 0.6}, {"seen_through": 0.2}, {"next_best": 0.84}):
+        assert not replace(sure, **other).accepted
+        assert "state scanner_guess" in replace(sure, **other).sentence
