@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.calibration.eye_on_base.test_joint_fit import X_BC as CELL_X_BC
 from tests.calibration.eye_on_base.test_joint_fit import _cell
+from tests.calibration.flange.face import face_points
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.few_poses import axis_turn, calibrate_from_few, estimate_from_whole_poses
@@ -17,7 +18,7 @@ from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
-from weldcal.models.flanges import face_points, get_flange
+from weldcal.models.flanges import get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.1, 0.5), [-0.6, -0.2, 1.3])

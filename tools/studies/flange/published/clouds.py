@@ -212,7 +212,7 @@ def read_material(data: Dataset, standard: FlangeStandard, seed: int) -> Materia
     seen = see_flanges(data, standard, seed=seed)
     good = {o.id: o for o in seen.observations}
     clouds = {id: data.cloud(id) for id in data.clouds if id in good}
-    circles, faces, _ = find_centres(clouds, segmented=True, seed=seed)
+    circles, faces, _ = find_centres(clouds, seed=seed)
     return Material(
         data=data,
         standard=standard,
