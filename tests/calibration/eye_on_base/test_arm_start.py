@@ -142,7 +142,7 @@ def test_the_face_is_found_from_a_pose_two_centimetres_off() -> None:
         face_guess(one.clouds[0].reshape(-1, 3) + 1.0, X_CR, standard)
 
 
-def test_the_bore_places_half_a_face() -> None:
+def test_half_a_face_is_found() -> None:
     standard = get_flange("iso9409-1-50-4-m6")
     x, y = (g.ravel() for g in np.meshgrid(*[np.arange(-0.04, 0.04, 0.001)] * 2))
     rho = np.hypot(x, y)

@@ -110,14 +110,13 @@ def imperfect(
 
 
 def _start_figures(results: Results) -> Figures:
-    found = list(results.values())
-    counts: Figures = {k: Counter(str(r.get(k, "failed")) for r in found) for k in ("start", "calibration", "alone")}
-    return {"cells": len(found), **counts, "start_mm": statistics(r.get("start_mm", np.nan) for r in found)}
+    of = results.values()
+    counts: Figures = {k: Counter(str(r.get(k, "failed")) for r in of) for k in ("start", "calibration", "alone")}
+    return {"cells": len(of), **counts, "start_mm": statistics(r.get("start_mm", np.nan) for r in of)}
 
 
 def _start_rows(f: Figures) -> Iterable[Row]:
-    for k, what in (("start", "start"), ("calibration", "calibration"), ("alone", "without the arm")):
-        yield what, ", ".join(f"{n} {verdict}" for verdict, n in sorted(f[k].items()))
+    yield from ((k, ", ".join(f"{n} {v}" for v, n in sorted(f[k].items()))) for k in ("start", "calibration", "alone"))
     yield "error of all starts at the work point", "{median:.0f} mm median, {p95:.0f} mm 95 %".format(**f["start_mm"])
 
 
