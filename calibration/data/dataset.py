@@ -3,7 +3,7 @@
 import csv
 import hashlib
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -202,6 +202,18 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
         f"'{folder.name}' holds neither poses.csv nor pairs.csv; add poses.csv with the columns id,x,y,z,qw,qx,qy,qz, or poses in another "
         "form of docs/datasets.md."
     )
+
+
+def joint_angles(data: Dataset, ids: Sequence[str], joints: int) -> Array | None:
+    """Joint angles (n, joints) rad at the poses of these ids; None where poses.csv and pairs.csv have none. Raises DatasetError for bad numbers."""
+    path = data.folder / ("pairs.csv" if data.pairs else "poses.csv")
+    if not path.is_file():
+        return None  # another form of poses
+    names = tuple(f"q{i + 1}" for i in range(joints))
+    rows = {row["id"]: row for row in table_rows(path, ("id",))}
+    if not all(rows.get(id, {}).get(name) for id in ids for name in names):
+        return None
+    return np.array([row_numbers(rows[id], names, path) for id in ids])
 
 
 def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.checks import row_numbers, table_rows
-from weldcal.calibration.data.dataset import Dataset
+from weldcal.calibration.data.dataset import Dataset, joint_angles
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import DatasetError
@@ -24,18 +23,6 @@ _SAME_M, _SAME_RAD = (
     1e-4,
     float(np.radians(0.01)),
 )  # what a controller rounds, and less than a factory calibration changes
-
-
-def joint_angles(data: Dataset, ids: Sequence[str], joints: int) -> Array | None:
-    """Joint angles (n, joints) rad at the poses of these ids; None where poses.csv and pairs.csv have none. Raises DatasetError for bad numbers."""
-    path = data.folder / ("pairs.csv" if data.pairs else "poses.csv")
-    if not path.is_file():
-        return None  # another form of poses
-    names = tuple(f"q{i + 1}" for i in range(joints))
-    rows = {row["id"]: row for row in table_rows(path, ("id",))}
-    if not all(rows.get(id, {}).get(name) for id in ids for name in names):
-        return None
-    return np.array([row_numbers(rows[id], names, path) for id in ids])
 
 
 def require_joint_angles(data: Dataset, ids: Sequence[str], arm: Chain, stated: Array) -> Array:

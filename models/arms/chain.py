@@ -87,6 +87,11 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
     )
 
 
+def chain_capsules(name: str) -> list[list[float]]:
+    """The capsules in an arm's chain.yaml: link (0 the base), ends of the axis in its frame, radius, m."""
+    return [[float(v) for v in row] for row in yaml_load_file(str(_HERE / name / "chain.yaml"))["capsules"]]
+
+
 def chain_of(arm: ArmModel) -> Chain:
     """A Universal Robots arm with its own kinematics as a chain."""
     return Chain(
@@ -102,7 +107,7 @@ def chain_of(arm: ArmModel) -> Chain:
 
 def chain_forward(chain: Chain, q: ArrayLike) -> RigidTransform:
     """Flange pose X_BF at joint angles q (n,) rad."""
-    X = _frames(chain, np.asarray(q, dtype=float))[-1] @ chain.X_LF
+    X = chain_frames(chain, np.asarray(q, dtype=float))[-1] @ chain.X_LF
     return RigidTransform(RotationMatrix(X[:3, :3]), X[:3, 3])
 
 
@@ -120,7 +125,7 @@ def chain_poses(chain: Chain, q: Array) -> Array:
 
 def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
     """Geometric Jacobian (6, n) of the flange: [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq. 3.30)."""
-    X = _frames(chain, np.asarray(q, dtype=float))
+    X = chain_frames(chain, np.asarray(q, dtype=float))
     p = (X[-1] @ chain.X_LF)[:3, 3]
     z = X[:, :3, 2]
     return np.vstack([z.T, np.cross(z, p - X[:, :3, 3]).T])
@@ -166,12 +171,12 @@ def _descend(chain: Chain, goal: Array, start: Array) -> Array | None:
 
 
 def _error(chain: Chain, goal: Array, q: Array) -> Array:
-    X = _frames(chain, q)[-1] @ chain.X_LF
+    X = chain_frames(chain, q)[-1] @ chain.X_LF
     turn = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(goal[:3, :3] @ X[:3, :3].T)).ToAngleAxis()
     return np.concatenate([turn.axis() * turn.angle(), goal[:3, 3] - X[:3, 3]])
 
 
-def _frames(chain: Chain, q: Array) -> Array:
+def chain_frames(chain: Chain, q: Array) -> Array:
     """Poses (n, 4, 4) of the joints in B, turned by q."""
     c, s = np.cos(q)[:, None], np.sin(q)[:, None]
     step = chain.stack.copy()

@@ -15,10 +15,11 @@ from weldcal.calibration.calibrate import KINEMATICS_FILE, REFINEMENTS, Steps
 from weldcal.calibration.calibrate import calibrate as calibrate_observations
 from weldcal.calibration.calibrate import refine as refine_calibration
 from weldcal.calibration.data.checks import is_carried, is_motion
-from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
+from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
@@ -28,7 +29,7 @@ from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.stated_arm import joint_angles, require_joint_angles
+from weldcal.calibration.refinement.stated_arm import require_joint_angles
 from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
@@ -214,11 +215,15 @@ def calibrate_dataset(
         data = data.between(poses)
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
+    start: ArmStart | None = None
+    if len(seen.observations) < ENOUGH and seen.refused and not data.pairs and data.header.scanner_guess is None:
+        tell("comparing the visible arm", 0.7)
+        seen, start = see_with_arm(data, seen, standard, robot or data.header.robot, seed=seed)
     data = seen.data or data
     observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
     few = len(observations) < ENOUGH
     with examined_where_refused(Path(out), data, seen, standard, seed):
-        _enough(observations, refused)
+        _enough(observations, refused, start)
         steps = Steps(
             patterns=seen.patterns,
             correct_scanner=correct_scanner,
@@ -229,6 +234,7 @@ def calibrate_dataset(
             seed=seed,
         )
         found = calibrate_observations(observations, steps, lambda step: tell(step, 0.72))
+        agreement = "" if start is None else start.agreement(found.X_rigid, np.array([o.p_BR for o in observations]))
     if refine is not None:
         tell("refining", 0.73)
         steps = _refinement(refine, steps, data, observations, robot or data.header.robot, kinematics)
@@ -269,6 +275,8 @@ def calibrate_dataset(
             f"{len(loose)} of {len(fits)} clouds have no pixel grid that could be rebuilt ({', '.join(loose[:3])}): fused, thinned, or not in "
             "the scanner's frame. Their centres are two to three times less precise; export single scans as the scanner takes them."
         )
+    if agreement:
+        warnings.append(agreement)
     if refined is not None:
         warnings.append(refined.sentence)
     if scanner is not None and scanner.worth_saying:
@@ -367,21 +375,23 @@ def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
     return []
 
 
-def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:
-    """Requires one usable scan, and four where others were refused (then more can be taken).
+def _enough(observations: list[Observation], refused: list[tuple[str, str]], start: ArmStart | None) -> None:
+    """Requires one usable scan; where others were refused, four (then more can be taken), or two that the visible arm confirms.
 
     Raises:
         InputError, TooFewPoses: there are fewer.
     """
     n = len(observations)
+    arm = "" if start is None else f" {start.sentence}"
     if n == 0:
         same = len({r for _, r in refused}) == 1 and len(refused) > 1
         which = "every cloud" if same else f"the first, {refused[0][0]}"
-        raise InputError(f"None of the {len(refused)} clouds can be used. Reason for {which}: {refused[0][1]}")
-    if n < ENOUGH and refused:
+        raise InputError(f"None of the {len(refused)} clouds can be used. Reason for {which}: {refused[0][1]}{arm}")
+    confirmed = start is not None and start.accepted and n > 1
+    if n < ENOUGH and refused and not confirmed:
         names = "; ".join(f"{i}: {t}" for i, t in refused[:3])
         raise TooFewPoses(
-            f"Only {n} usable poses remain of {n + len(refused)}; at least {ENOUGH} are needed. Refused: {names}"
+            f"Only {n} usable poses remain of {n + len(refused)}; at least {ENOUGH} are needed. Refused: {names}{arm}"
         )
 
 

@@ -13,14 +13,13 @@ from pydrake.common.yaml import yaml_dump
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.clouds import save_cloud
-from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.header import Units
 from weldcal.calibration.data.poses.lists import folder_lists, read_lists, two_lists
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, pairs_of_lists, read_pairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
-from weldcal.calibration.refinement.stated_arm import joint_angles
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, load_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
@@ -20,7 +20,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.hand_eye.solve import as_transform
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.local_field import field_from_document
-from weldcal.calibration.refinement.stated_arm import joint_angles, shared_error
+from weldcal.calibration.refinement.stated_arm import shared_error
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

@@ -1,5 +1,6 @@
 """Enumerate the plausible readings of a list of poses: notation of the rotation, unit and order of its numbers, transposition."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
@@ -9,11 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.poses.rotations import notation
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import inverse, nearest_rotation, pose
 from weldcal.models.arrays import Array
 
+_ALIASES = {
+    "roll_pitch_yaw": "euler_xyz", "rpy": "euler_xyz", "fanuc_wpr": "euler_xyz", "kuka_abc": "euler_ZYX",
+    "ur": "rotation_vector", "axis_angle": "rotation_vector", "quaternion_ros": "quaternion_xyzw",
+}  # fmt: skip
+_NOTATIONS = (
+    "rotation_vector, quaternion_wxyz, quaternion_xyzw, euler_xyz (fixed axes, lower case), euler_ZYX (moving axes, upper case), "
+    "kuka_abc or fanuc_wpr"
+)
 CHANGES = ("transposed", "left_handed", "inverse")
 """What a form may add to a notation: rotations transposed, a left-handed frame (y mirrored), poses inverted."""
 _TURN_RAD = 7.0  # a whole turn and a little: larger numbers are degrees
@@ -222,3 +230,14 @@ def _angle_readings() -> tuple[tuple[str, str, str, list[int]], ...]:
 
 
 _ANGLES = _angle_readings()
+
+
+def notation(word: str, where: str) -> str:
+    """A notation by its name; empty stays empty. Raises DatasetError naming those known."""
+    name = _ALIASES.get(word.strip().lower(), word.strip())
+    if name in ("", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw"):
+        return name
+    axes = name.removeprefix("euler_")
+    if axes != name and re.fullmatch("[xyz]{3}|[XYZ]{3}", axes) and axes[0] != axes[1] != axes[2]:
+        return name
+    raise DatasetError(f"'{where}' names the rotation '{word[:40]}'; use {_NOTATIONS}.")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.source import read_poses
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.eye_on_base.conventions import choose_reading
+from weldcal.calibration.eye_on_base.observations import choose_reading
 
 WRITERS = {
     "fixed xyz": lambda R: R.as_euler("xyz", degrees=True),
