@@ -23,8 +23,8 @@ _WORST_TURN_RAD = 0.2
 _SUBSETS = 60
 
 
-USUAL_DISCORD_RAD = 3e-3
-"""Angle, an axis, by which positions and rotations of usual cameras disagree: three pixels of the principal point."""
+USUAL_DISCORD_RAD = 5e-3
+"""Angle, an axis, by which positions and rotations of usual cameras disagree: six pixels of the principal point at a focal length of 1,200."""
 
 
 @dataclass(frozen=True)

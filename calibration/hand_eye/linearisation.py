@@ -13,7 +13,8 @@ from weldcal.models.arrays import Array
 _HUBER = 2.0  # in sigma per axis
 TINY = 1e-24  # of the squared extent: exact data have no noise to estimate
 RANK = 1e-11  # eigenvalues below this share of the largest count as zero: a direction the observations do not fix
-_LOG_VARIANCE = 1.0  # standard deviation of the logarithm of the discord beforehand
+_LOG_SIGMA = 1.5  # standard deviation of the logarithm of the discord beforehand
+_DISCORDS = np.exp(np.arange(-3.0, 5.01, 0.5))  # in units of the usual one, for sums over its posterior
 _SLIGHT = 1e-9  # share of what displacements know of rotations that stays: it bounds the rounding
 _VARIANCE_STEPS = 2
 _SURE = 1e-7  # a matrix with no eigenvalue below this share needs no look at its eigenvalues
@@ -39,8 +40,8 @@ class Scaled:
     the noise centre.
 
     ``usual_discord`` (rad, 0: none): the displacements are those of a camera that is turned by a rotation vector with the
-    variance ``discord``^2 per axis against the camera of the rotations. ``discord`` is the mode of its restricted
-    likelihood (REML) with a log-normal prior about ``usual_discord``.
+    same variance per axis against the camera of the rotations. Its size has a log-normal prior about ``usual_discord`` and the
+    restricted likelihood (REML); the answer is the mean over the posterior, and ``discord`` its rms.
     """
 
     def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss, usual_discord: float = 0.0) -> None:
@@ -77,8 +78,7 @@ class Scaled:
         self.gw, self.gd = pull(unit.Jw, self._a * self.ww, unit.w), pull(unit.Jd, self._b * self.wd, unit.d)
         self.discord, self._by_w, self._by_d = 0.0, self.V, self.V
         if usual_discord:
-            self.discord = usual_discord * self._discord(usual_discord)
-            self._by_w, self._by_d = self._apart()
+            self.discord, self._by_w, self._by_d = self._marginal(usual_discord)
         taken_w, taken_d = float((self._by_w * self._Aw).sum()), float((self._by_d * self._Ad).sum())
         self.free_w, self.free_d = max(self.total_w - taken_w, 0.3), max(self.total_d - taken_d, 0.3)
 
@@ -88,46 +88,38 @@ class Scaled:
             return -(self._by_w @ self.gw + self._by_d @ self.gd)
         return np.asarray(-self._newton() @ (self.gw + self.gd))
 
-    def _discord(self, usual: float) -> float:
-        """The discord in units of the usual one: the mode of its likelihood, all unknowns marginalised out."""
-        own = self._Ad[:3]
-        values, axes = np.linalg.eigh(own[:, :3] - own @ self.V @ own.T)
-        score = axes.T @ (self.gd[:3] - own @ self.V @ (self.gw + self.gd))
-        good = values > RANK * float(np.trace(own[:, :3]))
-        known, square = values[good] * usual**2, score[good] ** 2 / values[good]
+    def _marginal(self, usual: float) -> tuple[float, Array, Array]:
+        """The rms discord over its posterior, and the means over it of what the gradients (m,) of rotations and of displacements
+        move (m, m).
 
-        def slopes(log: Array) -> tuple[Array, Array]:
-            x = np.exp(log)[:, None] * known
-            first = 0.5 * (x / (1.0 + x) - square * x / (1.0 + x) ** 2).sum(axis=1) + log / (2.0 * _LOG_VARIANCE) ** 2
-            second = 0.5 * (x / (1.0 + x) ** 2 - square * x * (1.0 - x) / (1.0 + x) ** 3).sum(axis=1)
-            return first, second + 1.0 / (2.0 * _LOG_VARIANCE) ** 2
-
-        log = np.linspace(-10.0, 20.0, 121)
-        x = np.exp(log)[:, None] * known
-        cost = 0.5 * (np.log1p(x) + square / (1.0 + x)).sum(axis=1) + 0.5 * (log / (2.0 * _LOG_VARIANCE)) ** 2
-        mode = log[[int(np.argmin(cost))]]
-        for _ in range(8):
-            first, second = slopes(mode)
-            mode = mode - np.clip(first / np.maximum(second, 1e-3), -0.25, 0.25)
-        return float(np.exp(0.5 * mode[0]))
-
-    def _apart(self) -> tuple[Array, Array]:
-        """What the gradients (m,) of rotations and of displacements move (m, m) each, with a discord between them.
-
-        The rotations follow from both, as far as the discord lets the displacements know them. The positions are the best for
-        these rotations and the displacements as measured: so they predict them best.
+        At one discord the rotations follow from both, as far as it lets the displacements know them. The positions are the
+        best for these rotations and the displacements as measured: so they predict them best.
         """
-        Ad, k = self._Ad, len(self.A)
-        K = np.linalg.inv(Ad[:3, :3] * (1.0 + _SLIGHT) + np.eye(3) / self.discord**2)
-        less = np.eye(k)
-        less[:, :3] -= Ad[:, :3] @ K
-        B = inverse_information(self.A - Ad[:, :3] @ K @ Ad[:3])
-        moved = np.arange(k) % 6 < 3
-        moved[self.size :] = False
-        by_w, by_d = np.where(moved[:, None], B, 0.0), np.where(moved[:, None], B @ less, 0.0)
+        Ad, V, k = self._Ad, self.V, len(self.A)
+        own = Ad[:3]
+        values, axes = np.linalg.eigh(own[:, :3] - own @ V @ own.T)
+        score = axes.T @ (self.gd[:3] - own @ V @ (self.gw + self.gd))
+        good = values > RANK * float(np.trace(own[:, :3]))
+        x = (usual * _DISCORDS[:, None]) ** 2 * values[good]
+        cost = (np.log1p(x) + score[good] ** 2 / values[good] / (1.0 + x)).sum(axis=1)
+        cost += (np.log(_DISCORDS) / _LOG_SIGMA) ** 2
+        weight = np.exp(-0.5 * (cost - cost.min()))
+        weight /= weight.sum()
+        turned = np.arange(k) % 6 < 3
+        turned[self.size :] = False
+        by_w, by_d = np.zeros((2, k, k))
+        for discord, w in zip(usual * _DISCORDS, weight, strict=True):
+            if w < _SLIGHT:
+                continue
+            less = Ad[:, :3] @ np.linalg.inv(own[:, :3] * (1.0 + _SLIGHT) + np.eye(3) / discord**2)
+            B = np.where(turned[:, None], w * inverse_information(self.A - less @ own), 0.0)
+            by_w += B
+            by_d += B
+            by_d[:, :3] -= B @ less
         places = np.zeros((k, k))
-        places[np.ix_(~moved, ~moved)] = inverse_information(Ad[np.ix_(~moved, ~moved)])
-        return by_w - places @ Ad @ by_w, by_d + places - places @ Ad @ by_d
+        places[np.ix_(~turned, ~turned)] = inverse_information(Ad[np.ix_(~turned, ~turned)])
+        rms = usual * float(np.sqrt(weight @ _DISCORDS**2))
+        return rms, by_w - places @ Ad @ by_w, by_d + places - places @ Ad @ by_d
 
     def _newton(self) -> Array:
         """Inverse of the exact second derivative; that of the mean slope where it is not positive."""
