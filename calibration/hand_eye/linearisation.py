@@ -41,7 +41,7 @@ class Scaled:
 
     ``usual_discord`` (rad, 0: none): the displacements are those of a camera that is turned by a rotation vector with the
     same variance per axis against the camera of the rotations. Its size has a log-normal prior about ``usual_discord`` and the
-    restricted likelihood (REML); the answer is the mean over the posterior, and ``discord`` its rms.
+    restricted likelihood (REML). The answer is the mean over the posterior; ``discord`` has the mean information.
     """
 
     def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss, usual_discord: float = 0.0) -> None:
@@ -89,7 +89,7 @@ class Scaled:
         return np.asarray(-self._newton() @ (self.gw + self.gd))
 
     def _marginal(self, usual: float) -> tuple[float, Array, Array]:
-        """The rms discord over its posterior, and the means over it of what the gradients (m,) of rotations and of displacements
+        """The discord whose information is the mean over its posterior, and the means over it of what the gradients (m,) of rotations and of displacements
         move (m, m).
 
         At one discord the rotations follow from both, as far as it lets the displacements know them. The positions are the
@@ -118,8 +118,8 @@ class Scaled:
             by_d[:, :3] -= B @ less
         places = np.zeros((k, k))
         places[np.ix_(~turned, ~turned)] = inverse_information(Ad[np.ix_(~turned, ~turned)])
-        rms = usual * float(np.sqrt(weight @ _DISCORDS**2))
-        return rms, by_w - places @ Ad @ by_w, by_d + places - places @ Ad @ by_d
+        likely = usual / float(np.sqrt(weight @ _DISCORDS**-2.0))
+        return likely, by_w - places @ Ad @ by_w, by_d + places - places @ Ad @ by_d
 
     def _newton(self) -> Array:
         """Inverse of the exact second derivative; that of the mean slope where it is not positive."""

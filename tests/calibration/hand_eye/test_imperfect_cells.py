@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
 from tests.calibration.hand_eye.poses import eye_in_hand, random_poses
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.choice import solve
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.problem import full_problem, residuals
-from weldcal.calibration.hand_eye.solve import IDENTITY, solve_problem
+from weldcal.calibration.hand_eye.solve import IDENTITY, HandEyeConfig, solve_problem
 from weldcal.tools.worlds.imperfect_cells import imperfect_cell, ratios
 
 KNOWN = (IDENTITY, IDENTITY, IDENTITY)
@@ -58,3 +59,18 @@ def test_the_truth_of_a_cell_fits_its_poses_up_to_their_errors(kind: str) -> Non
     w, d = residuals(full_problem(cell.F, cell.G), (cell.X, cell.Y, IDENTITY))
     assert np.degrees(np.linalg.norm(w, axis=1)).max() < 6.0
     assert 1e-5 < np.linalg.norm(d, axis=1).max() < 0.04
+
+
+def test_the_region_holds_the_truth_as_often_as_stated() -> None:
+    """Poses from corners with noise by PnP: errors grow with the distance, and no two poses have the same."""
+    nees, bound = [], []
+    for seed in range(2000, 2090):
+        cell = imperfect_cell("corners only", seed)
+        found = solve_problem(full_problem(cell.F, cell.G), config=HandEyeConfig(folds=0))
+        nees.append(found.normalised_error("X", RigidTransform(cell.X)))
+        bound.append(found.region(0.95))
+    shares = [float((np.array(nees) < factor * np.array(bound)).mean()) for factor in (0.25, 1.0)]
+    assert 0.91 <= shares[1] <= 0.985
+    # half of the sigma would be refused, and so would twice of it: then a quarter of the squares count
+    assert shares[0] < 0.91
+    assert 0.75 < np.mean(nees) / 6.0 < 1.2
