@@ -230,18 +230,3 @@ def flange_mesh(
     for rim in rims[1:]:
         pockets += [wall(rim[::-1], -depth, 0.0), plane_mesh(rim, triangulate_polygon(rim), -depth, up=True)]
     return merge(face, *bodies, *pockets, tolerance_m=1e-9)
-
-
-def face_points(standard: FlangeStandard, spacing_m: float = 0.0005) -> Floats:
-    """(N,3) points in R on a hexagonal lattice over the flat face: between the chamfers and clear of every hole."""
-    if spacing_m <= 0.0:
-        raise InputError("The spacing of sampled face points must be positive: give it in metres.")
-    rows = math.ceil(standard.face_outer_radius_m / (spacing_m * math.sqrt(0.75))) + 1
-    columns = math.ceil(standard.face_outer_radius_m / spacing_m) + 1
-    j, i = np.mgrid[-rows : rows + 1, -columns : columns + 1]
-    xy = np.stack([(i + 0.5 * (j % 2)) * spacing_m, j * math.sqrt(0.75) * spacing_m], axis=-1).reshape(-1, 2)
-    reach = np.hypot(xy[:, 0], xy[:, 1])
-    keep = (reach >= standard.face_inner_radius_m) & (reach <= standard.face_outer_radius_m)
-    for x, y, radius in standard.openings():
-        keep &= np.hypot(xy[:, 0] - x, xy[:, 1] - y) >= radius
-    return np.column_stack([xy[keep], np.zeros(np.count_nonzero(keep))])

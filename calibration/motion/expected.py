@@ -1,6 +1,5 @@
-"""Predicts what a planned motion will tell of X_BC and of the scanner's clock, and picks the best of several."""
+"""Predicts what a planned motion will tell of X_BC and of the scanner's clock."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,14 +80,3 @@ def expected_of_motion(
         offset_s=float(sigma[6]) if sigma[6] < limits[6] else float("inf"),
         shared=share,
     )
-
-
-def best_motion(
-    candidates: Sequence[ContinuousMotion], X_BC: RigidTransform, *, speed_m_s: float = 0.25, **noise: float
-) -> int:
-    """Index of the motion that leaves the least error of a scanned point on a part that moves at ``speed_m_s``: that of the pose, and that
-    of the clock times the speed. ``noise`` as for expected_of_motion. Raises InputError without candidates."""
-    if not candidates:
-        raise InputError("There is no motion to choose from.")
-    told = [expected_of_motion(motion, X_BC, **noise) for motion in candidates]
-    return int(np.argmin([np.hypot(e.work_m, speed_m_s * e.offset_s) for e in told]))

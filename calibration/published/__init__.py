@@ -1,1 +1,1 @@
-"""The methods of the flange paper: segmentation, circle search, Algorithm 1 and its ICP figure."""
+"""The methods of the flange paper: circle search, Algorithm 1 and its ICP figure."""

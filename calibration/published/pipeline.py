@@ -1,4 +1,4 @@
-"""The paper's calibration pipeline: segmentation, circle, Eq. (9)-(12), Algorithm 1 with the ICP of Eq. (13)."""
+"""The paper's calibration pipeline on segmented faces: circle, Eq. (9)-(12), Algorithm 1 with the ICP of Eq. (13)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,14 +11,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.calibration.published.algorithm1 import (
-    Algorithm1State,
-    Cost,
-    algorithm1_start,
-    algorithm1_step,
-    translation_cost,
-)
-from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
+from weldcal.calibration.published.icp import FAILED, VerificationError
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
@@ -104,82 +97,18 @@ def circumcircles(triples: Array) -> tuple[Array, Array]:
     return A + to_center, radii
 
 
-@dataclass(frozen=True, kw_only=True)
-class SegmentationParameters:
-    """Numbers of the segmentation, m. Section 2.1.4 names the steps but no number; these are the ones that the authors
-    published beside the paper for the UR10e: filters of 50 neighbours and one standard deviation, applied twice, clusters
-    of 8 000 to 100 000 points linked over 0.5 mm, and a face of 0.9 to 1.1 flange diameters."""
-
-    depth_m: tuple[float, float] = (0.4, 1.0)
-    neighbours: int = 50
-    deviations: float = 1.0
-    passes: int = 2
-    link_m: float = 0.0005
-    cluster_points: tuple[int, int] = (8_000, 100_000)
-    plane_m: float = 0.001
-    plane_draws: int = 10_000
-    width_in_diameters: tuple[float, float] = (0.9, 1.1)
-    depth_in_diameters: float = 0.55
-
-
-def segment_flange(
-    points_C: Array, radius_m: float = 0.031, parameters: SegmentationParameters | None = None, *, seed: int = 0
-) -> Array:
-    """The points (n, 3) m of the first cluster whose dominant plane has about the size of a flange of that radius.
-
-    ``points_C``: a scene (N, 3) or (H, W, 3) m, NaN where invalid. Source: paper, section 2.1.4, first step; the largest
-    clusters are tried first. Its failings are kept: the size is measured along the camera's axes, so a flange that leans
-    is narrower than allowed; the fixed number of points ties it to one resolution and distance; a plate of the same size
-    passes (three did for the UR5, section 3.2.2). Deterministic for ``seed``. Raises FlangeNotFound, saying at which
-    step nothing was left.
-    """
-    import open3d as o3d  # slow to import
-
-    p = parameters or SegmentationParameters()
-    flat = np.asarray(points_C, dtype=float).reshape(-1, 3)
-    flat = flat[np.isfinite(flat).all(axis=1)]
-    flat = flat[(flat[:, 2] > p.depth_m[0]) & (flat[:, 2] < p.depth_m[1])]
-    if len(flat) <= p.neighbours:
-        raise FlangeNotFound(f"The published pass-through from {p.depth_m[0]:g} to {p.depth_m[1]:g} m leaves no scene.")
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(flat))
-    for _ in range(p.passes):
-        cloud, _kept = cloud.remove_statistical_outlier(p.neighbours, p.deviations)
-    # Euclidean clusters are DBSCAN's in which every point is a core point
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        labels = np.asarray(cloud.cluster_dbscan(eps=p.link_m, min_points=1))
-    names, sizes = np.unique(labels[labels >= 0], return_counts=True)
-    allowed = (sizes >= p.cluster_points[0]) & (sizes <= p.cluster_points[1])
-    if not allowed.any():
-        largest = int(sizes.max(initial=0))
-        raise FlangeNotFound(
-            f"No cluster has the published {p.cluster_points[0]} to {p.cluster_points[1]} points; the largest has {largest}."
-        )
-    o3d.utility.random.seed(seed)
-    diameter = 2.0 * radius_m
-    for name in names[allowed][np.argsort(-sizes[allowed], kind="stable")]:
-        cluster = cloud.select_by_index(np.nonzero(labels == name)[0].tolist())
-        _model, inliers = cluster.segment_plane(p.plane_m, 3, p.plane_draws)
-        face = np.asarray(cluster.points)[np.asarray(inliers, dtype=int)]
-        extent = np.ptp(face, axis=0) / diameter
-        low, high = p.width_in_diameters
-        if low < extent[0] < high and low < extent[1] < high and extent[2] < p.depth_in_diameters:
-            return np.asarray(face)
-    raise FlangeNotFound("No cluster of the published size has a plane as wide as the flange.")
-
-
 Method = Literal["point_to_point", "point_to_plane"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedParameters:
-    """Parameters of the pipeline: segmentation, circle, and registration.
+    """Parameters of the pipeline: circle and registration.
 
     Partners at most 1 mm apart, Open3D's iterations and its stop rule 1e-6 on numbers of ``unit_m`` (the authors' clouds
     are in mm, the AUBO's in m, which stops a thousand times earlier) and the program's point-to-plane or the
     point-to-point ICP that its figures for the AUBO agree with. The paper names no e_required; 0.28 mm is what it claims.
     """
 
-    segmentation: SegmentationParameters = field(default_factory=SegmentationParameters)
     circle: CircleParameters = field(default_factory=CircleParameters)
     max_distance_m: float = 0.001
     method: Method = "point_to_point"
@@ -256,10 +185,9 @@ def find_centres(
     clouds_C: Mapping[str, Array],
     parameters: PublishedParameters | None = None,
     *,
-    segmented: bool = False,
     seed: int = 0,
 ) -> tuple[dict[str, PublishedCircle], dict[str, Array], tuple[tuple[str, str], ...]]:
-    """Circle and face points of each scan by id, and (id, reason) of those without; ``segmented`` clouds are faces already.
+    """Circle and face points of each scan by id, and (id, reason) of those without. The clouds are faces: segmented scans.
 
     Each scan draws from its own stream of ``seed``, so that adding one changes no other.
     """
@@ -271,8 +199,6 @@ def find_centres(
         own = int(np.random.SeedSequence([seed, *id.encode()]).generate_state(1)[0] % 2**31)
         try:
             face = np.asarray(points, dtype=float).reshape(-1, 3)
-            if not segmented:
-                face = segment_flange(points, p.circle.R, p.segmentation, seed=own)
             circles[id] = search_circle(face, p.circle, seed=own)
             faces[id] = face[np.isfinite(face).all(axis=1)]
         except FlangeNotFound as e:
@@ -288,16 +214,6 @@ def published_pairs(circles: Mapping[str, PublishedCircle], poses: Mapping[str, 
 def all_pairs(pairs: Sequence[Observation]) -> RigidTransform:
     """Eq. (10)-(12) on every pair, without weights or outlier rejection: Table 1's calibration."""
     return fit_rigid(np.array([o.p_BR for o in pairs]), np.array([o.p_CR for o in pairs]))
-
-
-def run_published(
-    pairs: Sequence[Observation], verifier: Verifier, parameters: PublishedParameters, cost: Cost = translation_cost
-) -> Algorithm1State:
-    """Algorithm 1 over pairs in the order given, as printed (a new pair may replace more than one of the four)."""
-    state = algorithm1_start(parameters.e_required, parameters.k_max)
-    for o in pairs:
-        state = algorithm1_step(state, o, verifier, cost, as_printed=True)
-    return state
 
 
 def at_flange(error: VerificationError, X_BC: RigidTransform, X_BF: RigidTransform) -> Array:

@@ -70,6 +70,7 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
         "weldcal check-cell",
         "weldcal robots",
         "weldcal schema",
+        "weldcal mutate",
     )
     assert name in only_look or {"--out", "--seed"} <= options
 

@@ -9,9 +9,10 @@ import numpy as np
 import open3d
 import pytest
 
+from tests.calibration.flange.face import face_points
 from tests.places import SHARED_DATA, needs
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import PAPER_RADIUS_M, STANDARDS, face_points, flange_mesh, flange_ring, get_flange
+from weldcal.models.flanges import PAPER_RADIUS_M, STANDARDS, flange_mesh, flange_ring, get_flange
 
 DATA = SHARED_DATA / "flange/cad"
 

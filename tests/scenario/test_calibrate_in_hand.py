@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from weldcal.calibration.data.header import DatasetHeader
@@ -17,19 +18,53 @@ from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_datas
 from weldcal.calibration.errors import DatasetError, UndeterminedPoses
 from weldcal.calibration.motion.estimate import estimate_in_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import closed_moves, recorded_stream
+from weldcal.calibration.planning.moves import ROBOT, Moves, closed_moves, recorded_stream
+from weldcal.models.arms.chain import chain_inverse, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.worlds.flange_frames import flange_frame
-from weldcal.tools.worlds.moves import SeenFromHand, hand_moves, observed_frames
+from weldcal.tools.worlds.moves import SeenFromHand, observed_frames
 
 SECONDS, EVERY = 12.0, 3
 TARGET = "iso9409-1-50-4-m6"
 
 Truth = tuple[Path, RigidTransform, RigidTransform]
+
+
+def hand_moves(
+    rng: np.random.Generator,
+    *,
+    lean_deg: float = 25.0,
+    spread_m: float = 0.08,
+    waypoints: int = 6,
+) -> tuple[Moves, RigidTransform, RigidTransform]:
+    """Moves of a UR10e with a scanner on its flange about a fixed target, X_FC and X_BT; the target stays near the middle of the view."""
+    chain = load_chain(ROBOT)
+    X_FC = RigidTransform(
+        RotationMatrix(
+            Rotation.from_euler("zxy", [rng.uniform(-np.pi, np.pi), *rng.uniform(-0.2, 0.2, 2)]).as_matrix()
+        ),
+        np.array([0.08, 0.02, 0.06]) + rng.uniform(-0.02, 0.02, 3),
+    )
+    X_BT = RigidTransform(
+        RotationMatrix(Rotation.from_euler("xy", rng.uniform(-0.1, 0.1, 2)).as_matrix()),
+        [rng.uniform(0.55, 0.7), rng.uniform(-0.2, 0.2), 0.02],
+    )
+    q: list[Array] = []
+    near = np.array([0.2, -1.4, 2.0, -2.1, -1.6, 0.0])
+    while len(q) < waypoints:
+        lean = np.radians(lean_deg) * rng.uniform(-1.0, 1.0, 3)
+        R_BC = Rotation.from_euler("zxy", [lean[0], np.pi + lean[1], lean[2]]).as_matrix()
+        p = X_BT.translation() - rng.uniform(0.5, 0.62) * R_BC[:, 2] + spread_m * rng.uniform(-1.0, 1.0, 3)
+        X_BF = RigidTransform(RotationMatrix(R_BC), p) @ X_FC.inverse()
+        found = chain_inverse(chain, X_BF, near)
+        if found is not None:
+            near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
+            q.append(near)
+    return closed_moves(np.array(q)), X_FC, X_BT
 
 
 @pytest.fixture(scope="module")

@@ -28,12 +28,13 @@ from weldcal.tools.commands.dataset_case import dataset_case
 from weldcal.tools.commands.replay import replay_recording
 from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.commands.weld import SCANS, SUMMARY, live_case
-from weldcal.tools.commands.weld_causes import weld_causes
 from weldcal.tools.report.doctor import CALIBRATION, DoctorReport, worded
-from weldcal.welding.record.weld_log import CSV_NAME, load_weld_log
+from weldcal.welding.record.signs import PICTURE_S, WORN, blind_s, gain_off
+from weldcal.welding.record.weld_log import CSV_NAME, WeldRecord, load_weld_log
 
 _LOOKED_AT = 3  # scans in which other flanges are tried
 _SEEN = 0.8  # of the edge
+_SURE, _LIKELY, _SAID = 1e4, 1e3, 1.0  # log odds of a cause
 
 
 @command("doctor", common=("seed", *LOOK), short_help="Name what disturbs a calibration or a weld.")
@@ -150,3 +151,17 @@ def _of_weld(folder: Path) -> tuple[Cause, ...]:
 
 def _both(found: Diagnosis, more: tuple[Cause, ...]) -> Diagnosis:
     return Diagnosis(tuple(sorted((*found.causes, *more), key=lambda c: -c.score)), found.n, found.spread_m)
+
+
+def weld_causes(record: WeldRecord | None, reason: str) -> tuple[Cause, ...]:
+    """A hidden tag and a worn tip, from the log; another reason of a hold as it was given ("": the run was not held)."""
+    causes = []
+    blind = 0.0 if record is None else blind_s(record)
+    if "Tag hidden" in reason or (not reason and blind > PICTURE_S):
+        causes.append(Cause("hidden tag", 0.99 if reason else 0.8, _SURE, {"blind_s": blind}, (), reason))
+    elif reason:
+        causes.append(Cause("the run was held", 0.5, _SAID, {}, (), reason))
+    off = None if record is None else gain_off(record)
+    if off is not None and abs(off) > WORN:
+        causes.append(Cause("soft tip worn", 0.9, _LIKELY, {"gain": 1.0 + off}, ()))
+    return tuple(causes)

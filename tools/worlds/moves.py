@@ -123,40 +123,6 @@ class SeenFromHand:
         return np.asarray(inverse(self.moves.at(t)) @ self.X_BT.GetAsMatrix4())
 
 
-def hand_moves(
-    rng: np.random.Generator,
-    *,
-    linear: bool = False,
-    lean_deg: float = 25.0,
-    spread_m: float = 0.08,
-    waypoints: int = 6,
-) -> tuple[Moves, RigidTransform, RigidTransform]:
-    """Moves of a UR10e with a scanner on its flange about a fixed target, X_FC and X_BT; the target stays near the middle of the view."""
-    chain = load_chain(ROBOT)
-    X_FC = RigidTransform(
-        RotationMatrix(
-            Rotation.from_euler("zxy", [rng.uniform(-np.pi, np.pi), *rng.uniform(-0.2, 0.2, 2)]).as_matrix()
-        ),
-        np.array([0.08, 0.02, 0.06]) + rng.uniform(-0.02, 0.02, 3),
-    )
-    X_BT = RigidTransform(
-        RotationMatrix(Rotation.from_euler("xy", rng.uniform(-0.1, 0.1, 2)).as_matrix()),
-        [rng.uniform(0.55, 0.7), rng.uniform(-0.2, 0.2), 0.02],
-    )
-    q: list[Array] = []
-    near = np.array([0.2, -1.4, 2.0, -2.1, -1.6, 0.0])
-    while len(q) < waypoints:
-        lean = np.radians(lean_deg) * rng.uniform(-1.0, 1.0, 3)
-        R_BC = Rotation.from_euler("zxy", [lean[0], np.pi + lean[1], lean[2]]).as_matrix()
-        p = X_BT.translation() - rng.uniform(0.5, 0.62) * R_BC[:, 2] + spread_m * rng.uniform(-1.0, 1.0, 3)
-        X_BF = RigidTransform(RotationMatrix(R_BC), p) @ X_FC.inverse()
-        found = chain_inverse(chain, X_BF, near)
-        if found is not None:
-            near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
-            q.append(near)
-    return closed_moves(np.array(q), linear=linear), X_FC, X_BT
-
-
 def exact_errors(frames: ObservedFrames, capture: Array, moves: Moves, X_BC: RigidTransform) -> Array:
     """Errors (7,) of X_BC's six and of the clock's offset in sigmas, by least squares with the true motion and noise.
 

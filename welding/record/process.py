@@ -90,15 +90,6 @@ class WeldProcess:
 
 
 @dataclass(frozen=True)
-class TorchEvent:
-    """The arc going on or off at a time s and a seam arc length m."""
-
-    time: float
-    on: bool
-    s: float
-
-
-@dataclass(frozen=True)
 class PathError:
     """Per sample: arc length on the true seam m, offset to its left m, offset along its up m."""
 
@@ -155,13 +146,6 @@ def path_error(p_B: ArrayLike, seam: SeamCurve) -> PathError:
         s[i] = seam.nearest(p[i], s[i - 1])
     gap = p - seam.position(s)
     return PathError(s, np.sum(gap * seam.normal(s), axis=1), np.sum(gap * seam.up(s), axis=1))
-
-
-def torch_events(time: ArrayLike, torch_on: ArrayLike, s: ArrayLike) -> tuple[TorchEvent, ...]:
-    """Every change of the arc, from (N,) times, flags and seam arc lengths. The arc is off before the first."""
-    t, on, arc = np.asarray(time, dtype=float), np.asarray(torch_on, dtype=bool), np.asarray(s, dtype=float)
-    before = np.concatenate([[False], on[:-1]])
-    return tuple(TorchEvent(float(t[i]), bool(on[i]), float(arc[i])) for i in np.flatnonzero(on != before))
 
 
 def speed_statistics(

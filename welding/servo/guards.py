@@ -169,11 +169,6 @@ class SlewLimits:
         return row(self.speed), row(self.acceleration), row(self.jerk)
 
 
-def command_is_finite(v_des: ArrayLike) -> bool:
-    """Whether every number of a command is finite; `slew_limit` brings the arm to rest when one is not."""
-    return bool(np.isfinite(np.asarray(v_des, dtype=float)).all())
-
-
 def slew_limit(v_des: ArrayLike, v_prev: Array, a_prev: Array, limits: SlewLimits, dt: float) -> tuple[Array, Array]:
     """One tick towards v_des within speed, acceleration and jerk; (v, a), each (n,).
 

@@ -12,9 +12,8 @@ import pytest
 from tests.calibration.eye_on_base.test_change_point import moved
 from tests.calibration.eye_on_base.test_solve import X_BC, displaced, make_observations, tangent_error
 from weldcal.calibration.eye_on_base.change_point import find_change
-from weldcal.calibration.eye_on_base.nested import bootstrap_interval
 from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import k_fold
+from weldcal.calibration.eye_on_base.validation import bootstrap_interval, k_fold
 
 
 def seconds(task: Callable[[], object]) -> float:

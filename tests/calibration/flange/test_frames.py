@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from tests.calibration.flange.face import face_points
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
-from weldcal.models.flanges import STANDARDS, face_points, get_flange
+from weldcal.models.flanges import STANDARDS, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.worlds.flange_frames import facing, flange_frame, hidden_frame
 

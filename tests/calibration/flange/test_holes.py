@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.calibration.flange.face import face_points
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
-from weldcal.models.flanges import FlangeStandard, face_points, get_flange
+from weldcal.models.flanges import FlangeStandard, get_flange
 
 Array = NDArray[np.float64]
 STANDARD = get_flange("iso9409-1-50-4-m6")

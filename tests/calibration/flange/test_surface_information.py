@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.calibration.flange.face import face_points
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.icp import (
     COMPONENTS,
@@ -17,7 +18,7 @@ from weldcal.calibration.published.icp import (
     surface_normals,
     unobservable_components,
 )
-from weldcal.models.flanges import face_points, flange_mesh, get_flange
+from weldcal.models.flanges import flange_mesh, get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])

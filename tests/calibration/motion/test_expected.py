@@ -7,7 +7,7 @@ import pytest
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.motion.estimate import estimate_in_motion
-from weldcal.calibration.motion.expected import best_motion, expected_of_motion
+from weldcal.calibration.motion.expected import expected_of_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.errors import InputError
@@ -46,8 +46,5 @@ def test_coming_back_tells_clock_from_pose() -> None:
     assert one.shared > 0.99
     assert two.shared < 0.3
     assert one.offset_s > 20.0 * two.offset_s
-    assert best_motion([way, round_trip], X_BC, **NOISE) == 1
-    with pytest.raises(InputError, match="no motion"):
-        best_motion([], X_BC)
     with pytest.raises(InputError, match="frames"):
         expected_of_motion(cut(stream, 0.0, 0.1), X_BC)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.calibration.flange.face import face_points
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.published.icp import (
@@ -20,7 +21,7 @@ from weldcal.calibration.published.icp import (
     sight,
 )
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import face_points, get_flange
+from weldcal.models.flanges import get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])

@@ -6,27 +6,31 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.calibration.flange.face import face_points
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm1_step, axes_cost, work_radius_cost
+from weldcal.calibration.published.algorithm1 import (
+    algorithm1_start,
+    algorithm1_step,
+    axes_cost,
+    translation_cost,
+    work_radius_cost,
+)
 from weldcal.calibration.published.icp import VerificationError
 from weldcal.calibration.published.pipeline import (
     CircleParameters,
     PublishedParameters,
     PublishedVerification,
-    SegmentationParameters,
     all_pairs,
     at_flange,
     circumcircles,
     find_centres,
     published_model,
     published_pairs,
-    run_published,
     search_circle,
-    segment_flange,
 )
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import face_points, get_flange
+from weldcal.models.flanges import get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
@@ -82,23 +86,6 @@ def test_no_circle_is_refused_by_name() -> None:
         CircleParameters(e_r=0.1)
 
 
-def test_segmentation_leaves_the_flange_of_a_scene_and_says_where_nothing_was_left() -> None:
-    X_CR = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.03, 0.02, 0.7])
-    flange = face_at(X_CR, 1, spacing=0.0007)
-    x, y = np.meshgrid(np.arange(-0.07, 0.07, 0.001), np.arange(-0.07, 0.07, 0.001))
-    table = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.95)])
-    few = SegmentationParameters(neighbours=20, link_m=0.0015, cluster_points=(2000, 20_000), plane_draws=100)
-    found = segment_flange(np.vstack([flange, table]), parameters=few)
-    assert np.abs(found[:, 2] - 0.7).max() < 0.002
-    assert len(found) > 0.8 * len(flange)
-    with pytest.raises(FlangeNotFound, match=r"pass-through from 0\.4 to 1 m"):
-        segment_flange(flange + np.array([0.0, 0.0, 1.0]))
-    with pytest.raises(FlangeNotFound, match="the largest has"):
-        segment_flange(flange)
-    with pytest.raises(FlangeNotFound, match="as wide as the flange"):
-        segment_flange(table, parameters=few)
-
-
 def test_equation_10_read_literally_loses_the_camera() -> None:
     rng = np.random.default_rng(2)
     p_C = rng.uniform([-0.2, -0.15, 0.5], [0.2, 0.15, 0.9], (30, 3))
@@ -141,7 +128,7 @@ def test_the_pipeline_runs_as_a_whole_and_compensation_flatters_its_own_pose() -
         clouds[f"s{k}"], poses[f"s{k}"] = face_at(X_CF, k), X_BC @ X_CF
     clouds["blank"], poses["blank"] = clouds["s0"][:2], poses["s0"]
     parameters = PublishedParameters(unit_m=1.0, max_distance_m=0.01, e_required=1e-9)
-    circles, faces, refused = find_centres(clouds, parameters, segmented=True)
+    circles, faces, refused = find_centres(clouds, parameters)
     assert [id for id, _ in refused] == ["blank"]
     pairs = [o for o in published_pairs(circles, poses) if o.id != "s7"]
     model_F, normals_F = published_model(STANDARD)
@@ -155,7 +142,9 @@ def test_the_pipeline_runs_as_a_whole_and_compensation_flatters_its_own_pose() -
         unit_m=1.0,
     )
     assert verifier(all_pairs(pairs)).found
-    state = run_published([pairs[i] for i in np.random.default_rng(0).permutation(7)], verifier, parameters)
+    state = algorithm1_start(parameters.e_required, parameters.k_max)
+    for i in np.random.default_rng(0).permutation(7):
+        state = algorithm1_step(state, pairs[i], verifier, translation_cost, as_printed=True)
     assert state.X_BC is not None
     assert state.cost <= state.history[0][1]
     assert "s7" not in {o.id for o in state.pool}

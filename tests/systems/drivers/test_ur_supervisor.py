@@ -268,6 +268,14 @@ def test_an_output_that_goes_off_unasked_is_a_fault_once_the_guard_would_have_sa
     assert "is off" in sentence(decisions[-1].fault, decisions[-1].detail)
 
 
+def test_an_output_that_stays_on_after_its_end_is_a_fault_once_it_should_have_followed(rig: Rig) -> None:
+    for _ in range(25):
+        assert rig.one(**ON) == Decision(Action.SEND)  # type: ignore[arg-type]
+    decisions = [rig.one(process_on=True, process_asked=False) for _ in range(8)]
+    assert decisions[4] == Decision(Action.SEND)  # 16 ms after the first sample without the wish
+    assert decisions[-1] == Decision(Action.BRAKE, Fault.PROCESS_OUTPUT, 1.0)
+
+
 def test_an_output_that_follows_its_command_some_frames_later_is_none(rig: Rig) -> None:
     for k in range(100):  # on and off, each for 0.1 s, shown 16 ms later
         assert rig.one(process_asked=k % 50 < 25, process_on=(k - 4) % 50 < 25 and k >= 4) == Decision(Action.SEND)
@@ -448,3 +456,13 @@ def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
     of_the_start = {fault for fault in Fault if fault >= Fault.GUARD_REFUSED}
     assert seen == set(Fault) - of_the_start - {Fault.NONE, Fault.WORKER_DIED}, "every fault is tested here"
     assert seen <= set(ACTIONS)
+
+
+def test_an_arm_at_a_limit_may_leave_it_and_not_go_on() -> None:
+    """Within the margin of its limits, as a person may have left it."""
+    for q, way in ((-5.99, 1.0), (5.99, -1.0)):
+        for sign, fault in ((1.0, Fault.NONE), (-1.0, Fault.JOINT_LIMIT)):
+            rig = Rig(velocity=sign * way * np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]))
+            rig.robot = replace(rig.robot, q=np.array([q, 0.0, 0.0, 0.0, 0.0, 0.0]))
+            rig._led = rig.robot.q
+            assert rig.passes(0.05).fault is fault

@@ -12,7 +12,7 @@ import pytest
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.shared import Given, Memory
-from weldcal.systems.drivers.ur.supervisor import OBEYING, PLAYING, RUNNING, Limits, RobotSample
+from weldcal.systems.drivers.ur.supervisor import OBEYING, PLAYING, RUNNING, Command, Limits, RobotSample
 from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.worker import Worker, WorkerConfig
 
@@ -33,11 +33,12 @@ FRESH, LATE = range(5, 15), range(30, 40)  # passes of 4 ms; the cell computes f
 class RecordingRobot:
     """A healthy robot. Its set points are `right` or not. The cell's commands stop for 30 passes."""
 
-    def __init__(self, memory: Memory, right: bool) -> None:
+    def __init__(self, memory: Memory, right: bool, moves: int = 0) -> None:
         self.clock = SimpleNamespace(to_host=float, residual_s=0.0, drift=0.0)
         self.numbers, self.echo_latency, self.process_on, self.powered = (0.0, 0.0, 0.0), 0.0, False, False
         self.sent: dict[int, tuple[bool, bool]] = {}
         self._memory, self._right, self._passes = memory, right, 0
+        self._moves, self.ended = moves, 0  # passes in which the arm still moves; the pass in which its program ended
 
     def sample(self, now: float) -> RobotSample:
         self._passes += 1
@@ -49,7 +50,7 @@ class RecordingRobot:
             robot_time=now,
             fresh_at=now,
             q=np.zeros(6),
-            qd=np.zeros(6),
+            qd=np.full(6, 0.1 * (self._passes < self._moves)),
             robot_mode=RUNNING,
             safety_mode=1,
             runtime_state=PLAYING,
@@ -63,29 +64,40 @@ class RecordingRobot:
         self.sent[self._passes] = (process, armed)
         return True
 
+    def end_program(self) -> None:
+        self.ended = self._passes
+
     def __getattr__(self, name: str) -> Any:
-        return lambda *_: None  # torch_off, gas, excuse, forget, end_program
+        return lambda *_: None  # torch_off, gas, excuse, forget
 
 
-def run(right: bool) -> tuple[RecordingRobot, Fault]:
-    """Run a worker for which the torch is wanted, until it is stopped."""
+def memory_of() -> Memory:
+    """Memory that no other process has."""
     descriptor = os.memfd_create("test")
     os.ftruncate(descriptor, Memory.size())
     memory = Memory(descriptor)
     os.close(descriptor)
-    config = WorkerConfig(
-        host="",
-        arm=ARM,
-        limits=LIMITS,
-        rate_hz=250.0,
-        upper_registers=True,
-        payload_kg=0.0,
-        payload_cog_m=(0.0, 0.0, 0.0),
-        parent=os.getppid(),
-        levels=(Level(output=0, volts=True, share=0.5),),
-    )
-    robot = RecordingRobot(memory, right)
-    assert Worker(config, memory).run(robot) == 0  # type: ignore[arg-type]
+    return memory
+
+
+CONFIG = WorkerConfig(
+    host="",
+    arm=ARM,
+    limits=LIMITS,
+    rate_hz=250.0,
+    upper_registers=True,
+    payload_kg=0.0,
+    payload_cog_m=(0.0, 0.0, 0.0),
+    parent=os.getppid(),
+    levels=(Level(output=0, volts=True, share=0.5),),
+)
+
+
+def run(right: bool, moves: int = 0) -> tuple[RecordingRobot, Fault]:
+    """Run a worker for which the torch is wanted, until it is stopped."""
+    memory = memory_of()
+    robot = RecordingRobot(memory, right, moves)
+    assert Worker(CONFIG, memory).run(robot) == 0  # type: ignore[arg-type]
     published = memory.state.read()
     assert published is not None
     return robot, Fault(published.fault)
@@ -112,3 +124,19 @@ def test_a_late_command_with_the_torch_on_is_a_fault_and_the_torch_stays_off() -
     assert robot.sent[16] == (True, True)
     assert {robot.sent.get(k, (False, False)) for k in range(30, 60)} == {(False, False)}
     assert fault is Fault.COMMAND_LATE
+
+
+def test_the_program_ends_once_the_braked_arm_is_at_rest() -> None:
+    """A late command with the torch on brakes the arm from pass 28 on."""
+    resting, moving = run(right=True)[0], run(right=True, moves=50)[0]
+    assert 28 < resting.ended < 50
+    assert moving.ended >= 50 + 0.05 * 250.0, "0.05 s at rest"
+
+
+@pytest.mark.parametrize(("process", "scale"), [(False, 0.0), (True, 1.0)])
+def test_a_late_velocity_slows_the_arm_but_not_under_a_burning_torch(process: bool, scale: float) -> None:
+    """The torch goes out first: an arm that slowed under it would burn a hole."""
+    memory = memory_of()
+    sample = RecordingRobot(memory, right=True).sample(100.0)
+    late = Command(number=1, given_at=99.94, qd=np.full(6, 0.1), process=process)
+    assert Worker(CONFIG, memory)._scaled(late, 100.0, sample).scale == scale

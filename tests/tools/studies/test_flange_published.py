@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
+from tests.calibration.flange.face import face_points
 from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
@@ -18,7 +21,7 @@ from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm1_step
 from weldcal.calibration.published.icp import COMPONENTS, VerificationError
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import face_points, get_flange
+from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.flange.published.clouds import METHODS, study_clouds
 from weldcal.tools.studies.flange.published.command import find_datasets, title
@@ -30,6 +33,7 @@ from weldcal.tools.studies.flange.published.pairs import (
     study_kinect,
     study_pairs,
 )
+from weldcal.tools.studies.flange.published.report import table1_rows
 from weldcal.tools.studies.flange.published.simulation import (
     X_BC_TRUE,
     algorithm1_batch,
@@ -197,3 +201,12 @@ def test_without_data_the_simulated_parts_are_reported(tmp_path: Path) -> None:
     assert "No data folder was given" in table
     assert "only the simulated" in table
     assert {p.name for p in (tmp_path / "o/figures").iterdir()} == {"costs.svg", "fig9_noise.svg", "fig10_steps.svg"}
+
+
+def test_table_1_names_pairs_that_hold_no_stored_runs() -> None:
+    """Pairs of the UR5 are judged further down, so Table 1 does not call them absent."""
+    study: Any = SimpleNamespace(pairs=(SimpleNamespace(title="UR5 & PhoXi M", table1=None),), clouds=())
+    rows = [row[0] for row in table1_rows(study)]
+    below = {name: rows[rows.index(f"{name}, paper") + 1] for name in ("UR5 & PhoXi M", "AUBO i5 & PhoXi S")}
+    assert below["UR5 & PhoXi M"] == "  pairs without stored runs"
+    assert below["AUBO i5 & PhoXi S"] == "  no data of it here"

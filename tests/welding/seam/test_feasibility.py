@@ -9,7 +9,7 @@ import pytest
 
 from tests.welding.weld_kinematics import l_curve, straight
 from weldcal.tools.worlds.weld.seams import arcs, s_curve
-from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics, torch_events
+from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
@@ -112,7 +112,5 @@ def test_speed_counts_by_length_where_the_arc_burned() -> None:
     assert result.mean == pytest.approx(13.33e-3, rel=0.01)
     assert result.cv == pytest.approx(3.77 / 13.33, rel=0.02)
     assert result.outside_m == pytest.approx(0.16, abs=0.002)
-    events = torch_events(t, on, x)
-    assert [e.on for e in events] == [True]
     with pytest.raises(ProcessLogError, match="never"):
         speed_statistics(t, p, np.zeros(len(t), dtype=bool), 0.008)

@@ -89,6 +89,18 @@ def test_a_straight_seam_with_no_noise_is_fitted_exactly() -> None:
     np.testing.assert_allclose(fit.tangent, direction / np.linalg.norm(direction), atol=1e-6)
 
 
+@pytest.mark.parametrize("radius", [0.020, 0.060])
+def test_the_bend_of_the_fit_is_that_of_the_curve(radius: float) -> None:
+    """A circle's second derivative by its arc is 1/R towards the centre."""
+    arc = np.arange(0.0, 0.03, 8e-3 / 30.0)
+    a = arc / radius
+    seam = felt(radius * np.column_stack([np.sin(a), 1.0 - np.cos(a), 0.0 * a]), arc)
+    at = 0.015 / radius
+    fit = local_fit(seam, 0.015, np.array([np.cos(at), np.sin(at), 0.0]), radius, CONFIG)
+    assert fit is not None
+    np.testing.assert_allclose(fit.bend, np.array([-np.sin(at), np.cos(at), 0.0]) / radius, atol=0.05 / radius)
+
+
 def test_there_is_no_fit_where_nothing_was_felt() -> None:
     arc = np.concatenate([np.arange(0.0, 0.02, 3e-4), np.arange(0.05, 0.07, 3e-4)])
     seam = felt(np.column_stack([arc, 0 * arc, 0 * arc]), arc)

@@ -12,7 +12,6 @@ from weldcal.welding.servo.guards import (
     ArmGuardConfig,
     GuardError,
     SlewLimits,
-    command_is_finite,
     guarded_joint_velocity,
     seam_conditioning,
     slew_limit,
@@ -141,8 +140,6 @@ def test_from_any_motion_it_comes_to_rest_without_reversing_far() -> None:
     for _ in range(1000):
         v, a = slew_limit(np.full(6, np.nan), v, a, LIMITS, DT)
     np.testing.assert_allclose(v, 0.0, atol=1e-9)
-    assert not command_is_finite(np.array([1.0, np.nan]))
-    assert command_is_finite(np.zeros(6))
 
 
 def test_the_seams_conditioning_is_that_of_the_chord() -> None:

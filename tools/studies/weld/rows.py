@@ -64,7 +64,7 @@ ROWS: tuple[Row, ...] = (
         "imperfect",
         "imperfect world: straight, S R60, L R20",
         tuple(Case(seam, "imperfect") for seam in _EASY),
-        (*_WRONG, *_BOUNDED),
+        (*_WRONG, Target("space_mean_mm", 0.30, "mean"), Target("space_mm", 0.70), *_BOUNDED),
     ),
     Row(
         "imperfect_corners",

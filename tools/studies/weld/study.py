@@ -144,6 +144,7 @@ def _row_summary(row: RowResult) -> dict[str, object]:
 
 FIGURE_NAMES = {
     "mean_mm": "torch, mean", "max_mm": "torch, largest", "space_mm": "torch in space, largest",
+    "space_mean_mm": "torch in space, mean",
     "height_mm": "torch height, largest", "end_mm": "last chord, largest",
     "gap_mm": "gap and 60 mm after, largest", "cv_percent": "torch speed CV", "time_ratio": "time over L/V",
     "omega_rad_s": "turning rate", "tip_speed_mm_s": "tip speed", "end_step_mm_s": "robot's velocity step",

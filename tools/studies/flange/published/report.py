@@ -40,7 +40,8 @@ def table1_rows(study: Found) -> list[Row]:
                 (f"  ours, median of {len(e)} scans", np.median(e, axis=0)),
                 ("  spread over those scans", e.std(axis=0)),
             ]
-        rows += [(label, *_six(e, 2)) for label, e in here] or [("  no data of it here", *("–",) * 6)]
+        none = "  pairs without stored runs" if name in {p.title for p in study.pairs} else "  no data of it here"
+        rows += [(label, *_six(e, 2)) for label, e in here] or [(none, *("–",) * 6)]
     return rows
 
 

@@ -1,0 +1,59 @@
+"""The list of mutations fits the sources and the tests as they are."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.places import ROOT
+from weldcal.models.errors import InputError
+from weldcal.tools.commands import mutate
+from weldcal.tools.commands.mutate import KILLED, LIST, SURVIVED, Mutation, read_mutations, run_mutations
+
+MUTATIONS = read_mutations(LIST.read_text())
+
+
+def test_every_text_occurs_once_and_its_replacement_is_python() -> None:
+    for mutation in MUTATIONS:
+        source = (ROOT / mutation.file).read_text()
+        mutated = mutation.applied(source)
+        assert mutated != source, mutation.reason
+        ast.parse(mutated, mutation.reason)
+    assert len({m.reason for m in MUTATIONS}) == len(MUTATIONS) >= 90
+
+
+def test_every_test_named_exists() -> None:
+    for argument in {argument for mutation in MUTATIONS for argument in mutation.tests}:
+        file, _, name = argument.partition("::")
+        assert (ROOT / file).exists(), argument
+        assert not name or f"def {name}(" in (ROOT / file).read_text(), argument
+
+
+def test_a_text_that_is_gone_fails_with_one_sentence() -> None:
+    gone = Mutation(file="calibration/errors.py", tests=("tests",), reason="gone", text="no such text", replacement="")
+    with pytest.raises(InputError, match=r"'gone' occurs 0 times in calibration/errors.py: correct mutations.txt"):
+        next(run_mutations([gone], 1, lambda stage, share: None))
+    with pytest.raises(InputError, match="Line 2 of mutations"):
+        read_mutations("calibration/errors.py: tests\nno reason")
+
+
+def test_a_copy_is_changed_and_the_project_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A project of one module and one test: one mutation is noticed, the other is not, and the files stay as they are."""
+    root = tmp_path / "weldcal"
+    (root / "tests").mkdir(parents=True)
+    (root / "half.py").write_text("def half(x):\n    return x / 2\n\n\nUNUSED = 1\n")
+    (root / "tests" / "test_half.py").write_text(
+        "import importlib.util, pathlib\n"
+        "spec = importlib.util.spec_from_file_location('half', pathlib.Path(__file__).parents[1] / 'half.py')\n"
+        "module = importlib.util.module_from_spec(spec)\nspec.loader.exec_module(module)\n\n\n"
+        "def test_half():\n    assert module.half(4) == 2\n"
+    )
+    (tmp_path / "shared").mkdir()
+    before = (root / "half.py").read_text()
+    monkeypatch.setattr(mutate, "ROOT", root)
+    text = "half.py: tests/test_half.py\n  third\n  - x / 2\n  + x / 3\n  unused\n  - UNUSED = 1\n  + UNUSED = 2\n"
+    found = {m.reason: verdict for m, verdict, _ in run_mutations(read_mutations(text), 1, lambda stage, share: None)}
+    assert found == {"third": KILLED, "unused": SURVIVED}
+    assert (root / "half.py").read_text() == before
