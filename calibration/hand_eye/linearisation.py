@@ -14,7 +14,7 @@ _HUBER = 2.0  # in sigma per axis
 TINY = 1e-24  # of the squared extent: exact data have no noise to estimate
 RANK = 1e-11  # eigenvalues below this share of the largest count as zero: a direction the observations do not fix
 _LOG_SIGMA = 1.5  # standard deviation of the logarithm of the discord beforehand
-_DISCORDS = np.exp(np.arange(-3.0, 5.01, 0.5))  # in units of the usual one, for sums over its posterior
+_DISCORDS = np.exp(np.arange(-5.0, 5.01, 0.5))  # in units of the usual one, for sums over its posterior
 _SLIGHT = 1e-9  # share of what displacements know of rotations that stays: it bounds the rounding
 _VARIANCE_STEPS = 2
 _SURE = 1e-7  # a matrix with no eigenvalue below this share needs no look at its eigenvalues
@@ -41,7 +41,7 @@ class Scaled:
 
     ``usual_discord`` (rad, 0: none): the displacements are those of a camera that is turned by a rotation vector with the
     same variance per axis against the camera of the rotations. Its size has a log-normal prior about ``usual_discord`` and the
-    restricted likelihood (REML). The answer is the mean over the posterior; ``discord`` has the mean information.
+    restricted likelihood (REML). The answer is the mean over the posterior; ``discord`` has the information that is the mean over the likelihood.
     """
 
     def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss, usual_discord: float = 0.0) -> None:
@@ -89,7 +89,7 @@ class Scaled:
         return np.asarray(-self._newton() @ (self.gw + self.gd))
 
     def _marginal(self, usual: float) -> tuple[float, Array, Array]:
-        """The discord whose information is the mean over its posterior, and the means over it of what the gradients (m,) of rotations and of displacements
+        """The discord whose information is the mean over its likelihood, and the means over it of what the gradients (m,) of rotations and of displacements
         move (m, m).
 
         At one discord the rotations follow from both, as far as it lets the displacements know them. The positions are the
@@ -102,6 +102,7 @@ class Scaled:
         good = values > RANK * float(np.trace(own[:, :3]))
         x = (usual * _DISCORDS[:, None]) ** 2 * values[good]
         cost = (np.log1p(x) + score[good] ** 2 / values[good] / (1.0 + x)).sum(axis=1)
+        free = cost.copy()  # the covariance follows the data alone, as with ideal cameras, too
         cost += (np.log(_DISCORDS) / _LOG_SIGMA) ** 2
         weight = np.exp(-0.5 * (cost - cost.min()))
         weight /= weight.sum()
@@ -118,7 +119,8 @@ class Scaled:
             by_d[:, :3] -= B @ less
         places = np.zeros((k, k))
         places[np.ix_(~turned, ~turned)] = inverse_information(Ad[np.ix_(~turned, ~turned)])
-        likely = usual / float(np.sqrt(weight @ _DISCORDS**-2.0))
+        flat = np.exp(-0.5 * (free - free.min()))
+        likely = usual / float(np.sqrt((flat / flat.sum()) @ _DISCORDS**-2.0))
         return likely, by_w - places @ Ad @ by_w, by_d + places - places @ Ad @ by_d
 
     def _newton(self) -> Array:
