@@ -1,14 +1,12 @@
-"""Solves one hand-eye problem: starts, outlier rejection, and the mean of several weightings of rotations against translations."""
+"""Solves one hand-eye problem: starts, outlier rejection, and the fit of poses and variance components."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.geometry.robust import t_quantile
-from weldcal.calibration.geometry.se3 import exp_rotation, mean_of
 from weldcal.calibration.hand_eye.fit import Fit, descend, fit, noise_of
 from weldcal.calibration.hand_eye.linearisation import Loss
 from weldcal.calibration.hand_eye.problem import Problem, State, residuals
@@ -25,30 +23,13 @@ _WORST_TURN_RAD = 0.2
 _SUBSETS = 60
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A weighting of the observations: the loss, and how much less than estimated the translations count."""
-
-    name: str
-    loss: Loss
-    ratio: float = 1.0
-
-
-CANDIDATES = (
-    Candidate("least squares", Loss.SQUARES),
-    *(Candidate(f"translations / {r:g}", Loss.SQUARES, r) for r in (2.0, 4.0, 8.0, 16.0)),
-    Candidate("rotations alone", Loss.SQUARES, 1e3),
-    Candidate("Student's t, translations / 4", Loss.STUDENT, 4.0),
-)
-"""Weightings of poses whose rotations can be had without their translations: all are averaged, none is chosen (docs/hand_eye.md)."""
-INSEPARABLE = (Candidate("least squares", Loss.SQUARES), Candidate("Student's t", Loss.STUDENT))
-"""Weightings where they cannot: points, normals, three unknowns."""
-_LEVEL = 0.01  # of all paired t tests together (Bonferroni) at which candidates count as different
+USUAL_DISCORD_RAD = 5e-3
+"""Angle, an axis, by which positions and rotations of usual cameras disagree: six pixels of the principal point at a focal length of 1,200."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The answer, how it was found, and what the candidates reached: name -> (deg, length) rms of the held-out errors.
+    """The answer and how it was found.
 
     ``covariance`` of the free poses, 6 each in the order X, Y, Z, in the tangent of se3.moved.
     """
@@ -58,7 +39,6 @@ class Choice:
     fit: Fit
     method: str
     start: str
-    scores: dict[str, tuple[float, float]]
 
 
 def solve(
@@ -68,14 +48,12 @@ def solve(
     seed: int = 0,
     starts: tuple[State, ...] = (),
     max_outliers: float = 0.40,
-    candidates: tuple[Candidate, ...] = CANDIDATES,
-    pose_only: bool = False,
+    usual_discord: float = USUAL_DISCORD_RAD,
 ) -> Choice:
     """Solve one problem; ``known`` holds the poses that are not free. Deterministic for ``seed``.
 
-    Where the rotations can be had without the translations the answer is the mean of all ``candidates`` on SE(3), each with the
-    same weight. Where they cannot, it is the mean of those of INSEPARABLE whose held-out errors a paired test cannot tell
-    apart. ``pose_only``: without covariance and scores, where only the poses are wanted. Raises InconsistentPoses where no rigid poses explain enough observations.
+    Where the rotations can be had without the translations, a discord between both is estimated (see Scaled) whose size is
+    ``usual_discord`` (rad) beforehand; 0: least squares, without discord. Raises InconsistentPoses where no rigid poses explain enough observations.
     """
     state, name = _start(problem, known, seed, starts)
     state = _concentrated(problem, state)
@@ -85,7 +63,7 @@ def solve(
     tried_sets: set[bytes] = set()
     for _ in range(10):
         noise = noise_of(problem, w, d, keep) if base is None else base.noise
-        base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2, leave_one_out=False)
+        base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2)
         state = base.state
         tried_sets.add(keep.tobytes())
         new = _within(problem, base)
@@ -107,44 +85,22 @@ def solve(
             f"{100.0 * np.sqrt(base.noise.translation) / problem.extent:.0f} % of their own extent; check units, pose "
             "order, the quaternion order, and which pose is stated from which frame."
         )
-    fits: dict[str, Fit] = {}
     # only full poses hold the rotation of X without their translations; three unknowns need what both know
     separable = bool(problem.full.all()) and not all(problem.free)
-    tried = INSEPARABLE if candidates is CANDIDATES and not separable else candidates
-    for c in tried:
-        near = next((f for f in reversed(fits.values()) if f.loss is c.loss), next(iter(fits.values()), base))
-        noise = replace(near.noise, ratio=c.ratio)
-        # the first candidate finds the noise centre for all
-        fits[c.name] = fit(
-            problem,
-            near.state,
-            centre=near.centre,
-            noise=noise,
-            loss=c.loss,
-            keep=keep,
-            hold_centre=bool(fits),
-            begin=near.lin if np.array_equal(near.keep, keep) else None,
-            leave_one_out=not (pose_only and separable),
-        )
-    squares = _held_out(fits)
-    agreed = list(fits) if separable else _alike(fits, squares)
-    best = fits[agreed[0]]
-    state, covariance = (
-        best.state,
-        best.scaled.V[: problem.size, : problem.size] if pose_only else best.scaled.covariance(),
+    best = fit(
+        problem,
+        base.state,
+        centre=base.centre,
+        noise=base.noise,
+        loss=Loss.HUBER if usual_discord else Loss.SQUARES,
+        keep=keep,
+        usual_discord=usual_discord if separable else 0.0,
+        begin=base.lin if np.array_equal(base.keep, keep) else None,
     )
-    if len(agreed) > 1:
-        chosen = [fits[k] for k in agreed]
-        parts = [mean_of([f.state[k] for f in chosen]) if problem.free[k] else known[k] for k in range(3)]
-        state = parts[0], parts[0] if problem.tied else parts[1], parts[2]
-        if pose_only:
-            return Choice(state, covariance, best, _said(agreed), name, {})
-        covariance = (
-            sum((f.scaled.cross_covariance(o.scaled) for f in chosen for o in chosen), np.zeros_like(covariance))
-            / len(chosen) ** 2
-        )
-    scores = {k: _rms(s) for k, s in squares.items()}
-    return Choice(state, 0.5 * (covariance + covariance.T), best, _said(agreed), name, scores)
+    s = best.scaled
+    said = f"variance components, discord {np.degrees(s.discord):.2g} deg" if s.discord else "variance components"
+    covariance = s.covariance()
+    return Choice(best.state, 0.5 * (covariance + covariance.T), best, said, name)
 
 
 def _concentrated(problem: Problem, state: State) -> State:
@@ -173,9 +129,7 @@ def _concentrated(problem: Problem, state: State) -> State:
             break
         kept = rows
         keep = np.isin(np.arange(n), rows)
-        state = fit(
-            problem, state, noise=noise, loss=Loss.SQUARES, keep=keep, tolerance=1e-2, leave_one_out=False
-        ).state
+        state = fit(problem, state, noise=noise, loss=Loss.SQUARES, keep=keep, tolerance=1e-2).state
     return state
 
 
@@ -259,44 +213,3 @@ def _clean(problem: Problem, state: State) -> bool:
     turned = np.sqrt(noise.rotation) if (problem.full | problem.normal).any() else 0.0
     few = int((~_gate(problem, w, d)).sum()) <= max(0.02 * len(problem), 1)
     return few and np.sqrt(noise.translation) < 0.05 * problem.extent and bool(turned < 0.1)
-
-
-def _held_out(fits: dict[str, Fit]) -> dict[str, Array]:
-    """Squares (n, 2) of the held-out errors, rotation and displacement, all at the noise centre of the first fit."""
-    centre = next(iter(fits.values())).centre
-    out = {}
-    for k, f in fits.items():
-        w, d = f.left_w[f.keep], f.left_d[f.keep]
-        d = d + np.where(f.scaled.full[:, None], (exp_rotation(w) - np.eye(3)) @ (centre - f.centre), 0.0)
-        out[k] = np.column_stack([(w**2).sum(axis=1), (d**2).sum(axis=1)])
-    return out
-
-
-def _said(names: list[str]) -> str:
-    return " + ".join(names) if len(names) < 3 else f"mean of {len(names)} weightings"
-
-
-def _rms(squares: Array) -> tuple[float, float]:
-    rms = np.sqrt(squares.mean(axis=0))
-    return float(np.degrees(rms[0])), float(rms[1])
-
-
-def _alike(fits: dict[str, Fit], squares: dict[str, Array]) -> list[str]:
-    """The candidate with the least regret, and those whose held-out errors cannot be told apart from the best of either
-    column (paired t test of the squares)."""
-    means = {k: s.mean(axis=0) for k, s in squares.items()}
-    least = np.maximum(np.min(list(means.values()), axis=0), 1e-300)
-    order = sorted(fits, key=lambda k: (float(max(means[k] / least)), list(fits).index(k)))
-    column_best = [list(means)[int(np.argmin([m[c] for m in means.values()]))] for c in range(2)]
-    tests = 2.0 * max(len(fits) - 1, 1)
-    limit = float(t_quantile(1.0 - 0.5 * _LEVEL / tests, max(len(squares[order[0]]) - 1, 1)))
-    out = [order[0]]
-    for k in order[1:]:
-        apart = False
-        for c in range(2):
-            difference = squares[k][:, c] - squares[column_best[c]][:, c]
-            error = float(difference.std(ddof=1)) / np.sqrt(len(difference))
-            apart |= bool(float(difference.mean()) > limit * error)
-        if not apart:
-            out.append(k)
-    return out

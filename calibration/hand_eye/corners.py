@@ -9,7 +9,6 @@ import numpy as np
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.robust import chi2_quantile
 from weldcal.calibration.geometry.se3 import difference, pose
-from weldcal.calibration.hand_eye.choice import CANDIDATES
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import NAMES, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
@@ -71,7 +70,7 @@ def refine_with_corners(pairs: PosePairs, config: HandEyeConfig | None = None) -
     Raises as poses_from_corners and solve_problem.
     """
     config = config or HandEyeConfig()
-    quick = replace(config, folds=0, candidates=CANDIDATES[:1])
+    quick = replace(config, folds=0, usual_discord_rad=0.0)
     plain = solve_problem(full_problem(pairs.F, poses_from_corners(pairs, np.zeros(2)), pairs.H), config=config)
     n = 3.0 * len(np.unique(plain.observation[plain.inliers]))
 

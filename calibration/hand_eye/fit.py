@@ -22,8 +22,8 @@ _HERE = 0.1  # share of the tolerance up to which derivatives are those of the p
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """A converged fit. ``left_w``, ``left_d`` (n, 3): residuals of each observation under the fit without it; ``w``, ``d``
-    (n, 3): under the fit itself; ``scaled``, ``lin``: normal equations and derivatives of the observations kept."""
+    """A converged fit. ``w``, ``d`` (n, 3): residuals; ``scaled``, ``lin``: normal equations and derivatives of the
+    observations kept."""
 
     state: State
     noise: Noise
@@ -32,8 +32,6 @@ class Fit:
     keep: Flags
     scaled: Scaled
     lin: Linearised
-    left_w: Array
-    left_d: Array
     w: Array
     d: Array
 
@@ -108,19 +106,18 @@ def fit(
     loss: Loss,
     keep: Flags,
     centre: Array | None = None,
-    hold_centre: bool = False,
+    usual_discord: float = 0.0,
     begin: Linearised | None = None,
     iterations: int = 60,
     tolerance: float = 1e-6,
-    leave_one_out: bool = True,
 ) -> Fit:
     """Newton's method on the robust cost from a good start; the variances are re-estimated at every step.
 
     Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. The noise centre is
     an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
     displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so the
-    answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``hold_centre``: keep it,
-    and count it only as something else that is uncertain. ``keep`` (n,): observations that count; the others get residuals
+    answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``usual_discord``:
+    see Scaled. ``keep`` (n,): observations that count; the others get residuals
     only. ``begin``: the derivatives at the start, where known. ``tolerance``: of what is left, in standard deviations.
     """
     sub = problem if keep.all() else problem.pick(keep)
@@ -135,14 +132,12 @@ def fit(
 
     lin = taken(state, centre) if begin is None else begin
     loose &= lin.Jw.shape[2] > sub.size
-    s = Scaled(sub, lin, noise, loss)
+    s = Scaled(sub, lin, noise, loss, usual_discord)
     scale = np.append(np.tile(np.repeat([1.0, sub.extent], 3), len(sub.blocks)), np.full(3, sub.extent))
     near = _NEAR if len(sub) >= _MANY else 0.0
-    before, drift, stale = tolerance, np.zeros(len(s.g)), 0.0
+    before, drift, stale = tolerance, np.zeros(len(s.A)), 0.0
     for _ in range(iterations):
-        moving = sub.size if hold_centre else len(s.g)
-        change = np.zeros(len(s.g))
-        change[:moving] = -s.newton(moving) @ s.g[:moving]
+        change = s.step()
         change *= min(1.0, _LONGEST / max(float(np.abs(change / scale[: len(change)]).max()), 1e-300))
         size = float(np.sqrt(max(float(change @ s.A @ change), 0.0)))
         state = sub.step(state, change[: sub.size])
@@ -167,15 +162,12 @@ def fit(
         if exact and loose:  # there is no noise to have a centre
             loose, centre = False, np.zeros(3)
             lin, drift = taken(state, centre), np.zeros(sub.size)
-        s = Scaled(sub, lin, noise, loss)
+        s = Scaled(sub, lin, noise, loss, usual_discord)
         if done:
             break
         before = leap
     # every observation, at the same state
     w, d = (lin.w, lin.d) if sub is problem else residuals(problem, state, centre)
-    left_w, left_d = w.copy(), d.copy()
-    if leave_one_out:
-        left_w[keep], left_d[keep] = s.leave_one_out(lin)
     return Fit(
         state=state,
         noise=noise,
@@ -184,8 +176,6 @@ def fit(
         keep=keep,
         scaled=s,
         lin=lin,
-        left_w=left_w,
-        left_d=left_d,
         w=w,
         d=d,
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cached_property
 
 import numpy as np
 
@@ -12,9 +11,11 @@ from weldcal.calibration.hand_eye.problem import Linearised, Problem, gram
 from weldcal.models.arrays import Array
 
 _HUBER = 2.0  # in sigma per axis
-_STUDENT = 5.0  # degrees of freedom of the heavy-tailed loss
 TINY = 1e-24  # of the squared extent: exact data have no noise to estimate
 RANK = 1e-11  # eigenvalues below this share of the largest count as zero: a direction the observations do not fix
+_LOG_SIGMA = 1.5  # standard deviation of the logarithm of the discord beforehand
+_DISCORDS = np.exp(np.arange(-5.0, 5.01, 0.5))  # in units of the usual one, for sums over its posterior
+_SLIGHT = 1e-9  # share of what displacements know of rotations that stays: it bounds the rounding
 _VARIANCE_STEPS = 2
 _SURE = 1e-7  # a matrix with no eigenvalue below this share needs no look at its eigenvalues
 
@@ -24,33 +25,32 @@ class Loss(Enum):
 
     SQUARES = "least squares"
     HUBER = "Huber"
-    STUDENT = "Student's t"
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances per axis beyond the observations' own covariances: rotation rad^2 and translation of the noise centre.
-
-    ``ratio``: factor on the translation's sigma in the weights only: > 1 lets the rotations decide the rotations.
-    """
+    """Variances per axis beyond the observations' own covariances: rotation rad^2 and translation of the noise centre."""
 
     rotation: float
     translation: float
-    ratio: float = 1.0
 
 
 class Scaled:
     """The observations of a linearisation, weighed. ``lin`` may hold three more columns than the problem has unknowns: those of
-    the noise centre."""
+    the noise centre.
 
-    def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss) -> None:
+    ``usual_discord`` (rad, 0: none): the displacements are those of a camera that is turned by a rotation vector with the
+    same variance per axis against the camera of the rotations. Its size has a log-normal prior about ``usual_discord`` and the
+    restricted likelihood (REML). The answer is the mean over the posterior; ``discord`` has the information that is the mean over the likelihood.
+    """
+
+    def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss, usual_discord: float = 0.0) -> None:
         self.size, self.full = problem.size, problem.full
         n = len(problem)
         self.loss, self.noise, self.n = loss, noise, n
         self.numbers_w = problem.numbers_w
         self.total_w, self.total_d = float(self.numbers_w.sum()), 3.0 * n
         self.m_w = np.maximum(self.numbers_w, 1.0)
-        self.inflate = noise.ratio**2
         self.root: Array | None = None
         self.share_w: Array | float = 1.0  # how much of each observation's variance is the common one
         self.share_d: Array | float = 1.0
@@ -72,58 +72,75 @@ class Scaled:
         self.slope_w = float(slope_w @ self.numbers_w) / max(self.total_w, 1.0)
         self.slope_d = float(slope_d.mean())
         self.Gw, self.Gd = self._a * unit.Gw, self._b * unit.Gd
-        self.A = self.slope_w * self.Gw + (self.slope_d / self.inflate) * self.Gd
+        self._Aw, self._Ad = self.slope_w * self.Gw, self.slope_d * self.Gd
+        self.A = self._Aw + self._Ad
         self.V = inverse_information(self.A)
-        self.g = pull(unit.Jw, self._a * self.ww, unit.w) + pull(unit.Jd, self._b / self.inflate * self.wd, unit.d)
-        taken_w = self.slope_w * float((self.V * self.Gw).sum())
-        taken_d = self.slope_d / self.inflate * float((self.V * self.Gd).sum())
+        self.gw, self.gd = pull(unit.Jw, self._a * self.ww, unit.w), pull(unit.Jd, self._b * self.wd, unit.d)
+        self.discord, self._by_w, self._by_d = 0.0, self.V, self.V
+        if usual_discord:
+            self.discord, self._by_w, self._by_d = self._marginal(usual_discord)
+        taken_w, taken_d = float((self._by_w * self._Aw).sum()), float((self._by_d * self._Ad).sum())
         self.free_w, self.free_d = max(self.total_w - taken_w, 0.3), max(self.total_d - taken_d, 0.3)
 
-    @cached_property
-    def ew(self) -> Array:
-        """Rotations (n, 3) in units of their noise."""
-        return np.asarray(self._unit.w * np.sqrt(self._a))
+    def step(self) -> Array:
+        """Change (m,) of the unknowns. Without discord: Newton's, with the exact second derivative of the robust cost."""
+        if self.discord or self.loss is Loss.SQUARES:
+            return -(self._by_w @ self.gw + self._by_d @ self.gd)
+        return np.asarray(-self._newton() @ (self.gw + self.gd))
 
-    @cached_property
-    def ed(self) -> Array:
-        """Displacements (n, 3) in units of their noise."""
-        return np.asarray(self._unit.d * np.sqrt(self._b))
+    def _marginal(self, usual: float) -> tuple[float, Array, Array]:
+        """The discord whose information is the mean over its likelihood, and the means over it of what the gradients (m,) of rotations and of displacements
+        move (m, m).
 
-    @cached_property
-    def Jw(self) -> Array:
-        """Derivatives (n, 3, m) of ``ew``."""
-        return np.asarray(self._unit.Jw * np.sqrt(self._a))
+        At one discord the rotations follow from both, as far as it lets the displacements know them. The positions are the
+        best for these rotations and the displacements as measured: so they predict them best.
+        """
+        Ad, V, k = self._Ad, self.V, len(self.A)
+        own = Ad[:3]
+        values, axes = np.linalg.eigh(own[:, :3] - own @ V @ own.T)
+        score = axes.T @ (self.gd[:3] - own @ V @ (self.gw + self.gd))
+        good = values > RANK * float(np.trace(own[:, :3]))
+        x = (usual * _DISCORDS[:, None]) ** 2 * values[good]
+        cost = (np.log1p(x) + score[good] ** 2 / values[good] / (1.0 + x)).sum(axis=1)
+        free = cost.copy()  # the covariance follows the data alone, as with ideal cameras, too
+        cost += (np.log(_DISCORDS) / _LOG_SIGMA) ** 2
+        weight = np.exp(-0.5 * (cost - cost.min()))
+        weight /= weight.sum()
+        turned = np.arange(k) % 6 < 3
+        turned[self.size :] = False
+        by_w, by_d = np.zeros((2, k, k))
+        for discord, w in zip(usual * _DISCORDS, weight, strict=True):
+            if w < _SLIGHT:
+                continue
+            less = Ad[:, :3] @ np.linalg.inv(own[:, :3] * (1.0 + _SLIGHT) + np.eye(3) / discord**2)
+            B = np.where(turned[:, None], w * inverse_information(self.A - less @ own), 0.0)
+            by_w += B
+            by_d += B
+            by_d[:, :3] -= B @ less
+        places = np.zeros((k, k))
+        places[np.ix_(~turned, ~turned)] = inverse_information(Ad[np.ix_(~turned, ~turned)])
+        flat = np.exp(-0.5 * (free - free.min()))
+        likely = usual / float(np.sqrt((flat / flat.sum()) @ _DISCORDS**-2.0))
+        return likely, by_w - places @ Ad @ by_w, by_d + places - places @ Ad @ by_d
 
-    @cached_property
-    def Jd(self) -> Array:
-        """Derivatives (n, 3, m) of ``ed``."""
-        return np.asarray(self._unit.Jd * np.sqrt(self._b))
-
-    def newton(self, moving: int) -> Array:
-        """Inverse of the exact second derivative of the robust cost (Gauss-Newton in the residuals) by the first
-        ``moving`` unknowns; that of the mean slope where the exact one is not positive."""
-        if self.loss is Loss.SQUARES:
-            return self._mean(moving)
+    def _newton(self) -> Array:
+        """Inverse of the exact second derivative; that of the mean slope where it is not positive."""
         N = np.zeros_like(self.A)
         unit = self._unit
-        for J, e, q, m, w, own, inflate in (
-            (unit.Jw, unit.w, self.qw, self.m_w, self.ww, self._a, 1.0),
-            (unit.Jd, unit.d, self.qd, 3.0, self.wd, self._b, self.inflate),
+        for J, e, q, m, w, own in (
+            (unit.Jw, unit.w, self.qw, self.m_w, self.ww, self._a),
+            (unit.Jd, unit.d, self.qd, 3.0, self.wd, self._b),
         ):
-            N += gram(J * np.sqrt(w * own / inflate)[:, None, None])
-            outside = np.where(q > m * _HUBER**2, w / np.maximum(q, 1e-300), 0.0)
-            bend = 2.0 * w / (_STUDENT + q) if self.loss is Loss.STUDENT else outside
-            along = (e * (own * np.sqrt(bend / inflate))[:, None])[:, None, :] @ J
+            N += gram(J * np.sqrt(w * own)[:, None, None])
+            bend = np.where(q > m * _HUBER**2, w / np.maximum(q, 1e-300), 0.0)
+            along = (e * (own * np.sqrt(bend))[:, None])[:, None, :] @ J
             along = along[:, 0]
             N -= along.T @ along
         s = 1.0 / np.sqrt(np.maximum(np.diag(self.A), 1e-300))
         scaled = N * s[:, None] * s
         if _sure_inverse(scaled) is None and float(np.linalg.eigvalsh(scaled)[0]) < -RANK:
-            return self._mean(moving)
-        return inverse_information(N[:moving, :moving])
-
-    def _mean(self, moving: int) -> Array:
-        return self.V if moving == len(self.V) else inverse_information(self.A[:moving, :moving])
+            return self.V
+        return inverse_information(N)
 
     def _whiten(self, lin: Linearised) -> tuple[Array, Array]:
         assert self.root is not None
@@ -160,16 +177,11 @@ class Scaled:
 
     def covariance(self) -> Array:
         """Covariance of the unknowns for the weights used (Huber 1981, 6.3, one factor per group of residuals)."""
-        return self.cross_covariance(self)
-
-    def cross_covariance(self, other: Scaled) -> Array:
-        """Covariance between the unknowns of two fits of the same observations, each with its own weights."""
-        cross_w = float((self.ww * other.ww * (self.ew * other.ew).sum(axis=1)).sum()) / self.free_w
-        cross_d = float((self.wd * other.wd * (self.ed * other.ed).sum(axis=1)).sum()) / self.free_d
-        k, m = self.Jw.shape[2], other.Jw.shape[2]
-        middle = cross_w * self.Jw.reshape(-1, k).T @ other.Jw.reshape(-1, m)
-        middle += cross_d / (self.inflate * other.inflate) * self.Jd.reshape(-1, k).T @ other.Jd.reshape(-1, m)
-        return np.asarray((self.V @ middle @ other.V)[: self.size, : self.size])
+        spread_w = float((self.ww**2 * self.qw).sum()) / self.free_w * self.Gw
+        spread_d = float((self.wd**2 * self.qd).sum()) / self.free_d * self.Gd
+        spread_d += self.discord**2 * (self._Ad[:, :3] @ self._Ad[:3])
+        out = self._by_w @ spread_w @ self._by_w.T + self._by_d @ spread_d @ self._by_d.T
+        return np.asarray(out[: self.size, : self.size])
 
     def information(self) -> Array:
         """Information of the unknowns alone, unweighted by the loss, the noise centre marginalised out."""
@@ -178,27 +190,11 @@ class Scaled:
             return N
         return np.asarray(N[:m, :m] - N[:m, m:] @ np.linalg.pinv(N[m:, m:], rcond=1e-10, hermitian=True) @ N[m:, :m])
 
-    def leave_one_out(self, lin: Linearised) -> tuple[Array, Array]:
-        """Residuals (n, 3), (n, 3) of each observation under the fit without it (exact where linear: PRESS, Allen 1974)."""
-        J = np.concatenate([self.Jw, self.Jd], axis=1)
-        m = self.size
-        u = np.repeat(np.column_stack([self.ww, self.wd / self.inflate]), 3, axis=1)
-        hat = (J @ (self.V @ np.swapaxes(J, 1, 2))) * u[:, None, :]
-        e = np.concatenate([self.ew, self.ed], axis=1)
-        eased = np.linalg.solve(np.eye(6) * (1.0 + 1e-9) - hat, e[:, :, None])
-        change = self.V @ (np.swapaxes(J, 1, 2) @ (u[:, :, None] * eased))
-        out = np.concatenate([lin.w, lin.d], axis=1)
-        out = out + (np.concatenate([lin.Jw, lin.Jd], axis=1)[:, :, :m] @ change[:, :m])[:, :, 0]
-        return out[:, :3], out[:, 3:]
-
 
 def weigh(q: Array, m: Array, loss: Loss) -> tuple[Array, Array]:
     """Weight of squares q (n,) of m numbers each, and the mean slope of weight times residual per number."""
     if loss is Loss.SQUARES:
         return np.ones_like(q), np.ones_like(q)
-    if loss is Loss.STUDENT:
-        w = (_STUDENT + m) / (_STUDENT + q)
-        return w, w * (1.0 - 2.0 * q / (m * (_STUDENT + q)))
     r = np.sqrt(np.maximum(q / m, 1e-300))
     w = np.minimum(1.0, _HUBER / r)
     return w, np.where(r > _HUBER, w * (1.0 - 1.0 / m), 1.0)
@@ -209,12 +205,7 @@ def _growth(q: Array, m: Array, loss: Loss, redundancy: float, share: Array | fl
     much of each observation's variance it is."""
     w, _ = weigh(q, m, loss)
     total = float((w * q).sum())
-    if loss is Loss.STUDENT:
-        power = float((w * q * share * _STUDENT / (_STUDENT + q)).sum())
-    elif loss is Loss.HUBER:
-        power = float((w * q * share * np.where(w < 1.0, 0.5, 1.0)).sum())
-    else:
-        power = float((w * q * share).sum())
+    power = float((w * q * share * np.where(w < 1.0, 0.5, 1.0)).sum())
     ratio = max(total / redundancy, 1e-12)
     least = 0.3 if isinstance(share, float) else 0.1
     return float(np.clip(ratio ** (1.0 / max(power / max(total, 1e-300), least)), 1e-4, 1e4))

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import PoseReading, apply_change
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
-from weldcal.calibration.hand_eye.choice import CANDIDATES
 from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.pairs.conventions import Agreement
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
@@ -57,7 +56,7 @@ def _solvable(one: Agreement, mode: str) -> bool:
     F = one.robot.X if mode == "eye_in_hand" else inverse(one.robot.X)
     try:
         solve_problem(
-            full_problem(F, _scaled(one.camera.X, one.scale)), config=HandEyeConfig(folds=0, candidates=CANDIDATES[:1])
+            full_problem(F, _scaled(one.camera.X, one.scale)), config=HandEyeConfig(folds=0, usual_discord_rad=0.0)
         )
     except WeldcalError:
         return False

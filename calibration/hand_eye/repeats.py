@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, log_rotation, mean_of
-from weldcal.calibration.hand_eye.choice import CANDIDATES, solve
+from weldcal.calibration.hand_eye.choice import solve
 from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
@@ -65,7 +65,7 @@ def one_per_pose(problem: Problem, known: State = (IDENTITY, IDENTITY, IDENTITY)
 def _noise(problem: Problem, known: State) -> _Noise:
     """The noise of one sample of each pose; infinite where no solution is found."""
     try:
-        found = solve(problem, known, candidates=CANDIDATES[:1], pose_only=True).fit
+        found = solve(problem, known, usual_discord=0.0).fit
     except WeldcalError:
         return _Noise(np.inf, np.inf, np.zeros(3))
     own = np.zeros(6) if problem.covariance is None else problem.covariance.diagonal(axis1=1, axis2=2).max(axis=0)

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.errors import UndeterminedPoses
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import IDENTITY, difference, inverse
-from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate, solve
+from weldcal.calibration.hand_eye.choice import USUAL_DISCORD_RAD, solve
 from weldcal.calibration.hand_eye.determinacy import (
     Diversity,
     check_poses,
@@ -34,14 +34,14 @@ _RIGID = 0.05  # deviation of a rotation from orthonormal that two printed decim
 class HandEyeConfig:
     """Settings. ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive;
     ``allow_open``: give an answer even where more than one direction of translation stays open; ``join_repeats``: samples at one robot
-    pose are one observation."""
+    pose are one observation; ``usual_discord_rad``: angle by which rotations and positions of the camera disagree beforehand."""
 
     seed: int = 0
     folds: int = 5
     max_outliers: float = 0.40
     allow_coplanar: bool = False
     allow_open: bool = False
-    candidates: tuple[Candidate, ...] = CANDIDATES
+    usual_discord_rad: float = USUAL_DISCORD_RAD
     join_repeats: bool = True
 
 
@@ -95,7 +95,6 @@ class HandEyeResult:
     condition: float
     method: str
     start: str
-    scores: dict[str, tuple[float, float]]
     diversity: Diversity
     extent: float
     observation: NDArray[np.int64]
@@ -214,7 +213,7 @@ def solve_problem(
         seed=config.seed,
         starts=starts,
         max_outliers=config.max_outliers,
-        candidates=config.candidates,
+        usual_discord=config.usual_discord_rad,
     )
     keep = choice.fit.keep
     used = problem if keep.all() else problem.pick(keep)
@@ -224,7 +223,13 @@ def solve_problem(
     s = choice.fit.scaled
     noise = choice.fit.noise
     found = determinacy(
-        used, choice.state, s.information(), choice.covariance, length, float(np.sqrt(noise.rotation)), labels
+        used,
+        choice.state,
+        s.information(),
+        s.V[: problem.size, : problem.size],
+        length,
+        float(np.sqrt(noise.rotation)),
+        labels,
     )
     _refuse_open(problem, found.directions, found.names, config)
     state = without_drift(used, choice.state, found)
@@ -265,7 +270,6 @@ def solve_problem(
         condition=found.condition,
         method=choice.method,
         start=choice.start,
-        scores=choice.scores,
         diversity=diverse,
         extent=length,
         observation=observation,
@@ -314,8 +318,7 @@ def _held_out(
                 seed=config.seed,
                 starts=starts,
                 max_outliers=config.max_outliers,
-                candidates=config.candidates,
-                pose_only=True,
+                usual_discord=config.usual_discord_rad,
             )
         except WeldcalError:
             continue

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 
 from weldcal.calibration.geometry.se3 import exp_rotation, flange_poses, inverse, nearest_rotation, pose
-from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
@@ -113,10 +112,10 @@ def _read(
     return pose(nearest_rotation(np.asarray(cv2.Rodrigues(turn)[0], dtype=float)), np.asarray(shift, dtype=float)[:, 0])
 
 
-WEIGHTINGS: dict[str, tuple[Candidate, ...]] = {
-    "weldcal": CANDIDATES,
-    "least squares alone": CANDIDATES[:1],
-    "rotations alone": CANDIDATES[5:6],
+WEIGHTINGS = {
+    "weldcal": HandEyeConfig(),
+    "least squares alone": HandEyeConfig(usual_discord_rad=0.0),
+    "rotations alone": HandEyeConfig(usual_discord_rad=1e6),
 }
 NO_ANSWER = 1e9  # the ratio where weldcal gives none: the worst one
 
@@ -128,9 +127,9 @@ def ratios(kind: str, seed: int) -> dict[str, list[float]]:
     whole = [h for h in theirs if np.isfinite(h.translation).all()]
     best = min(h.rms_deg for h in whole), min(h.rms_translation for h in whole)
     out = {}
-    for name, weightings in WEIGHTINGS.items():
+    for name, config in WEIGHTINGS.items():
         try:
-            ours = solve_problem(full_problem(cell.F, cell.G), config=HandEyeConfig(candidates=weightings)).held_out
+            ours = solve_problem(full_problem(cell.F, cell.G), config=config).held_out
             out[name] = [ours.rms_deg / best[0], ours.rms_translation / best[1]]
         except WeldcalError:
             out[name] = [NO_ANSWER, NO_ANSWER]

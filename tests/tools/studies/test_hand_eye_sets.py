@@ -12,7 +12,13 @@ from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.hand_eye.comparison import SETS, HandEyeBenchmark, run_hand_eye_benchmark
+from weldcal.tools.studies.hand_eye.comparison import (
+    SETS,
+    HandEyeBenchmark,
+    dataset_row,
+    lowest_ratio,
+    run_hand_eye_benchmark,
+)
 
 DATA = SHARED_DATA / "handeye"
 
@@ -33,7 +39,7 @@ BARS = {
 }
 MARGIN = 1.02
 # Two small sets (15 and 8 poses) miss the margin by what docs/hand_eye.md states; a third one, or more on these, is a fault.
-BEHIND = {"ros_industrial_charuco_static_camera": 1.029, "visp_franka_eye_in_hand": 1.045}
+BEHIND = {"ros_industrial_circle_grid_camera_on_wrist": 1.029, "visp_franka_eye_in_hand": 1.033}
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +55,18 @@ def test_an_opencv_method_is_ahead_on_two_small_sets_only(report: HandEyeBenchma
     assert set(behind) == set(BEHIND), ratios
     for name, ratio in behind.items():
         assert ratio <= BEHIND[name], f"{name}: {ratio}"
+
+
+@pytest.mark.parametrize("name", sorted(BEHIND))
+def test_no_method_is_ahead_beyond_chance(name: str) -> None:
+    path = DATA / name
+    require_data(path)
+    pairs = read_pairs(path)
+    row = dataset_row(name, pairs.F, pairs.G, None)
+    assert row.holds
+    assert min(row.low_deg, row.low_mm) < 1.0
+    # errors that are a tenth larger in every pose are no chance
+    assert lowest_ratio(1.1 * np.arange(1.0, 9.0), np.arange(1.0, 9.0)) == pytest.approx(1.1)
 
 
 def test_opencv_reaches_the_published_bar_on_the_same_folds() -> None:
