@@ -13,9 +13,9 @@ from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 
-KINDS = ("corners only", "camera", "robot", "both", "target poses", "heavy tails", "poor camera")
+KINDS = ("corners only", "camera", "robot", "both", "target poses", "heavy tails", "poor camera", "far target")
 """What is wrong besides the corners' own noise; "target poses" and "heavy tails": no corners, but poses with noise of their own (normal, or Student's t of
-three degrees of freedom)."""
+three degrees of freedom); "far target": a larger board 2 to 6 m away."""
 _ARMS = ("ur10e", "ur5e")
 _WIDTH, _HEIGHT = 1280.0, 960.0
 _LEAST = 6  # corners in an image that is kept
@@ -60,18 +60,24 @@ def imperfect_cell(kind: str, seed: int) -> Cell:
         true_bend[:2] = 0.02 * much * rng.normal(size=2)
     pixel = rng.uniform(0.1, 0.6)
     rows, columns, side = int(rng.integers(4, 9)), int(rng.integers(5, 12)), rng.uniform(0.012, 0.03)
+    side *= 2.5 if kind == "far target" else 1.0
     flat = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * side
     board: Array = np.column_stack([flat, np.zeros(len(flat))]).astype(np.float64)
     X = pose(exp_rotation(rng.normal(size=3) * 0.7), rng.normal(size=3) * 0.05)
     middle = np.radians([0.0, -80.0, 110.0, -120.0, -90.0, 0.0]) + rng.normal(size=6) * 0.2
-    distance = rng.uniform(0.3, 1.0)
+    distance = rng.uniform(2.0, 6.0) if kind == "far target" else rng.uniform(0.3, 1.0)
     seen_at = pose(
         exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(rng.normal(size=3) * 0.3),
         np.array([0.0, 0.0, distance]),
     )
     seen_at[:3, 3] -= seen_at[:3, :3] @ board.mean(axis=0)
     Y = flange_poses(arm, middle[None], errors)[0] @ X @ seen_at
-    spread = np.radians(rng.uniform(6.0, 35.0)) * np.array([0.4, 0.4, 0.4, 1.0, 1.0, 1.0])
+    # a small turn moves a far target out of the image
+    spread = (
+        np.radians(rng.uniform(6.0, 35.0))
+        * (0.25 if kind == "far target" else 1.0)
+        * np.array([0.4, 0.4, 0.4, 1.0, 1.0, 1.0])
+    )
     path = bool(rng.integers(2))
     F, G = [], []
     walk = np.zeros(6)

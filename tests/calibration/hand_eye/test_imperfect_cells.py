@@ -26,13 +26,16 @@ def test_a_large_discord_lets_rotations_owe_nothing_to_the_translations() -> Non
 
 
 def test_a_wrong_camera_bends_the_rotations_of_least_squares_alone() -> None:
-    cells = [ratios("camera", seed) for seed in (503, 506)]
-    deg, mm = ({name: [cell[name][column] for cell in cells] for name in cells[0]} for column in (0, 1))
-    assert max(deg["weldcal"]) < 1.03
-    assert deg["least squares alone"][0] > 1.05
-    assert all(a <= b for a, b in zip(deg["weldcal"], deg["least squares alone"], strict=True))
-    # and the translations keep a part of what they gain
-    assert all(a < 0.93 * b for a, b in zip(mm["weldcal"], mm["rotations alone"], strict=True))
+    """Ten cells in a row; ratios to the best of OpenCV's methods in each column, geometric means."""
+    cells = [ratios("camera", seed) for seed in range(502, 512)]
+    deg, mm = (
+        {name: float(np.exp(np.mean([np.log(c[name][column]) for c in cells]))) for name in cells[0]}
+        for column in (0, 1)
+    )
+    assert deg["weldcal"] < 1.01
+    assert deg["weldcal"] + 0.01 < deg["least squares alone"]
+    # and the translations keep most of what they gain
+    assert mm["weldcal"] < 0.8 < mm["rotations alone"]
 
 
 def test_a_target_at_five_metres_is_placed_by_its_translations() -> None:
