@@ -205,7 +205,7 @@ class CalibrationStatus(Message):
     @property
     def correction(self) -> ScannerCorrection:
         """The correction of scanned points; the identity where none was estimated."""
-        found = None if self.estimate is None else self.estimate.scanner
+        found = None if self.estimate is None else self.estimate.correction
         return ScannerCorrection() if found is None else found
 
 

@@ -37,6 +37,16 @@ class ScannerCorrection:
         if not np.isfinite(values).all() or abs(self.scale - 1.0) > _LARGEST or len(self.values) not in TERMS.values():
             raise InputError("The scanner correction is invalid: its scale must lie within 5 % of 1.")
 
+    @classmethod
+    def unchanged(cls, terms: int) -> "ScannerCorrection":
+        """The correction with that many terms (3, 6 or 10) that changes nothing: for its derivatives."""
+        return cls(bend=(0.0,) * (terms - 3))
+
+    @property
+    def changes(self) -> bool:
+        """Whether it moves any point."""
+        return bool(self.scale != 1.0 or np.any(self.values[1:]))
+
     @property
     def values(self) -> Array:
         """Factors (K,) of the terms, K = 3, 6 or 10."""

@@ -33,9 +33,10 @@ class CalibrationEstimate:
     base side about the camera origin, dp (m) the displacement of the camera origin, both expressed in B.
     ``position_residuals_m`` (n,) and ``tilt_residuals_rad`` (n,; NaN without a normal) are in the order of the
     observations; the covariance is widened so that its Gaussian 95 % region holds the truth that often with few poses, too.
-    Where the scanner was corrected it contains what that leaves open, and ``joint`` (6 + K, 6 + K) is that of X_BC and the K
-    factors of ``scanner`` together. ``sigma_position_m`` (per axis) and ``sigma_normal_rad`` (per axis) are the spread of robot
-    and scanner together beyond the noise of the fits, estimated from the residuals.
+    Where the scanner's errors were estimated it contains what that leaves open, and ``joint`` (6 + K, 6 + K) is that of X_BC and
+    the K factors of ``scanner`` together; a ``scanner`` that changes nothing was not found wrong. ``sigma_position_m`` and
+    ``sigma_normal_rad`` (per axis) are the spread of robot and scanner together beyond the noise of the fits, estimated from the
+    residuals.
     """
 
     X_BC: RigidTransform
@@ -50,6 +51,11 @@ class CalibrationEstimate:
     warnings: tuple[str, ...]
     scanner: ScannerCorrection | None = None
     joint: Array | None = None
+
+    @property
+    def correction(self) -> ScannerCorrection | None:
+        """The correction to apply to scans; None where the scanner is taken as it is."""
+        return self.scanner if self.scanner is not None and self.scanner.changes else None
 
 
 def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:

@@ -1,18 +1,21 @@
 """Estimates X_BC from one, two or three scans, from normals or from whole poses by the hole pattern."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut
+from weldcal.calibration.eye_on_base.observations import corrected_observation
+from weldcal.calibration.eye_on_base.scanner_fit import expected_factors
 from weldcal.calibration.eye_on_base.solve import USUAL_SPREAD_M, USUAL_TILT_RAD, SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector, skew
 from weldcal.calibration.planning.observability import unobservable_sentences
 from weldcal.models.arrays import Array
 
@@ -21,6 +24,7 @@ ENOUGH = 4
 
 _TURN_KNOWN_RAD = float(np.radians(0.1))  # as well as a calibration from many poses states it, and as a person would
 _HOLE_CIRCLE_M = 0.025
+_TERMS = 6  # of the correction that few scans leave open
 _USUAL_WEIGHT = 4.0  # residuals' worth of what is usual of robot and scanner
 
 
@@ -47,7 +51,10 @@ def estimate_from_whole_poses(
     total = np.zeros((3, 3))
     for o in seen:
         R_BR = o.X_BR.rotation().matrix() @ turn
-        total += R_BR @ patterns[o.id].X_CR.rotation().matrix().T
+        R_CR = patterns[o.id].X_CR.rotation().matrix()
+        if o.n_C is not None:  # a correction of the scanner turns the face: the pattern with it
+            R_CR = exp_rotation(np.cross(R_CR[:, 2], o.n_C)) @ R_CR
+        total += R_BR @ R_CR.T
     u, _, vt = np.linalg.svd(total)
     R = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
     c, b = np.array([o.p_CR for o in seen]), np.array([o.p_BR for o in seen])
@@ -105,7 +112,7 @@ def calibrate_from_few(
     """
     n = len(observations)
     if axis_turn_rad is not None:
-        return _from_whole_poses(observations, patterns, axis_turn_rad)
+        return _said(_from_whole_poses(observations, patterns, axis_turn_rad), len(_with_turn(observations, patterns)))
     normals = all(o.n_C is not None for o in observations)
     need = 2 if normals else 3
     if n < need:
@@ -115,9 +122,34 @@ def calibrate_from_few(
             "hole pattern is turned about the flange's axis with --axis-turn DEGREES (a calibration from many scans reports it)."
         )
     config = SolveConfig(seed=seed, min_poses=need, allow_coplanar=True, usual_weight=_USUAL_WEIGHT)
+    estimate = estimate_eye_on_base(tuple(observations), config)
+    once = replace(config, leave_one_out=False)
     return _said(
-        estimate_eye_on_base(observations if isinstance(observations, tuple) else list(observations), config), n
+        _with_open_scanner(estimate, observations, lambda some: estimate_eye_on_base(tuple(some), once).X_BC), n
     )
+
+
+def _with_open_scanner(
+    estimate: CalibrationEstimate,
+    observations: Sequence[Observation],
+    solve: Callable[[Sequence[Observation]], RigidTransform],
+) -> CalibrationEstimate:
+    """The estimate with a covariance that holds what scanners are usually off: so few scans do not show it.
+
+    Had the scanner needed the factors v, ``solve`` would have found X_BC moved by L v (derivative by differences).
+    """
+    sigma = expected_factors(_TERMS, float(np.median([o.p_CR[2] for o in observations])))
+    R, p = estimate.X_BC.rotation(), estimate.X_BC.translation()
+    L = np.zeros((6, _TERMS))
+    for k, step in enumerate(0.1 * sigma):
+        values = ScannerCorrection.unchanged(_TERMS).values
+        values[k] += step
+        correction = ScannerCorrection(values[0], (values[1], values[2]), tuple(values[3:]))
+        moved = solve([corrected_observation(correction, o) for o in observations])
+        L[:, k] = np.concatenate([rotation_vector(moved.rotation() @ R.inverse()), moved.translation() - p]) / step
+    left = L * sigma
+    joint = np.block([[estimate.covariance + left @ left.T, left * sigma], [(left * sigma).T, np.diag(sigma**2)]])
+    return replace(estimate, covariance=joint[:6, :6], joint=joint, scanner=ScannerCorrection.unchanged(_TERMS))
 
 
 def _from_whole_poses(
@@ -127,16 +159,20 @@ def _from_whole_poses(
     ids = {o.id for o in seen}
     X = estimate_from_whole_poses(observations, patterns, turn_rad).X_BC
     n = len(seen)
-    information = np.zeros((3, 3))
+    information, own = np.zeros((3, 3)), np.zeros((3, 3))
     for o in seen:
         R = o.X_BR.rotation().matrix()
-        sigma = np.array([USUAL_TILT_RAD, USUAL_TILT_RAD, max(patterns[o.id].rms_m / _HOLE_CIRCLE_M, USUAL_TILT_RAD)])
+        tilt = float(np.hypot(USUAL_TILT_RAD, o.normal_sigma or 0.0))
+        sigma = np.array([tilt, tilt, max(patterns[o.id].rms_m / _HOLE_CIRCLE_M, USUAL_TILT_RAD)])
         information += R @ np.diag(1.0 / sigma**2) @ R.T
+        if o.center_covariance is not None:
+            R_BC = X.rotation().matrix()
+            own += R_BC @ o.center_covariance @ R_BC.T / n**2
     axis = np.mean([o.n_B for o in seen], axis=0)
     # the turn is stated once for all scans: its error does not average out
     rotation = np.linalg.inv(information) + _TURN_KNOWN_RAD**2 * np.outer(axis, axis)
     covariance = np.zeros((6, 6))
-    covariance[:3, :3], covariance[3:, 3:] = rotation, USUAL_SPREAD_M**2 / n * np.eye(3)
+    covariance[:3, :3], covariance[3:, 3:] = rotation, USUAL_SPREAD_M**2 / n * np.eye(3) + own
     T = np.eye(6)
     T[3:, :3] = -skew(np.asarray(X.translation()) - np.mean([o.p_BR for o in seen], axis=0))
     held_out = np.full((2, len(observations)), np.nan)
@@ -157,7 +193,7 @@ def _from_whole_poses(
         unobservable=unobservable_sentences([o.X_BR for o in seen], USUAL_SPREAD_M, True),
         warnings=(),
     )
-    return _said(estimate, n)
+    return _with_open_scanner(estimate, seen, lambda some: estimate_from_whole_poses(some, patterns, turn_rad).X_BC)
 
 
 def _said(estimate: CalibrationEstimate, n: int) -> CalibrationEstimate:

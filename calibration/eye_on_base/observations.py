@@ -1,6 +1,8 @@
 """Fits the flange in every cloud of a dataset; returns observations and the reasons of refused scans."""
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,20 +61,25 @@ def see_flanges(
     patterns: dict[str, HolePattern] = {}
     clouds: dict[str, Array] = {}
     refused = list(data.refused)
-    for k, id in enumerate(data.clouds):
-        tell(k / len(data.clouds))
+
+    def measured(id: str) -> tuple[FlangeFit, HolePattern | None, Array] | CloudError | FlangeNotFound:
         try:
             points = data.cloud(id)
             fit = _fit(points, standard, _guess(data, id, standard, X_BC), seed, whole=X_BC is not None)
-        except (CloudError, FlangeNotFound) as e:
-            refused.append((id, e.reason))
-            continue
-        fits[id] = fit
-        pattern = find_holes(points, fit, standard) if holes else None
-        if pattern is not None:
-            patterns[id] = pattern
-        clouds[id] = face_cloud(points, fit, standard)
-        observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
+        except (CloudError, FlangeNotFound) as refusal:
+            return refusal
+        return fit, find_holes(points, fit, standard) if holes else None, face_cloud(points, fit, standard)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and fitting leave the interpreter most of the time
+        for k, (id, found) in enumerate(zip(data.clouds, pool.map(measured, data.clouds), strict=True)):
+            tell(k / len(data.clouds))
+            if isinstance(found, CloudError | FlangeNotFound):
+                refused.append((id, found.reason))
+                continue
+            fits[id], pattern, clouds[id] = found
+            if pattern is not None:
+                patterns[id] = pattern
+            observations.append(observation_from_fit(id, data.poses[id], fits[id], data.X_FR))
     if len(data.readings) > 1 and observations:
         data = _read_by_scans(data, observations)
         observations = [observation_from_fit(id, data.poses[id], fit, data.X_FR) for id, fit in fits.items()]

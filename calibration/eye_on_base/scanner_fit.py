@@ -110,7 +110,7 @@ def from_motion(
     sigma_r = _ratio_sigma(rows[:, :3], ratio)
     size = 6 + terms + (3 if len(ratio) else 0)  # with circles: three for what is their own, see CIRCLE_OWN
     prior = np.zeros(size)
-    prior[6 : 6 + terms] = 1.0 / _expected(terms, float(np.median(c[:, 2])), usual)
+    prior[6 : 6 + terms] = 1.0 / expected_factors(terms, float(np.median(c[:, 2])), usual)
     prior[6 + terms :] = 1.0 / CIRCLE_OWN[: size - 6 - terms]
     found = _gauss_newton(
         *(c, b, vague, shape.terms(c)),  # a correction is linear in its factors
@@ -155,8 +155,8 @@ def correction_of(change: Array, field: tuple[float, float, float, float] | None
     return ScannerCorrection(1.0 + float(limited), (float(change[1]), float(change[2])), bend, field if bend else None)
 
 
-def _expected(terms: int, depth: float, usual: bool) -> Array:
-    """Standard deviations (K,) of the factors before anything is seen; bends by their size at the edge of the image."""
+def expected_factors(terms: int, depth: float, usual: bool = True) -> Array:
+    """Standard deviations (K,) of a correction's factors before any scan, at a depth (m); bends by their size at the edge of the image."""
     edge = _EDGE * depth
     bends = np.concatenate([np.full(3, _USUAL_BEND / edge**2), np.full(4, _USUAL_BEND / edge**3)])
     return np.concatenate([_USUAL if usual else _LOOSE, bends])[:terms]

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
@@ -47,11 +47,8 @@ def stated_median_limit(
     if not result.sigma_position_mm > 0.0 or not observations:
         return floor
     rng = np.random.default_rng(_SEED)
-    joint = result.joint_covariance if correction is not None else None
-    if joint is not None and correction is not None and len(joint) != 6 + len(correction.values):
-        joint = None  # of another correction
-    J = np.array([_sensitivity(result, o, correction if joint is not None else None) for o in observations])
-    whole = result.covariance if joint is None else joint
+    whole, correction = joint_terms(result, correction)
+    J = np.array([_sensitivity(result, o, correction) for o in observations])
     if shared is not None:
         J, whole = shared
     values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
@@ -73,6 +70,19 @@ def stated_median_limit(
         medians[k] = np.median(np.sqrt(np.vecdot(error, error)), axis=1)
     limit = 1e3 * float(np.quantile(medians, 1.0 - FALSE_ALARM))
     return limit if floor is None else max(limit, floor)
+
+
+def joint_terms(
+    result: CalibrationResult, correction: ScannerCorrection | None
+) -> tuple[Array, ScannerCorrection | None]:
+    """The covariance of X_BC and correction together, (6 + K, 6 + K), with the correction whose K terms belong to it (one that changes
+    nothing where the scanner was not found wrong); that of X_BC alone and None where the two do not fit."""
+    joint = result.joint_covariance
+    if joint is not None and correction is None and len(joint) - 6 in TERMS.values():
+        correction = ScannerCorrection.unchanged(len(joint) - 6)
+    if joint is None or correction is None or len(joint) != 6 + len(correction.values):
+        return result.covariance, None
+    return joint, correction
 
 
 def orientations_of(observations: Sequence[Observation], X_FR: RigidTransform | None = None) -> dict[str, Any]:

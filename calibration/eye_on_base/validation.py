@@ -1,4 +1,4 @@
-"""Held-out errors of a calibration: k-fold cross-validation and convergence over the number of scans."""
+"""Held-out errors of a calibration: k-fold cross-validation, convergence over the number of scans, intervals of new errors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +10,7 @@ from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.robust import t_quantile
 from weldcal.calibration.published.algorithm1 import Cost, algorithm1_start, algorithm1_step, translation_cost
 from weldcal.calibration.published.icp import VerificationError, Verifier
 from weldcal.models.arrays import Array
@@ -21,7 +22,8 @@ Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
 
 def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
     """Distances (n,) m between the flange centres by the calibration and by the robot."""
-    return np.array([float(np.linalg.norm(X_BC @ o.p_CR - o.p_BR)) for o in observations])
+    p_C, p_B = (np.array([getattr(o, name) for o in observations]).reshape(-1, 3) for name in ("p_CR", "p_BR"))
+    return np.asarray(np.linalg.norm(X_BC.multiply(p_C.T).T - p_B, axis=1))
 
 
 def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
@@ -130,9 +132,15 @@ def run_algorithm1(
 
 
 def convergence(
-    observations: Sequence[Observation], verification: Verifier | None, *, orders: int = 8, seed: int = 0
+    observations: Sequence[Observation],
+    verification: Verifier | None,
+    *,
+    orders: int = 8,
+    seed: int = 0,
+    solve: Solve | None = None,
 ) -> Convergence:
-    """Both methods over seeded orders of the same scans, in the manner of the paper's Fig. 11; at least two scans judge."""
+    """Both methods over seeded orders of the same scans, in the manner of the paper's Fig. 11; at least two scans judge. ``solve``
+    replaces the plain estimate, as in k_fold."""
     n = len(observations)
     counts = np.unique(np.concatenate([np.arange(4, 10), np.round(np.geomspace(9, max(n, 10), 8)).astype(int)]))
     counts = counts[counts <= n - 2]
@@ -146,12 +154,51 @@ def convergence(
         for k, m in enumerate(counts):
             rows = slice(r * n, r * n + n - int(m))
             try:
-                X = estimate_eye_on_base(shuffled[:m], config).X_BC
-                held_out[rows, k] = position_errors(X, shuffled[m:])
+                X, correction = (
+                    (estimate_eye_on_base(shuffled[:m], config).X_BC, ScannerCorrection())
+                    if solve is None
+                    else solve(shuffled[:m])
+                )
+                seen = correction.points(np.array([o.p_CR for o in shuffled[m:]]))
+                p_B = np.array([o.p_BR for o in shuffled[m:]])
+                held_out[rows, k] = np.linalg.norm(X.multiply(seen.T).T - p_B, axis=1)
             except InputError:
                 pass  # the first m scans of this order lie in one plane
-            seen = 0 if run is None else int((run.counts <= m).sum())
-            if run is not None and seen:
-                figure[r, k] = run.figures[seen - 1]
-                figure_true[rows, k] = position_errors(run.path[seen - 1], shuffled[m:])
+            taken = 0 if run is None else int((run.counts <= m).sum())
+            if run is not None and taken:
+                figure[r, k] = run.figures[taken - 1]
+                figure_true[rows, k] = position_errors(run.path[taken - 1], shuffled[m:])
     return Convergence(counts.astype(float), held_out, figure, figure_true)
+
+
+def mean_interval(errors: Array, level: float = 0.95) -> tuple[float, float] | None:
+    """Interval in which the mean error of as many new poses lies with that probability; None for fewer than four errors.
+
+    From the scatter of the held-out ``errors`` (n,) themselves: both means know theirs to c / sqrt(n), c the coefficient
+    of variation, so the logarithm of their ratio has the variance 2 c^2 / n (Student's t with n - 1 degrees of freedom).
+    """
+    e = np.asarray(errors, dtype=float)
+    e = e[np.isfinite(e)]
+    n = len(e)
+    if n < 4 or not e.mean() > 0.0:
+        return None
+    spread = float(np.std(e, ddof=1) / e.mean() * np.sqrt(2.0 / n) * t_quantile(0.5 + 0.5 * level, n - 1))
+    return float(e.mean() * np.exp(-spread)), float(e.mean() * np.exp(spread))
+
+
+def bootstrap_interval(
+    errors: Array, share: float = 0.5, level: float = 0.95, seed: int = 0
+) -> tuple[float, float] | None:
+    """Interval in which the quantile ``share`` of as many new errors lies with that probability; None for fewer than four errors.
+
+    From 4 000 pairs of resamples of the held-out ``errors`` (n,): one stands for what was seen, the other for what comes, and the
+    ratio of their quantiles is that of the new one to the reported one (bootstrap, Efron and Tibshirani 1993, 13.3).
+    """
+    e = np.asarray(errors, dtype=float)
+    e = e[np.isfinite(e)]
+    if len(e) < 4 or not e.min() > 0.0:
+        return None
+    drawn = np.quantile(e[np.random.default_rng(seed).integers(len(e), size=(2, 4000, len(e)))], share, axis=2)
+    low, high = np.quantile(drawn[1] / drawn[0], [0.5 - 0.5 * level, 0.5 + 0.5 * level])
+    reported = float(np.quantile(e, share))
+    return reported * float(low), reported * float(high)

@@ -101,7 +101,7 @@ def error_budget(
     judged = len(held) >= 4
     whole2 = float(np.mean(held**2)) if judged else 3.0 * estimate.sigma_position_m**2 + noise2
     estimated2 = float(np.mean([sum(_estimated(estimate, o.p_BR)) for o in kept])) if judged else 0.0
-    corrected = estimate.scanner is not None
+    corrected = estimate.correction is not None
     if not corrected:
         off = np.array([o.p_BR for o in kept]) - middle
         scanner2 = (USUAL_SCALE if scale_error is None else scale_error) ** 2 * float((off**2).sum(axis=1).mean())

@@ -10,6 +10,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
+from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
@@ -24,7 +25,7 @@ from weldcal.calibration.refinement.kinematics_fit import (
     fit_kinematics,
     unsought,
 )
-from weldcal.calibration.refinement.local_field import GAIN, PlainSolve, calibrate_plain
+from weldcal.calibration.refinement.local_field import GAIN
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arrays import Array
@@ -67,14 +68,12 @@ def choose_kinematics(
     *,
     correct_scanner: bool = True,
     seed: int = 0,
-    plain_solve: PlainSolve | None = None,
 ) -> KinematicsChoice:
     """Fit errors of the arm to n inlier observations at joint angles q (n, joints), from their plain estimate, and decide on them.
 
     In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if the mean falls by
     5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The prior
-    is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more. ``plain_solve``: how the plain
-    calibration was made, where it is not that of `calibrate`.
+    is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more.
 
     Raises TooFewPoses below twelve, InputError for poses of one orientation or an unknown ``kind``.
     """
@@ -102,7 +101,7 @@ def choose_kinematics(
         rest = np.setdiff1d(np.arange(n), test)
         train, new = [observations[i] for i in rest], [observations[i] for i in test]
         try:
-            X, c = plain_solve(train) if plain_solve else calibrate_plain(train, patterns, correct_scanner, seed)
+            X, c = solve_jointly(train, patterns, correct_scanner=correct_scanner, seed=seed)
         except InputError:
             continue
         plain[test] = position_errors(X, [corrected_observation(c, o) for o in new])
@@ -117,7 +116,7 @@ def choose_kinematics(
     used = 2 if large else 1
     refined, tilt, after = new_m[used], new_tilt[used], means[used]
     holes = from_holes(observations, patterns)
-    start = estimate.scanner or ScannerCorrection()
+    start = estimate.correction or ScannerCorrection()
     fit = fit_kinematics(
         observations,
         q,

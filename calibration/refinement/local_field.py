@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut
-from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
+from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -176,8 +176,6 @@ def _kernel(p: Array, R: Array, q: Array, S: Array, values: Array) -> Array:
 
 GAIN = 0.95
 """Share of the nested held-out mean error that a refinement must leave at most."""
-PlainSolve = Callable[[Sequence[Observation]], tuple[RigidTransform, ScannerCorrection]]
-"""Makes the plain calibration from some of the poses; raises InputError where they are too few."""
 _FOLDS = 20  # at most; up to so many poses each is held out alone
 _STARTS = 60
 
@@ -205,13 +203,12 @@ def choose_local(
     *,
     correct_scanner: bool = True,
     seed: int = 0,
-    plain_solve: PlainSolve | None = None,
 ) -> LocalChoice:
     """Fit a field to the held-out residuals of a calibration (``X_BC`` with ``correction``) of n inlier observations, and decide on it.
 
     For every held-out pose (20 folds at most) the whole is repeated without it: the choice of the scanner's correction, the held-out
-    residuals of the others, the field and its lengths. The field is accepted if the mean of these errors falls by 5 %.
-    ``plain_solve``: how the plain calibration was made, where it is not that of `calibrate`. Raises TooFewPoses below ten.
+    residuals of the others, the field and its lengths. The field is accepted if the mean of these errors falls by 5 %. Raises
+    TooFewPoses below ten.
     """
     n = len(observations)
     if n < LEAST:
@@ -227,7 +224,7 @@ def choose_local(
         held = set(test.tolist())
         rest = [o for i, o in enumerate(observations) if i not in held]
         try:
-            X, c = plain_solve(rest) if plain_solve else calibrate_plain(rest, patterns, correct_scanner, seed)
+            X, c = solve_jointly(rest, patterns, correct_scanner=correct_scanner, seed=seed)
             without = fit_field([o.X_BR for o in rest], held_out_residuals(rest, patterns, X, c, seed))
         except InputError:
             continue
@@ -252,15 +249,6 @@ def choose_local(
     )
 
 
-def calibrate_plain(
-    observations: Sequence[Observation], patterns: Mapping[str, HolePattern], correct_scanner: bool, seed: int
-) -> tuple[RigidTransform, ScannerCorrection]:
-    """X_BC and correction that `calibrate` finds without a refinement, choices included."""
-    if correct_scanner:
-        return calibrate_by_choice(observations, patterns, seed=seed)
-    return _rigid(observations, seed), ScannerCorrection()
-
-
 def held_out_residuals(
     observations: Sequence[Observation],
     patterns: Mapping[str, HolePattern],
@@ -270,11 +258,10 @@ def held_out_residuals(
 ) -> Array:
     """Residuals (n, 3) m, in the base, of each pose under the same kind of calibration without it."""
     out = np.empty((len(observations), 3))
-    plain = np.array_equal(correction.values, ScannerCorrection().values)
     for i, o in enumerate(observations):
         rest = [other for k, other in enumerate(observations) if k != i]
         try:
-            if plain:
+            if not correction.changes:
                 X, c = _rigid(rest, seed), correction
             else:
                 found = from_motion(rest, patterns, seed=seed, order=correction.order, usual=True, start=X_BC)

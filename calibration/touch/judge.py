@@ -17,6 +17,7 @@ from weldcal.calibration.eye_on_base.stated_error import (
     USUAL_FIELD_M,
     USUAL_TURN_RAD,
     feature_rotation,
+    joint_terms,
     scatter_elsewhere,
 )
 from weldcal.calibration.flange.observation import Observation
@@ -142,9 +143,7 @@ def _calibration_terms(
         stated = shared_error(result, kinematics, correction, tips, np.array([t.q for t in touches]))
         if stated is not None:
             return stated
-    joint = result.joint_covariance
-    if joint is None or correction is None or len(joint) != 6 + len(correction.values):
-        joint, correction = result.covariance, None
+    joint, correction = joint_terms(result, correction)
     J = []
     R = result.X_BC.rotation()
     for t in touches:

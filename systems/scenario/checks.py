@@ -7,10 +7,10 @@ from typing import Any, get_args, get_origin
 
 import numpy as np
 
+from weldcal.calibration.calibrate import LIVE_KINDS, PLAIN
 from weldcal.calibration.published.algorithm1 import named_cost
 from weldcal.calibration.refinement.kinematics_choice import LEAST as LEAST_OF_ARM
 from weldcal.calibration.refinement.local_field import LEAST as LEAST_OF_FIELD
-from weldcal.calibration.refinement.refined import LIVE_KINDS, PLAIN
 from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot

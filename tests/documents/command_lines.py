@@ -49,6 +49,7 @@ SHORT = (
     (r"benchmark robot$", "benchmark robot --minutes 0.2"),
     (r"(benchmark flange --what live) --seeds 12 --redraws 200", r"\1 --seeds 1 --redraws 5 --scans 4"),
     (r"(benchmark flange --what honesty) --runs 500", r"\1 --runs 10"),
+    (r"(benchmark flange --what stated)", r"\1 --runs 2"),
     (r"benchmark seam-planning --runs 5", "benchmark seam-planning --runs 1 --preset phoxi_m --no-troubles"),
     (r"reproduce flange (\S+)", r"reproduce flange \1 --quick"),
     (r"reproduce flange-sphere$", "reproduce flange-sphere --scans 20 --draws 3"),

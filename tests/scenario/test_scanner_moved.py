@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
 from tests.calibration.eye_on_base.test_change_point import moved
-from tests.calibration.eye_on_base.test_self_calibration import RIGHT, X_BC, _cell
+from tests.calibration.eye_on_base.test_joint_fit import RIGHT, X_BC, _cell
 from weldcal.calibration.flange.observation import Observation
 from weldcal.tools.cli.app import app
 

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,29 +11,23 @@ import numpy as np
 import typer
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.calibrate import KINEMATICS_FILE, REFINEMENTS, Steps
+from weldcal.calibration.calibrate import calibrate as calibrate_observations
+from weldcal.calibration.calibrate import refine as refine_calibration
 from weldcal.calibration.data.checks import is_motion
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
-from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
-from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
+from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
 from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig
 from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.refined import (
-    KINEMATICS_FILE,
-    REFINEMENTS,
-    Plain,
-    Refined,
-    refine_arm,
-    refine_locally,
-)
 from weldcal.calibration.refinement.stated_arm import joint_angles, require_joint_angles
 from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.models.arms.chain import load_chain
@@ -53,7 +48,6 @@ from weldcal.tools.cli.options import (
     switch,
 )
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
-from weldcal.tools.commands.contradictions import estimate_consistent
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
 from weldcal.tools.console import Progress
 from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
@@ -216,58 +210,33 @@ def calibrate_dataset(
     data = seen.data or data
     observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
     few = len(observations) < ENOUGH
-    tcp: tuple[str, ...] = ()
     with examined_where_refused(Path(out), data, seen, standard, seed):
         _enough(observations, refused)
-        tell("solving", 0.7)
-        if few:
-            turn = None if axis_turn_deg is None else float(np.radians(axis_turn_deg))
-            estimate = calibrate_from_few(observations, seen.patterns, turn, seed=seed)
-        else:
-            config = SolveConfig(seed=seed, allow_coplanar=bool(fits))
-            X_FR = None if data.pairs else data.X_FR
-            estimate, tcp = estimate_consistent(observations, config, X_FR, 0.5 * standard.outer_m)
-    tell("estimating the scanner correction", 0.72)
-    rigid = estimate
-    scanner, corrected, estimate = apply_self_calibration(
-        observations, rigid, seen.patterns, seed=seed, wanted=correct_scanner and not few, nested=refine is None
-    )
-    refined: Refined | None = None
-    if refine is not None:
-        tell("refining", 0.73)
-        refined = refine_calibration(
-            refine,
-            data,
-            Plain(
-                observations=observations,
-                corrected=tuple(corrected),
-                patterns=seen.patterns,
-                estimate=estimate,
-                correction=None if scanner is None else scanner.accepted,
-                correct_scanner=correct_scanner and not few,
-            ),
-            robot or data.header.robot,
-            kinematics,
+        steps = Steps(
+            patterns=seen.patterns,
+            correct_scanner=correct_scanner,
+            axis_turn_rad=None if axis_turn_deg is None else float(np.radians(axis_turn_deg)),
+            X_FR=None if data.pairs else data.X_FR,
+            feature_m=0.5 * standard.outer_m,
+            coplanar=bool(fits),
             seed=seed,
         )
-        estimate, corrected = refined.estimate, list(refined.observations)
+        found = calibrate_observations(observations, steps, lambda step: tell(step, 0.72))
+    if refine is not None:
+        tell("refining", 0.73)
+        steps = _refinement(refine, steps, data, observations, robot or data.header.robot, kinematics)
+        found = refine_calibration(found, observations, steps)
+    estimate, corrected, scanner, refined = found.estimate, found.observations, found.scanner, found.refined
     outliers = tuple(o.id for o, keep in zip(observations, estimate.inliers, strict=True) if not keep)
     errors = dict(zip((o.id for o in observations), estimate.position_residuals_m, strict=True))
     refused += [
         (i, f"Its centre disagrees by {1e3 * errors[i]:.1f} mm with the other poses; it is not used.") for i in outliers
     ]
     inliers = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
-    accepted = None if scanner is None else scanner.accepted
-    chose = scanner is not None and (scanner.could_choose or scanner.accepted is not None)
     tell("cross-validating", 0.75)
+    solve = partial(solve_jointly, patterns=seen.patterns, correct_scanner=correct_scanner and not few, seed=seed)
     folds = (
-        k_fold(
-            inliers,
-            folds=min(5, len(inliers)),
-            repeats=2 if chose else 5,
-            seed=seed,
-            solve=(lambda poses: calibrate_by_choice(poses, seen.patterns, seed=seed)) if chose else None,
-        )
+        k_fold(inliers, folds=min(5, len(inliers)), repeats=5, seed=seed, solve=solve)
         if len(inliers) >= 6
         else np.full((1, 1), np.nan)
     )
@@ -276,8 +245,8 @@ def calibrate_dataset(
     algorithm1, verifier, icp = compare_algorithm1(
         observations, inliers if compare else [], clouds, fits, standard, seed
     )
-    curve = convergence(inliers, verifier, orders=8, seed=seed)
-    warnings = [*tcp, *estimate.warnings]
+    curve = convergence(inliers, verifier, orders=8, seed=seed, solve=solve)
+    warnings = [*found.warnings, *estimate.warnings]
     if data.pairs and not any(p.has_orientation for p in data.pairs):
         warnings.append(
             "The pairs have no orientations. A constant error of the flange centre would not show in these figures."
@@ -297,9 +266,7 @@ def calibrate_dataset(
         warnings.append(refined.sentence)
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
-    if refined is not None and refined.correction is not None:
-        accepted = refined.correction
-    correction = None if accepted is None else accepted.document()
+    correction = None if found.correction is None else found.correction.document()
     result = CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
@@ -318,7 +285,7 @@ def calibrate_dataset(
         data_hashes=data.hashes,
         scanner_correction=correction,
         joint_covariance=estimate.joint,
-        axis_turn_deg=_axis_turn(inliers, seen.patterns, rigid.X_BC) if axis_turn_deg is None else None,
+        axis_turn_deg=_axis_turn(inliers, seen.patterns, found.X_rigid) if axis_turn_deg is None else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
         orientations=orientations_of(inliers, None if data.pairs else data.X_FR)
         if not data.pairs or all(p.has_orientation for p in data.pairs)
@@ -333,7 +300,7 @@ def calibrate_dataset(
     report = CalibrationReport(
         result=result,
         estimate=estimate,
-        observations=tuple(corrected),
+        observations=corrected,
         scanner=scanner,
         fits=fits,
         refused=tuple(refused),
@@ -365,26 +332,23 @@ def calibrate_dataset(
     return report
 
 
-def refine_calibration(
-    kind: str, data: Dataset, plain: Plain, robot: str, kinematics: Path | None, *, seed: int
-) -> Refined:
-    """Refine a calibration by ``kind`` of REFINEMENTS; it stays as it is, but for nested held-out errors, where that does not help.
-
-    Raises TooFewPoses and other InputErrors where the data cannot be refined in this way.
-    """
+def _refinement(
+    kind: str, steps: Steps, data: Dataset, observations: list[Observation], robot: str, kinematics: Path | None
+) -> Steps:
+    """The steps with a refinement of REFINEMENTS. Raises InputError where the arm or its joint angles are not known."""
     if kind == "local":
-        return refine_locally(plain, seed=seed)
+        return replace(steps, refine=kind)
     if robot not in known_arms():
         raise InputError(
             f"Errors of the arm (--refine {kind}) are written as Universal Robots' kinematics: name one of {', '.join(known_arms())} with "
             "--robot, or use --refine local."
         )
     arm = load_chain(robot, kinematics)
-    ids = [o.id for o in plain.observations]
+    ids = [o.id for o in observations]
     poses = {p.id: p.X_BR for p in data.pairs} or data.poses
     q = require_joint_angles(data, ids, arm, np.array([poses[id].GetAsMatrix4() for id in ids]))
     note = f"{robot}, refined by weldcal calibrate --refine {kind}"
-    return refine_arm(kind, plain, q, arm, note=note, seed=seed)
+    return replace(steps, refine=kind, arm=arm, joints=q, note=note)
 
 
 def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:

@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from pydrake.systems.framework import Context
 
+from weldcal.calibration.calibrate import KINEMATICS_FILE
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
@@ -13,7 +14,6 @@ from weldcal.calibration.doctor.case import Case
 from weldcal.calibration.doctor.record import case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.stated_error import orientations_of
-from weldcal.calibration.refinement.refined import KINEMATICS_FILE
 from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.models.result_files import whole_result
 from weldcal.systems.cell import Cell
@@ -157,7 +157,7 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
         sigma_position_mm=1e3 * estimate.sigma_position_m,
         sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
         seed=seed,
-        scanner_correction=None if estimate.scanner is None else estimate.scanner.document(),
+        scanner_correction=None if estimate.correction is None else estimate.correction.document(),
         joint_covariance=estimate.joint,
         orientations=orientations_of(inliers, cell.job.X_FR),
         observed=observed_document(

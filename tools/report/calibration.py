@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,14 @@ from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note, export_ros2, matrix4
 from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
-from weldcal.calibration.eye_on_base.nested import bootstrap_interval, mean_interval
-from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
+from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
-from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence
+from weldcal.calibration.eye_on_base.validation import (
+    Algorithm1Run,
+    Convergence,
+    bootstrap_interval,
+    mean_interval,
+)
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -91,7 +96,7 @@ class CalibrationReport:
     result: CalibrationResult
     estimate: CalibrationEstimate
     observations: tuple[Observation, ...]
-    scanner: SelfCalibration | None
+    scanner: ScannerVerdict | None
     fits: dict[str, FlangeFit]
     refused: tuple[tuple[str, str], ...]
     outliers: tuple[str, ...]
@@ -150,7 +155,7 @@ class CalibrationReport:
         used = [o.p_BR for o, keep in zip(self.observations, self.estimate.inliers, strict=True) if keep]
         return work_point_error(self.estimate, np.mean(used, axis=0))
 
-    @property
+    @cached_property
     def budget(self) -> ErrorBudget:
         """What contributes to the error at the work point."""
         try:

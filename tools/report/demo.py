@@ -118,7 +118,7 @@ class DemoResult:
         # what is not observable and matters to X_BC is among the warnings
         concerns = (*self.warnings, *estimate.warnings)
         notes = [*refused_note(status.refused, self.n_scans), *self.arm_note]
-        if estimate.scanner is not None:
+        if estimate.correction is not None:
             notes.insert(0, correction_hint("X_BC", self.folder / RESULT_FILE))
         found = Findings(against=against, tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)

@@ -131,7 +131,7 @@ def live_calibration_error(
     p_true = true_work_point(arm or station.arm, truth.arm, X_FT, work, np.deg2rad(scenario.home_deg), poses)
     p_C = truth.X_BC.inverse().multiply(p_true)
     seen = p_C if truth.scanner is None else truth.scanner.device.measured(p_C)
-    corrected = seen if estimate.scanner is None else estimate.scanner.points(seen)
+    corrected = seen if estimate.correction is None else estimate.correction.points(seen)
     off = calibration_error(estimate.X_BC, truth.X_BC, work)
     return replace(off, at_work_m=float(np.linalg.norm(estimate.X_BC.multiply(corrected) - work)))
 

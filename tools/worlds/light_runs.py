@@ -137,7 +137,7 @@ def _calibrate(observed: Sequence[Observation], scenario: Scenario, work: Array)
     """Calibrate as the job does: from the least number of scans on, until the expected error is small enough."""
     limits = scenario.calibration
     for n in range(limits.minimum_scans, len(observed) + 1):
-        estimate = estimate_jointly(observed[:n])
+        estimate, _ = estimate_jointly(observed[:n])
         if expected_error(estimate, work) <= 1e-3 * limits.required_error_mm:
             break
     return n, estimate
@@ -145,7 +145,7 @@ def _calibrate(observed: Sequence[Observation], scenario: Scenario, work: Array)
 
 def _landed(estimate: CalibrationEstimate, p_C: Array) -> Array:
     """Where the estimate puts a measured point (3,) m in B."""
-    return np.asarray(estimate.X_BC.multiply(p_C if estimate.scanner is None else estimate.scanner.points(p_C)))
+    return np.asarray(estimate.X_BC.multiply(p_C if estimate.correction is None else estimate.correction.points(p_C)))
 
 
 def _rigid(observed: Sequence[Observation], p_C: Array) -> Array:

@@ -125,7 +125,7 @@ def _scan(id: str, nominal: ArmModel, true: ArmModel, scanner: _Scanner, rng: np
 
 def _calibrated(observations: list[Observation]) -> CalibrationResult:
     """As a live calibration writes it."""
-    e = estimate_jointly(observations)
+    e, _ = estimate_jointly(observations)
     return CalibrationResult(
         X_BC=e.X_BC,
         covariance=e.covariance,
@@ -135,7 +135,7 @@ def _calibrated(observations: list[Observation]) -> CalibrationResult:
         robot="ur10e",
         sigma_position_mm=1e3 * e.sigma_position_m,
         sigma_normal_deg=float(np.degrees(e.sigma_normal_rad)),
-        scanner_correction=None if e.scanner is None else e.scanner.document(),
+        scanner_correction=None if e.correction is None else e.correction.document(),
         joint_covariance=e.joint,
         orientations=orientations_of([o for o, k in zip(observations, e.inliers, strict=True) if k], _X_FR),
         observed=observed_document([o for o, k in zip(observations, e.inliers, strict=True) if k], _X_FR),

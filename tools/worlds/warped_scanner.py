@@ -9,10 +9,9 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import CoplanarPoses
-from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation
-from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.holes import HolePattern
@@ -30,6 +29,7 @@ X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
 NOISE_M, NOISE_RAD, NOISE_RATIO = 1e-4, 1e-3, 6e-4  # of a centre and a normal per axis, and of a hole circle's ratio
 _FIELD = 0.5  # half of what the scanner sees over its distance
 _BORDER = 12  # pixels
+_ARM_WAVE_M = 0.8
 _REACH = np.array([0.12, 0.10, 0.06])  # m, of the places round the middle of the field
 _MIDDLE = np.array([0.0, 0.0, REFERENCE_M])
 WORK_C = np.array([0.02, -0.05, 0.38])
@@ -51,9 +51,10 @@ def warped_point(p_C: Array, device: int, warp_m: float = WARP_M) -> Array:
 
 
 def warped_observations(
-    device: int, n: int, seed: int, warp_m: float = WARP_M
+    device: int, n: int, seed: int, warp_m: float = WARP_M, arm_m: float = 0.0
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """Observations (n) and hole circles by such a scanner; both follow from where it puts the points of the flange."""
+    """Observations (n) and hole circles by such a scanner; both follow from where it puts the points of the flange. The arm's stated
+    positions are off by a smooth field of ``arm_m`` (per axis, rms)."""
     rng, observations, patterns, h = np.random.default_rng((device, seed)), [], {}, 0.02
     for k in range(n):
         true = _MIDDLE + rng.uniform(-_REACH, _REACH)
@@ -68,7 +69,10 @@ def warped_observations(
         normal = normal / np.linalg.norm(normal) + NOISE_RAD * rng.standard_normal(3)
         p_C = warped_point(true, device, warp_m) + NOISE_M * rng.standard_normal(3)
         name = f"p{k:02d}"
-        observations.append(Observation(name, X_BC @ RigidTransform(R_CR, true), p_C, normal / np.linalg.norm(normal)))
+        X_BR = X_BC @ RigidTransform(R_CR, true)
+        if arm_m:
+            X_BR = RigidTransform(X_BR.rotation(), X_BR.translation() - arm_error(X_BR.translation(), device, arm_m))
+        observations.append(Observation(name, X_BR, p_C, normal / np.linalg.norm(normal)))
         ratio = 0.5 * float(np.linalg.norm(x) + np.linalg.norm(y)) + NOISE_RATIO * rng.standard_normal()
         patterns[name] = HolePattern(
             holes_C=np.zeros((4, 3)),
@@ -81,23 +85,25 @@ def warped_observations(
     return observations, patterns
 
 
-def calibrate_warped(
-    device: int, n: int, warp_m: float = WARP_M
-) -> tuple[CalibrationEstimate, CalibrationEstimate, SelfCalibration]:
-    """Without a correction, and as ``weldcal calibrate`` does it, with its verdict on the scanner."""
+def arm_error(p_B: Array, device: int, arm_m: float) -> Array:
+    """By how much (3,) m an arm misses a place: six waves of about 0.8 m, as kinematics that are off by hundredths of a degree do."""
+    rng = np.random.default_rng([device, 41])
+    waves, phases = 2.0 * np.pi / _ARM_WAVE_M * rng.standard_normal((6, 3)), rng.uniform(0.0, 2.0 * np.pi, 6)
+    along = arm_m * np.sqrt(2.0 / 6.0) * rng.standard_normal((6, 3))
+    return np.asarray(np.cos(waves @ np.asarray(p_B) + phases) @ along)
+
+
+def calibrate_warped(device: int, n: int, warp_m: float = WARP_M) -> tuple[CalibrationEstimate, CalibrationEstimate]:
+    """Without a correction, and as ``weldcal calibrate`` does it."""
     observations, patterns = warped_observations(device, n, 0, warp_m)
     rigid = estimate_eye_on_base(observations, SolveConfig(hypotheses=60))
-    scanner, _, estimate = apply_self_calibration(observations, rigid, patterns)
-    assert scanner is not None
-    return rigid, estimate, scanner
+    return rigid, estimate_jointly(observations, patterns, config=SolveConfig(hypotheses=60))[0]
 
 
-def new_errors(
-    device: int, estimate: CalibrationEstimate, scanner: SelfCalibration | None, warp_m: float = WARP_M
-) -> Array:
+def new_errors(device: int, estimate: CalibrationEstimate, warp_m: float = WARP_M) -> Array:
     """Errors (60,) m at places that the calibration did not use, with an observation's noise."""
     new, _ = warped_observations(device, 60, 1, warp_m)
-    correction = None if scanner is None else scanner.accepted
+    correction = estimate.correction
     return position_errors(
         estimate.X_BC, new if correction is None else [corrected_observation(correction, o) for o in new]
     )

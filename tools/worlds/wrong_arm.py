@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import f as fisher
 
-from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
+from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -143,7 +143,7 @@ def study_station(world: Station, kind: str = "links", prior: FactoryPrior | Non
     """Calibrate one world plain, with the choice of the scanner's correction, and refined, and judge both on its new scans."""
     arm = load_chain("ur10e")
     sought: ArmErrors = arm_errors(arm, kind, prior)
-    X_BC, correction = calibrate_by_choice(world.observations, world.patterns)
+    X_BC, correction = solve_jointly(world.observations, world.patterns)
     nothing = KinematicsFit(
         X_BC=X_BC,
         correction=correction,

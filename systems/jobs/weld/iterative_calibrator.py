@@ -1,16 +1,17 @@
 """IterativeCalibrator: estimates X_BC until its error is small enough; CalibrationPosePlanner: the next pose."""
 
 import dataclasses as dc
-from functools import partial
 
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, State
 
-from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
+from weldcal.calibration.calibrate import PLAIN, Refined, Steps, calibrate
+from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
+from weldcal.calibration.eye_on_base.few_poses import ENOUGH
 from weldcal.calibration.eye_on_base.observations import corrected_observation
-from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, predicted_sigma
@@ -22,7 +23,6 @@ from weldcal.calibration.published.algorithm1 import (
     named_cost,
 )
 from weldcal.calibration.published.icp import make_verification
-from weldcal.calibration.refinement.refined import PLAIN, Plain, Refined, refine_arm, refine_locally
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
 from weldcal.models.arrays import Array
@@ -40,31 +40,23 @@ TIME_S = 120.0  # for which the job waits, at rest, for the folds beside a robot
 def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_scanner: bool) -> CalibrationStatus:
     """The status with its estimate refined by ``kind`` of LIVE_KINDS, or as it was with the reason; ``arm`` is the one that observed.
 
-    The choice is that of `weldcal calibrate --refine`; live scans have no hole patterns.
+    Live scans have no hole patterns.
     """
-    estimate = status.estimate
-    if estimate is None or kind == PLAIN:
+    if status.estimate is None or kind == PLAIN:
         return status
-    corrected = tuple(corrected_observation(status.correction, o) for o in status.observations)
-    solve = partial(solve_jointly, start=estimate.X_BC, correct_scanner=correct_scanner)
-    plain = Plain(
-        observations=status.observations,
-        corrected=corrected,
-        patterns={},
-        estimate=estimate,
-        correction=estimate.scanner,
+    steps = Steps(
         correct_scanner=correct_scanner,
-        solve=solve,
+        refine=kind,
+        arm=None if kind == "local" else chain_of(arm),
+        joints=np.array(status.joints),
+        note=f"{arm.name}, refined by a live calibration (calibration.refine: {kind})",
     )
     try:
-        if kind == "local":
-            found = refine_locally(plain, seed=0)
-        else:
-            note = f"{arm.name}, refined by a live calibration (calibration.refine: {kind})"
-            found = refine_arm(kind, plain, np.array(status.joints), chain_of(arm), note=note, seed=0)
-        return dc.replace(status, estimate=found.estimate, refinement=_message(kind, found, arm))
+        found = calibrate(status.observations, steps)
     except WeldcalError as error:
         return dc.replace(status, refinement=Refinement(kind=kind, sentence=f"The calibration is not refined: {error}"))
+    assert found.refined is not None
+    return dc.replace(status, estimate=found.estimate, refinement=_message(kind, found.refined, arm))
 
 
 def _message(kind: str, found: Refined, arm: ArmModel) -> Refinement:
@@ -157,7 +149,8 @@ class IterativeCalibrator(BackgroundSystem):
         output_ports:
         - calibration_status
 
-    The estimate contains a correction of the scanner's own errors, unless `correct_scanner` is off. It is done when the
+    The estimate is that of `weldcal calibrate` (calibration/calibrate.py): it contains a correction of the scanner's own errors where the
+    scans show one, unless `correct_scanner` is off. It is done when the
     expected error at the work point is within the required one; then it is refined (`refine`), and what the status says of the arm
     holds for the verification and all that follows. Algorithm 1's figure is kept
     for display only, because it does not measure the remaining error (docs/calibration.md).
@@ -222,9 +215,14 @@ def digest(
         status, observations=observations, joints=joints, algorithm_1=_algorithm_1(status, observation, config)
     )
     try:
-        estimate = estimate_jointly(observations) if config.correct_scanner else estimate_eye_on_base(observations)
+        if len(observations) < ENOUGH:
+            raise TooFewPoses(f"{len(observations)} usable scans do not fix the scanner's pose; take {ENOUGH} or more.")
+        found = calibrate(observations, Steps(correct_scanner=config.correct_scanner))
     except WeldcalError as error:
         return dc.replace(status, message=str(error))
+    estimate = found.estimate
+    if found.warnings:
+        estimate = dc.replace(estimate, warnings=(*found.warnings, *estimate.warnings))
     predicted = expected_error(estimate, config.p_BWork)
     figure = status.algorithm_1.cost if status.algorithm_1 is not None else np.nan
     held_out = float(np.median(estimate.held_out.position_m))

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.calibrate import PLAIN
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.calibration.refinement.kinematics_fit import KINDS
 from weldcal.calibration.refinement.poses import informative_poses
-from weldcal.calibration.refinement.refined import PLAIN
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from tests.calibration.eye_on_base.test_self_calibration import NOISE_M, RIGHT, WRONG, _cell
+from tests.calibration.eye_on_base.test_joint_fit import NOISE_M, RIGHT, WRONG, _cell
 from weldcal.calibration.eye_on_base.change_point import find_change
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.calibration.eye_on_base.test_joint_fit import X_BC as CELL_X_BC
+from tests.calibration.eye_on_base.test_joint_fit import _cell
 from tests.calibration.flange.face import face_points
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.few_poses import axis_turn, estimate_from_whole_poses
+from weldcal.calibration.eye_on_base.few_poses import axis_turn, calibrate_from_few, estimate_from_whole_poses
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
+from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.models.flanges import get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")
@@ -79,3 +83,37 @@ def test_a_rotation_that_the_holes_leave_open_is_not_used() -> None:
     patterns = {k: replace(p, other_turns_rad=quarter) for k, p in patterns.items()}
     with pytest.raises(TooFewPoses, match=r"dowel hole, .* any of 0, 90, 180, 270 degrees"):
         estimate_from_whole_poses(observations, patterns, TURN)
+
+
+@pytest.mark.parametrize(("n", "holes"), [(1, True), (3, True), (3, False)])
+def test_the_region_of_few_scans_holds_what_they_cannot_show_of_the_scanner(n: int, holes: bool) -> None:
+    """Scanners off by what is usual: scale 0.2 %, gradient 0.15 % per 100 mm, bends 0.1 % at the image's edge, 0.4 m away."""
+    squares, alone = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        edge = 0.35 * 0.4
+        bend = tuple(1e-3 / edge**2 * rng.standard_normal(3))
+        gx, gy = 1.5e-2 * rng.standard_normal(2)
+        observations, patterns = _cell(
+            ScannerCorrection(1.0 + 2e-3 * rng.standard_normal(), (gx, gy), bend), n=n, seed=seed
+        )
+        for o in observations:
+            R = patterns[o.id].X_CR.rotation().matrix()
+            R = (
+                exp_rotation(np.cross(R[:, 2], o.n_C))
+                @ R
+                @ exp_rotation(np.array([0.0, 0.0, 1e-3 * rng.standard_normal()]))
+            )
+            X_CR = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), o.p_CR)
+            patterns[o.id] = replace(patterns[o.id], X_CR=X_CR, holes_C=np.zeros((5, 3)))
+        e = calibrate_from_few(observations, patterns, 0.0 if holes else None)
+        turn = rotation_vector(CELL_X_BC.rotation() @ e.X_BC.rotation().inverse())
+        off = np.concatenate([turn, CELL_X_BC.translation() - e.X_BC.translation()])
+        assert e.joint is not None
+        squares.append(off @ np.linalg.solve(e.covariance, off) / 6.0)
+        # what the region was without the scanner's part
+        closed = e.covariance - e.joint[:6, 6:] @ np.linalg.solve(e.joint[6:, 6:], e.joint[6:, :6])
+        alone.append(off @ np.linalg.solve(closed, off) / 6.0)
+    # 360 squares know their mean to 0.08; the usual spread of robot and scanner is larger than this cell's noise
+    assert 0.42 < np.mean(squares) < 1.15
+    assert np.mean(alone) > 3.0 * np.mean(squares)

@@ -79,3 +79,18 @@ def test_a_fused_cloud_is_measured_without_a_grid() -> None:
     fit = fit_flange(points, STANDARD)
     assert not fit.on_grid
     assert float(np.linalg.norm(fit.center_C - X_CR[:3, 3])) < 4e-4
+
+
+def test_the_region_without_a_grid_holds_the_pull_of_the_chamfer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("weldcal.calibration.flange.fit.rebuild_grid", lambda cloud: None)
+    squares = []
+    for k in range(16):
+        rng = np.random.default_rng([7, k])
+        X_CR = random_flange(rng)
+        sigma_m = (5e-5, 2e-4)[k % 2]
+        cropped = forms(scan(X_CR, rng, CAMERA, sigma=sigma_m), rng, X_CR[:3, 3])["cropped"]
+        fit = fit_flange(cropped, STANDARD)
+        e = fit.center_C - X_CR[:3, 3]
+        squares.append(float(e @ np.linalg.solve(fit.center_covariance, e)) / 3.0)
+    # 48 degrees of freedom, half of them of one bias; without its part the mean is 3 to 4
+    assert 0.55 < np.mean(squares) < 1.6

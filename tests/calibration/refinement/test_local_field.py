@@ -11,9 +11,8 @@ from scipy.stats import chi2
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.nested import bootstrap_interval
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import position_errors
+from weldcal.calibration.eye_on_base.validation import bootstrap_interval, position_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.refinement.local_field import (
     LocalChoice,

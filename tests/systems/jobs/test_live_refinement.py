@@ -33,7 +33,7 @@ from weldcal.tools.worlds.wrong_arm import Station, station
 def status_of(world: Station) -> CalibrationStatus:
     """The live calibration of a light world, before it is refined."""
     seen = tuple(world.observations)
-    return CalibrationStatus(observations=seen, joints=tuple(world.q), estimate=estimate_jointly(seen), done=True)
+    return CalibrationStatus(observations=seen, joints=tuple(world.q), estimate=estimate_jointly(seen)[0], done=True)
 
 
 def flange(arm: ArmModel, q: Array) -> Array:

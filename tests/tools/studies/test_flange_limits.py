@@ -11,7 +11,7 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.tools.studies.flange.live import live_scenario
-from weldcal.tools.studies.flange.recorded import median_sigma, study_few_scans, study_ingredients
+from weldcal.tools.studies.flange.recorded import median_sigma, study_few_scans
 from weldcal.tools.worlds.redrawn import Station, bound_covariance, joints_of, redraw
 
 DATA = SHARED_DATA / "flange"
@@ -81,12 +81,6 @@ def test_the_spread_of_a_median_is_that_of_many_medians() -> None:
     medians = [float(np.median(np.abs(rng.standard_normal(18)))) for _ in range(2000)]
     stated = [median_sigma(np.abs(rng.standard_normal(18)), seed) for seed in range(40)]
     assert np.mean(stated) == pytest.approx(np.std(medians), rel=0.25)
-
-
-@needs(DATA)
-def test_a_comparison_of_ingredients_needs_a_dozen_scans() -> None:
-    with pytest.raises(TooFewPoses, match="needs 12 usable scans, and there are 1"):
-        study_ingredients(DATA / "franka_phoxi_m")
 
 
 @needs(DATA)

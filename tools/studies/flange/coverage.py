@@ -9,9 +9,12 @@ from matplotlib.figure import Figure
 from pydrake.math import RigidTransform
 from scipy.stats import binom, chi2
 
+from weldcal.calibration.calibrate import PLAIN, Steps, calibrate
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, with_scanner
+from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
+from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
@@ -23,6 +26,7 @@ from weldcal.tools.worlds import warped_scanner
 from weldcal.tools.worlds.warped_scanner import as_measured, seen_by_a_wrong_scanner, simulated_observations
 
 LEVEL = 0.95
+_ARM_M = 1.5e-4  # per axis, what recorded arms leave of a calibration
 WORK_C = np.array([0.02, -0.05, 0.72])
 """The work point (3,) m in the camera."""
 Calibrated = tuple[CalibrationEstimate, RigidTransform, Array]
@@ -138,11 +142,11 @@ def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Cov
     stated, true = [], []
 
     def calibrate(device: int) -> Calibrated:
-        _, estimate, scanner = warped_scanner.calibrate_warped(device, poses)
+        _, estimate = warped_scanner.calibrate_warped(device, poses)
         seen = warped_scanner.warped_point(warped_scanner.WORK_C, device)
         stated.append(float(np.mean(estimate.held_out.position_m)))
-        true.append(float(np.mean(warped_scanner.new_errors(device, estimate, scanner))))
-        found = seen if scanner.accepted is None else scanner.accepted.points(seen)
+        true.append(float(np.mean(warped_scanner.new_errors(device, estimate))))
+        found = seen if estimate.correction is None else estimate.correction.points(seen)
         return estimate, warped_scanner.X_BC, estimate.X_BC @ found
 
     name = f"calibrations of {poses} scans by a warped scanner"
@@ -186,3 +190,76 @@ def honesty(
     studies.append(study_warped(12, max(10, runs // 5), call.progress))
     write_atomic(folder / "coverage.svg", coverage_picture(studies))
     return HONESTY.measured({"all": {"studies": [vars(s) for s in studies]}}, folder).outcome()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stated:
+    """Of ``runs`` worlds of one class (scans, largest error of the scanner m, rms error of the arm m, with a local field or plain): mean
+    error (m) of 60 new scans each, and how many times that is stated (nested held-out errors, both means over the worlds)."""
+
+    poses: int
+    warp_m: float
+    arm_m: float
+    local: bool
+    runs: int
+    true_m: float
+    stated_over_true: float
+
+
+def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: bool) -> Stated:
+    """Calibrate ``runs`` devices with an arm each as `weldcal calibrate` does, and measure on scans that it has not seen."""
+    stated, true = [], []
+    for device in range(runs):
+        observations, patterns = warped_scanner.warped_observations(device, poses, 0, warp_m, arm_m)
+        new, _ = warped_scanner.warped_observations(device, 60, 1, warp_m, arm_m)
+        found = calibrate(observations, Steps(patterns=patterns, refine="local" if local else PLAIN))
+        correction, refined = found.correction, found.refined
+        seen = new if correction is None else [corrected_observation(correction, o) for o in new]
+        if refined is not None and refined.field is not None:
+            seen = refined.field.applied(found.estimate.X_BC, seen)
+        true.append(float(np.mean(position_errors(found.estimate.X_BC, seen))))
+        stated.append(float(np.nanmean(found.estimate.held_out.position_m[found.estimate.inliers])))
+    ratio = float(np.mean(stated) / np.mean(true))
+    return Stated(
+        poses=poses,
+        warp_m=warp_m,
+        arm_m=arm_m,
+        local=local,
+        runs=runs,
+        true_m=float(np.mean(true)),
+        stated_over_true=ratio,
+    )
+
+
+def _stated_rows(f: Figures) -> Iterable[Row]:
+    for s in f["classes"]:
+        yield (
+            str(s["poses"]), "local" if s["local"] else "plain", fixed(1e3 * s["warp_m"], 1), fixed(1e3 * s["arm_m"], 2),
+            str(s["runs"]), fixed(1e3 * s["true_m"]), fixed(s["stated_over_true"], 2),
+        )  # fmt: skip
+    yield "all", "", "", "", str(sum(s["runs"] for s in f["classes"])), "", fixed(f["mean"], 2)
+
+
+STATED = Study(
+    name="flange-stated",
+    what="The stated mean error over the true one, in generated worlds with errors of scanner and arm.",
+    figures=lambda results: results["all"],
+    header=("scans", "way", "scanner off, mm", "arm off, mm", "worlds", "true mean error, mm", "stated over true"),
+    rows=_stated_rows,
+    numbers=5,
+)
+
+
+@command("benchmark flange-stated", short_help="Measure stated over true error in generated worlds.", hidden=True)
+def stated(
+    call: Call, runs: Annotated[int, option("--runs", "N", "Number of worlds of each class.", min=2)] = 28
+) -> Outcome:
+    """Measure how many times the true mean error of new scans is stated, in generated worlds with errors of scanner and arm."""
+    folder, classes = STATED.folder(call), []
+    sizes = [(n, False) for n in (8, 12, 20, 30)] + [(n, True) for n in (20, 30)]
+    for k, (poses, local) in enumerate(sizes):
+        for warp_m in (2e-4, 8e-4, 1.6e-3):
+            call.progress(f"{poses} scans", k / len(sizes))
+            classes.append(study_stated(poses, warp_m, _ARM_M, runs, local=local))
+    mean = float(np.mean([s.stated_over_true for s in classes]))
+    return STATED.measured({"all": {"classes": [vars(s) for s in classes], "mean": mean}}, folder).outcome()

@@ -1,4 +1,4 @@
-"""Calibrations of recorded scans: the worth of each ingredient, and the errors with few scans."""
+"""Calibrations of recorded scans: the errors with few of them, and with halves."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,19 +8,15 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from pydrake.math import RigidTransform
-from scipy.stats import chi
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.eye_on_base.nested import calibrate_by_choice, mean_interval, nested_errors
+from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
-from weldcal.calibration.eye_on_base.scanner_fit import from_holes, from_motion
-from weldcal.calibration.eye_on_base.self_calibration import held_out_errors
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
+from weldcal.calibration.eye_on_base.validation import mean_interval, position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.refinement.local_field import choose_local
@@ -33,21 +29,9 @@ from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.flange.halves import study_parts
 from weldcal.tools.studies.harness import Figures, Row, Study, statistics
 
-LEAST = 12
 SIZES = (1, 2, 3, 4, 6, 8, 12)
 KEPT = 4  # scans that at least are left to judge by
 _DRAWS = 2000
-
-
-@dataclass(frozen=True)
-class Ingredient:
-    """One way to calibrate, every scan left out in turn: errors (n,) m and tilts (n,) rad; ``floor_m`` is the median error that the
-    spread of arm and scanner about this model leaves even where it is known exactly."""
-
-    name: str
-    position_m: Array
-    tilt_rad: Array
-    floor_m: float
 
 
 def median_sigma(values: Array, seed: int = 0) -> float:
@@ -72,59 +56,6 @@ def usable_scans(
     rough = estimate_eye_on_base(seen.observations, config)
     good = [o for o, keep in zip(seen.observations, rough.inliers, strict=True) if keep]
     return good, dict(seen.patterns), rough.X_BC
-
-
-def study_ingredients(folder: Path, seed: int = 0, progress: Progress = no_progress) -> list[Ingredient]:
-    """Step by step on one dataset of scans. Raises InputError for a folder that is none, TooFewPoses below twelve usable scans."""
-    refusal = f"The comparison leaves every scan out in turn: it needs {LEAST} usable scans"
-    good, patterns, _ = usable_scans(folder, LEAST, refusal, seed, progress, 0.5)
-    if len(good) < LEAST:
-        raise TooFewPoses(f"{refusal}, and there are {len(good)}.")
-    rows = []
-    for k, (name, normals) in enumerate((("centres, scanner as it is", False), ("and face normals", True))):
-        progress(name, 0.5 + 0.05 * k)
-        config = SolveConfig(seed=seed, use_normals=normals)
-        e = estimate_eye_on_base(good, config)
-        tilt = e.held_out.tilt_rad if normals else _tilts(good, config)
-        rows.append(Ingredient(name, e.held_out.position_m, tilt, _floor(e.sigma_position_m)))
-    progress("hole circle alone", 0.6)
-    if from_holes(good, patterns) is not None:
-        rows.append(_holes_alone(good, patterns, seed))
-    names = ("scale and gradient, hole circle and motion", "and bends of order 2", "and bends of order 3")
-    for order, name in enumerate(names, 1):
-        progress(name, 0.55 + 0.12 * order)
-        position, tilt = held_out_errors(good, patterns, seed, order)
-        sigma = from_motion(good, patterns, seed=seed, order=order, usual=True).sigma_position_m
-        rows.append(Ingredient(name, position, tilt, _floor(sigma)))
-    return rows
-
-
-def _floor(sigma_m: float) -> float:
-    return float(sigma_m * chi.median(3))
-
-
-def _tilts(good: Sequence[Observation], config: SolveConfig) -> Array:
-    """Held-out tilts of calibrations by centres alone."""
-    once = SolveConfig(seed=config.seed, use_normals=False, leave_one_out=False)
-    return np.array(
-        [float(tilt_errors(estimate_eye_on_base([p for p in good if p is not o], once).X_BC, [o])[0]) for o in good]
-    )
-
-
-def _holes_alone(good: Sequence[Observation], patterns: Mapping[str, HolePattern], seed: int) -> Ingredient:
-    """The correction from the hole circle, no robot in it; then as with an exact scanner."""
-    config = SolveConfig(seed=seed, leave_one_out=False)
-    errors, tilts = np.full((2, len(good)), np.nan)
-    sigma = 0.0
-    for k, o in enumerate(good):
-        rest = [p for p in good if p is not o]
-        found = from_holes(rest, patterns)
-        correction = ScannerCorrection() if found is None else found.correction
-        e = estimate_eye_on_base([corrected_observation(correction, p) for p in rest], config)
-        seen = [corrected_observation(correction, o)]
-        errors[k], tilts[k] = float(position_errors(e.X_BC, seen)[0]), float(tilt_errors(e.X_BC, seen)[0])
-        sigma += e.sigma_position_m / len(good)
-    return Ingredient("scale and gradient, hole circle alone", errors, tilts, _floor(sigma))
 
 
 @dataclass(frozen=True)
@@ -178,10 +109,7 @@ def _calibrated(
     if len(used) < ENOUGH:
         alone = len(used) == 1
         return calibrate_from_few(used, patterns, turn if alone else None, seed=seed).X_BC, ScannerCorrection()
-    rigid = estimate_eye_on_base(used, SolveConfig(seed=seed, allow_coplanar=True))
-    scanner, _, estimate = apply_self_calibration(used, rigid, patterns, seed=seed, nested=False)
-    accepted = None if scanner is None else scanner.accepted
-    return estimate.X_BC, ScannerCorrection() if accepted is None else accepted
+    return solve_jointly(used, patterns, seed=seed)
 
 
 LEAST_HALVES = 16
@@ -208,14 +136,16 @@ def study_halves(
         order = np.random.default_rng([seed, k]).permutation(len(good))
         ours, others = ([good[i] for i in part] for part in (order[:half], order[half:]))
         try:
-            X_BC, correction = calibrate_by_choice(ours, patterns, seed=seed)
+            X_BC, correction = solve_jointly(ours, patterns, seed=seed)
             new_scans = [corrected_observation(correction, o) for o in others]
             if local:
                 choice = choose_local(ours, patterns, X_BC, correction, seed=seed)
                 errors = choice.local_m if choice.accepted else choice.plain_m
                 new_scans = choice.field.applied(X_BC, new_scans) if choice.accepted else new_scans
             else:
-                errors, _ = nested_errors(ours, patterns, seed=seed)
+                errors = estimate_jointly(ours, patterns, config=SolveConfig(seed=seed, allow_coplanar=True))[
+                    0
+                ].held_out.position_m
         except InputError:
             skipped += 1
             continue
@@ -229,43 +159,7 @@ def study_halves(
     return {"draws": draws, "scans": half, "stated_mm": stated, "new_mm": new, "inside": inside, "skipped": skipped}
 
 
-def _ingredient(r: Ingredient) -> dict[str, object]:
-    tilt = np.degrees(r.tilt_rad)
-    return {
-        "name": r.name,
-        "position_mm": statistics(1e3 * r.position_m, "median", "mean", "p95"),
-        "median_sigma_mm": 1e3 * median_sigma(r.position_m),
-        "tilt_deg": statistics(tilt, "median", "p95"),
-        "floor_mm": 1e3 * r.floor_m,
-    }
-
-
-def _ingredient_rows(f: Figures) -> Iterable[Row]:
-    for r in f["rows"]:
-        p, t = r["position_mm"], r["tilt_deg"]
-        yield (
-            r["name"],
-            f"{p['median']:.3f} ± {r['median_sigma_mm']:.3f}",
-            *(f"{v:.3f}" for v in (p["mean"], p["p95"], t["median"], t["p95"], r["floor_mm"])),
-        )
-
-
-INGREDIENTS = Study(
-    name="flange-ingredients",
-    what="What normals, hole circle, gradient and bends each contribute on recorded scans, every scan held out in turn.",
-    figures=lambda results: results["all"],
-    header=("calibration", "median mm", "mean mm", "95 % mm", "tilt deg", "95 % deg", "spread alone mm"),
-    rows=_ingredient_rows,
-    numbers=6,
-)
 DatasetArgument = Annotated[Path, typer.Argument(metavar="DATASET", help="A dataset folder with scans.")]
-
-
-@command("benchmark flange-ingredients", short_help="Measure what each part of the method contributes.", hidden=True)
-def ingredients(call: Call, dataset: DatasetArgument) -> Outcome:
-    """Measure what normals, hole circle, gradient and bends each contribute on at least twelve recorded scans."""
-    folder, found = INGREDIENTS.folder(call), study_ingredients(dataset, call.seed, call.progress)
-    return INGREDIENTS.measured({"all": {"rows": [_ingredient(r) for r in found]}}, folder).outcome()
 
 
 def _few(found: Sequence[Draws], draws: int) -> dict[str, object]:

@@ -16,9 +16,9 @@ from weldcal.tools.cli.options import Call, Outcome, command, switch
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.flange.cells import arm, imperfect
-from weldcal.tools.studies.flange.coverage import honesty
+from weldcal.tools.studies.flange.coverage import honesty, stated
 from weldcal.tools.studies.flange.live import live
-from weldcal.tools.studies.flange.recorded import few, halves, ingredients, parts
+from weldcal.tools.studies.flange.recorded import few, halves, parts
 from weldcal.tools.studies.flange.scans import frames, hidden, holes
 from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.worlds.flange_frames import Frame, facing, flange_frame
@@ -212,8 +212,8 @@ def speed(
     hidden=hidden,
     parts=parts,
     honesty=honesty,
+    stated=stated,
     live=live,
-    ingredients=ingredients,
     few=few,
     holes=holes,
     imperfect=imperfect,
@@ -221,5 +221,5 @@ def speed(
     arm=arm,
 )
 def flange(call: Call) -> None:
-    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden, holes), uncertainty (parts, honesty,
-    imperfect, halves) and accuracy (live, ingredients, few, arm)."""
+    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden, holes), uncertainty (parts, honesty, stated,
+    imperfect, halves) and accuracy (live, few, arm)."""

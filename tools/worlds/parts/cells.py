@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from weldcal.calibration.refinement.refined import PLAIN
+from weldcal.calibration.calibrate import PLAIN
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario

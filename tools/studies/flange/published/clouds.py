@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
+from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
@@ -250,8 +250,8 @@ def split_once(material: Material, fit: list[str], seed: int) -> Mapping[str, tu
     ours = [material.good[id] for id in fit]
     estimate = estimate_eye_on_base(ours, SolveConfig(seed=seed))
     out["rigid"] = (position_errors(estimate.X_BC, rest), float(np.median(estimate.held_out.position_m)))
-    scanner, _, corrected = apply_self_calibration(ours, estimate, material.seen.patterns, seed=seed)
-    accepted = ScannerCorrection() if scanner is None or scanner.accepted is None else scanner.accepted
+    corrected, _ = estimate_jointly(ours, material.seen.patterns, config=SolveConfig(seed=seed))
+    accepted = corrected.correction or ScannerCorrection()
     errors = position_errors(corrected.X_BC, [corrected_observation(accepted, o) for o in rest])
     out["ours"] = (errors, float(np.median(corrected.held_out.position_m)))
     return {name: out[name] for name in METHODS}

@@ -66,10 +66,10 @@ def compare_sphere(
                 rigid = estimate_eye_on_base(
                     seen, SolveConfig(seed=seed, leave_one_out=False, allow_coplanar=True)
                 ).X_BC
-                ours = estimate_jointly(seen)
+                ours, _ = estimate_jointly(seen)
             except WeldcalError:
                 continue
-            corrected = [o if ours.scanner is None else corrected_observation(ours.scanner, o) for o in rest]
+            corrected = [o if ours.correction is None else corrected_observation(ours.correction, o) for o in rest]
             errors["sphere"].append(position_errors(sphere_calibration(used), rest))
             errors["flange, rigid"].append(position_errors(rigid, rest))
             errors["flange, weldcal"].append(position_errors(ours.X_BC, corrected))
