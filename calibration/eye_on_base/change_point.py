@@ -23,6 +23,7 @@ _LARGER_THAN = (
 _SCANNER_ORDERS = ((14, 2), (_LEAST, 1))  # from how many poses on the scanner's own error is left open to which order
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 0.02, 0.02, 0.02])  # what the factors of a scanner are off (1, 1/m, 1/m^2)
 _CANDIDATES = 60  # places looked at first
+_FINER = 10  # times finer are the places near the best
 _SAME_M, _SAME_RAD = 5e-3, 1e-2  # starts so near to each other lead to the same fit
 _HUBER = 2.0
 _FLOOR_M = 1e-6
@@ -68,12 +69,15 @@ def find_change(observations: Sequence[Observation]) -> ChangePoint | None:
     starts = _starts(observations)
     best: tuple[float, int, _Split] | None = None
     for X in starts:
-        places = list(range(LEAST_PART, n - LEAST_PART + 1))
+        places = range(LEAST_PART, n - LEAST_PART + 1)
         step = max(1, len(places) // _CANDIDATES)
         fits = {k: _fit(b, c, X, k, order) for k in places[::step]}
-        near = min(fits, key=lambda k: fits[k].loss)
-        fits |= {k: _fit(b, c, X, k, order) for k in places if abs(k - near) < step}
         k = min(fits, key=lambda k: fits[k].loss)
+        while step > 1:
+            finer = max(1, step // _FINER)
+            near = range(max(k - step + 1, places[0]), min(k + step, places[-1] + 1), finer)
+            fits |= {i: _fit(b, c, X, i, order) for i in near if i not in fits}
+            step, k = finer, min(fits, key=lambda k: fits[k].loss)
         if best is None or fits[k].loss < best[0]:
             best = (fits[k].loss, k, fits[k])
     if best is None:
@@ -168,8 +172,9 @@ def _fit(
         w = np.minimum(1.0, _HUBER * np.sqrt(3.0) * scale / np.maximum(size, 1e-12))
         prior = np.zeros(J.shape[2])
         prior[6 * poses :] = (scale / _USUAL[:terms]) ** 2
-        N = np.einsum("nki,n,nkj->ij", J, w, J) + np.diag(prior)
-        g = np.einsum("nki,n,nk->i", J, w, e) + prior * np.concatenate([np.zeros(6 * poses), factors])
+        JW = (J * w[:, None, None]).reshape(3 * n, -1).T
+        N = JW @ J.reshape(3 * n, -1) + np.diag(prior)
+        g = JW @ e.reshape(-1) + prior * np.concatenate([np.zeros(6 * poses), factors])
         step = -np.linalg.lstsq(N, g, rcond=1e-13)[0]
         factors = factors + step[6 * poses :]
         X = [

@@ -29,12 +29,12 @@ Flags = NDArray[np.bool_]
 _GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion at the rim of its field reaches five
 _WIDEST_GATE = 10.0  # so many times wider at most, where three spare numbers or fewer set the scale
 _HUBER = 2.0
+_START_POSES = 500  # at most: more do not make a start better
+_HELD_OUT_FITS = 100  # at most, so that the time grows with the number of poses and not with its square
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _WORST_TILT_RAD = 0.17  # of the normals' median: no arm, scanner or fit is ten degrees off
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
 _NORMAL_FLOOR_RAD = 1e-6
-MOST_FOLDS = 100
-"""Of held-out errors by fits of a pose alone."""
 USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
 """What robot and scanner together are off, an axis, where too few scans show it: as on the recorded arms."""
 
@@ -67,7 +67,7 @@ class _Data:
     cov: Array
     var_n: Array
 
-    def pick(self, keep: Flags) -> _Data:
+    def pick(self, keep: Flags | NDArray[np.int64]) -> _Data:
         return _Data(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
@@ -91,9 +91,9 @@ def estimate_eye_on_base(
     Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share
     of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and
     of normals are estimated from the residuals (Helmert's simplified estimator, each group divided by its own
-    redundancy), never set by taste. Held-out errors repeat the weighted fit without each pose in turn. Deterministic
-    for ``config.seed``. Raises TooFewPoses, RepeatedPoses, CoplanarPoses (see observability.check_diversity) and
-    InconsistentPoses when no rigid transform explains enough of the poses.
+    redundancy), never set by taste. Held-out errors repeat the weighted fit without each pose in turn (of more than 100
+    poses: without each of 100 groups). Deterministic for ``config.seed``. Raises TooFewPoses, RepeatedPoses, CoplanarPoses
+    (see observability.check_diversity) and InconsistentPoses when no rigid transform explains enough of the poses.
     """
     config = config or SolveConfig()
     observations = tuple(observations)
@@ -178,6 +178,8 @@ def _residuals(data: _Data, X_BC: RigidTransform) -> tuple[Array, Array]:
 
 def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
     """Best of seeded minimal sets, each concentrated twice (least trimmed squares, Rousseeuw and Van Driessen 1999)."""
+    if len(data.b) > _START_POSES:
+        data = data.pick(np.linspace(0, len(data.b) - 1, _START_POSES).round().astype(int))
     n = len(data.b)
     if n < 3:
         return _closed_form(data)
@@ -383,18 +385,15 @@ def _gauss_newton(
 
 
 def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldOut, usual: float) -> HeldOut:
-    """The held-out errors of the inliers, each alone up to MOST_FOLDS of them, so that the time grows with their number only."""
     position, tilt = full.position_m.copy(), full.tilt_rad.copy()
     if int(inliers.sum()) < (3 if data.has.all() else 4):
         return HeldOut(np.full_like(position, np.nan), np.full_like(tilt, np.nan))
     used = np.flatnonzero(inliers)
-    folds = min(len(used), MOST_FOLDS)
-    for f in range(folds):
+    for k in range(min(len(used), _HELD_OUT_FITS)):
+        out = used[k::_HELD_OUT_FITS]
         keep = inliers.copy()
-        keep[used[f::folds]] = False
-        e, t = _residuals(data, _fit(data, keep, solution, usual).X_BC)
-        held = inliers & ~keep
-        position[held], tilt[held] = e[held], t[held]
+        keep[out] = False
+        position[out], tilt[out] = _residuals(data.pick(out), _fit(data, keep, solution, usual).X_BC)
     return HeldOut(position, tilt)
 
 

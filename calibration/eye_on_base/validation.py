@@ -62,7 +62,8 @@ def k_fold(
         order = rng.permutation(n)
         for f in range(folds):
             test = order[f::folds]
-            train = [observations[i] for i in range(n) if i not in set(test.tolist())]
+            held = set(test.tolist())
+            train = [o for i, o in enumerate(observations) if i not in held]
             try:
                 X, correction = (
                     (estimate_eye_on_base(train, plain).X_BC, ScannerCorrection()) if solve is None else solve(train)
@@ -198,7 +199,9 @@ def bootstrap_interval(
     e = e[np.isfinite(e)]
     if len(e) < 4 or not e.min() > 0.0:
         return None
-    drawn = np.quantile(e[np.random.default_rng(seed).integers(len(e), size=(2, 4000, len(e)))], share, axis=2)
-    low, high = np.quantile(drawn[1] / drawn[0], [0.5 - 0.5 * level, 0.5 + 0.5 * level])
+    rng = np.random.default_rng(seed)
+    # few resamples at a time: all of them would take memory for 8 000 times n numbers
+    drawn = np.concatenate([np.quantile(e[rng.integers(len(e), size=(80, len(e)))], share, axis=1) for _ in range(100)])
+    low, high = np.quantile(drawn[4000:] / drawn[:4000], [0.5 - 0.5 * level, 0.5 + 0.5 * level])
     reported = float(np.quantile(e, share))
     return reported * float(low), reported * float(high)
