@@ -303,9 +303,9 @@ def _keep_pace(run: Run[JobOf], root: Context) -> None:
 def _keep_scan(run: Run[JobOf], root: Context) -> None:
     """Store a new scan with its purpose; the phase after a scan starts only when the scan has been processed."""
     station = run.cell.station.diagram
-    if not run.phases or not run.phases[-1][0].startswith("scan_") or not station.HasOutputPort("scanner.scan"):
+    if not run.phases or not run.phases[-1][0].startswith("scan") or not station.HasOutputPort("scanner.scan"):
         return
     scan: Scan = station.GetOutputPort("scanner.scan").Eval(station.GetMyContextFromRoot(root))
     command = run.command
-    if scan.sequence:
+    if scan.sequence and command.scan_label:
         run.scans[command.scan_label] = (scan, command.scan_purpose)

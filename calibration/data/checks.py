@@ -14,7 +14,7 @@ from weldcal.calibration.data.cloud_files.depth import checked_intrinsics
 from weldcal.calibration.data.cloud_files.form import VIEWPOINTS
 from weldcal.calibration.data.cloud_files.grid import measured
 from weldcal.calibration.data.clouds import CloudError, CloudForm, read_cloud
-from weldcal.calibration.data.header import DatasetHeader, Feature, PoseForm, ScannerGuess, Units
+from weldcal.calibration.data.header import DatasetHeader, Feature, PoseForm, ScannerGuess, SecondRobot, Units
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
@@ -27,6 +27,10 @@ UNITS = {"m": 1.0, "mm": 1e-3}
 AUTO = "auto"
 CONFIGURATIONS = ("eye_on_base", "eye_in_hand")
 IN_HAND = "eye_in_hand"
+CARRIED = ("eye_on_arm_target_on_flange", "eye_on_arm_target_on_base", "co_manipulation")
+"""Other mountings, which are calibrated from scans at rest."""
+ALIASES = {"eye_on_arm": CARRIED[0], "eye_on_arm_base": CARRIED[1]}
+LARGEST_ARM_MM = 5.0
 MODES = ("static", "motion")
 _SAMPLE = 10_000  # points whose distance is enough to tell metres from millimetres
 # Median distances that a flange has from its base, and a scanned point from its camera. The bounds are a factor of 1000 apart, so
@@ -70,26 +74,29 @@ def read_header(path: Path) -> DatasetHeader:
     if header.mode not in MODES:
         raise DatasetError(f"'{path.name}' gives the mode '{header.mode}'; write {' or '.join(MODES)}.")
     header.configuration = mounting_name(header.configuration)
-    if header.configuration not in CONFIGURATIONS:
-        command = "axb-ycz" if header.configuration == "co_manipulation" else "ax-yb"
-        known = header.configuration.startswith(("eye_on_arm", "co_manipulation"))
-        there = f"; 'weldcal hand-eye {command} PAIRS' calibrates that mounting from pairs of poses" if known else ""
+    header.configuration = ALIASES.get(header.configuration, header.configuration)
+    known = CONFIGURATIONS if header.mode == "motion" else (*CONFIGURATIONS, *CARRIED)
+    if header.configuration not in known:
         raise DatasetError(
-            f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles "
-            f"{', '.join(CONFIGURATIONS)}{there}."
+            f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles {', '.join(known)}"
+            f"{' in motion' if header.mode == 'motion' else ''}."
         )
-    if header.configuration == IN_HAND and header.mode != "motion":
+    if not 0.0 < header.arm_error_mm <= LARGEST_ARM_MM:
         raise DatasetError(
-            f"'{path.name}' asks for the configuration '{IN_HAND}' (the scanner on the arm), which calibrate handles in motion (mode: "
-            f"motion); at rest use weldcal hand-eye: 'weldcal hand-eye ax-yb PAIRS --mounting {IN_HAND}' takes pairs of robot and camera "
-            "poses, and 'weldcal hand-eye live eye_in_hand' scans the foot of the robot."
+            f"'{path.name}': arm_error_mm must be above 0 and at most {LARGEST_ARM_MM:g}, and it is {header.arm_error_mm:g}."
         )
     _check_poses(header, path)
     _check_clouds(header, path)
     return header
 
 
-_PARTS = {"units": Units, "feature_in_flange": Feature, "scanner_guess": ScannerGuess, "poses": PoseForm}
+_PARTS = {
+    "units": Units,
+    "feature_in_flange": Feature,
+    "scanner_guess": ScannerGuess,
+    "poses": PoseForm,
+    "second_robot": SecondRobot,
+}
 """The keys of dataset.yaml that hold keys of their own."""
 
 
@@ -124,6 +131,16 @@ def is_motion(folder: Path) -> bool:
         return path.is_file() and read_header(path).mode == "motion"
     except DatasetError:
         return False
+
+
+def is_carried(folder: Path) -> bool:
+    """Whether a folder's dataset.yaml is of scans at rest by a scanner that an arm carries. False where it cannot be read."""
+    path = Path(folder) / "dataset.yaml"
+    try:
+        header = read_header(path) if path.is_file() else None
+    except DatasetError:
+        return False
+    return header is not None and header.mode != "motion" and header.configuration != CONFIGURATIONS[0]
 
 
 def metric_cloud(path: Path, header: DatasetHeader, folder: Path) -> Array:
@@ -175,7 +192,8 @@ def _check_clouds(header: DatasetHeader, path: Path) -> None:
 def _check_poses(header: DatasetHeader, path: Path) -> None:
     """The lists of the header's poses: their lengths, finite numbers, metres, unit quaternions."""
     guess = header.scanner_guess
-    for key, found in (("feature_in_flange", header.feature_in_flange), ("scanner_guess", guess)):
+    second = ("second_robot", header.second_robot)
+    for key, found in (("feature_in_flange", header.feature_in_flange), ("scanner_guess", guess), second):
         if found is None:
             continue
         for name, values, n in ((f"{key}.xyz", found.xyz, 3), (f"{key}.wxyz", found.wxyz, 4)):

@@ -14,6 +14,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.checks import (
     AUTO,
+    CONFIGURATIONS,
     REACH_M,
     UNITS,
     check_reach,
@@ -40,6 +41,9 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import sha256
 from weldcal.models.result_files import require_whole, whole_result, write_atomic
+
+JOINTS = tuple(f"q{k}" for k in range(1, 7))
+SECOND_JOINTS = tuple(f"second_q{k}" for k in range(1, 7))
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,14 @@ class Dataset:
         g = self.header.scanner_guess
         return None if g is None else RigidTransform(unit_quaternion(g.wxyz, "scanner_guess"), g.xyz)
 
+    def joints(self, names: tuple[str, ...] = JOINTS) -> dict[str, Array]:
+        """Joint angles (6,) rad by id, of poses.csv; empty where it has none. Raises DatasetError for bad numbers."""
+        path = self.folder / "poses.csv"
+        rows = table_rows(path, ("id",)) if path.is_file() else []
+        if not all(row.get(name) for row in rows for name in names):
+            return {}
+        return {row["id"]: np.array(row_numbers(row, names, path)) for row in rows}
+
     def cloud(self, id: str) -> Array:
         """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
         if id in self.recorded:
@@ -124,11 +136,11 @@ class Dataset:
         return metric_cloud(self.clouds[id], self.header, self.folder)
 
 
-def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
+def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dataset:
     """Read and check a dataset: dataset.yaml with poses.csv and clouds/, or pairs.csv; or the poses in any form of docs/datasets.md.
 
     Without dataset.yaml the scanner is taken as fixed beside the robot, and the units follow from the size of the numbers.
-    ``robot`` gives the kinematics of a recording that holds joint angles.
+    ``robot`` gives the kinematics of a recording that holds joint angles. ``carried``: the scanner may be carried by an arm.
 
     Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown
     unit or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses
@@ -158,6 +170,11 @@ def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
         raise DatasetError(
             f"'{folder.name}' is a recording in motion (mode: motion); 'weldcal calibrate' and 'weldcal monitor' read it. "
             "This command needs scans at rest, with poses.csv."
+        )
+    if header.configuration != CONFIGURATIONS[0] and not carried:
+        raise DatasetError(
+            f"'{folder.name}' is of a scanner that an arm carries ({header.configuration}); only 'weldcal calibrate' reads it. This command "
+            "needs a scanner beside the robot (eye_on_base)."
         )
     hashes = {} if bare else {"dataset.yaml": digest(description)}
     if header.poses is not None and header.poses.file:
@@ -321,11 +338,13 @@ def save_dataset(
     clouds: Mapping[str, Array],
     *,
     times: Mapping[str, float] | None = None,
+    joints: Mapping[str, Array] | None = None,
     intrinsics: tuple[float, float, float, float] | None = None,
 ) -> None:
     """Record scans as a dataset folder that load_dataset reads back: X_BF and a cloud in metres ((N, 3) or (H, W, 3)) per id.
 
-    ``times`` (s) adds the column `time`; ``intrinsics`` writes organised clouds as depth maps.
+    ``times`` (s) adds the column `time`, ``joints`` (6,) or (12,) rad q1 to q6, and of a second arm second_q1 to second_q6;
+    ``intrinsics`` writes organised clouds as depth maps.
     ``header.units`` is written as metres. Raises DatasetError when the ids of poses and clouds differ.
     """
     if set(poses) != set(clouds):
@@ -333,10 +352,12 @@ def save_dataset(
     document = {**without_cloud_form(header), "schema": 1, "units": {"clouds": "m", "poses": "m"}}
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", *(["time"] if times else [])])
+    angles = [] if not joints else [*JOINTS, *SECOND_JOINTS][: len(next(iter(joints.values())))]
+    writer.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", *(["time"] if times else []), *angles])
     for id, X_BF in poses.items():
-        taken = [repr(float(times[id]))] if times else []
-        writer.writerow([id, *map(repr, X_BF.translation().tolist()), *map(repr, _wxyz(X_BF)), *taken])
+        more = [] if not times else [float(times[id])]
+        more += [] if not joints else [float(v) for v in joints[id]]
+        writer.writerow([id, *map(repr, [*X_BF.translation().tolist(), *_wxyz(X_BF), *more])])
     with whole_result(folder):
         write_atomic(folder / "dataset.yaml", yaml_dump(document))
         for id, points in clouds.items():

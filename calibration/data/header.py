@@ -33,6 +33,15 @@ class ScannerGuess:
 
 
 @dataclass
+class SecondRobot:
+    """The second robot of a co-manipulation and the approximate pose X_BD of its base in the first one's base: m, quaternion wxyz."""
+
+    robot: str = "ur10e"
+    xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass
 class DepthCamera:
     """Intrinsics of depth images, pixels; the centre of the first pixel is 0, 0."""
 
@@ -63,7 +72,9 @@ class PoseForm:
 @dataclass(kw_only=True)
 class DatasetHeader:
     """Contents of dataset.yaml. ``mode``: static (a scan at each pose) or motion (scans while the arm moves). ``intrinsics`` and
-    ``depth_scale`` (metres of one unit) of depth images; ``viewpoint``: what VIEWPOINT of PCD files means."""
+    ``depth_scale`` (metres of one unit) of depth images; ``viewpoint``: what VIEWPOINT of PCD files means. Of a scanner that an arm carries:
+    ``scanner_guess`` is its pose on its carrier; ``scanner_link`` the link that carries it (eye_on_arm), ``second_robot`` the arm that shows
+    its flange (co_manipulation), ``arm_error_mm`` the rms error of the flange's reported position."""
 
     schema: int = 0
     robot: str = ""
@@ -79,6 +90,9 @@ class DatasetHeader:
     intrinsics: DepthCamera | None = None
     depth_scale: float = 0.0
     viewpoint: str = ""
+    scanner_link: str = ""
+    second_robot: SecondRobot | None = None
+    arm_error_mm: float = 0.4
 
 
 def without_cloud_form(header: DatasetHeader) -> dict[str, Any]:

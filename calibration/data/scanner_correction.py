@@ -14,7 +14,12 @@ EXPONENTS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1,
 TERMS = {1: 3, 2: 6, 3: 10}
 """How many terms a correction of that order has."""
 
-_LARGEST = 0.05  # a factor farther from 1 is no property of a scanner that measures
+LARGEST = 0.05
+"""A factor farther from 1 is no property of a scanner that measures."""
+LOOSE = np.array([0.03, 0.3, 0.3])
+"""Standard deviations of scale and gradient that keep poses on one spot solvable, and a gradient that no circle shows."""
+_USUAL = np.array([2e-3, 1.5e-2, 1.5e-2])  # what scanners are off in scale and gradient (1/m)
+_USUAL_BEND, _EDGE = 1e-3, 0.35  # and by a bend, at the edge of the image: so many depths from its middle
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class ScannerCorrection:
 
     def __post_init__(self) -> None:
         values = np.array([self.scale, *self.gradient_per_m, *self.bend, *(self.field_m or ())])
-        if not np.isfinite(values).all() or abs(self.scale - 1.0) > _LARGEST or len(self.values) not in TERMS.values():
+        if not np.isfinite(values).all() or abs(self.scale - 1.0) > LARGEST or len(self.values) not in TERMS.values():
             raise InputError("The scanner correction is invalid: its scale must lie within 5 % of 1.")
 
     @classmethod
@@ -156,3 +161,17 @@ def correction_from_document(document: dict[str, Any] | None, file: str = "") ->
         raise InputError(
             f"{where}The scanner correction in the result cannot be read; it holds scale and gradient_per_m [gx, gy]."
         ) from e
+
+
+def correction_of(change: Array, field: tuple[float, float, float, float] | None = None) -> ScannerCorrection:
+    """The correction whose factors (K,) differ by ``change`` from those of a perfect scanner."""
+    limited = np.clip(change[0], -LARGEST, LARGEST)
+    bend = tuple(float(v) for v in change[3:])
+    return ScannerCorrection(1.0 + float(limited), (float(change[1]), float(change[2])), bend, field if bend else None)
+
+
+def expected_factors(terms: int, depth: float, usual: bool = True) -> Array:
+    """Standard deviations (K,) of the factors of a scanner before its first scan; bends by their size at the edge of the image."""
+    edge = _EDGE * depth
+    bends = np.concatenate([np.full(3, _USUAL_BEND / edge**2), np.full(4, _USUAL_BEND / edge**3)])
+    return np.concatenate([_USUAL if usual else LOOSE, bends])[:terms]

@@ -6,7 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
+from weldcal.calibration.data.scanner_correction import (
+    LARGEST,
+    LOOSE,
+    TERMS,
+    ScannerCorrection,
+    correction_of,
+    expected_factors,
+)
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
@@ -19,12 +26,8 @@ from weldcal.models.compiled import compiled
 
 LEAST_PATTERNS = 6
 STARTS = 30  # random starts of an estimate: these observations are cleared of gross outliers
-_LARGEST = 0.05  # a scale farther from 1 is no property of a scanner that measures
 _MARGIN_M = 0.03  # a face reaches so far about its centre: there, too, a bend was seen
-_USUAL = np.array([2e-3, 1.5e-2, 1.5e-2])  # what scanners are off in scale and gradient (1/m)
 _USUAL_SPREAD_M = 1e-4
-_USUAL_BEND, _EDGE = 1e-3, 0.35  # and by a bend, at the edge of the image: so many depths from its middle
-_LOOSE = np.array([0.03, 0.3, 0.3])  # keeps poses on one spot solvable, and a gradient that no circle shows
 # how far a hole circle may differ from what motion shows: the maker's pitch circle is trusted to 25 micrometres on 50 mm,
 # and a circle sees a distortion of higher order in one place, motion sees it over the whole field
 CIRCLE_OWN = np.array([5e-4, 3e-3, 3e-3])
@@ -143,23 +146,9 @@ def from_holes(observations: Sequence[Observation], patterns: Mapping[str, HoleP
         return None
     # 1 / ratio is the stretch asked for; a weak prior holds a gradient that no circle shows
     sigma = _ratio_sigma(A, ratio)
-    inverse = np.linalg.inv(A.T @ A / sigma**2 + np.diag(1.0 / _LOOSE**2))
+    inverse = np.linalg.inv(A.T @ A / sigma**2 + np.diag(1.0 / LOOSE**2))
     v = inverse @ (A.T @ (1.0 / ratio - 1.0)) / sigma**2
     return CorrectionEstimate(correction=correction_of(v), covariance=np.asarray(inverse))
-
-
-def correction_of(change: Array, field: tuple[float, float, float, float] | None = None) -> ScannerCorrection:
-    """The correction whose factors (K,) differ by ``change`` from those of a perfect scanner."""
-    limited = np.clip(change[0], -_LARGEST, _LARGEST)
-    bend = tuple(float(v) for v in change[3:])
-    return ScannerCorrection(1.0 + float(limited), (float(change[1]), float(change[2])), bend, field if bend else None)
-
-
-def expected_factors(terms: int, depth: float, usual: bool = True) -> Array:
-    """Standard deviations (K,) of a correction's factors before any scan, at a depth (m); bends by their size at the edge of the image."""
-    edge = _EDGE * depth
-    bends = np.concatenate([np.full(3, _USUAL_BEND / edge**2), np.full(4, _USUAL_BEND / edge**3)])
-    return np.concatenate([_USUAL if usual else _LOOSE, bends])[:terms]
 
 
 @compiled()
@@ -201,7 +190,7 @@ def _gauss_newton(
     s, seen = np.zeros(3), np.zeros(3)
     for count in range(40):
         values = change[:terms].copy()
-        values[0] = 1.0 + min(max(change[0], -_LARGEST), _LARGEST)
+        values[0] = 1.0 + min(max(change[0], -LARGEST), LARGEST)
         for i in range(n):
             factor = basis[i] @ values
             q = R @ (factor * c[i]) + p

@@ -33,7 +33,7 @@ class BaseCircleConfig:
     """Limits of the fit. ``radius_sigma_m``: uncertainty of the drawing's outer radius, which an arc determines badly; ``min_arc``: share of
     the edge that must be seen; ``min_points`` on the ring."""
 
-    radius_sigma_m: float = 1e-4
+    radius_sigma_m: float = 2.2e-4
     min_arc: float = 0.25
     min_points: int = 80
     seed: int = 0

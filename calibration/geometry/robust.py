@@ -92,3 +92,13 @@ def solved(N: Array, g: Array, free: int) -> tuple[bool, Array]:
             s -= L[k, i] * x[k]
         x[i] = s / L[i, i]
     return True, x
+
+
+def radius_95(S: Array) -> float:
+    """Distance that an error of covariance ``S`` (3, 3) does not exceed with 95 %, in the square root of its unit.
+
+    It is that of a scaled chi-square with the mean and variance of the squared error (Satterthwaite 1946).
+    """
+    mean, square = float(np.trace(S)), float(np.trace(S @ S))
+    freedom = mean**2 / square if square > 0.0 else 3.0
+    return float(np.sqrt(chi2_quantile(0.95, freedom) * mean / freedom))

@@ -43,7 +43,7 @@ def export_drake_directive(X: RigidTransform, parent: str, child: str) -> str:
 
 def document(result: HandEyeResult, mounting: Mounting, provenance: Provenance) -> dict[str, object]:
     """All of a result in plain types: what hand_eye.yaml holds."""
-    held = result.held_out
+    held, correction = result.held_out, getattr(result, "correction", None)
     return {
         "schema": 1,
         "software": software_version(),
@@ -51,6 +51,7 @@ def document(result: HandEyeResult, mounting: Mounting, provenance: Provenance) 
         "equation": mounting.equation,
         "poses": {u.symbol: _pose(result, k, u) for k, u in mounting.unknowns.items() if k in result.poses},
         "covariance_order": "rotation (rad) then translation (m), on the parent's side about the child's origin",
+        **({} if correction is None else {"scanner_correction": correction.document()}),
         "held_out": {"deg": _number(held.rms_deg), "mm": _number(1e3 * held.rms_translation)},
         "noise": {
             "deg": _number(float(np.degrees(result.sigma_rotation_rad))),

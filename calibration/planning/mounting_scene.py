@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +16,34 @@ from weldcal.calibration.hand_eye.mountings import Mounting, TargetObservation, 
 from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes
 from weldcal.calibration.planning.surroundings import Surroundings
-from weldcal.models.arms.kinematics import ArmModel, link_frames
+from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.scanners import ScannerPreset
 
 BASE, FLANGE = 0, 6
 """Places in link_frames of what does not move, and of the flange."""
+FOOT = ("eye_in_hand", "eye_on_arm_target_on_base")
+"""Configurations with the circle of the base mounting as target; the others have a flange."""
 SCANNER_BODY = (0.13, 0.06, -0.045)
 """A scanner that is carried, as a capsule: half its length along x of the camera, radius, and where it lies along z (m)."""
+ARM_ERROR_M = 4e-4
+"""Rms error of the flange's position that an arm with its maker's calibration usually has."""
+LENGTH_M = 0.5
+"""A link's length error (m) over its angle error (rad)."""
 _RING = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
 _ALONG = np.linspace(0.0, 1.0, 9)[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedLink:
+    """A link between base and scanner (``sign`` +1) or circle (-1): frames in B of the link before it and of itself; its errors' size, and its
+    joint's spread at a stop, rad."""
+
+    X_before: RigidTransform
+    X: RigidTransform
+    sign: float
+    error_rad: float
+    spread_rad: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,7 +52,8 @@ class MountingScene:
 
     ``link``: place in link_frames of what carries the scanner (0 base, 6 flange), ``X_LC`` the scanner there. ``X_HR``: the
     circle on what carries it: in the base, on the flange, or on the second arm's flange. ``radius_m``: its outer edge.
-    ``target_known``: the drawing of X_HR is believed. ``arm_2``, ``X_BD``, ``q_home_2``: the second arm of a co-manipulation.
+    ``target_known``: the drawing of X_HR is believed. ``arm_error_m``: rms error of the flange's reported position.
+    ``arm_2``, ``X_BD``, ``q_home_2``: the second arm of a co-manipulation.
     """
 
     configuration: str
@@ -49,6 +69,34 @@ class MountingScene:
     X_BD: RigidTransform | None = None
     q_home_2: Array | None = None
     surroundings: Surroundings = field(default_factory=Surroundings)
+    arm_error_m: float = ARM_ERROR_M
+    repeatability_m: float = 5e-5
+
+    @cached_property
+    def sizes(self) -> tuple[tuple[float, float], ...]:
+        """Of each arm: error (rad) of each angle of a link, for which the flange at home is off by ``arm_error_m`` (rms), and spread (rad)
+        of each joint at a stop, by which it moves by ``repeatability_m``."""
+        found = []
+        for arm, q in ((self.arm, self.q_home), (self.arm_2, self.q_home_2)):
+            if arm is not None and q is not None:
+                frames = link_frames(arm, q)
+                levers = [float(np.sum((frames[-1].translation() - X.translation()) ** 2)) for X in frames[:-1]]
+                # two of the three angles move the flange by the lever, three lengths by themselves
+                gain = float(np.sqrt(sum(2.0 * square + 3.0 * LENGTH_M**2 for square in levers)))
+                found.append(
+                    (self.arm_error_m / gain, self.repeatability_m / float(np.linalg.norm(jacobian(arm, q)[3:])))
+                )
+        return tuple(found)
+
+    def carried(self, q: Array, q_2: Array | None) -> list[CarriedLink]:
+        """The links whose errors move scanner or circle, but not both."""
+        end = 0 if self.two or self.configuration in FOOT else FLANGE
+        frames = self.frames(q)
+        found = [(frames, k, float(k < self.link) - float(k < end), self.sizes[0]) for k in range(FLANGE)]
+        if self.two and q_2 is not None:
+            second = self.frames_2(q_2)
+            found += [(second, k, -1.0, self.sizes[1]) for k in range(FLANGE)]
+        return [CarriedLink(X[k], X[k + 1], sign, *size) for X, k, sign, size in found if sign]
 
     @property
     def mounting(self) -> Mounting:
@@ -102,8 +150,7 @@ class MountingScene:
         if self.two:
             assert q_2 is not None
             return self.frames_2(q_2)[FLANGE] @ self.X_HR
-        on_base = self.configuration in ("eye_in_hand", "eye_on_arm_target_on_base")
-        return self.X_HR if on_base else frames[FLANGE] @ self.X_HR
+        return self.X_HR if self.configuration in FOOT else frames[FLANGE] @ self.X_HR
 
     def observation(
         self, q: Array, q_2: Array | None, p_CR: Array, n_CR: Array, covariance: Array | None = None
@@ -167,7 +214,7 @@ class Bodies:
         eye = np.asarray((frames[self.scene.link] @ self.scene.X_LC).translation())
         ring = self.scene.radius_m * np.column_stack([np.cos(_RING), np.sin(_RING), 0.0 * _RING])
         points = (X_BR @ ring.T).T
-        if self.scene.configuration in ("eye_in_hand", "eye_on_arm_target_on_base"):
+        if self.scene.configuration in FOOT:
             toward = eye - X_BR.translation()
             points = points[(points - X_BR.translation()) @ toward > -0.1 * self.scene.radius_m]
         carrier = self.scene.link

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
-from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate, correction_of
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, correction_of
+from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, flange_poses, inverse, pose, skew
 from weldcal.models.arms.chain import Chain

@@ -59,7 +59,9 @@ class CalibrationConfig:
     )  # nominal X_BC (X_FC, X_LC), such as measured with a tape
     guess_radius_mm: float = 60.0  # largest distance of the feature from its predicted position
     theta_max_deg: float = 25.0  # between the feature's normal and the line of sight
-    required_error_mm: float = 0.10  # e_required, for the estimate's expected error at the work point
+    required_error_mm: float = (
+        0.10  # e_required, for the estimate's expected error at the work point; in a mounting job for its bound at 95 %
+    )
     minimum_scans: int = 6
     maximum_scans: int = 10  # k_max, without the verification scans
     correct_scanner: bool = True  # estimate scale, gradient and bends of the scanner with X_BC

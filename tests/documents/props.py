@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import weldcal
 from tests.calibration.hand_eye import rendering
 from tests.calibration.tablet.visit import write_visit
-from tests.documents.scans import write_scans
+from tests.documents.scans import write_scans, write_wrist_scans
 from tests.places import ROOT, SHARED_DATA
 from tests.short_job import SHORT_JOB
 from weldcal.calibration.data.results import save_result
@@ -173,6 +173,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "my_scans": lambda path: write_scans(path, 12, 0),
     "other_scans": lambda path: write_scans(path, 8, 1),
     "three_scans": lambda path: write_scans(path, 3, 2),
+    "my_wrist_scans": write_wrist_scans,
     "one_scan": lambda path: write_scans(path, 1, 5),
     "pairs.npz": lambda path: _hand_eye(path, "eye_in_hand"),
     "eMc.yaml": _camera_pose,

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from tests.calibration.flange.test_base_circle import scan
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, ScannerGuess
 from weldcal.models.arms.inverse import inverse_kinematics
-from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.flanges import get_flange
 
 Floats = npt.NDArray[np.float64]
@@ -69,3 +70,28 @@ def _add_joints(path: Path, poses: list[RigidTransform]) -> None:
     lines = [",".join([header, *(f"q{k}" for k in range(1, 7))])]
     lines += [",".join([row, *(f"{angle:.9f}" for angle in q)]) for row, q in zip(rows, angles, strict=True)]
     path.write_text("\n".join(lines) + "\n")
+
+
+X_FC = RigidTransform(RollPitchYaw(0.02, -0.015, 0.01), [0.008, -0.095, 0.064])
+WRIST_POSES = (  # joints, degrees, from which a scanner on the wrist sees the foot
+    (-80.8, -76.1, 69.0, -38.3, -99.8, 27.2),
+    (-0.3, -78.3, 83.7, -56.7, -102.8, -113.5),
+    (44.5, -85.3, 57.2, -24.0, -88.2, 15.5),
+    (-137.1, -102.2, 119.9, -55.0, -103.5, -25.1),
+    (-78.0, -177.6, 57.3, -11.6, -110.6, -8.6),
+    (98.4, -76.1, 82.0, -34.4, -109.1, -80.8),
+    (-66.6, -86.1, 92.7, -38.0, -97.6, -70.6),
+    (-17.2, -72.4, 50.3, -29.0, -111.7, -71.0),
+    (-76.7, -74.9, 41.8, -21.7, -88.7, 38.5),
+)
+
+
+def write_wrist_scans(folder: Path, scale: float = 1.0) -> Path:
+    """A dataset of a scanner on the wrist, at X_FC, that sees the foot of a UR10e; it measures ``scale`` times what is true."""
+    arm = load_arm("ur10e")
+    poses = {f"pose{k + 1:02d}": forward_kinematics(arm, np.radians(q)) for k, q in enumerate(WRIST_POSES)}
+    header = DatasetHeader(schema=1, robot="ur10e", flange=FLANGE, scanner="phoxi_m", configuration="eye_in_hand")
+    header.scanner_guess = ScannerGuess(xyz=[0.0, -0.1, 0.06])
+    clouds = {id: scale * scan(X @ X_FC, 1e-4, size=(824, 616), seed=k) for k, (id, X) in enumerate(poses.items())}
+    save_dataset(folder, header, poses, clouds)
+    return folder

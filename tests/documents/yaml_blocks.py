@@ -78,7 +78,7 @@ def _dataset(block: Block, folder: Path) -> str:
     (scans / "dataset.yaml").write_text(block.text, encoding="utf-8")
     if "euler_ZYX" in block.text:
         (scans / "poses.csv").write_text("id,x,y,z,e1,e2,e3\npose01,400,0,300,10,20,30\npose02,450,50,300,20,10,40\n")
-    data = load_dataset(scans)
+    data = load_dataset(scans, carried=True)
     assert set(data.clouds) == {"pose01", "pose02"}
     return "dataset"
 

@@ -28,6 +28,7 @@ from tests.systems.cells import Q_HOME, TOOL, plain_station, the_arm
 from tests.systems.drivers.sensors.scripted import Scripted
 from tests.systems.drivers.still_link import StillLink
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.planning.mounting_estimate import Circle
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
@@ -221,7 +222,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     MountingProcedure: lambda: MountingProcedure((), 0, 0, (Q_HOME, None)),
     MountingCalibrator: lambda: MountingCalibrator(
         mounting_scene(load_scenario("eye_on_arm"), the_arm())[0],
-        MountingFitConfig(get_flange("tool-ring-63"), 0.06, False, 6, 1e-4),
+        MountingFitConfig(Circle(get_flange("tool-ring-63"), 0.06, False), 6, 1e-4),
         (),
     ),
     ProfilerSensor: lambda: ProfilerSensor(RenderedProfiler(), profiler_fixture(), BodyIndex(7), 0, 0.004),

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.calibrate import KINEMATICS_FILE, REFINEMENTS, Steps
 from weldcal.calibration.calibrate import calibrate as calibrate_observations
 from weldcal.calibration.calibrate import refine as refine_calibration
-from weldcal.calibration.data.checks import is_motion
+from weldcal.calibration.data.checks import is_carried, is_motion
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
@@ -137,6 +137,13 @@ def calibrate(
             )
         moving = other_command("calibrate-motion").body
         return moving(call, dataset, robot=robot, flange=flange, centres=centres, limit_mm=limit_mm)
+    if is_carried(dataset):
+        if axis_turn is not None or refine is not None or compare or centres or not scanner_correction:
+            raise typer.BadParameter(
+                "--refine, --axis-turn, --compare, --centres and --no-scanner-correction are for a scanner beside the robot; omit them"
+            )
+        carried = other_command("calibrate-carried").body
+        return carried(call, dataset, robot=robot, flange=flange, poses=poses, limit_mm=limit_mm)
     report = calibrate_dataset(
         dataset,
         call.folder("calibrate", dataset.resolve().name),

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
-from weldcal.calibration.geometry.robust import chi2_quantile
+from weldcal.calibration.geometry.robust import radius_95 as radius_95
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -61,16 +61,6 @@ class WorkPoint:
             "unseen_poses": self.unseen_poses,
             "held_out_95_mm": self.held_out_95_mm,
         }
-
-
-def radius_95(S: Array) -> float:
-    """Distance that an error of covariance ``S`` (3, 3) does not exceed with 95 %, in the square root of its unit.
-
-    It is that of a scaled chi-square with the mean and variance of the squared error (Satterthwaite 1946).
-    """
-    mean, square = float(np.trace(S)), float(np.trace(S @ S))
-    freedom = mean**2 / square if square > 0.0 else 3.0
-    return float(np.sqrt(chi2_quantile(0.95, freedom) * mean / freedom))
 
 
 def work_point_error(estimate: CalibrationEstimate, p_BQ: Array) -> WorkPoint:

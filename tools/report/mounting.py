@@ -1,6 +1,7 @@
-"""The result of a live calibration in any mounting and its page: the station, what was found in which direction, how sure."""
+"""The result of a calibration in any mounting, live or from recorded scans, and its page."""
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,12 +20,16 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
+from weldcal.calibration.hand_eye.exports import RESULT_FILE
 from weldcal.calibration.hand_eye.mountings import Mounting
-from weldcal.calibration.hand_eye.solve import HandEyeResult, pose_difference
+from weldcal.calibration.hand_eye.solve import pose_difference
+from weldcal.calibration.planning.mounting_estimate import MountingResult
 from weldcal.calibration.planning.mounting_poses import work_point
-from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
+from weldcal.calibration.planning.mounting_scene import BASE, FLANGE, FOOT, MountingScene
+from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.mounting.job import FOOT, AddedMounting
+from weldcal.models.scanners import ScannerPreset
+from weldcal.systems.jobs.mounting.job import AddedMounting
 from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
@@ -35,8 +40,6 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
     after_hold,
     expected_error,
-    point_covariance,
-    radius_95,
     refused_note,
 )
 from weldcal.tools.report.hand_eye import (
@@ -65,10 +68,10 @@ class TruthError:
 
 @dataclass(frozen=True, eq=False)
 class MountingReport:
-    """The result of a live calibration, and its folder."""
+    """The result of a calibration, and its folder; ``run`` is None where the scans were recorded."""
 
-    run: Run[AddedMounting]
-    result: HandEyeResult | None
+    run: Run[AddedMounting] | None
+    result: MountingResult | None
     folder: Path
     seconds: float
     robot: str = "simulated"
@@ -76,78 +79,111 @@ class MountingReport:
     @property
     def job(self) -> AddedMounting:
         """The job that ran."""
+        assert self.run is not None
         return self.run.cell.job
 
     @property
+    def scene(self) -> MountingScene:
+        """The scene as known before the first scan."""
+        return self.job.scene
+
+    @property
+    def truth(self) -> Mapping[str, RigidTransform]:
+        """The true poses by their letters; empty where they are not known."""
+        return {} if self.run is None else self.job.truth
+
+    @property
+    def device(self) -> ScannerPreset | None:
+        """The simulated scanner with its own errors; None where it is not known."""
+        true = None if self.run is None else self.run.cell.station.truth.scanner
+        return None if true is None else true.device
+
+    @property
     def status(self) -> MountingStatus:
-        """The calibration's last status in the run."""
+        """The calibration's last status."""
+        assert self.run is not None
         return self.job.status(self.run.root)
+
+    @property
+    def tolerance(self) -> tuple[float | None, str]:
+        """The error (mm, 95 %) that the job allows, and where that is stated."""
+        assert self.run is not None
+        return self.run.cell.scenario.calibration.required_error_mm, "calibration.required_error_mm"
+
+    @property
+    def description(self) -> str:
+        """One sentence on the cell."""
+        return "" if self.run is None else self.run.cell.scenario.description
 
     @property
     def mounting(self) -> Mounting:
         """The configuration."""
-        return self.job.scene.mounting
+        return self.scene.mounting
 
     @property
     def state(self) -> str:
         """`done`, or `held` with a reason."""
-        return "done" if not self.run.held and self.result is not None else "held"
+        return "done" if self.result is not None and (self.run is None or not self.run.held) else "held"
 
     @property
     def reason(self) -> str:
         """The reason why the job was held; empty where it is done."""
         if self.state == "done":
             return ""
-        return self.run.reason or self.status.message
+        return (self.run.reason if self.run is not None else "") or self.status.message
 
     @property
     def first(self) -> FirstScreen:
         """The first screen: the job's own tolerance on its expected error, at the scanner's best distance."""
-        status, result, scenario = self.status, self.result, self.run.cell.scenario
+        status, result = self.status, self.result
         against = [self.reason] if self.state != "done" else []
         aside = [1e3 * k.error_m for k in status.held_out]
-        what = f"error {1e3 * self.job.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
+        what = f"error of a scanned point {1e3 * self.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
         if result is None:
             found = Findings(against=against or ["There is no result."], unseen=0)
-            after = after_hold(self.run.ended_by_operator)
+            after = after_hold(self.run is not None and self.run.ended_by_operator)
             return FirstScreen(
                 found, Expected(what, "not known", "there is no calibration"), after, more={"pose": "none was found"}
             )
-        X = result.X
-        p = np.asarray(X @ work_point(self.job.scene))
-        own = 1e3 * radius_95(point_covariance(X, result.covariance["X"], p))
         _, p95, n = held_out_error(result)
-        expected, _ = expected_error(what, own, p95, n, "poses")
+        expected, figure = expected_error(what, 1e3 * status.error_95_m, p95, n, "poses")
         if aside:
             more = f"{expected.backing}; {len(aside)} held out by the job: at most {max(aside):.3f} mm"
             expected = Expected(what, expected.figure, more)
-        tolerance = Tolerance(
-            "the expected error, one sigma,", 1e3 * status.sigma_work_m, scenario.calibration.required_error_mm,
-            "calibration.required_error_mm",
-        )  # fmt: skip
+        limit, source = self.tolerance
+        tolerance = None if limit is None else Tolerance("the expected error, 95 %,", figure, limit, source)
         open_directions = undetermined(result)
         against += open_directions
         concerns = [
             *(f"Not observable: {text}" for text in result.unobservable if not open_directions),
             *result.warnings,
         ]
-        notes = refused_note(status.refused, status.sequence)
+        notes = [self.scanner_sentence(), *refused_note(status.refused, status.sequence)]
         found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
         if status.next_best is not None:
             after = Next(f"To know it better, add the pose {status.next_best.sentence()}")
         else:
-            after = Next("Use the pose; calibrate again after any knock.")
-        return FirstScreen(
-            found,
-            expected,
-            after,
-            shown_poses(result, self.mounting),
+            after = Next("Use the pose; calibrate again after the scanner was moved.")
+        return FirstScreen(found, expected, after, shown_poses(result, self.mounting))
+
+    def scanner_sentence(self) -> str:
+        """What was found of the scanner, and what the scans do not determine of it."""
+        assert self.result is not None
+        r = self.result
+        m, f = len(r.joint_covariance), r.correction
+        scale, along_x, along_y = np.sqrt(np.diag(r.with_factors)[m : m + 3])
+        text = (
+            f"The pose goes with the scanner's correction in {RESULT_FILE}: scale {100 * (f.scale - 1.0):+.3f} % (sigma {100 * scale:.3f}), gradient "
+            f"{f.gradient_per_m[0]:+.4f} and {f.gradient_per_m[1]:+.4f} per m (sigma {along_x:.4f} and {along_y:.4f})."
         )
+        if r.undetermined:
+            text += f" The scans do not determine its {', '.join(r.undetermined)}: the usual size is assumed."
+        return text
 
     def truth_errors(self) -> dict[str, TruthError]:
         """Symbol (X_FC ...) -> error against the truth."""
         out = {}
-        for letter, X in self.job.truth.items():
+        for letter, X in self.truth.items():
             if self.result is None or letter not in self.result.poses:
                 continue
             e = pose_difference(self.result.poses[letter], X)
@@ -160,12 +196,12 @@ class MountingReport:
         return out
 
     def work_error_mm(self) -> float | None:
-        """True error of a point at the scanner's best distance, mm."""
-        truth = self.job.truth.get("X")
-        if self.result is None or truth is None:
+        """True error of a scanned point at the scanner's best distance, mm."""
+        truth, device = self.truth.get("X"), self.device
+        if self.result is None or truth is None or device is None:
             return None
-        p = work_point(self.job.scene)
-        return 1e3 * float(np.linalg.norm(self.result.X @ p - truth @ p))
+        p = work_point(self.scene)
+        return 1e3 * float(np.linalg.norm(self.result.place(device.measured(p)) - truth @ p))
 
     def summary(self) -> dict[str, object]:
         """The JSON object: the keys of hand-eye and those of the run."""
@@ -180,13 +216,19 @@ class MountingReport:
         }
         if result is not None:
             for k, X in result.poses.items():
-                out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": result.covariance[k]}
+                u = self.mounting.unknowns[k]
+                out |= {k: X, u.symbol: X, f"{k}_is": u.sentence, f"covariance_{k}": result.covariance[k]}
             out |= {
                 "held_out_deg": held_out_used(result).rms_deg,
                 "held_out_mm": 1e3 * held_out_used(result).rms_translation,
                 "kept_aside_mm": [1e3 * k.error_m for k in status.held_out],
                 "kept_aside_deg": [float(np.degrees(k.tilt_rad)) for k in status.held_out],
                 "expected_error_mm": 1e3 * status.sigma_work_m,
+                "error_95_mm": 1e3 * status.error_95_m,
+                "scanner_correction": result.correction.document(),
+                "scanner_undetermined": list(result.undetermined),
+                "arm_error_mm": 1e3 * result.arm_error_m,
+                "outliers": [s.label for s, used in zip(status.seen, result.inliers, strict=True) if not used],
                 "work_error_mm": self.work_error_mm(),
                 "truth": {s: vars(e) for s, e in self.truth_errors().items()},
                 "inliers": result.inliers,
@@ -195,20 +237,18 @@ class MountingReport:
                 "method": result.method,
                 "next_pose": None if status.next_best is None else status.next_best.sentence(),
             }
-        return out | self.run.timing() | {"seconds": self.seconds}
+        return out | ({} if self.run is None else self.run.timing()) | {"seconds": self.seconds}
 
     def given(self) -> tuple[str, ...]:
         """The given data: the pose of the circle, and the link that carries the scanner."""
-        scene, scenario = self.job.scene, self.run.cell.scenario
+        scene = self.scene
         out = []
         for letter in scene.known:
             u = self.mounting.unknowns[letter]
-            circle = (
-                "the circle of the base mounting" if scenario.calibration.configuration in FOOT else "the flange itself"
-            )
+            circle = "the circle of the base mounting" if scene.configuration in FOOT else "the flange itself"
             out.append(f"{u.symbol} is known: the target M is {circle}, at the pose of the robot's drawing.")
-        if "arm" in scene.configuration and (scanner := scenario.scanner_config()) is not None:
-            out.append(f"The arm link L is the {scanner.mounted_on.replace('_', ' ')}.")
+        if "arm" in scene.configuration:
+            out.append(f"The arm link L is the {LINKS[scene.link - 1].replace('_', ' ')}.")
         return tuple(out)
 
     def text(self) -> str:
@@ -233,8 +273,10 @@ class MountingReport:
         if aside:
             lines.append(f"verified     {aside} mm at held-out poses, which the calibration did not use")
         lines.append(
-            f"expected     {1e3 * status.sigma_work_m:.3f} mm (1 sigma) of a point at the scanner's best distance"
+            f"expected     {1e3 * status.sigma_work_m:.3f} mm (1 sigma), {1e3 * status.error_95_m:.3f} mm (95 %) of a scanned point at the "
+            "scanner's best distance"
         )
+        lines.append(f"scanner      {self.scanner_sentence()}")
         for symbol, e in self.truth_errors().items():
             lines.append(
                 f"truth        {symbol} is off by {e.mm:.3f} mm, {e.deg:.4f} deg (simulation; squared error in units of its "
@@ -242,6 +284,39 @@ class MountingReport:
             )
         lines += [f"refused      {id}: {why}" for id, why in status.refused]
         return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordedMounting(MountingReport):
+    """The result of recorded scans. ``limit_mm``: the error that the job allows (--limit-mm); ``source``: the dataset's name,
+    ``digest`` what stands for its files."""
+
+    recorded: MountingStatus
+    place: MountingScene
+    folder: Path = Path()
+    source: str = ""
+    digest: str = ""
+    limit_mm: float | None = None
+
+    @property
+    def scene(self) -> MountingScene:
+        """See MountingReport."""
+        return self.place
+
+    @property
+    def status(self) -> MountingStatus:
+        """See MountingReport."""
+        return self.recorded
+
+    @property
+    def tolerance(self) -> tuple[float | None, str]:
+        """See MountingReport."""
+        return self.limit_mm, "--limit-mm"
+
+    @property
+    def description(self) -> str:
+        """See MountingReport."""
+        return f"Recorded scans: {self.source}."
 
 
 def mounting_report(report: MountingReport, picture: bytes | None) -> str:
@@ -265,7 +340,7 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
     ]
     return render(
         "mounting.html.j2",
-        **robot_timing(report.run),
+        **({} if report.run is None else robot_timing(report.run)),
         first=report.first,
         name=mounting.name,
         words=mounting.words,
@@ -273,14 +348,14 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         source=mounting.source,
         sketch=mounting.sketch,
         given=report.given(),
-        description=report.run.cell.scenario.description,
+        description=report.description,
         picture=picture,
         unknowns=unknowns,
         aside_mm=float(np.median(aside)) if len(aside) else None,
         n_aside=len(aside),
         expected_mm=1e3 * status.sigma_work_m,
         work_mm=report.work_error_mm(),
-        distance_mm=1e3 * report.job.scene.scanner.optimum_m,
+        distance_mm=1e3 * report.scene.scanner.optimum_m,
         n_used=len(status.seen),
         n_scans=status.sequence,
         unobservable=() if result is None else result.unobservable,
@@ -292,19 +367,21 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         if len(aside)
         else None,
         rows=rows,
-        seconds=report.run.seconds,
+        scanner="" if result is None else report.scanner_sentence(),
+        seconds=None if report.run is None else report.run.seconds,
     )
 
 
 def _growth(report: MountingReport) -> bytes:
     """Expected error of a point at the work distance after every scan."""
     n, sigma = np.array(report.status.history).T
-    required = report.run.cell.scenario.calibration.required_error_mm
+    required = report.tolerance[0]
     figure = Figure(figsize=(8.2, 2.8), layout="constrained")
     axes = figure.subplots()
     axes.plot(n, 1e3 * sigma, "o-", color=OURS, markersize=5)
-    axes.axhline(required, color="#a8402f", linewidth=1, linestyle=":")
-    axes.annotate(f"required {required:.2f}", (n[0], required), fontsize=9, va="bottom", color="#a8402f")
+    if required is not None:
+        axes.axhline(required, color="#a8402f", linewidth=1, linestyle=":")
+        axes.annotate(f"required {required:.2f}", (n[0], required), fontsize=9, va="bottom", color="#a8402f")
     axes.set_yscale("log")
     millimetres(axes)
     axes.set_xticks(n)
@@ -324,9 +401,9 @@ def station_picture(report: MountingReport) -> bytes | None:
 
     Seen from the side on which the frames lie farthest apart. It shows what truly is: None where nothing is simulated.
     """
-    run, cell = report.run, report.run.cell
-    world = cell.station.world
-    if world is None:
+    run = report.run
+    world = None if run is None else run.cell.station.world
+    if run is None or world is None:
         return None
     pose = report.status.seen[-1].pose if report.status.seen else report.job.plan[0]
     frames = true_frames(report, pose.q, pose.q_2)
@@ -353,7 +430,7 @@ def station_picture(report: MountingReport) -> bytes | None:
 
 def true_frames(report: MountingReport, q: Array, q_2: Array | None) -> dict[str, RigidTransform]:
     """Letter -> pose in the base B of every frame in the mounting's sketch, as it truly is."""
-    scene = report.job.scene.believing(report.job.truth)
+    scene = report.scene.believing(dict(report.truth))
     links = scene.frames(q)
     found = {"B": RigidTransform(), "F": links[FLANGE], "C": links[scene.link] @ scene.X_LC}
     if scene.link not in (BASE, FLANGE):

@@ -1,7 +1,8 @@
-"""Coverage of the live calibration's stated error with an imperfect scanner and arm, without rendering."""
+"""Calibrations with an imperfect scanner and arm, without rendering: beside the robot, and in any mounting."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -12,15 +13,22 @@ from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
+from weldcal.calibration.planning.mounting_estimate import SeenCircle
+from weldcal.calibration.planning.mounting_poses import MountingPose
+from weldcal.calibration.planning.mounting_scene import MountingScene
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner, random_pose_error
+from weldcal.systems.drivers.simulated.second_arm import place_second_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
+from weldcal.systems.jobs.mounting.config import MountingJob
+from weldcal.systems.jobs.mounting.job import mounting_scene, plan_mounting
 from weldcal.systems.jobs.weld.iterative_calibrator import expected_error
 from weldcal.systems.jobs.weld.settings import feature_on_flange, plan_poses, work_point
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.report.weld import true_work_point
@@ -121,16 +129,23 @@ def _observe(world: _World, q: Array, id: str, rng: np.random.Generator) -> Obse
     """The observation at reported joints q (6,) rad."""
     sigma = world.repeatability_m / float(np.linalg.norm(jacobian(world.arm, q)[3:]))
     X_CR = world.X_BC.inverse() @ forward_kinematics(world.true_arm, q + sigma * rng.standard_normal(6)) @ world.X_FR
+    p, n = _seen(world.device, X_CR, _FACE_M, rng)
+    X_BR = forward_kinematics(world.arm, q) @ world.X_FR
+    return Observation(id, X_BR, p, n, _CENTRE_M**2 * np.eye(3), _NORMAL_RAD)
+
+
+def _seen(
+    device: ScannerPreset, X_CR: RigidTransform, radius_m: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Centre (3,) m and normal (3,) of a circle of that radius as the device measures it, with the noise of a fit."""
     angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    ring = _FACE_M * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(12)])
-    face = world.device.measured(X_CR.multiply(ring.T).T)
+    ring = radius_m * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(12)])
+    face = device.measured(X_CR.multiply(ring.T).T)
     n = np.linalg.svd(face - face.mean(axis=0))[2][2]
     n = n * np.sign(n @ X_CR.rotation().matrix()[:, 2])
     lean = _NORMAL_RAD * rng.standard_normal(3)
     n = exp_rotation(lean - n * float(n @ lean)) @ n
-    p = world.device.measured(np.asarray(X_CR.translation())) + _CENTRE_M * rng.standard_normal(3)
-    X_BR = forward_kinematics(world.arm, q) @ world.X_FR
-    return Observation(id, X_BR, p, n, _CENTRE_M**2 * np.eye(3), _NORMAL_RAD)
+    return device.measured(np.asarray(X_CR.translation())) + _CENTRE_M * rng.standard_normal(3), n
 
 
 def _calibrate(observed: Sequence[Observation], scenario: Scenario, work: Array) -> tuple[int, CalibrationEstimate]:
@@ -150,3 +165,64 @@ def _landed(estimate: CalibrationEstimate, p_C: Array) -> Array:
 
 def _rigid(observed: Sequence[Observation], p_C: Array) -> Array:
     return np.asarray(estimate_eye_on_base(list(observed), SolveConfig(leave_one_out=False)).X_BC.multiply(p_C))
+
+
+@dataclass(frozen=True, eq=False)
+class MountedWorld:
+    """A scene as known before the first scan, as it is, the device, and the scans (n) at the planned poses."""
+
+    scene: MountingScene
+    true: MountingScene
+    device: ScannerPreset
+    seen: tuple[SeenCircle, ...]
+
+    @property
+    def truth(self) -> dict[str, RigidTransform]:
+        """The true poses by the letters of the mounting's unknowns."""
+        found = {"X": self.true.X_LC} | ({} if self.true.X_BD is None else {"Y": self.true.X_BD})
+        return found if self.scene.target_known else found | {"Z" if self.scene.two else "Y": self.true.X_HR}
+
+
+@cache
+def mounted_plan(name: str) -> tuple[Scenario, MountingScene, float, tuple[MountingPose, ...]]:
+    """A mounting's scenario by name, its scene, the radius of its circle's face (m), and the planned poses."""
+    scenario = load_scenario(name)
+    scene, standard = mounting_scene(scenario, load_arm(scenario.arm))
+    return scenario, scene, 0.9 * standard.outer_radius_m, plan_mounting(scenario, scene, 0)
+
+
+def mounted_world(name: str, seed: int, scans: int | None = None) -> MountedWorld:
+    """Draw a cell of a mounting's scenario: device, arms and mounting of its own. ``scans``: how many; None: the scenario's maximum.
+
+    The arm's links, its stops and the scanner's warp are drawn from the simulation's models; a fit of the circle errs by its noise.
+    """
+    scenario, scene, radius, plan = mounted_plan(name)
+    rng = np.random.default_rng([seed, 1])
+    scanner, job = scenario.scanner_config(), scenario.part(MountingJob)
+    assert isinstance(scanner, RenderedScanner)
+    assert job is not None
+    off = random_pose_error(rng, 1e-3 * scanner.mounting_translation_mm, np.deg2rad(scanner.mounting_rotation_deg))
+    X_LC = RigidTransform(scene.X_LC.rotation() @ off.rotation(), scene.X_LC.translation() + off.translation())
+    device = scanner.device(rng)
+    true = replace(scene, X_LC=X_LC, arm=scenario.robot.true_arm(scene.arm, scene.q_home, rng))
+    if job.second_arm is not None and scene.arm_2 is not None and scene.q_home_2 is not None:
+        second = job.second_arm
+        off = random_pose_error(rng, 1e-3 * second.placement_translation_mm, np.deg2rad(second.placement_rotation_deg))
+        arm_2 = scenario.robot_2.true_arm(scene.arm_2, scene.q_home_2, rng)
+        true = replace(true, X_BD=place_second_arm(second, off).X_BD, arm_2=arm_2)
+
+    def stop(robot: object, arm: ArmModel | None, q: Array | None) -> Array | None:
+        if q is None or arm is None or not isinstance(robot, SimulatedUr):
+            return q
+        sigma = 1e-3 * robot.repeatability_mm / float(np.linalg.norm(jacobian(arm, q)[3:]))
+        return np.asarray(q + sigma * rng.standard_normal(6))
+
+    seen = []
+    for k, pose in enumerate(plan[: scans or scenario.calibration.maximum_scans]):
+        q = stop(scenario.robot, scene.arm, pose.q)
+        assert q is not None
+        X_CR = true.seen(q, stop(scenario.robot_2, scene.arm_2, pose.q_2))
+        p, n = _seen(device, X_CR, radius, rng)
+        C = np.diag([_NORMAL_RAD**2] * 3 + [_CENTRE_M**2] * 3)
+        seen.append(SeenCircle(f"pose{k + 1:02d}", pose, scene.observation(pose.q, pose.q_2, p, n, C), 1.0))
+    return MountedWorld(scene, true, device, tuple(seen))

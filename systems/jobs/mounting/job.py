@@ -6,8 +6,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
+from weldcal.calibration.planning.mounting_estimate import Circle
 from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
-from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
+from weldcal.calibration.planning.mounting_scene import FLANGE, FOOT, MountingScene
 from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
@@ -30,8 +31,6 @@ from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
 
 SPARE = 8  # additional poses, from which the next best one is selected
-FOOT = ("eye_in_hand", "eye_on_arm_target_on_base")
-"""Configurations with the circle of the base mounting as target; the others have a flange."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +115,8 @@ class Mounting(Job[MountingPlanned]):
             "mounting_procedure",
             MountingProcedure(plan.poses, c.maximum_scans, c.verification_scans, home, maximum_time_s=maximum_time_s),
         )
-        fit = MountingFitConfig(
-            plan.standard,
-            c.guess_radius_mm * 1e-3,
-            c.configuration in FOOT,
-            c.minimum_scans,
-            c.required_error_mm * 1e-3,
-        )
+        circle = Circle(plan.standard, c.guess_radius_mm * 1e-3, c.configuration in FOOT)
+        fit = MountingFitConfig(circle, c.minimum_scans, c.required_error_mm * 1e-3)
         calibrator = wiring.add(
             "mounting_calibrator", MountingCalibrator(scene, fit, plan.poses, wiring.station.background)
         )

@@ -8,8 +8,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.hand_eye.mountings import TargetObservation
-from weldcal.calibration.hand_eye.solve import HandEyeResult
+from weldcal.calibration.planning.mounting_estimate import MountingResult, SeenCircle
 from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
@@ -29,16 +28,7 @@ class MountingState(ProcedureState):
     visit: int = -1  # index of the planned pose
     purpose: str = ""  # of the newest scan: calibrate, or verify at a held-out pose
     label: str = ""  # of the pose at the end of the route; empty: home
-
-
-@dataclass(frozen=True, eq=False)
-class SeenCircle(Message):
-    """One scan with the circle: the arms' poses, the observation, and the visible share of the circle's edge."""
-
-    label: str
-    pose: MountingPose
-    observation: TargetObservation
-    coverage: float
+    scanned: str = ""  # label of the newest scan
 
 
 @dataclass(frozen=True)
@@ -79,9 +69,10 @@ class MountingStatus(Message):
     sequence: int = 0
     seen: tuple[SeenCircle, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
-    result: HandEyeResult | None = None
-    sigma_work_m: float = np.inf  # predicted error (3-D, rms) of a point at the scanner's best distance
-    history: tuple[tuple[int, float], ...] = ()
+    result: MountingResult | None = None
+    sigma_work_m: float = np.inf  # expected error (3-D, rms) of a point at the scanner's best distance
+    error_95_m: float = np.inf  # and the bound that it keeps with 95 %
+    history: tuple[tuple[int, float], ...] = ()  # of that bound, by the number of scans
     held_out: tuple[HeldOut, ...] = ()
     next_best: NextBest | None = None
     done: bool = False
@@ -156,7 +147,7 @@ class MountingProcedure(Procedure[MountingState, MountingInputs]):
 
     def command(self, s: MountingState, arm: int = 0) -> JobCommand:
         """See Procedure."""
-        command = super().command(s)
+        command = replace(super().command(s), scan_label=s.scanned)
         return command if s.moving == arm else replace(command, mode="hold", q_goal=None)
 
     def _start(self, s: MountingState, now: MountingInputs) -> MountingState:
@@ -168,7 +159,7 @@ class MountingProcedure(Procedure[MountingState, MountingInputs]):
         if s.route:
             return self._follow(s, now, s.route, s.label)
         if s.label:
-            return self.request(s, now, "scan")
+            return self.request(s, now, "scan", scanned=s.label)
         if s.visit + 1 < self._scans + self._held_out:
             return self._visit(s, now, s.visit + 1)
         return self.enter(s, now, "done")

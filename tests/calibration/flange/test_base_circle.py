@@ -33,9 +33,15 @@ def camera(elevation_deg: float, azimuth_deg: float, distance_m: float = 0.7) ->
     )
 
 
-def scan(X_BC: RigidTransform, noise_m: float = 0.0, foot: bool = True) -> Array:
+def scan(
+    X_BC: RigidTransform,
+    noise_m: float = 0.0,
+    foot: bool = True,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    seed: int = 0,
+) -> Array:
     """Organised cloud (H, W, 3) of table, foot and column by exact ray casting, with noise along the rays."""
-    u, v = np.meshgrid(np.arange(WIDTH) - 0.5 * (WIDTH - 1), np.arange(HEIGHT) - 0.5 * (HEIGHT - 1))
+    u, v = np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in size))
     ray_C = np.stack([u / F_PX, v / F_PX, np.ones_like(u)], axis=2)
     R, o = X_BC.rotation().matrix(), X_BC.translation()
     d = ray_C @ R.T
@@ -48,7 +54,7 @@ def scan(X_BC: RigidTransform, noise_m: float = 0.0, foot: bool = True) -> Array
             inside = np.hypot(o[0] + top * d[..., 0], o[1] + top * d[..., 1]) < reach
             t = np.where(inside, np.minimum(t, top), t)
         t = np.minimum(t, _cylinder(o, d, COLUMN_M, TOP_M))
-    t = t * (1.0 + noise_m / 0.7 * np.random.default_rng(0).normal(size=t.shape))
+    t = t * (1.0 + noise_m / 0.7 * np.random.default_rng(seed).normal(size=t.shape))
     return np.asarray(t[..., None] * ray_C)
 
 

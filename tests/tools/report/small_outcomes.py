@@ -21,6 +21,7 @@ from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.calibration.motion.drift.sequential import MOVED, DriftEvent
 from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.systems.messages import CalibrationStatus, VerificationResult
@@ -38,6 +39,7 @@ from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.tablet import Shown, tablet_screen
 from weldcal.tools.report.tablet import calibration_report as tablet_report
 from weldcal.tools.report.verify import PoseError, Verdict, VerifyReport, verify_report
+from weldcal.tools.worlds.light_runs import mounted_world
 
 Made = tuple[FirstScreen, str]
 OUT = Path("result")
@@ -250,34 +252,24 @@ def _run(name: str, **job: Any) -> Any:
     )
 
 
-class LiveMounting(MountingReport):
-    """A mounting's report without ground truth."""
-
-    def truth_errors(self) -> dict[str, Any]:
-        """None."""
-        return {}
-
-
 def mounting() -> Made:
-    """`hand-eye live`."""
-    from weldcal.models.scanners import get_scanner
-
-    scanner = get_scanner("phoxi_s")
-    scene = SimpleNamespace(
-        mounting=get_mounting("eye_in_hand"), scanner=scanner, known=(), configuration="eye_in_hand", two=False
-    )
+    """`hand-eye live`, without ground truth."""
+    world = mounted_world("eye_in_hand", 0, scans=9)
+    result = solve_mounting(world.scene, world.seen, folds=5)
     status = SimpleNamespace(
-        sequence=9,
-        seen=(),
+        sequence=10,
+        seen=world.seen,
         refused=(("pose3", "No circle."),),
         sigma_work_m=2e-5,
+        error_95_m=4e-5,
         history=((4, 4e-5), (9, 2e-5)),
         held_out=(SimpleNamespace(label="pose9", error_m=1e-4, tilt_rad=1e-3),),
         next_best=None,
         message="",
     )
-    run = _run("eye_in_hand", scene=scene, truth={}, status=lambda root: status)
-    report = LiveMounting(run, _hand_eye(), OUT, 5.0)
+    run = _run("eye_in_hand", scene=world.scene, truth={}, status=lambda root: status)
+    run.cell.station = SimpleNamespace(truth=SimpleNamespace(scanner=None))
+    report = MountingReport(run, result, OUT, 5.0)
     return report.first, mounting_report(report, None)
 
 
