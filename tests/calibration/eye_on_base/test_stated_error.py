@@ -11,7 +11,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 from typer.testing import CliRunner
 
-from tests.calibration.eye_on_base.test_solve import make_observations
+from tests.calibration.eye_on_base.test_solve import X_BC, make_observations
 from tests.calibration.eye_on_base.test_tcp import _pairs
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_ur_pose, load_result, save_result
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -48,6 +48,31 @@ def calibrated(n: int, seed: int) -> CalibrationResult:
 def good() -> list[CalibrationResult]:
     """150 calibrations from 8 to 15 scans; they do not depend on how many new scans judge them."""
     return [calibrated(8 + seed % 8, seed) for seed in range(150)]
+
+
+def test_an_error_of_rotation_and_one_of_translation_cancel_where_the_flange_was_measured() -> None:
+    """One milliradian about the place of the flange: nothing there, and a tenth of a millimetre 0.1 m beside it."""
+    here = make_observations(1, 3)[0]
+    arm = np.asarray(here.p_BR - X_BC.translation())
+    lever = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
+    # a turn w about the place p moves the camera's origin by w x (origin - p) = p' x w
+    A = np.vstack([1e-3 * np.eye(3), 1e-3 * lever])
+    result = CalibrationResult(
+        X_BC=X_BC,
+        covariance=A @ A.T,
+        held_out_mm={},
+        tilt_deg={},
+        poses=tuple(PoseRecord(id=str(k), used=True) for k in range(20)),
+        sigma_position_mm=1e-4,
+    )
+    at_flange = stated_median_limit(result, [replace(here, center_covariance=None)], None)
+    assert at_flange is not None
+    assert at_flange < 0.01
+    beside = replace(here, X_BR=RigidTransform(here.X_BR.rotation(), here.p_BR + np.array([0.1, 0.0, 0.0])))
+    moved = replace(beside, p_CR=np.asarray(X_BC.inverse() @ beside.p_BR), center_covariance=None)
+    limit = stated_median_limit(result, [moved], None)
+    assert limit is not None
+    assert 0.1 < limit < 0.5
 
 
 @pytest.mark.parametrize("new", [1, 5, 20])
