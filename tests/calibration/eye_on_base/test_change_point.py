@@ -9,6 +9,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from tests.calibration.eye_on_base.test_joint_fit import NOISE_M, RIGHT, WRONG, _cell
+from tests.calibration.eye_on_base.test_solve import make_observations
 from weldcal.calibration.eye_on_base.change_point import find_change
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation
@@ -58,3 +59,9 @@ def test_single_wrong_poses_are_no_change() -> None:
 def test_eight_poses_are_too_few() -> None:
     observations, _ = _cell(RIGHT, n=8)
     assert find_change(moved(observations, 4, 0.05)) is None
+
+
+@pytest.mark.parametrize(("shift_m", "found"), [(6e-5, False), (3e-4, True)])
+def test_a_shift_within_what_arms_repeat_to_is_no_reason_to_refuse(shift_m: float, found: bool) -> None:
+    observations = make_observations(18, 3, sigma=1e-5)
+    assert (find_change(moved(observations, 8, shift_m)) is not None) == found
