@@ -94,7 +94,9 @@ class _Copy:
     def passes(self, tests: Sequence[str], limit_s: float) -> tuple[bool | None, str]:
         """Whether tests pass, None where they could not run, and pytest's last line."""
         run = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
-        environment = os.environ | {"PYTHONPATH": str(self.root.parent), "OMP_NUM_THREADS": "1"}
+        # pytest's own variables are of the run that calls this one
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+        environment = inherited | {"PYTHONPATH": str(self.root.parent), "OMP_NUM_THREADS": "1"}
         try:
             done = subprocess.run(
                 run, cwd=self.root, env=environment, capture_output=True, text=True, check=False, timeout=limit_s

@@ -54,7 +54,8 @@ def test_halves_of_a_cloud_agree_within_their_stated_noise() -> None:
     half = len(points) // 2
     a, b = (fit_flange(p, get_flange(ISO_50)) for p in (points[:half], points[half:]))
     spread = np.sqrt(np.trace(a.center_covariance) + np.trace(b.center_covariance))
-    assert np.linalg.norm(a.center_C - b.center_C) < 3.0 * spread < 2e-4
+    # the spread holds the pull of a chamfer, too, 0.03 mm an axis, which has no part in the difference
+    assert np.linalg.norm(a.center_C - b.center_C) < 3.0 * spread < 2.5e-4
 
 
 def test_a_flange_of_which_a_third_is_missing_is_still_found() -> None:
