@@ -105,6 +105,8 @@ def _unread(name: str, given: object, problem: str) -> str:
     for part, kind in (("", DatasetHeader), *_PARTS.items()):
         keys = given.get(part) if part and isinstance(given, dict) else given
         known = {f.name for f in fields(kind)}
+        if part and keys is not None and not isinstance(keys, dict):
+            return f"'{name}' gives {part} as '{str(keys)[:40]}'; it holds the keys {', '.join(sorted(known))}."
         wrong = next((str(key) for key in keys if key not in known), None) if isinstance(keys, dict) else None
         if wrong is not None:
             near = get_close_matches(wrong, known, 1, 0.5)

@@ -23,6 +23,10 @@ ENOUGH = 4
 
 _TURN_KNOWN_RAD = float(np.radians(0.1))  # as well as a calibration from many poses states it, and as a person would
 _HOLE_CIRCLE_M = 0.025
+_TURN_STATED = (
+    "The rotation about the flange's axis is as stated with --axis-turn: a degree of error there turns the scanner by a degree. A "
+    "calibration from many scans reports it."
+)
 _TERMS = 6  # of the correction that few scans leave open
 _USUAL_WEIGHT = 4.0  # residuals' worth of what is usual of robot and scanner
 
@@ -111,7 +115,10 @@ def calibrate_from_few(
     """
     n = len(observations)
     if axis_turn_rad is not None:
-        return _said(_from_whole_poses(observations, patterns, axis_turn_rad), len(_with_turn(observations, patterns)))
+        estimate = _said(
+            _from_whole_poses(observations, patterns, axis_turn_rad), len(_with_turn(observations, patterns))
+        )
+        return replace(estimate, warnings=(*estimate.warnings, _TURN_STATED))
     normals = all(o.n_C is not None for o in observations)
     need = 2 if normals else 3
     if n < need:
@@ -202,7 +209,7 @@ def _said(estimate: CalibrationEstimate, n: int) -> CalibrationEstimate:
     judged = (
         "nothing could be held out"
         if not np.isfinite(held).any()
-        else f"the held-out errors are those of {n - 1} of them"
+        else "each held-out error is that of one under the others"
     )
     text = (
         f"From {scans} only: the uncertainty is based on typical errors of robot and scanner ({1e3 * USUAL_SPREAD_M:.2f} mm and "

@@ -30,5 +30,7 @@ def test_a_scanner_on_the_flange_calibrates_itself_on_the_controllers_arm(tmp_pa
     assert summary["robot"] == "an emulated controller"
     (error,) = report.truth_errors().values()
     assert error.nees < error.bound  # 99.7 % of its own covariance
-    assert summary["work_error_mm"] < 0.3  # of a scanned point: X itself is open along the view where the scanner's scale is
+    assert (
+        summary["work_error_mm"] < 0.3
+    )  # of a scanned point: X itself is open along the view where the scanner's scale is
     assert (report.folder / "report.html").is_file()

@@ -162,6 +162,8 @@ class MountingReport:
         found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
         if status.next_best is not None:
             after = Next(f"To know it better, add the pose {status.next_best.sentence()}")
+        elif tolerance is not None and not tolerance.met:
+            after = Next("Add poses that are turned more and lie farther apart, and calibrate again.")
         else:
             after = Next("Use the pose; calibrate again after the scanner was moved.")
         return FirstScreen(found, expected, after, shown_poses(result, self.mounting))
@@ -353,6 +355,7 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         unknowns=unknowns,
         aside_mm=float(np.median(aside)) if len(aside) else None,
         n_aside=len(aside),
+        held_mm=None if result is None else 1e3 * held_out_used(result).rms_translation,
         expected_mm=1e3 * status.sigma_work_m,
         work_mm=report.work_error_mm(),
         distance_mm=1e3 * report.scene.scanner.optimum_m,

@@ -60,7 +60,10 @@ def columns_of(header: list[str]) -> tuple[list[Column], dict[str, int]]:
     found: list[Column] = []
     other: dict[str, int] = {}
     plain = [_unit_of(h.strip().lower()) for h in header]
+    joints = any(name in ("q5", "q6") for name, _ in plain)  # then q1 to q4 are joint angles and no quaternion
     for k, (name, unit) in enumerate(plain):
+        if joints and re.fullmatch(r"q[0-9]", name):
+            continue
         if name in IDS and "id" not in other:
             other["id"] = k
             continue

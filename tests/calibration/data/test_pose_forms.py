@@ -243,6 +243,20 @@ def test_captures_in_a_closed_format_are_to_be_exported(tmp_path: Path) -> None:
         load_dataset(tmp_path)
 
 
+@pytest.mark.parametrize("missing", ["qz", "qw", "z"])
+def test_joint_angles_do_not_stand_for_a_missing_column(scans: Path, missing: str) -> None:
+    names = [
+        n for n in ("id", "x", "y", "z", "qw", "qx", "qy", "qz", "q1", "q2", "q3", "q4", "q5", "q6") if n != missing
+    ]
+    text = [
+        ",".join(names),
+        *(",".join([f"s{k}", *(f"{0.1 * k + 0.01 * c:.3f}" for c in range(12))]) for k in range(6)),
+    ]
+    (scans / "poses.csv").write_text("\n".join(text) + "\n")
+    with pytest.raises(DatasetError, match=f"lacks the column {missing}|names no columns|no rotation that it names"):
+        load_dataset(scans)
+
+
 @pytest.mark.parametrize("configuration", ["eye-in-hand", "co_manipulation"])
 def test_scans_of_a_carried_scanner_are_sent_to_calibrate(scans: Path, configuration: str) -> None:
     np.save(scans / "poses.npy", X)

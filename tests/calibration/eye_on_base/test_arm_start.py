@@ -158,3 +158,12 @@ def test_an_arm_that_is_seen_through_is_no_start() -> None:
     for other in ({"explained": 0.6}, {"seen_through": 0.2}, {"next_best": 0.84}):
         assert not replace(sure, **other).accepted
         assert "state scanner_guess" in replace(sure, **other).sentence
+
+
+def test_surface_seen_through_is_allowed_only_where_nothing_else_comes_near() -> None:
+    """Links inside their capsules: 0.15 of a rendered UR10e's surface is seen through; a wrong place leads by less than 0.2."""
+    start = ArmStart(X_BC=RigidTransform(), explained=0.82, seen_through=0.15, score=0.67, next_best=0.1)
+    assert start.accepted
+    assert not replace(start, next_best=0.45).accepted
+    assert not replace(start, seen_through=0.2, score=0.62).accepted
+    assert not replace(start, explained=0.7).accepted
