@@ -141,10 +141,9 @@ class MountingReport:
         what = f"error of a scanned point {1e3 * self.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
         if result is None:
             found = Findings(against=against or ["There is no result."], unseen=0)
-            after = after_hold(self.run is not None and self.run.ended_by_operator)
-            return FirstScreen(
-                found, Expected(what, "not known", "there is no calibration"), after, more={"pose": "none was found"}
-            )
+            none = Expected(what, "not known", "there is no calibration")
+            held = after_hold(self.run is not None and self.run.ended_by_operator)
+            return FirstScreen(found, none, held, more={"pose": "none was found"})
         _, p95, n = held_out_error(result)
         expected, figure = expected_error(what, 1e3 * status.error_95_m, p95, n, "poses")
         if aside:
@@ -160,13 +159,12 @@ class MountingReport:
         ]
         notes = [self.scanner_sentence(), *refused_note(status.refused, status.sequence)]
         found = Findings(against=against, tolerance=tolerance, unseen=n, concerns=concerns, notes=notes)
+        after = "Use the pose; calibrate again after the scanner was moved."
         if status.next_best is not None:
-            after = Next(f"To know it better, add the pose {status.next_best.sentence()}")
+            after = f"To know it better, add the pose {status.next_best.sentence()}"
         elif tolerance is not None and not tolerance.met:
-            after = Next("Add poses that are turned more and lie farther apart, and calibrate again.")
-        else:
-            after = Next("Use the pose; calibrate again after the scanner was moved.")
-        return FirstScreen(found, expected, after, shown_poses(result, self.mounting))
+            after = "Add poses that are turned more and lie farther apart, and calibrate again."
+        return FirstScreen(found, expected, Next(after), shown_poses(result, self.mounting))
 
     def scanner_sentence(self) -> str:
         """What was found of the scanner, and what the scans do not determine of it."""
