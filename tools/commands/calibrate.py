@@ -22,8 +22,9 @@ from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
-from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
+from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
 from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.solve import SolveConfig
 from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
@@ -56,6 +57,7 @@ from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.render import write_atomic
 
+_CONFIRMING = 3  # hole circles without which the robot's motion alone does not change the scanner
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 
 
@@ -222,11 +224,12 @@ def calibrate_dataset(
     data = seen.data or data
     observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
     few = len(observations) < ENOUGH
+    confirmed = len(seen.patterns) >= _CONFIRMING
     with examined_where_refused(Path(out), data, seen, standard, seed):
         _enough(observations, refused, start)
         steps = Steps(
             patterns=seen.patterns,
-            correct_scanner=correct_scanner,
+            correct_scanner=correct_scanner and confirmed,
             axis_turn_rad=None if axis_turn_deg is None else float(np.radians(axis_turn_deg)),
             X_FR=None if data.pairs else data.X_FR,
             feature_m=0.5 * standard.outer_m,
@@ -247,7 +250,9 @@ def calibrate_dataset(
     ]
     inliers = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
     tell("cross-validating", 0.75)
-    solve = partial(solve_jointly, patterns=seen.patterns, correct_scanner=correct_scanner and not few, seed=seed)
+    solve = partial(
+        solve_jointly, patterns=seen.patterns, correct_scanner=correct_scanner and confirmed and not few, seed=seed
+    )
     folds = (
         k_fold(inliers, folds=min(5, len(inliers)), repeats=5, seed=seed, solve=solve)
         if len(inliers) >= 6
@@ -281,6 +286,8 @@ def calibrate_dataset(
         warnings.append(refined.sentence)
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
+    if correct_scanner and not confirmed and not few:
+        warnings += _unconfirmed(inliers, seed)
     correction = None if found.correction is None else found.correction.document()
     result = CalibrationResult(
         X_BC=estimate.X_BC,
@@ -364,6 +371,19 @@ def _refinement(
     q = require_joint_angles(data, ids, arm, np.array([poses[id].GetAsMatrix4() for id in ids]))
     note = f"{robot}, refined by weldcal calibrate --refine {kind}"
     return replace(steps, refine=kind, arm=arm, joints=q, note=note)
+
+
+def _unconfirmed(inliers: list[Observation], seed: int) -> list[str]:
+    """A sentence where the robot's motion alone asks for a correction of the scanner: many programs could not apply it, and without it
+    X_BC would be off by what it takes over."""
+    asked, verdict = estimate_jointly(inliers, config=SolveConfig(seed=seed, allow_coplanar=True))
+    if verdict is None or verdict.accepted is None:
+        return []
+    left = 1e3 * float(np.nanmean(asked.held_out.position_m))
+    return [
+        f"The scanner is not corrected: the robot's motion asks for a scale of {1e2 * (verdict.accepted.scale - 1.0):+.2f} %, with which the "
+        f"held-out errors would be {left:.3f} mm (mean), but fewer than {_CONFIRMING} scans show the flange's hole circle to confirm it."
+    ]
 
 
 def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
