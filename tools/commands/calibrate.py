@@ -241,6 +241,8 @@ def calibrate_dataset(
     if refine is not None:
         tell("refining", 0.73)
         steps = _refinement(refine, steps, data, observations, robot or data.header.robot, kinematics)
+        if refine != "local":  # errors of the arm are found beside those of the scanner, as motion shows both
+            steps = replace(steps, correct_scanner=correct_scanner and not few)
         found = refine_calibration(found, observations, steps)
     estimate, corrected, scanner, refined = found.estimate, found.observations, found.scanner, found.refined
     outliers = tuple(o.id for o, keep in zip(observations, estimate.inliers, strict=True) if not keep)
