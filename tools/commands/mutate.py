@@ -94,9 +94,11 @@ class _Copy:
     def passes(self, tests: Sequence[str], limit_s: float) -> tuple[bool | None, str]:
         """Whether tests pass, None where they could not run, and pytest's last line."""
         run = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
-        # pytest's own variables are of the run that calls this one
+        # pytest's own variables are of the run that calls this one. No byte code is written: two mutations of one
+        # length within a second have the same stamp, and the second would run the byte code of the first.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-        environment = inherited | {"PYTHONPATH": str(self.root.parent), "OMP_NUM_THREADS": "1"}
+        fixed = {"PYTHONPATH": str(self.root.parent), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+        environment = inherited | fixed
         try:
             done = subprocess.run(
                 run, cwd=self.root, env=environment, capture_output=True, text=True, check=False, timeout=limit_s
