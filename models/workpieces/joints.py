@@ -18,6 +18,7 @@ from OCP.BRepBndLib import BRepBndLib
 from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeVertex
 from OCP.BRepClass3d import BRepClass3d_SolidClassifier
 from OCP.BRepExtrema import BRepExtrema_DistShapeShape
+from OCP.collections import IndexedDataMap_TopoDS_Shape_List_TopoDS_Shape_TopTools_ShapeMapHasher as EdgeFaces
 from OCP.GeomAbs import GeomAbs_CurveType, GeomAbs_SurfaceType
 from OCP.GeomAPI import GeomAPI_IntCS, GeomAPI_IntSS, GeomAPI_ProjectPointOnCurve
 from OCP.GeomLProp import GeomLProp_SLProps
@@ -25,8 +26,10 @@ from OCP.gp import gp_Dir, gp_Lin, gp_Pnt, gp_Vec
 from OCP.IntCurvesFace import IntCurvesFace_ShapeIntersector
 from OCP.ShapeAnalysis import ShapeAnalysis_Surface
 from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_State
-from OCP.TopExp import TopExp_Explorer
+from OCP.TopExp import TopExp, TopExp_Explorer
 from OCP.TopoDS import TopoDS
+
+from weldcal.models.workpieces.shape import PartEdge, PartJoint
 
 Floats = npt.NDArray[np.float64]
 
@@ -48,11 +51,13 @@ class Piece:
 
     line    (N,3) mm; a closed one repeats its first point
     up      (3,) unit, in the middle of the line, out of the joint
-    type    T, lap, corner, V, HV, butt, edge or a pipe's
+    type    T, lap, corner, V, HV, butt or edge
     angle   rad, through the free space
     gap     mm, between the bodies
     bodies  numbers of the two bodies
-    side    inside or outside of a corner; else ""
+    side    inside or outside of a corner, left or right of a web; else ""
+    walls   mm, extent of the two walls from the root; of flush faces the depth of the joint
+    pipe    the type of a ring of such pieces: pipe on plate, pipe on pipe or flange on pipe; else ""
     """
 
     line: Floats
@@ -62,6 +67,8 @@ class Piece:
     gap: float
     bodies: tuple[int, int]
     side: str = ""
+    walls: tuple[float, float] = (0.0, 0.0)
+    pipe: str = ""
 
 
 class _Face:
@@ -100,11 +107,26 @@ class _Body:
     """A solid with its faces and with what answers whether a point is inside."""
 
     def __init__(self, solid: Any) -> None:
+        self._solid = solid
         self.faces = [_Face(TopoDS.Face(face)) for face in parts_of(solid, TopAbs_ShapeEnum.TopAbs_FACE)]
         self.low, self.high = _box(solid)
         self._classifier = BRepClass3d_SolidClassifier(solid)
         self._rays = IntCurvesFace_ShapeIntersector()
         self._rays.Load(solid, 1e-6)
+
+    def edges(self) -> list[tuple[Any, tuple[_Face, _Face]]]:
+        """The edges at which two different faces meet, with these."""
+        faces_of = EdgeFaces()
+        TopExp.MapShapesAndAncestors_s(
+            self._solid, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_FACE, faces_of
+        )
+        found = []
+        for k in range(faces_of.Extent()):
+            edge = TopoDS.Edge(faces_of.FindKey(k + 1))
+            met = [next(f for f in self.faces if f.face.IsSame(face)) for face in faces_of.FindFromIndex(k + 1)]
+            if len(met) == 2 and met[0] is not met[1] and not BRep_Tool.Degenerated_s(edge):
+                found.append((edge, (met[0], met[1])))
+        return found
 
     def holds(self, p: Floats) -> bool:
         """Whether a point is inside."""
@@ -129,8 +151,8 @@ def parts_of(shape: Any, kind: Any) -> list[Any]:
     return found
 
 
-def joints_between(shape: Any) -> list[list[Piece]]:
-    """The joints between the solids of a shape, each as its pieces in the order of travel.
+def joints_of(shape: Any) -> list[list[Piece]]:
+    """The joints between the solids of a shape, and where there are none those inside each solid, each as its pieces in the order of travel.
 
     Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece may
     end; each stretch between two crossings is a joint or is none.
@@ -150,7 +172,41 @@ def joints_between(shape: Any) -> list[list[Piece]]:
                     pieces += _met(bodies, (i, j), f, g)
                     pieces += _flush(bodies, (i, j), f, g)
         found += chains(pieces)
-    return found
+    if not found:
+        found = [chain for k in range(len(bodies)) for chain in chains(_within(bodies, k))]
+    return [_named(chain, found) for chain in found]
+
+
+def _within(bodies: list[_Body], k: int) -> Iterable[Piece]:
+    """The pieces along the concave edges of one body."""
+    for edge, (f, g) in bodies[k].edges():
+        curve = BRepAdaptor_Curve(edge)
+        line = sampled(curve, curve.FirstParameter(), curve.LastParameter())
+        if _length(line) < LEAST_MM:
+            continue
+        x, t, _ = _middle(curve, curve.FirstParameter(), curve.LastParameter())
+        cut = _cut(bodies, (k, k), f, g, x, t, 0.0)
+        if cut is not None:
+            yield Piece(line=line, bodies=(k, k), **cut)
+
+
+def _named(chain: list[Piece], all_of_them: list[list[Piece]]) -> list[Piece]:
+    """The seam with the type of its longest piece; of a T with its side where there is one on the web's other side."""
+    first = max(chain, key=lambda piece: _length(piece.line))
+    ring = closes(chain) and all(piece.pipe for piece in chain)
+    chain = [replace(p, type=first.pipe if ring else first.type, side="" if ring else p.side) for p in chain]
+    if first.type != "T" or ring or closes(chain):
+        return chain
+    first = chain[0]
+    beside = [c[0] for c in all_of_them if c[0].type == "T" and c[0].bodies == first.bodies and len(c) == len(chain)]
+    pair = [p for p in beside if abs(_length(p.line) - _length(first.line)) < 1.0]
+    if len(pair) != 2:
+        return chain
+    other = pair[0] if pair[1].line is first.line else pair[1]
+    along = first.line[-1] - first.line[0]
+    along = along * np.sign(along[np.argmax(np.abs(along))])
+    left = np.cross(first.up + other.up, along) @ (first.line.mean(axis=0) - other.line.mean(axis=0)) > 0.0
+    return [replace(piece, side="left" if left else "right") for piece in chain]
 
 
 def _far(a: _Face | _Body, b: _Face | _Body) -> bool:
@@ -166,17 +222,18 @@ def _met(bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face) -> Iter
     for k in range(crossing.NbLines()):
         curve = crossing.Line(k + 1)
         breaks, closed = _breaks(bodies, curve, low, high, (f, g))
-        kept = [(t, u, _cut(bodies, pair, f, g, curve, (t, u))) for t, u in pairwise(breaks)]
+        kept = [(t, u, _cut(bodies, pair, f, g, *_middle(curve, t, u))) for t, u in pairwise(breaks)]
         runs: list[list[Any]] = []
         for t, u, cut in kept:
             if cut is not None and runs and t - runs[-1][1] <= BRIDGED_MM:
-                runs[-1][1] = u
+                longer = u - t > runs[-1][3]
+                runs[-1] = [runs[-1][0], u, *((cut, u - t) if longer else runs[-1][2:])]
             elif cut is not None:
-                runs.append([t, u, cut])
+                runs.append([t, u, cut, u - t])
         if closed and len(runs) > 1 and runs[0][0] == breaks[0] and runs[-1][1] == breaks[-1]:
             first = runs.pop(0)
             runs[-1][1] += first[1] - first[0]
-        for t, u, cut in runs:
+        for t, u, cut, _ in runs:
             line = sampled(curve, t, u)
             if _length(line) >= LEAST_MM:
                 yield Piece(line=line, bodies=pair, **cut)
@@ -221,16 +278,21 @@ def _breaks(
     return [inside[k] for k in kept], closed
 
 
-def _cut(
-    bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face, curve: Any, span: tuple[float, float]
-) -> dict[str, Any] | None:
-    """The joint of two faces in the cut at the middle of a stretch of their curve; None where they form no concave joint."""
+def _middle(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, float]:
+    """The middle of a stretch of a curve, its direction there, and how far from it a wall may end, along it.
+
+    A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
+    """
     point, along = gp_Pnt(), gp_Vec()
-    curve.D1(0.5 * sum(span), point, along)
-    # A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
-    length = (span[1] - span[0]) * along.Magnitude()
-    slack = 0.5 * length if length <= BRIDGED_MM else 0.0
-    x, t = _array(point), _unit(_array(along))
+    curve.D1(0.5 * (begin + end), point, along)
+    length = (end - begin) * along.Magnitude()
+    return _array(point), _unit(_array(along)), 0.5 * length if length <= BRIDGED_MM else 0.0
+
+
+def _cut(
+    bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face, x: Floats, t: Floats, slack: float
+) -> dict[str, Any] | None:
+    """The joint of two faces in the cut at one point of their curve; None where they form no concave joint there."""
     normals = f.normal(x), g.normal(x)
     cos = float(np.clip(normals[0] @ normals[1], -1.0, 1.0))
     if abs(cos) > math.cos(math.radians(10.0)):
@@ -256,8 +318,8 @@ def _cut(
     angle = math.pi - math.acos(cos)
     thick, wall, goes_on = [], [], []
     for k in (0, 1):
-        skin = x + (begins[k] + 0.01) * ways[k] - 0.1 * normals[k]
-        wall.append(begins[k] + two[k].through(skin, ways[k]))
+        skin = x + (begins[k] + IN_MM) * ways[k] - 0.1 * normals[k]
+        wall.append(begins[k] + IN_MM + two[k].through(skin, ways[k]))
         thick.append(two[k].through(x + (begins[k] + IN_MM) * ways[k], -ways[1 - k]))
         beyond = x - (thick[k] + 2.0 * IN_MM) * ways[1 - k]
         other, n = two[1 - k], normals[1 - k]
@@ -276,20 +338,23 @@ def _cut(
             k = narrow.index(True)  # the wall is the edge of a sheet: on another sheet, or beside a thinner one
             under = x - 2.0 * IN_MM * ways[1 - k] - IN_MM * normals[1 - k]
             kind, side = ("lap" if two[1 - k].holds(under) else "butt"), ""
-    if (kind != "lap" and (f.round or g.round)) or (f.round and g.round):
-        kind = _of_pipe(f, g, t, two) or kind
-    return {"up": up, "type": kind, "angle": angle, "gap": gap, "side": "" if "pipe" in kind else side}
+    pipe = _of_pipe(f, g, t, two) if f.round or g.round else ""
+    pipe = "" if kind == "lap" and pipe != "pipe on pipe" else pipe
+    walls = wall[0], wall[1]
+    return {"up": up, "type": kind, "angle": angle, "gap": gap, "side": side, "walls": walls, "pipe": pipe}
 
 
-def _of_pipe(f: _Face, g: _Face, t: Floats, two: tuple[_Body, _Body]) -> str | None:
-    """The joint of a pipe, None for none: along a cylinder's axis it is as between plates."""
+def _of_pipe(f: _Face, g: _Face, t: Floats, two: tuple[_Body, _Body]) -> str:
+    """The joint of a pipe, "" for none: along a cylinder's axis it is as between plates."""
     axes = [(face, face.axis) for face in (f, g) if face.round]
     if len(axes) == 2:
-        return None if axes[0][1].IsParallel(axes[1][1], 0.1) else "pipe on pipe"
+        return "" if axes[0][1].IsParallel(axes[1][1], 0.1) else "pipe on pipe"
     if abs(float(_array(axes[0][1].Direction()) @ t)) > 0.99:
-        return None
+        return ""
     pipe, plate = (f, two[1]) if f.round else (g, two[0])
-    coaxial = any(h.round and h.axis.IsCoaxial(pipe.axis, 1e-3, GAP_MM) and h.sign > 0 for h in plate.faces)
+    coaxial = two[0] is not two[1] and any(
+        h.round and h.axis.IsCoaxial(pipe.axis, 1e-3, GAP_MM) and h.sign > 0 for h in plate.faces
+    )
     return "flange on pipe" if coaxial else "pipe on plate"
 
 
@@ -318,8 +383,10 @@ def _flush(bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face) -> It
                 continue
             narrow = [wide[k] < 0.9 * depth[k] for k in (0, 1)]
             kind = "edge" if all(narrow) else "corner" if any(narrow) else "butt"
-            side = "outside" if kind == "corner" else ""
-            yield Piece(line=line, up=n, type=kind, angle=math.pi, gap=max(0.0, gap), bodies=pair, side=side)
+            side, walls = ("outside" if kind == "corner" else ""), (depth[0], depth[1])
+            yield Piece(
+                line=line, up=n, type=kind, angle=math.pi, gap=max(0.0, gap), bodies=pair, side=side, walls=walls
+            )
 
 
 def _facing(two: tuple[_Body, _Body], x: Floats, n: Floats, m: Floats, gap: float, depth: float) -> bool:
@@ -392,6 +459,49 @@ def closes(chain: list[Piece]) -> bool:
     """Whether a seam ends where it begins."""
     apart = float(np.linalg.norm(chain[0].line[0] - chain[-1].line[-1]))
     return apart < CHAINED_MM and sum(len(piece.line) for piece in chain) > 4
+
+
+def with_joints(edges: tuple[PartEdge, ...], shape: Any) -> tuple[tuple[PartEdge, ...], tuple[PartJoint, ...]]:
+    """The edges of a part with those of its joints that are no edge of a body added at the end, and its joints."""
+    known, joints = list(edges), []
+    for chain in joints_of(shape):
+        ids = []
+        for piece in chain:
+            kind = "concave" if piece.angle < math.pi - 0.01 else "flush"
+            lies = (k for k, edge in enumerate(known) if edge.up_P is None and _is(edge, 1e-3 * piece.line))
+            at = next(lies, len(known))
+            radius = known[at].radius_m if at < len(known) else None
+            line = known[at].points_P if at < len(known) else 1e-3 * piece.line
+            known[at : at + 1] = [PartEdge(at + 1, kind, line, piece.angle, radius, piece.up)]
+            ids.append(at + 1)
+        longest = max(chain, key=lambda piece: _length(piece.line))
+        joints.append(
+            PartJoint(
+                type=longest.type,
+                edges=tuple(ids),
+                length_m=1e-3 * sum(_length(piece.line) for piece in chain),
+                angle_rad=longest.angle,
+                gap_m=1e-3 * max(piece.gap for piece in chain),
+                walls_m=(1e-3 * longest.walls[0], 1e-3 * longest.walls[1]),
+                up_P=longest.up,
+                side=longest.side,
+                closed=closes(chain),
+            )
+        )
+    return tuple(known), tuple(joints)
+
+
+def _is(edge: PartEdge, line: Floats) -> bool:
+    """Whether an edge is this line (N,3) m."""
+    p, q = edge.points_P, line
+    if abs(edge.length_m - _length(q)) > 2e-5:
+        return False
+    ends = min(np.abs(p[[0, -1]] - q[[0, -1]]).max(), np.abs(p[[0, -1]] - q[[-1, 0]]).max())
+    middle = 0.5 * (q[0] + q[-1]) if len(q) == 2 else q[len(q) // 2]
+    a, d = p[:-1], np.diff(p, axis=0)
+    share = np.clip(np.vecdot(middle - a, d) / np.vecdot(d, d), 0.0, 1.0)
+    off = float(np.linalg.norm(a + share[:, None] * d - middle, axis=1).min())
+    return bool((ends < 2e-5 or (edge.closed and np.linalg.norm(q[0] - q[-1]) < 1e-5)) and off < 5e-5)
 
 
 def sampled(curve: Any, begin: float, end: float) -> Floats:

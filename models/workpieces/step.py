@@ -38,7 +38,10 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
     if units is not None and unit is not None and unit != units:
         raise InputError(f"'{path.name}' is in {unit}, not in {units}: give units {unit}.")
     mesh, bodies = _mesh(shape, path)
-    return PartShape(path.name, mesh, _edges(shape), UNITS_M[unit or units or "mm"], bodies)
+    from weldcal.models.workpieces.joints import with_joints
+
+    edges, joints = with_joints(_edges(shape), shape)
+    return PartShape(path.name, mesh, edges, UNITS_M[unit or units or "mm"], bodies, joints)
 
 
 def _check_text(path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from weldcal.models.workpieces.joints import closes, joints_between
+from weldcal.models.workpieces.joints import closes, joints_of
 from weldcal.tools.worlds.parts.step_parts import assembly, box, cylinder, fused, less, prism
 
 Floats = npt.NDArray[np.float64]
@@ -233,7 +233,7 @@ def mistakes(name: str, seed: int) -> list[str]:
     solids, seams = KINDS[name](rng)
     shape, R, shift = turned(assembly(*solids), rng)
     found = []
-    for pieces in joints_between(shape):
+    for pieces in joints_of(shape):
         pts = np.concatenate([piece.line for piece in pieces])
         longest = max(pieces, key=lambda p: float(np.linalg.norm(np.diff(p.line, axis=0), axis=1).sum()))
         length = sum(float(np.linalg.norm(np.diff(p.line, axis=0), axis=1).sum()) for p in pieces)
