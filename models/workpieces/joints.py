@@ -29,8 +29,6 @@ from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_State
 from OCP.TopExp import TopExp, TopExp_Explorer
 from OCP.TopoDS import TopoDS
 
-from weldcal.models.workpieces.shape import PartEdge, PartJoint
-
 Floats = npt.NDArray[np.float64]
 
 GAP_MM, OVERLAP_MM = 3.05, 2.05  # between bodies; an overlap counts where two faces are flush
@@ -71,7 +69,7 @@ class Piece:
     pipe: str = ""
 
 
-class _Face:
+class Face:
     """A face with its surface, box and normal."""
 
     def __init__(self, face: Any) -> None:
@@ -107,26 +105,12 @@ class _Body:
     """A solid with its faces and with what answers whether a point is inside."""
 
     def __init__(self, solid: Any) -> None:
-        self._solid = solid
-        self.faces = [_Face(TopoDS.Face(face)) for face in parts_of(solid, TopAbs_ShapeEnum.TopAbs_FACE)]
+        self.solid = solid
+        self.faces = [Face(TopoDS.Face(face)) for face in parts_of(solid, TopAbs_ShapeEnum.TopAbs_FACE)]
         self.low, self.high = _box(solid)
         self._classifier = BRepClass3d_SolidClassifier(solid)
         self._rays = IntCurvesFace_ShapeIntersector()
         self._rays.Load(solid, 1e-6)
-
-    def edges(self) -> list[tuple[Any, tuple[_Face, _Face]]]:
-        """The edges at which two different faces meet, with these."""
-        faces_of = EdgeFaces()
-        TopExp.MapShapesAndAncestors_s(
-            self._solid, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_FACE, faces_of
-        )
-        found = []
-        for k in range(faces_of.Extent()):
-            edge = TopoDS.Edge(faces_of.FindKey(k + 1))
-            met = [next(f for f in self.faces if f.face.IsSame(face)) for face in faces_of.FindFromIndex(k + 1)]
-            if len(met) == 2 and met[0] is not met[1] and not BRep_Tool.Degenerated_s(edge):
-                found.append((edge, (met[0], met[1])))
-        return found
 
     def holds(self, p: Floats) -> bool:
         """Whether a point is inside."""
@@ -148,6 +132,18 @@ def parts_of(shape: Any, kind: Any) -> list[Any]:
     while explorer.More():
         found.append(explorer.Current())
         explorer.Next()
+    return found
+
+
+def faces_at(shape: Any, faces: list[Face]) -> list[tuple[Any, list[Face]]]:
+    """The edges of a shape in the file's order, each with those of its faces that meet there; none within one face."""
+    faces_of, found = EdgeFaces(), []
+    TopExp.MapShapesAndAncestors_s(shape, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_FACE, faces_of)
+    for k in range(faces_of.Extent()):
+        edge, met = TopoDS.Edge(faces_of.FindKey(k + 1)), list(faces_of.FindFromIndex(k + 1))
+        own = [face for face in faces if any(face.face.IsSame(one) for one in met)]
+        if not BRep_Tool.Degenerated_s(edge) and (len(own) > 1 or len(met) == 1):
+            found.append((edge, own))
     return found
 
 
@@ -179,12 +175,15 @@ def joints_of(shape: Any) -> list[list[Piece]]:
 
 def _within(bodies: list[_Body], k: int) -> Iterable[Piece]:
     """The pieces along the concave edges of one body."""
-    for edge, (f, g) in bodies[k].edges():
+    for edge, met in faces_at(bodies[k].solid, bodies[k].faces):
+        if len(met) != 2:
+            continue
+        f, g = met
         curve = BRepAdaptor_Curve(edge)
         line = sampled(curve, curve.FirstParameter(), curve.LastParameter())
-        if _length(line) < LEAST_MM:
+        if length_of(line) < LEAST_MM:
             continue
-        x, t, _ = _middle(curve, curve.FirstParameter(), curve.LastParameter())
+        x, t, _ = middle_of(curve, curve.FirstParameter(), curve.LastParameter())
         cut = _cut(bodies, (k, k), f, g, x, t, 0.0)
         if cut is not None:
             yield Piece(line=line, bodies=(k, k), **cut)
@@ -192,14 +191,14 @@ def _within(bodies: list[_Body], k: int) -> Iterable[Piece]:
 
 def _named(chain: list[Piece], all_of_them: list[list[Piece]]) -> list[Piece]:
     """The seam with the type of its longest piece; of a T with its side where there is one on the web's other side."""
-    first = max(chain, key=lambda piece: _length(piece.line))
+    first = max(chain, key=lambda piece: length_of(piece.line))
     ring = closes(chain) and all(piece.pipe for piece in chain)
     chain = [replace(p, type=first.pipe if ring else first.type, side="" if ring else p.side) for p in chain]
     if first.type != "T" or ring or closes(chain):
         return chain
     first = chain[0]
     beside = [c[0] for c in all_of_them if c[0].type == "T" and c[0].bodies == first.bodies and len(c) == len(chain)]
-    pair = [p for p in beside if abs(_length(p.line) - _length(first.line)) < 1.0]
+    pair = [p for p in beside if abs(length_of(p.line) - length_of(first.line)) < 1.0]
     if len(pair) != 2:
         return chain
     other = pair[0] if pair[1].line is first.line else pair[1]
@@ -209,11 +208,11 @@ def _named(chain: list[Piece], all_of_them: list[list[Piece]]) -> list[Piece]:
     return [replace(piece, side="left" if left else "right") for piece in chain]
 
 
-def _far(a: _Face | _Body, b: _Face | _Body) -> bool:
+def _far(a: Face | _Body, b: Face | _Body) -> bool:
     return bool((np.maximum(a.low, b.low) > np.minimum(a.high, b.high) + REACH_MM).any())
 
 
-def _met(bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face) -> Iterable[Piece]:
+def _met(bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces meet in a concave joint."""
     crossing = GeomAPI_IntSS(f.surface, g.surface, 1e-6)
     if not crossing.IsDone():
@@ -222,7 +221,7 @@ def _met(bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face) -> Iter
     for k in range(crossing.NbLines()):
         curve = crossing.Line(k + 1)
         breaks, closed = _breaks(bodies, curve, low, high, (f, g))
-        kept = [(t, u, _cut(bodies, pair, f, g, *_middle(curve, t, u))) for t, u in pairwise(breaks)]
+        kept = [(t, u, _cut(bodies, pair, f, g, *middle_of(curve, t, u))) for t, u in pairwise(breaks)]
         runs: list[list[Any]] = []
         for t, u, cut in kept:
             if cut is not None and runs and t - runs[-1][1] <= BRIDGED_MM:
@@ -235,12 +234,12 @@ def _met(bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face) -> Iter
             runs[-1][1] += first[1] - first[0]
         for t, u, cut, _ in runs:
             line = sampled(curve, t, u)
-            if _length(line) >= LEAST_MM:
+            if length_of(line) >= LEAST_MM:
                 yield Piece(line=line, bodies=pair, **cut)
 
 
 def _breaks(
-    bodies: list[_Body], curve: Any, low: Floats, high: Floats, own: tuple[_Face, _Face]
+    bodies: list[_Body], curve: Any, low: Floats, high: Floats, own: tuple[Face, Face]
 ) -> tuple[list[float], bool]:
     """Ascending parameters between which a curve is a joint as a whole or not at all, and whether it is closed."""
     closed = bool(curve.IsClosed())
@@ -278,7 +277,7 @@ def _breaks(
     return [inside[k] for k in kept], closed
 
 
-def _middle(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, float]:
+def middle_of(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, float]:
     """The middle of a stretch of a curve, its direction there, and how far from it a wall may end, along it.
 
     A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
@@ -290,7 +289,7 @@ def _middle(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, float
 
 
 def _cut(
-    bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face, x: Floats, t: Floats, slack: float
+    bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face, x: Floats, t: Floats, slack: float
 ) -> dict[str, Any] | None:
     """The joint of two faces in the cut at one point of their curve; None where they form no concave joint there."""
     normals = f.normal(x), g.normal(x)
@@ -344,7 +343,7 @@ def _cut(
     return {"up": up, "type": kind, "angle": angle, "gap": gap, "side": side, "walls": walls, "pipe": pipe}
 
 
-def _of_pipe(f: _Face, g: _Face, t: Floats, two: tuple[_Body, _Body]) -> str:
+def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[_Body, _Body]) -> str:
     """The joint of a pipe, "" for none: along a cylinder's axis it is as between plates."""
     axes = [(face, face.axis) for face in (f, g) if face.round]
     if len(axes) == 2:
@@ -358,7 +357,7 @@ def _of_pipe(f: _Face, g: _Face, t: Floats, two: tuple[_Body, _Body]) -> str:
     return "flange on pipe" if coaxial else "pipe on plate"
 
 
-def _flush(bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face) -> Iterable[Piece]:
+def _flush(bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces go on in each other: a square butt, the outside of a corner, an edge joint."""
     two = bodies[pair[0]], bodies[pair[1]]
     if f.flat != g.flat or f.round != g.round or not (f.flat or f.round):
@@ -371,7 +370,7 @@ def _flush(bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face) -> It
             if not -OVERLAP_MM <= gap <= GAP_MM or abs(float((q - p) @ n)) > FLUSH_MM:
                 continue
             line = _shared(first, second, m, gap)
-            if line is None or _length(line) < LEAST_MM:
+            if line is None or length_of(line) < LEAST_MM:
                 continue
             x = 0.5 * (line[0] + line[-1]) if f.flat else p + 0.5 * gap * m
             if any(body.holds(x + IN_MM * n) for body in bodies):
@@ -379,7 +378,7 @@ def _flush(bodies: list[_Body], pair: tuple[int, int], f: _Face, g: _Face) -> It
             starts = [x - (0.5 * gap + IN_MM) * m, x + (0.5 * gap + IN_MM) * m]
             depth = [two[k].through(starts[k], -n) for k in (0, 1)]
             wide = [two[k].through(starts[k] - 0.1 * n, s * m) for k, s in ((0, -1.0), (1, 1.0))]
-            if _length(line) < min(depth) or not _facing(two, x, n, m, gap, min(depth)):
+            if length_of(line) < min(depth) or not _facing(two, x, n, m, gap, min(depth)):
                 continue
             narrow = [wide[k] < 0.9 * depth[k] for k in (0, 1)]
             kind = "edge" if all(narrow) else "corner" if any(narrow) else "butt"
@@ -395,7 +394,7 @@ def _facing(two: tuple[_Body, _Body], x: Floats, n: Floats, m: Floats, gap: floa
     return all(two[k].holds(down + s * (0.5 * abs(gap) + 0.3) * m) for k, s in ((0, -1.0), (1, 1.0)))
 
 
-def _end_of(face: _Face, edge: Any) -> tuple[Floats, Floats, Floats] | None:
+def _end_of(face: Face, edge: Any) -> tuple[Floats, Floats, Floats] | None:
     """Middle of a straight or round edge, the face's normal there, and the way out of the face in its plane."""
     curve = BRepAdaptor_Curve(edge)
     straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
@@ -461,54 +460,11 @@ def closes(chain: list[Piece]) -> bool:
     return apart < CHAINED_MM and sum(len(piece.line) for piece in chain) > 4
 
 
-def with_joints(edges: tuple[PartEdge, ...], shape: Any) -> tuple[tuple[PartEdge, ...], tuple[PartJoint, ...]]:
-    """The edges of a part with those of its joints that are no edge of a body added at the end, and its joints."""
-    known, joints = list(edges), []
-    for chain in joints_of(shape):
-        ids = []
-        for piece in chain:
-            kind = "concave" if piece.angle < math.pi - 0.01 else "flush"
-            lies = (k for k, edge in enumerate(known) if edge.up_P is None and _is(edge, 1e-3 * piece.line))
-            at = next(lies, len(known))
-            radius = known[at].radius_m if at < len(known) else None
-            line = known[at].points_P if at < len(known) else 1e-3 * piece.line
-            known[at : at + 1] = [PartEdge(at + 1, kind, line, piece.angle, radius, piece.up)]
-            ids.append(at + 1)
-        longest = max(chain, key=lambda piece: _length(piece.line))
-        joints.append(
-            PartJoint(
-                type=longest.type,
-                edges=tuple(ids),
-                length_m=1e-3 * sum(_length(piece.line) for piece in chain),
-                angle_rad=longest.angle,
-                gap_m=1e-3 * max(piece.gap for piece in chain),
-                walls_m=(1e-3 * longest.walls[0], 1e-3 * longest.walls[1]),
-                up_P=longest.up,
-                side=longest.side,
-                closed=closes(chain),
-            )
-        )
-    return tuple(known), tuple(joints)
-
-
-def _is(edge: PartEdge, line: Floats) -> bool:
-    """Whether an edge is this line (N,3) m."""
-    p, q = edge.points_P, line
-    if abs(edge.length_m - _length(q)) > 2e-5:
-        return False
-    ends = min(np.abs(p[[0, -1]] - q[[0, -1]]).max(), np.abs(p[[0, -1]] - q[[-1, 0]]).max())
-    middle = 0.5 * (q[0] + q[-1]) if len(q) == 2 else q[len(q) // 2]
-    a, d = p[:-1], np.diff(p, axis=0)
-    share = np.clip(np.vecdot(middle - a, d) / np.vecdot(d, d), 0.0, 1.0)
-    off = float(np.linalg.norm(a + share[:, None] * d - middle, axis=1).min())
-    return bool((ends < 2e-5 or (edge.closed and np.linalg.norm(q[0] - q[-1]) < 1e-5)) and off < 5e-5)
-
-
 def sampled(curve: Any, begin: float, end: float) -> Floats:
     """Points (N,3) on a stretch of a curve, 0.5 mm apart on a bent one."""
     steps = np.linspace(begin, end, 33)
     points = np.array([_array(curve.Value(u)) for u in steps])
-    length = _length(points)
+    length = length_of(points)
     if abs(length - float(np.linalg.norm(points[-1] - points[0]))) < EXACT_MM:
         return points[[0, -1]]
     return np.array([_array(curve.Value(u)) for u in np.linspace(begin, end, max(9, math.ceil(2.0 * length) + 1))])
@@ -520,7 +476,7 @@ def _box(shape: Any) -> tuple[Floats, Floats]:
     return _array(box.CornerMin()), _array(box.CornerMax())
 
 
-def _length(line: Floats) -> float:
+def length_of(line: Floats) -> float:
     return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
 
 
