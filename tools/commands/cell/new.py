@@ -77,6 +77,8 @@ HEAD = """# yaml-language-server: $schema={schema}
 """
 TOOL = "tool.yaml"
 NARROW_RAD = np.deg2rad(75.0)  # a V is narrower than this, a fillet wider
+FLUSH_RAD = np.deg2rad(179.0)  # a joint as open as this needs a gap for the tip to feel
+MOST_TRIED = 4  # seams for which a place is looked for
 OPEN_ABOVE = 0.3  # z of the joint's bisector
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
@@ -100,11 +102,12 @@ def new(
         Path | None, option("--part", "FILE", "A part of your own: STEP, STL, OBJ or PLY. It is copied there.")
     ] = None,
     edges: Annotated[
-        str, option("--edges", "N,N...", "Edges of the seam, from weldcal part; default: the longest.")
+        str, option("--edges", "N,N...", "Edges of the seam, from weldcal part; default: the best that can be welded.")
     ] = "",
     joint: Annotated[
         str | None, option("--joint", "NAME", "v_groove, butt, fillet or lap; default: by the angle.")
     ] = None,
+    units: Annotated[str | None, option("--units", "UNIT", "Of the part's file: mm, m or inch.")] = None,
     tool: Annotated[bool, switch("--tool", "Also write tool.yaml, a copy of the welding tool to change.")] = False,
     dataset: Annotated[
         bool, switch("--dataset", "Write an example of a calibration dataset, scanned in simulation, instead.")
@@ -122,7 +125,7 @@ def new(
         following = f"weldcal calibrate {written}"
     else:
         numbers = tuple(edge_numbers(edges))
-        own = None if part is None else OwnPart(part, numbers, joint)
+        own = None if part is None else OwnPart(part, numbers, joint, units)
         written, reason = write_cell(folder, base, own, WELDING if tool else None)
         following = f"weldcal demo --scenario {written}"
         if reason:
@@ -171,11 +174,12 @@ def write_example(folder: Path, seed: int, progress: Progress = no_progress, for
 
 @dataclass(frozen=True)
 class OwnPart:
-    """A part's file, the numbers of the seam's edges (none: the longest concave one), and the joint (None: by its angle)."""
+    """A part's file, the numbers of the seam's edges (none: the best that can be welded), the joint (None: by its angle), its unit."""
 
     file: Path
     edges: tuple[int, ...] = ()
     joint: str | None = None
+    units: str | None = None
 
 
 def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path | None = None) -> tuple[Path, str]:
@@ -195,16 +199,26 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     folder.mkdir(parents=True, exist_ok=True)
     if part is not None:
         scenario.description = f"A cell that welds {part.file.name}."
-        add_part(scenario, folder, part.file, list(part.edges), part.joint)
+        candidates = add_part(scenario, folder, part)
     if tool is not None:
         add_tool(scenario, folder, tool)
     write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
     unfinished = folder / UNFINISHED
     if part is not None:
         assert scenario.workpiece is not None
-        _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
-        scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)))
+        standing, nearest = scenario.workpiece.pose_guess, ""
+        for seam, joint in candidates:
+            scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
+            _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
+            scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)))
+            nearest = nearest or reason
+            if not reason:
+                break
         if reason:
+            several = f"None of {len(candidates)} seams can be welded; the first one: " if len(candidates) > 1 else ""
+            reason = several + nearest
+            seam, joint = candidates[0]
+            scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
             words = "\n# ".join(textwrap.wrap(reason, WIDTH - 2))
             _write(unfinished, scenario, CANNOT_WELD.format(reason=words, path=unfinished))
             return unfinished, reason
@@ -256,26 +270,29 @@ def _line(key: Key, value: Any, indent: str, written: bool = False) -> str:
     return "".join(f"{indent}# {words}\n" for words in above) + text + "\n"
 
 
-def add_part(scenario: Scenario, folder: Path, part: Path, edges: list[int], joint: str | None) -> None:
+def add_part(scenario: Scenario, folder: Path, part: OwnPart) -> list[tuple[SeamConfig, str]]:
     """Copy a part's file into the cell's folder, and make it the scenario's workpiece, standing on the table.
 
-    Without `edges` the longest concave one that opens upwards is the seam; without `joint` its angle says which joint it is.
+    Returns:
+        The seams to try, each with its joint, the best one first: without edges those that open upwards, by their length.
 
     Raises:
-        InputError: the part cannot be read, has no such edge, or no concave one.
+        InputError: the part cannot be read, has no such edge, or no joint.
     """
-    shape = read_shape(part)
-    chosen = _chosen(shape, part, edges)
-    name = joint or _joint(chosen[0])
+    shape = read_shape(part.file, part.units)
+    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else _candidates(shape, part.file)
+    found = [(SeamConfig(edges=[edge.id for edge in edges]), part.joint or _joint(edges[0])) for edges in chosen]
     scenario.workpiece = WorkpieceConfig(
-        file=part.name,
-        seams=[SeamConfig(edges=[edge.id for edge in chosen])],
-        joint=name,
+        file=part.file.name,
+        units=part.units,
+        seams=[found[0][0]],
+        joint=found[0][1],
         pose_guess=_standing(shape.mesh, TURNS_DEG[0], 0.5 * shape.mesh.bounds.sum(axis=0), scenario),
         located_by="scan",
         placement_error=ErrorConfig(OFF_MM, OFF_DEG),
     )
-    shutil.copyfile(part, folder / part.name)
+    shutil.copyfile(part.file, folder / part.file.name)
+    return found
 
 
 def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
@@ -337,17 +354,20 @@ def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
     scenario.tool = ToolFile(TOOL)
 
 
-def _chosen(shape: PartShape, part: Path, edges: list[int]) -> list[PartEdge]:
-    by_id = {edge.id: edge for edge in shape.edges}
-    if unknown := [str(number) for number in edges if number not in by_id]:
-        raise InputError(f"{part.name} has no edge {', '.join(unknown)}: see weldcal part {part}.")
-    if edges:
-        return [by_id[number] for number in edges]
-    concave = [edge for edge in shape.edges if edge.kind == "concave"]
-    if not concave:
+def _candidates(shape: PartShape, part: Path) -> list[list[PartEdge]]:
+    """The best seams of a part, at most MOST_TRIED, each by its edges; a seam with corners is taken edge by edge."""
+    chains = [[shape.edge(id) for id in j.edges] for j in shape.joints if j.gap_m > 0.0 or j.angle_rad < FLUSH_RAD]
+    if not shape.joints:
+        chains = [[edge] for edge in shape.edges if edge.kind == "concave"]
+    bent = [chain for chain in chains if all(len(edge.points_P) > 2 for edge in chain)]
+    found = bent + [[edge] for chain in chains if chain not in bent for edge in chain]
+    if not found:
         raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
-    concave.sort(key=lambda edge: -edge.length_m)
-    return [next((edge for edge in concave if _open_above(shape, edge)), concave[0])]
+    found.sort(key=lambda chain: -sum(edge.length_m for edge in chain))
+    above = [chain for chain in found if chain[0].up_P is not None and chain[0].up_P[2] > OPEN_ABOVE]
+    if not shape.joints:
+        above = [next((chain for chain in found if _open_above(shape, chain[0])), found[0])]
+    return (above + [chain for chain in found if chain not in above])[:MOST_TRIED]
 
 
 def _open_above(shape: PartShape, edge: PartEdge) -> bool:
@@ -360,4 +380,6 @@ def _open_above(shape: PartShape, edge: PartEdge) -> bool:
 
 
 def _joint(edge: PartEdge) -> str:
+    if edge.kind == "flush":
+        return "butt"
     return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"
