@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
+import re
+from itertools import combinations
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
+from weldcal.models.workpieces.reading import read_shape
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.parts.step_parts import PARTS
+from weldcal.tools.commands.cell.part import edges_picture
+from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, write_step
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +60,44 @@ def test_a_mistake_is_a_sentence(step: Path, arguments: list[str], says: str, tm
     assert result.exit_code == 1
     assert says in result.output
     assert not (tmp_path / "out").exists()
+
+
+def test_each_seam_says_whether_the_tool_fits_it(tmp_path: Path) -> None:
+    pipe = less(cylinder((0, 0, 0), 60, 80), cylinder((0, 0, -1), 30, 90))
+    write_step(assembly(box((-90, -90, -10), (180, 180, 10)), pipe), tmp_path / "pipe.step")
+    result = CliRunner().invoke(app, ["part", str(tmp_path / "pipe.step"), "--json", "--out", str(tmp_path / "out")])
+    outside, inside = json.loads(result.stdout.splitlines()[-1])["seams"]
+    assert [outside["type"], outside["weldable"]] == ["pipe on plate", True]
+    assert outside["length_mm"] == pytest.approx(2.0 * math.pi * 60.0, abs=0.05)
+    assert [outside["least_radius_mm"], inside["least_radius_mm"]] == pytest.approx([60.0, 30.0])
+    assert outside["closed"]
+    assert not inside["weldable"]
+    assert re.search(r"tool does not fit: .* \(-\d+\.\d mm\)", inside["reason"])
+    text = CliRunner().invoke(app, ["part", str(tmp_path / "pipe.step"), "--out", str(tmp_path / "text")]).stdout
+    assert re.search(r"pipe on plate +377\.0 +90\.0 .*  yes", text)
+    assert "Seams</h2>" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_numbers_in_the_picture_do_not_overlap(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    ribs = [box((0, y, 0), (200, 3, 40)) for y in range(5, 200, 12)]
+    write_step(assembly(box((0, 0, -5), (200, 200, 5)), *ribs), tmp_path / "ribs.step")
+    figures: list[Figure] = []
+    kept = Figure.savefig
+
+    def save(self: Figure, *args: object, **kwargs: object) -> None:
+        figures.append(self)
+        kept(self, *args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Figure, "savefig", save)
+    edges_picture(read_shape(tmp_path / "ribs.step"))
+    (figure,) = figures
+    for axes in figure.axes:
+        boxes = [text.get_window_extent() for text in axes.texts]
+        assert len(boxes) > 20
+        assert not [1 for a, b in combinations(boxes, 2) if a.overlaps(b)]
+
+
+def test_a_very_small_part_is_asked_whether_it_is_in_inches(tmp_path: Path) -> None:
+    write_step(box((0, 0, 0), (10, 5, 3)), tmp_path / "small.step")
+    text = CliRunner().invoke(app, ["part", str(tmp_path / "small.step"), "--out", str(tmp_path / "out")]).stdout
+    assert "10.0 x 5.0 x 3.0 mm: its unit may be inch" in text

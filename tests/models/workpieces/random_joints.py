@@ -270,4 +270,6 @@ if __name__ == "__main__":
         if wrong:
             bad += 1
             print(name, seed, *wrong, sep="\n    ", flush=True)
-    print(f"{count - bad} of {count} random joints right")
+        if n % 100 == 99:
+            print(f"{n + 1 - bad} of {n + 1} random joints right", flush=True)
+    sys.exit(bad > 0)
