@@ -81,7 +81,7 @@ class Face:
         adaptor = BRepAdaptor_Surface(face)
         self.round = adaptor.GetType() == GeomAbs_SurfaceType.GeomAbs_Cylinder
         self.flat = adaptor.GetType() == GeomAbs_SurfaceType.GeomAbs_Plane
-        self.axis = adaptor.Cylinder().Axis() if self.round else None
+        self.axis: Any = adaptor.Cylinder().Axis() if self.round else None
 
     @cached_property
     def ends(self) -> list[tuple[Any, tuple[Floats, Floats, Floats]]]:
@@ -209,11 +209,13 @@ def _named(chain: list[Piece], all_of_them: list[list[Piece]]) -> list[Piece]:
 
 
 def _far(a: Face | _Body, b: Face | _Body) -> bool:
-    return bool((np.maximum(a.low, b.low) > np.minimum(a.high, b.high) + REACH_MM).any())
+    return bool((np.maximum(a.low, b.low) > np.minimum(a.high, b.high) + GAP_MM).any())
 
 
 def _met(bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces meet in a concave joint."""
+    if f.round and g.round and f.axis.IsCoaxial(g.axis, 0.01, GAP_MM):
+        return  # a pin in its hole
     crossing = GeomAPI_IntSS(f.surface, g.surface, 1e-6)
     if not crossing.IsDone():
         return
@@ -252,7 +254,7 @@ def _breaks(
         begin, end = float(at.min()), float(at.max())
     found = [begin, end]
     for body in bodies:
-        for face in body.faces:
+        for face in () if (body.low > high).any() or (body.high < low).any() else body.faces:
             if face in own or (face.low > high).any() or (face.high < low).any():
                 continue
             crossed = GeomAPI_IntCS(curve, face.surface)

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -68,7 +68,7 @@ class Seam:
     radius_m: float | None
     reason: str
 
-    def as_row(self) -> dict[str, object]:
+    def as_row(self) -> dict[str, Any]:
         """The seam for JSON: millimetres and degrees."""
         j = self.joint
         return {
@@ -224,6 +224,7 @@ def edges_picture(shape: PartShape) -> bytes:
         _draw(axes, shape, _towards(elevation, azimuth))
         drawn.append(axes)
     figure.draw_without_rendering()  # the places of the axes are known only then
+    figure.set_layout_engine("none")  # numbers do not move them
     for axes in drawn:
         _number(axes, shape)
     stream = io.BytesIO()
