@@ -1,6 +1,5 @@
 """The worker's interface to the robot: connect, upload the guard, read samples, send numbered velocities."""
 
-import contextlib
 import sys
 import threading
 import time
@@ -11,14 +10,14 @@ from importlib.resources import files
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
-from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, RobotUnreachable
+from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, RobotUnreachable, reported_as
 from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, SET_POINTS, UPPER_OFFSET, register_names
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
 from weldcal.systems.drivers.ur.torch.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
 from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Level, OffSwitch, apart
 from weldcal.systems.drivers.ur.wire.dashboard import SCRIPT_PORT
 from weldcal.systems.drivers.ur.wire.line import Line
-from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe, Value
+from weldcal.systems.drivers.ur.wire.rtde_client import NotFinite, RtdeProbe, Value
 from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream
 
 BIN_S = 0.5
@@ -113,9 +112,9 @@ def same_payload(found: Mapping[str, Value], mass_kg: float, cog_m: Sequence[flo
 class Refused(Exception):
     """The start failed, with the fault that caused it."""
 
-    def __init__(self, fault: Fault) -> None:
+    def __init__(self, fault: Fault, detail: float = 0.0) -> None:
         super().__init__(fault.name)
-        self.fault = fault
+        self.fault, self.detail = fault, detail
 
 
 def guard_script(
@@ -181,6 +180,8 @@ class Robot:
         try:
             self._stream = RtdeStream(host, names, register_names(base, self._doubles))
             self._stream.first(FIRST_LIMIT_S)
+        except NotFinite as error:
+            raise Refused(Fault.STATE_NOT_FINITE, reported_as(error.output)) from error
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.CONTROL_REFUSED) from error
@@ -225,12 +226,15 @@ class Robot:
         if not self._once(SET_PAYLOAD, mass_kg, *cog_m):
             raise Refused(Fault.START_FAILED)
         found: dict[str, Value] = {}
-        reader = threading.Thread(target=self._read_back, args=(found, mass_kg, cog_m), daemon=True)
+        wrong: list[str] = []  # an output that is not finite
+        reader = threading.Thread(target=self._read_back, args=(found, wrong, mass_kg, cog_m), daemon=True)
         reader.start()
         while reader.is_alive():
             self.forget()
             self._stream.poll()
             reader.join(0.01)
+        if wrong:
+            raise Refused(Fault.STATE_NOT_FINITE, reported_as(wrong[0]))
         if np.abs(np.array(found.get("tcp_offset", np.inf))).max() > 1e-6:
             raise Refused(Fault.TCP_NOT_ZERO)
         if not same_payload(found, mass_kg, cog_m):
@@ -260,17 +264,22 @@ class Robot:
             numbers[DOUBLES + level.output] = level.share
         self._stream.send(command, *numbers)
 
-    def _read_back(self, found: dict[str, Value], mass_kg: float, cog_m: list[float]) -> None:
+    def _read_back(self, found: dict[str, Value], wrong: list[str], mass_kg: float, cog_m: list[float]) -> None:
         """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the guard
         waits for a package.
         """
         until = time.monotonic() + READ_BACK_LIMIT_S / self._pace
-        with contextlib.suppress(RobotUnreachable), RtdeProbe(self._host) as probe:
-            while True:
-                found.update(probe.read(READ_BACK))
-                if same_payload(found, mass_kg, cog_m) or time.monotonic() > until:
-                    return
-                time.sleep(0.01)
+        try:
+            with RtdeProbe(self._host) as probe:
+                while True:
+                    found.update(probe.read(READ_BACK))
+                    if same_payload(found, mass_kg, cog_m) or time.monotonic() > until:
+                        return
+                    time.sleep(0.01)
+        except NotFinite as error:
+            wrong.append(error.output)
+        except RobotUnreachable:
+            return
 
     def sample(self, now: float) -> RobotSample:
         """The newest sample, all fields of one package."""
@@ -298,6 +307,7 @@ class Robot:
             speed_scaling=stream.number("speed_scaling") * stream.number("target_speed_fraction"),
             guard=int(stream.number(self._latch)),
             connected=stream.connected,
+            not_finite=stream.not_finite,
             pose_error_m=float(
                 np.linalg.norm(
                     kinematics_and_jacobian(self._arm, q)[1] - np.array(stream.vector("actual_TCP_pose")[:3])

@@ -265,7 +265,7 @@ class Worker:
             )
         )
 
-    def refuse(self, fault: Fault) -> None:
+    def refuse(self, refused: Refused) -> None:
         """Publish the fault that made the start fail."""
         self._memory.state.write(
             Published(
@@ -279,8 +279,8 @@ class Worker:
                 safety_mode=0,
                 runtime_state=0,
                 speed_scaling=0.0,
-                fault=fault,
-                detail=0.0,
+                fault=refused.fault,
+                detail=refused.detail,
                 fault_time=0.0,
                 number=0,
                 sent_time=0.0,
@@ -317,7 +317,7 @@ def main() -> None:
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))
     except Refused as refused:
-        worker.refuse(refused.fault)
+        worker.refuse(refused)
         os._exit(1)
     os._exit(worker.run(robot))
 
