@@ -32,6 +32,7 @@ from weldcal.systems.drivers.ur.supervisor import (
     Supervisor,
 )
 from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas, Level, SetPoints, apart
+from weldcal.systems.drivers.ur.wire.transport import NATIVE
 
 FRESH_S = 0.012  # of robot time; three periods of the commands
 ZERO_S = 0.050
@@ -95,6 +96,7 @@ class WorkerConfig:
     gas_before_s: float = 0.0
     gas_after_s: float = 0.0
     levels: tuple[Level, ...] = ()
+    transport: str = NATIVE
 
 
 class Worker:
@@ -313,6 +315,7 @@ def main() -> None:
             arc_inputs=ArcInputs(config.arc_input, config.arc_fault_input),
             gas=config.gas_output,
             levels=config.levels,
+            transport=config.transport,
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))

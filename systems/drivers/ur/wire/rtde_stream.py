@@ -34,6 +34,7 @@ class RtdeStream:
             self._recipe, kinds = self._probe.claim_recipe(inputs) if inputs else (0, [])
             if {IN_USE, NOT_FOUND} & set(kinds):
                 raise RobotRefused("Another client or a fieldbus writes the command registers.")
+            self._inputs = len(kinds)
             self._package = struct.Struct(">B" + "".join(CODES[kind] for kind in kinds))
             rate = FASTEST_HZ if self._probe.version[0] >= E_SERIES else CB3_HZ
             kinds = self._probe.subscribe(outputs, rate)
@@ -133,8 +134,8 @@ class RtdeStream:
         return self._newest
 
     def send(self, *values: float) -> None:
-        """Write the inputs, in the order in which they were claimed."""
-        payload = self._package.pack(self._recipe, *values)
+        """Write the inputs, in the order in which they were claimed; those that are left out are zero."""
+        payload = self._package.pack(self._recipe, *values, *[0] * (self._inputs - len(values)))
         try:
             self._socket.settimeout(0.0)
             sent = self._socket.send(HEADER.pack(len(payload) + HEADER.size, DATA) + payload)
