@@ -61,11 +61,14 @@ class Controller:
 
 
 @contextmanager
-def independent_controller(host: str | None = None, q: Sequence[float] | None = None) -> Iterator[Controller]:
-    """A controller at a loopback address of this process's own."""
+def independent_controller(
+    host: str | None = None, q: Sequence[float] | None = None, *, own_computer: bool = True
+) -> Iterator[Controller]:
+    """A controller at a loopback address of this process's own; `own_computer`: with real-time priority, where that is allowed."""
     host = host or f"127.40.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
     command = [sys.executable, "-m", "tests.hardware.independent", "--host", host]
     command += [] if q is None else ["--q", *(f"{x:.6f}" for x in q)]
+    command += ["--own-computer"] if own_computer else []
     bare = {
         name: value for name, value in os.environ.items() if name != "PYTHONPATH"
     }  # where the product would be found

@@ -1,7 +1,7 @@
 """Whole jobs with the independent controller, in real time at ordinary priority: `python -m tests.hardware.try_independent jobs`.
 
 `jobs` runs scenarios that ship with their robot at the controller's address, each by the command line in a process of its own, and
-prints a table. `faults` breaks a moving session in every way that the control channel knows, and a whole job where it is asked to.
+prints a table; the controller has ordinary priority, unless --own-computer is given. `faults` breaks a moving session in every way that the control channel knows, and a whole job where it is asked to.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def run_job(
     state = controller.state()
     late = {key: state["late"][key] - before["late"][key] for key in ("slips", "slipped_ms")}
     return {
-        "scenario": name, "transport": transport, "seed": seed, "exit": running.returncode, **found, "said": said[-600:],
+        "groove": name, "transport": transport, "seed": seed, "exit": running.returncode, **found, "said": said[-600:],
         "wall_s": time.monotonic() - began, "load": os.getloadavg()[0], "slips": late["slips"], "slipped_ms": late["slipped_ms"],
         "program_left": state["program"], "robot_travel_rad": state["travel"],
     }  # fmt: skip
@@ -157,7 +157,7 @@ def print_job(job: dict[str, Any]) -> None:
     mean, most = job.get("torch_mean_mm"), job.get("torch_max_mm")
     torch = "-" if mean is None else f"{mean:.3f} / {most:.3f}"
     print(
-        f"{job['scenario']:16s} {job['transport']:8s} seed {job['seed']:<3d} {job.get('state', 'no result'):8s} torch {torch:15s} mm"
+        f"{job['groove']:16s} {job['transport']:8s} seed {job['seed']:<3d} {job.get('state', 'no result'):8s} torch {torch:15s} mm"
         f"  {job['wall_s']:5.0f} s  load {job['load']:4.1f}  late {job.get('late_ms')}"
         f"  controller slipped {job['slips']:.0f} times, {job['slipped_ms']:.0f} ms",
         flush=True,
@@ -166,11 +166,11 @@ def print_job(job: dict[str, Any]) -> None:
         print(f"    {job.get('reason')} {job['said']}", flush=True)
 
 
-def jobs(names: list[str], transports: list[str], seeds: list[int], host: str | None) -> int:
+def jobs(names: list[str], transports: list[str], seeds: list[int], host: str | None, own_computer: bool) -> int:
     """Run the jobs one after the other with one controller; returns how many were not done."""
     failed = 0
     home = np.deg2rad(load_scenario(names[0]).home_deg).tolist()
-    with independent_controller(host, home) as controller:
+    with independent_controller(host, home, own_computer=own_computer) as controller:
         for seed in seeds:
             for name in names:
                 for transport in transports:
@@ -184,15 +184,12 @@ def jobs(names: list[str], transports: list[str], seeds: list[int], host: str | 
     return failed
 
 
-def faults(host: str | None, job: str | None) -> int:
+def faults(host: str | None, job: str | None, own_computer: bool) -> int:
     """Make every fault in a session, or in the middle of a job; returns how many were not answered as they must be."""
     failed = 0
-    with independent_controller(host) as controller:
+    with independent_controller(host, own_computer=own_computer) as controller:
         for fault in FAULTS:
-            if job is None:
-                found = break_session(controller, fault)
-            else:
-                found = break_job(controller, fault, job)
+            found = break_session(controller, fault) if job is None else break_job(controller, fault, job)
             right = fault.word in found.named and found.rests_s <= fault.rests_s and found.resumed_rad < 1e-6
             failed += not right
             print(
@@ -244,10 +241,11 @@ def main() -> int:
     parser.add_argument("--transports", nargs="+", default=["default"], help="default, native, ur_rtde")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--job", help="faults: in the middle of a job of this scenario")
+    parser.add_argument("--own-computer", action="store_true", help="the controller takes real-time priority")
     given = parser.parse_args()
     if given.what == "jobs":
-        return jobs(given.scenarios, given.transports, given.seeds, given.host)
-    return faults(given.host, given.job)
+        return jobs(given.scenarios, given.transports, given.seeds, given.host, given.own_computer)
+    return faults(given.host, given.job, given.own_computer)
 
 
 if __name__ == "__main__":

@@ -9,14 +9,16 @@ import argparse
 import gc
 import json
 import math
+import os
 import select
 import socket
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
-from tests.hardware.independent.machine import HOME, STEP_S, Machine
+from tests.hardware.independent.machine import HOME, STARTS_S, STEP_S, Machine
 from tests.hardware.independent.ports import Client, real_time_package, state_package
 from tests.hardware.independent.rtde import Rtde, RtdeClient
 
@@ -24,6 +26,7 @@ CONTROL_PORT = 30095
 PORTS = (29999, 30001, 30002, 30003, 30004, CONTROL_PORT)
 STATE_EACH = 50  # frames: the client interface has 10 Hz
 CATCHES_UP_S = 0.010  # later frames are not made up for: the controller's time then runs slower than the computer's
+PRIORITY = 3  # of SCHED_RR, above that of its client's processes
 SECOND_PROGRAM = "def second():\n  while True:\n    sync()\n  end\nend\n"
 
 
@@ -81,8 +84,9 @@ class Hooks:
         self._rtde.wrong.clear()
         self._rtde.delay_s = self._rtde.silent_until = self._rtde.mute_until = 0.0
 
-    def do_second_program(self, text: str = SECOND_PROGRAM) -> None:
-        """Somebody sends another program."""
+    def do_second_program(self, text: str = SECOND_PROGRAM, starts_s: float | None = None) -> None:
+        """Somebody sends another program, which starts so long after the end of the present one."""
+        self._machine.starts_s = STARTS_S if starts_s is None else starts_s
         self._machine.upload(text)
 
     def do_wrong(self, name: str, value: float = math.nan, seconds: float = 1.0) -> None:
@@ -249,11 +253,19 @@ def main() -> None:
     parser.add_argument(
         "--payload", type=float, nargs=4, default=[1.4, 0.03, 0.0, 0.05], help="of the installation: kg, m"
     )
+    parser.add_argument(
+        "--own-computer",
+        action="store_true",
+        help="take real-time priority where the system allows it, as a controller that shares no processor with its client",
+    )
     given = parser.parse_args()
     if not given.host.startswith("127."):
         parser.error("the address must be a loopback address")
     controller = Controller(given.host, given.q)
     controller.machine.payload, controller.machine.cog = given.payload[0], given.payload[1:]
+    if given.own_computer:
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
     gc.collect()
     gc.freeze()
     print(f"ready {given.host}", flush=True)

@@ -19,6 +19,7 @@ POWER_OFF, POWER_ON, IDLE, RUNNING = 3, 4, 5, 7
 PROGRAM_STOP, SAFETY_STOP = 8.0, 25.0  # rad/s^2 [M]
 UNLOCK_S = 5.0  # [D] dashboard: a protective stop cannot be unlocked earlier
 RESUMES_S = 0.020  # [M]
+STARTS_S = 0.050  # [M] from the end of a program to the start of the one that replaces it
 REGISTERS = 48
 HALF_PI = math.pi / 2.0
 TURN = 2.0 * math.pi
@@ -121,7 +122,8 @@ class Machine:
         self._low_when_stopped: dict[int, int] = {}
         self._analog_low: dict[int, int] = {}
         self._protected_at = -math.inf
-        self._resumed_at = 0.0
+        self._resumed_at, self._starts_at = 0.0, 0.0
+        self.starts_s = STARTS_S
 
     def note(self, text: str) -> None:
         """Add a line to the log."""
@@ -150,6 +152,7 @@ class Machine:
             return
         if self._run is not None:
             self.stop("replaced by another program")
+            self._starts_at = self.time + self.starts_s
         self._queued = program
 
     def stop(self, why: str) -> None:
@@ -229,7 +232,7 @@ class Machine:
             self.state = PAUSED
         if self.state == STOPPING and not any(self.qd):
             self.state = STOPPED
-        if self.state == STOPPED and self._queued is not None:
+        if self.state == STOPPED and self._queued is not None and self.time >= self._starts_at:
             self._start(self._queued)
 
     def _start(self, program: Program) -> None:
