@@ -34,7 +34,7 @@ class Controller:
     process: subprocess.Popen[str]
     host: str
 
-    def do(self, name: str, **settings: Any) -> dict[str, Any]:
+    def do(self, name: str, /, **settings: Any) -> dict[str, Any]:
         """Ask for a fault or an operator's action; returns the answer."""
         with socket.create_connection((self.host, CONTROL_PORT), timeout=5.0) as line:
             line.sendall(json.dumps({"do": name, **settings}).encode() + b"\n")
@@ -51,12 +51,13 @@ class Controller:
         """The fastest joint, rad/s."""
         return float(np.abs(self.state()["qd"]).max())
 
-    def at_rest_within(self, seconds: float) -> float:
-        """Wait until the arm is at rest; returns for how long, on the controller's clock. Raises where it takes longer."""
+    def rests(self, seconds: float) -> dict[str, Any]:
+        """The state once the arm is at rest. Raises where it moves for longer, on the controller's clock."""
         began = float(self.state()["time"])
         while (state := self.state())["time"] - began < seconds:
             if np.abs(state["qd"]).max() < REST_RAD_S:
-                return float(state["time"]) - began
+                return state
+            time.sleep(0.005)
         raise AssertionError(f"the arm moves {seconds} s after the fault: {state}")
 
 

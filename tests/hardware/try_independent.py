@@ -1,7 +1,8 @@
-"""Whole jobs with the independent controller, in real time at ordinary priority: `python -m tests.hardware.try_independent jobs`.
+"""Whole jobs with the independent controller, in real time: `python -m tests.hardware.try_independent jobs`.
 
 `jobs` runs scenarios that ship with their robot at the controller's address, each by the command line in a process of its own, and
-prints a table; the controller has ordinary priority, unless --own-computer is given. `faults` breaks a moving session in every way that the control channel knows, and a whole job where it is asked to.
+prints a table. The controller has ordinary priority, unless --own-computer is given. `faults` breaks a moving session in every way
+that the control channel knows, or a whole job with --job.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from tests.hardware.independent_process import Controller, independent_controlle
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 
 GROOVES = ("straight_groove", "s_groove", "l_groove")
+FAST_RAD_S = 0.15
 WATCHED_S = 1.5  # after the repair and Play
 JOB_LIMIT_S = 1200.0
 
@@ -77,31 +79,34 @@ def break_session(controller: Controller, fault: Fault, **settings: Any) -> Brok
     process = settings.get("process_output") is not None
     with session(controller, **settings) as link:
         assert move(link, 0.3, process=process) is None
-        while controller.speed() < 0.1:
-            assert move(link, 0.05, process=process) is None
-        made: list[float] = []
-
-        def make() -> None:
-            time.sleep(0.05)
-            fault.make(controller)
-            made.append(controller.at_rest_within(5.0))
-
-        maker = Thread(target=make)
+        found: list[dict[str, Any]] = []
+        maker = Thread(target=lambda: found.append(_break(controller, fault)))
         maker.start()
-        named = move(link, 3.0, process=process)
+        named = move(link, 5.0, process=process)
         maker.join()
-        assert made, "the arm did not come to rest"
         controller.do("mark")
         controller.do("repair")
         controller.do("play")
         until = time.monotonic() + WATCHED_S
         while time.monotonic() < until:
-            link.command(link.state().qd * 0.0 + 0.1)  # a cell that would go on
+            link.command(np.full(6, 0.1))  # a cell that would go on
             time.sleep(0.01)
         state = controller.state()
     controller.do("stop")
-    controller.at_rest_within(2.0)
-    return Broken(str(named), made[0], state["travel"], bool(state["digital_out"]))
+    controller.rests(2.0)
+    assert found, "the arm did not come to rest"
+    return Broken(
+        str(named), found[0]["moved_at"] - found[0]["fault"]["at"], state["travel"], bool(state["digital_out"])
+    )
+
+
+def _break(controller: Controller, fault: Fault) -> dict[str, Any]:
+    """Make the fault while the arm moves; returns the controller's state when it is at rest."""
+    while controller.speed() < FAST_RAD_S:
+        time.sleep(0.002)
+    fault.make(controller)
+    time.sleep(0.5)
+    return controller.rests(4.0)
 
 
 def job_scenario(name: str, host: str, transport: str, folder: Path, more: str = "") -> Path:
@@ -210,10 +215,8 @@ def break_job(controller: Controller, fault: Fault, name: str) -> Broken:
         while controller.state()["started"] == began:
             time.sleep(0.2)
         time.sleep(6.0)
-        while controller.speed() < 0.1:
-            time.sleep(0.01)
-        fault.make(controller)
-        rested.append(controller.at_rest_within(5.0))
+        state = _break(controller, fault)
+        rested.append(state["moved_at"] - state["fault"]["at"])
         controller.do("mark")
         time.sleep(0.3)
         controller.do("repair")

@@ -26,6 +26,7 @@ CONTROL_PORT = 30095
 PORTS = (29999, 30001, 30002, 30003, 30004, CONTROL_PORT)
 STATE_EACH = 50  # frames: the client interface has 10 Hz
 CATCHES_UP_S = 0.010  # later frames are not made up for: the controller's time then runs slower than the computer's
+UNFAULTY = ("state", "repair", "play", "mark", "place", "inputs")
 PRIORITY = 3  # of SCHED_RR, above that of its client's processes
 SECOND_PROGRAM = "def second():\n  while True:\n    sync()\n  end\nend\n"
 
@@ -35,6 +36,7 @@ class Hooks:
 
     def __init__(self, machine: Machine, rtde: Rtde) -> None:
         self._machine, self._rtde = machine, rtde
+        self.fault: dict[str, float] = {}  # time and speed of the arm at the newest fault
         self.late: dict[str, float] = {"frames": 0, "worst_ms": 0.0, "slipped_ms": 0.0, "slips": 0}
 
     def ask(self, text: str) -> dict[str, Any]:
@@ -42,6 +44,8 @@ class Hooks:
         try:
             request = json.loads(text)
             name = request.pop("do")
+            if name not in UNFAULTY:
+                self.fault = {"at": self._machine.time, "speed": max(map(abs, self._machine.qd))}
             method: Callable[..., dict[str, Any] | None] = getattr(self, f"do_{name}")
             return method(**request) or {"ok": True}
         except Exception as error:
@@ -53,7 +57,7 @@ class Hooks:
         return {
             "time": m.time, "q": m.q, "qd": m.qd, "pose": m.pose, "runtime_state": m.state, "safety_mode": m.safety_mode,
             "robot_mode": m.robot_mode, "program": m.name if m.program else None, "started": m.programs_started,
-            "travel": m.travel, "digital_out": m.digital_out, "analog_out": m.analog_out, "command": m.ints_in[24],
+            "travel": m.travel, "moved_at": m.moved_at, "fault": self.fault, "digital_out": m.digital_out, "analog_out": m.analog_out, "command": m.ints_in[24],
             "tcp": m.tcp, "payload": m.payload, "log": m.log[-20:], "late": self.late,
             "modules": sorted({name.partition(".")[0] for name in sys.modules} - sys.stdlib_module_names),
         }  # fmt: skip

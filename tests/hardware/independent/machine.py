@@ -113,6 +113,7 @@ class Machine:
         self.programs_started = 0
         self.travel = 0.0  # rad, of the joint that moved most since `mark`
         self.travelled = [0.0] * 6
+        self.moved_at = 0.0  # newest time at which the arm moved
         self.log: list[tuple[float, str]] = []
         self._run: Generator[Any, None, None] | None = None
         self._doing: tuple[str, list[float], float, float] | None = None
@@ -265,6 +266,7 @@ class Machine:
             self.qd = [share * w for w in wanted]
         if not any(self.qd):
             return
+        self.moved_at = self.time
         self.q = [p + v * STEP_S for p, v in zip(self.q, self.qd, strict=True)]
         self.travelled = [t + abs(v) * STEP_S for t, v in zip(self.travelled, self.qd, strict=True)]
         self.travel = max(self.travelled)
