@@ -24,6 +24,7 @@ from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
 from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.wire.dashboard import stop_program
+from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
 from weldcal.systems.messages import UrStatus
 
@@ -133,6 +134,7 @@ class UrLink:
         gas_before_s: float = 0.0,
         gas_after_s: float = 0.0,
         levels: tuple[Level, ...] = (),
+        transport: str = NATIVE,
     ) -> UrLink:
         """Start the worker, upload the guard, and wait until it is active. The arm does not move, `process_output` is off.
 
@@ -155,6 +157,7 @@ class UrLink:
             gas_before_s=gas_before_s,
             gas_after_s=gas_after_s,
             levels=levels,
+            transport=transport,
         )
         link = cls(config)
         until = time.monotonic() + START_LIMIT_S / limits.pace

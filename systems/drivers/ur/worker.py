@@ -32,6 +32,7 @@ from weldcal.systems.drivers.ur.supervisor import (
     Supervisor,
 )
 from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas, Level, SetPoints, apart
+from weldcal.systems.drivers.ur.wire.transport import NATIVE
 
 FRESH_S = 0.012  # of robot time; three periods of the commands
 ZERO_S = 0.050
@@ -95,6 +96,7 @@ class WorkerConfig:
     gas_before_s: float = 0.0
     gas_after_s: float = 0.0
     levels: tuple[Level, ...] = ()
+    transport: str = NATIVE
 
 
 class Worker:
@@ -265,7 +267,7 @@ class Worker:
             )
         )
 
-    def refuse(self, fault: Fault) -> None:
+    def refuse(self, refused: Refused) -> None:
         """Publish the fault that made the start fail."""
         self._memory.state.write(
             Published(
@@ -279,8 +281,8 @@ class Worker:
                 safety_mode=0,
                 runtime_state=0,
                 speed_scaling=0.0,
-                fault=fault,
-                detail=0.0,
+                fault=refused.fault,
+                detail=refused.detail,
                 fault_time=0.0,
                 number=0,
                 sent_time=0.0,
@@ -313,11 +315,12 @@ def main() -> None:
             arc_inputs=ArcInputs(config.arc_input, config.arc_fault_input),
             gas=config.gas_output,
             levels=config.levels,
+            transport=config.transport,
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))
     except Refused as refused:
-        worker.refuse(refused.fault)
+        worker.refuse(refused)
         os._exit(1)
     os._exit(worker.run(robot))
 

@@ -150,6 +150,12 @@ def _refused(name: str, throw: Callable[[Bench], float], says: str, *, short: bo
     return Case(name=f"start {name}", throw=throw, must=REFUSE, says=says, short=short)
 
 
+REAL_OUTPUTS = (
+    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "speed_scaling", "target_speed_fraction",
+    "output_double_register_36", "output_double_register_37", "output_double_register_38",
+)  # fmt: skip
+SHORT_NUMBERS = (("actual_q", "nan"), ("actual_TCP_pose", "inf"), ("speed_scaling", "nan"), ("timestamp", "nan"))
+
 RUNNING: tuple[Case, ...] = (
     # the link
     Case(name="no state for 20 ms", throw=_fault("drop", seconds=0.02), must=GO, short=False),
@@ -195,6 +201,32 @@ RUNNING: tuple[Case, ...] = (
         "controller's clock jumps 10 s ahead", _fault("timestamp_jump", seconds=10.0), Fault.CLOCK_JUMPED, short=False
     ),
     _stops("controller's clock jumps 10 s back", _fault("timestamp_jump", seconds=-10.0), Fault.CLOCK_JUMPED),
+    # each output of real numbers that the driver reads; those of a register are the number, the time and the passes of the guard
+    *(
+        _stops(
+            f"{value} as {name}",
+            _fault("wrong_number", output=name, value=float(value)),
+            Fault.STATE_NOT_FINITE,
+            CLEAR,
+            random=(name, value) in SHORT_NUMBERS,
+            short=(name, value) in SHORT_NUMBERS,
+        )
+        for name in REAL_OUTPUTS
+        for value in ("nan", "inf")
+    ),
+    *(
+        _stops(
+            f"nan as {name}, process on",
+            _fault("wrong_number", output=name),
+            Fault.STATE_NOT_FINITE,
+            CLEAR,
+            process=True,
+            burns_s=0.06,
+            random=False,
+            short=name == "speed_scaling",
+        )
+        for name in ("speed_scaling", "target_speed_fraction")
+    ),
     # the robot
     Case(name="reduced mode", throw=_fault("reduced"), must=GO, repair=(Action("normal"),)),
     Case(name="tool contact", throw=_fault("tool_contact", n=1), must=GO, short=False),
@@ -317,5 +349,14 @@ AT_START: tuple[Case, ...] = (
     _refused("without power", _fault("robot_mode", value=3), "no power", short=False),
     _refused("with another TCP", _fault("wrong_tcp"), "TCP"),
     _refused("with another payload", lambda b: b.emulator.do("set_payload", mass=0.0), "payload"),
+    *(
+        _refused(
+            f"with nan as {name}",
+            _fault("wrong_number", output=name),
+            name.partition("_cog")[0],
+            short=name == "tcp_offset",
+        )
+        for name in ("actual_q", "speed_scaling", "tcp_offset", "payload_cog")
+    ),
     _refused("with the speed slider at 50 %", _fault("speed_scaling", value=0.5), "slider"),
 )

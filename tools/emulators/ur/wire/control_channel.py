@@ -91,6 +91,7 @@ class ControlServer(Server):
             "tracking_lag": lambda r, now: setattr(c.arm, "lag_s", _number(r, "seconds")),
             "wrong_tcp": lambda r, now: c.set_tcp(_six(r, "pose", [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])),
             "set_q": lambda r, now: c.arm.displace(np.array(_six(r, "q"))),
+            "wrong_number": self._wrong_number,
             "tool_contact": lambda r, now: setattr(c, "tool_contact_steps", int(_number(r, "n", 1))),
         }
         self._faults |= more_faults or {}
@@ -220,6 +221,7 @@ class ControlServer(Server):
 
     def _clear_links(self, request: Request, now: float) -> None:
         self._world.jitter_s = 0.0
+        self._rtde.wrong.clear()
         for connection in self._links({"kind": "all"} | dict(request)):
             connection.faults = LinkFaults()
 
@@ -294,6 +296,12 @@ class ControlServer(Server):
         if n not in (0, 1):
             raise InputError("Give 0 or 1 as 'n'.")
         self._controller.terminals.analog_foreign[n] = (_number(request, "share"), until)
+
+    def _wrong_number(self, request: Request, now: float) -> None:
+        name = str(request.get("output"))
+        if name not in self._rtde.real_outputs():
+            raise InputError(f"There is no output of real numbers {name!r}.")
+        self._rtde.wrong[name] = _number(request, "value", math.nan)
 
     def _reboot(self, request: Request, now: float) -> None:
         self._network.unplug(self)
