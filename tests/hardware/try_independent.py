@@ -57,7 +57,7 @@ FAULTS = (
     Fault("NaN in speed_scaling", _reported("speed_scaling"), "LINK"),
     Fault("outputs 300 ms late", lambda c: c.do("delay", seconds=0.3), "LINK"),
     Fault("outputs silent", lambda c: c.do("silent", seconds=1.0), "LINK"),
-    Fault("inputs ignored", lambda c: c.do("mute", seconds=1.0), "LINK"),
+    Fault("inputs ignored", lambda c: c.do("mute", seconds=1.0), "GUARD"),
     Fault("second program", lambda c: c.do("second_program"), "PROGRAM STOPPED"),
     Fault("connection reset", lambda c: c.do("reset"), "LINK"),
     Fault("slider at 50 %", lambda c: c.do("slider", fraction=0.5), "SPEED SLIDER"),
@@ -189,12 +189,18 @@ def jobs(names: list[str], transports: list[str], seeds: list[int], host: str | 
     return failed
 
 
-def faults(host: str | None, job: str | None, own_computer: bool) -> int:
+def faults(host: str | None, job: str | None, own_computer: bool, transport: str) -> int:
     """Make every fault in a session, or in the middle of a job; returns how many were not answered as they must be."""
     failed = 0
+    print(f"transport {transport}")
     with independent_controller(host, own_computer=own_computer) as controller:
         for fault in FAULTS:
-            found = break_session(controller, fault) if job is None else break_job(controller, fault, job)
+            settings = {} if transport == "default" else {"transport": transport}
+            found = (
+                break_session(controller, fault, **settings)
+                if job is None
+                else break_job(controller, fault, job, transport)
+            )
             right = fault.word in found.named and found.rests_s <= fault.rests_s and found.resumed_rad < 1e-6
             failed += not right
             print(
@@ -205,7 +211,7 @@ def faults(host: str | None, job: str | None, own_computer: bool) -> int:
     return failed
 
 
-def break_job(controller: Controller, fault: Fault, name: str) -> Broken:
+def break_job(controller: Controller, fault: Fault, name: str, transport: str) -> Broken:
     """A whole job by the command line, broken when the arm moves fast some seconds after its start."""
     rested: list[float] = []
     after: list[float] = []
@@ -224,7 +230,7 @@ def break_job(controller: Controller, fault: Fault, name: str) -> Broken:
         time.sleep(WATCHED_S)
         after.append(controller.state()["travel"])
 
-    found = run_job(name, controller, "default", 1, during)
+    found = run_job(name, controller, transport, 1, during)
     until = time.monotonic() + 5.0
     while not after and time.monotonic() < until:
         time.sleep(0.1)
@@ -248,7 +254,7 @@ def main() -> int:
     given = parser.parse_args()
     if given.what == "jobs":
         return jobs(given.scenarios, given.transports, given.seeds, given.host, given.own_computer)
-    return faults(given.host, given.job, given.own_computer)
+    return sum(faults(given.host, given.job, given.own_computer, transport) for transport in given.transports)
 
 
 if __name__ == "__main__":
