@@ -18,7 +18,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from tests.hardware.independent.machine import HOME, STARTS_S, STEP_S, Machine
+from tests.hardware.independent.machine import HOME, STEP_S, Machine
 from tests.hardware.independent.ports import Client, real_time_package, state_package
 from tests.hardware.independent.rtde import Rtde, RtdeClient
 
@@ -26,7 +26,7 @@ CONTROL_PORT = 30095
 PORTS = (29999, 30001, 30002, 30003, 30004, CONTROL_PORT)
 STATE_EACH = 50  # frames: the client interface has 10 Hz
 CATCHES_UP_S = 0.010  # later frames are not made up for: the controller's time then runs slower than the computer's
-UNFAULTY = ("state", "repair", "play", "mark", "place", "inputs")
+UNFAULTY = ("state", "repair", "play", "mark", "place", "inputs", "vary")
 PRIORITY = 3  # of SCHED_RR, above that of its client's processes
 SECOND_PROGRAM = "def second():\n  while True:\n    sync()\n  end\nend\n"
 
@@ -88,9 +88,8 @@ class Hooks:
         self._rtde.wrong.clear()
         self._rtde.delay_s = self._rtde.silent_until = self._rtde.mute_until = 0.0
 
-    def do_second_program(self, text: str = SECOND_PROGRAM, starts_s: float | None = None) -> None:
-        """Somebody sends another program, which starts so long after the end of the present one."""
-        self._machine.starts_s = STARTS_S if starts_s is None else starts_s
+    def do_second_program(self, text: str = SECOND_PROGRAM) -> None:
+        """Somebody sends another program."""
         self._machine.upload(text)
 
     def do_wrong(self, name: str, value: float = math.nan, seconds: float = 1.0) -> None:
@@ -129,6 +128,12 @@ class Hooks:
             raise ValueError("a program runs")
         self._machine.q = [float(x) for x in q]
         self._machine.qd = [1e-12] * 6  # the next frame computes the pose
+
+    def do_vary(self, choice: str, value: float) -> None:
+        """Choose otherwise where the manuals are silent."""
+        if choice not in ("keeps_outputs_in_pause", "starts_s", "target_speeds_late", "noise_rad_s"):
+            raise ValueError(f"there is no choice {choice}")
+        setattr(self._machine, choice, type(getattr(self._machine, choice))(value))
 
     def do_mark(self) -> None:
         """Count the arm's travel from now on."""

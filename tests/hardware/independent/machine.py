@@ -6,6 +6,8 @@ Marks: [D] stated in Universal Robots' manuals, [M] a choice of this model, wher
 from __future__ import annotations
 
 import math
+import random
+from collections import deque
 from collections.abc import Generator, Sequence
 from typing import Any
 
@@ -107,7 +109,11 @@ class Machine:
         self.floats_in, self.floats_out = [0.0] * REGISTERS, [0.0] * REGISTERS
         self.digital_in, self.digital_out = 0, 0
         self.analog_out, self.analog_volts = [0.0, 0.0], [True, True]
+        # choices of the model that a test may vary
         self.keeps_outputs_in_pause = True  # [M] whether a paused program counts as one that runs, for the outputs
+        self.starts_s = STARTS_S
+        self.target_speeds_late = 0  # [M] frames until get_target_joint_speeds shows a speedj
+        self.noise_rad_s = 0.0  # of the joint speeds that are reported
         self.program: Program | None = None
         self.name = ""
         self.programs_started = 0
@@ -123,8 +129,9 @@ class Machine:
         self._low_when_stopped: dict[int, int] = {}
         self._analog_low: dict[int, int] = {}
         self._protected_at = -math.inf
+        self._past = deque([[0.0] * 6], maxlen=8)  # the target speeds of the last frames
+        self._random = random.Random(1)
         self._resumed_at, self._starts_at = 0.0, 0.0
-        self.starts_s = STARTS_S
 
     def note(self, text: str) -> None:
         """Add a line to the log."""
@@ -209,6 +216,12 @@ class Machine:
         """What an operator does after any stop: unlock, release, power on, release the brakes, slider to 100 %."""
         self.safety_mode, self.robot_mode, self.slider = NORMAL, RUNNING, 1.0
 
+    def measured_speeds(self) -> list[float]:
+        """The joint speeds as they are reported."""
+        if not self.noise_rad_s:
+            return self.qd
+        return [v + self._random.gauss(0.0, self.noise_rad_s) for v in self.qd]
+
     def mark(self) -> None:
         """Count the travel from now on."""
         self.travelled, self.travel = [0.0] * 6, 0.0
@@ -228,6 +241,7 @@ class Machine:
         if self.state == PLAYING and self._doing is not None and self._doing[0] == "speedj":
             _, wanted, acceleration, _ = self._doing
         self._move(wanted, acceleration)
+        self._past.append(self.qd)
         self._after(wanted)
         if self.state == PAUSING and not any(self.qd):
             self.state = PAUSED
@@ -388,7 +402,7 @@ class Machine:
             "read_input_float_register": lambda i: self.floats_in[_index(i)],
             "write_output_integer_register": write(self.ints_out, (int,)),
             "write_output_float_register": write(self.floats_out, (int, float)),
-            "get_target_joint_speeds": lambda: list(self.qd),
+            "get_target_joint_speeds": lambda: list(self._past[max(-1 - self.target_speeds_late, -len(self._past))]),
             "get_actual_joint_speeds": lambda: list(self.qd),
             "get_actual_joint_positions": lambda: list(self.q),
             "get_target_joint_positions": lambda: list(self.q),

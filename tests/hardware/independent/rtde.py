@@ -70,8 +70,8 @@ def outputs() -> dict[str, Output]:
     }
     for name in ("actual_q", "target_q"):
         found[name] = ("VECTOR6D", lambda m: m.q)
-    for name in ("actual_qd", "target_qd"):
-        found[name] = ("VECTOR6D", lambda m: m.qd)
+    found["target_qd"] = ("VECTOR6D", lambda m: m.qd)
+    found["actual_qd"] = ("VECTOR6D", lambda m: m.measured_speeds())
     for name in ("actual_TCP_pose", "target_TCP_pose"):
         found[name] = ("VECTOR6D", lambda m: m.pose)
     for name in (
