@@ -116,6 +116,8 @@ class Run(Generic[JobOf]):
             found |= self.clock.summary()
         if self.host is not None:
             found["host_timing"] = self.host.summary()
+        if self.cell.station.robot.transport:
+            found["transport"] = self.cell.station.robot.transport
         if self.held_by_person:
             found["held_by_person"] = self.held_by_person
         return found

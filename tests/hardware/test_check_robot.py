@@ -520,7 +520,7 @@ def test_the_command_prints_a_table_that_fits_a_terminal(robot: Emulator, capsys
     assert finished.returncode == 0, finished.stderr
     lines = finished.stdout.splitlines()
     assert lines[0] == f"{robot.host}: ready"
-    assert [line.split()[0] for line in lines[1:]] == ["ok"] * (len(CHECKS) + 1)
+    assert [line.split()[0] for line in lines[1:]] == ["ok"] * (len(CHECKS) + 2)
     assert finished.stderr == ""
     for fault, values in (
         ("local_mode", {}),

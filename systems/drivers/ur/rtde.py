@@ -20,6 +20,7 @@ from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.supervisor import Limits
 from weldcal.systems.drivers.ur.torch.set_points import SETTLES_S, AnalogSetPoint, levels_of
+from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose, installed, taken
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.wall_clock import WallClock
 
@@ -36,6 +37,7 @@ class UrRtde(DriverConfig):
     FOR: ClassVar[tuple[str, ...]] = ("robot",)
 
     host: str = ""
+    transport: str = AUTO  # ur_rtde, native (weldcal's own client), or auto: ur_rtde where nothing is lost with it
     rate_hz: float = 250.0  # of the worker's loop
     pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
     lockstep: bool = False  # only for the emulator: its time waits for this computer
@@ -182,6 +184,30 @@ class UrRtdeArm(LeafSystem):
         output.set_value(status_of(tuple(context.get_discrete_state(self._codes).value())))
 
 
+def chosen_transport(config: UrRtde, version: tuple[int, ...], upper: bool) -> tuple[str, str]:
+    """The transport for this controller, `native` or `ur_rtde`, and why in a sentence.
+
+    Raises:
+        InputError: there is no such transport, or ur_rtde is asked for and cannot be used.
+        RobotUnreachable: the controller does not answer.
+    """
+    if config.transport not in (AUTO, NATIVE, UR_RTDE):
+        raise InputError(f"robot.transport must be {AUTO}, {NATIVE} or {UR_RTDE}, not '{config.transport}'.")
+    found = Situation(
+        version=version,
+        own_time=config.pace != FULL_PACE or config.lockstep,
+        set_points=config.set_points,
+        installed=installed(),
+    )
+    name, why = choose(config.transport, found)
+    if name == UR_RTDE:
+        claimed = taken(config.host, upper, config.process_output is not None)
+        name, why = choose(config.transport, dc.replace(found, taken=claimed))
+    if config.transport == UR_RTDE != name:
+        raise InputError(f"robot.transport cannot be {UR_RTDE} here. {why} Leave it at {AUTO}.")
+    return name, why
+
+
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not move.
 
@@ -225,6 +251,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     arm = report.arm
     if arm is None:
         raise RuntimeError("the pre-flight passed without the robot's kinematics")
+    transport, why = chosen_transport(config, report.version or (), report.upper_registers)
     x, y, z = config.payload_cog_m
     link = UrLink.start(
         config.host,
@@ -241,9 +268,10 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         gas_before_s=config.gas_before_s,
         gas_after_s=config.gas_after_s,
         levels=levels,
+        transport=transport,
     )
     clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
-    return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)
+    return PreparedRobot(arm, link.state().q, link, clock, config.lockstep, why)
 
 
 def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:

@@ -129,7 +129,7 @@ def choose(wanted: str, found: Situation) -> tuple[str, str]:
     if why:
         return NATIVE, f"Transport native: {why}."
     asked = (
-        "the scenario asks for it" if wanted == UR_RTDE else "this controller and these outputs lose nothing with it"
+        "the scenario asks for it" if wanted == UR_RTDE else "nothing is lost with it"
     )
     return UR_RTDE, f"Transport ur_rtde: {asked}."
 
