@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -66,6 +67,12 @@ def deferred() -> Iterator[None]:
             for number in tuple(_waiting):
                 _waiting.discard(number)
                 os.kill(os.getpid(), number)
+
+
+def started(*arguments: Any, **named: Any) -> "subprocess.Popen[Any]":
+    """subprocess.Popen, for a process that Ctrl-C must not reach."""
+    with deferred():
+        return subprocess.Popen(*arguments, **named)
 
 
 def _handle(number: int, _: object) -> None:

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Iterator
 
-import psutil
+import psutil  # type: ignore[import-untyped]
 
 Address = tuple[str, int]
 
@@ -32,14 +32,17 @@ def connect(address: Address) -> socket.socket | None:
 
 
 @contextlib.contextmanager
-def strangers(address: Address, idle: int, slow: int = 0, path: str = "/events") -> Iterator[list[socket.socket]]:
+def strangers(
+    address: Address, idle: int, slow: int = 0, path: str | None = "/events"
+) -> Iterator[list[socket.socket]]:
     """Idle connections, and some that ask for a stream and never read it, for the duration of the block."""
     found = [c for c in (connect(address) for _ in range(idle)) if c is not None]
     for _ in range(slow):
         if (reader := connect(address)) is not None:
             reader.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
             with contextlib.suppress(OSError):
-                reader.sendall(f"GET {path} HTTP/1.1\r\nHost: {address[0]}:{address[1]}\r\n\r\n".encode())
+                if path is not None:  # a controller takes a line of text for a program
+                    reader.sendall(f"GET {path} HTTP/1.1\r\nHost: {address[0]}:{address[1]}\r\n\r\n".encode())
             found.append(reader)
     try:
         yield found
@@ -103,7 +106,7 @@ def main(count: int, options: list[str]) -> int:
     command = [
         "sh",
         "-c",
-        'ulimit -n 1024; exec "$@"',
+        'ulimit -Sn 1024; exec "$@"',
         "sh",
         sys.executable,
         "-m",
@@ -130,9 +133,9 @@ def main(count: int, options: list[str]) -> int:
     key, token = key_of(page), text.rstrip("/").rpartition("/")[2]
     top = psutil.Process(run.pid)
     for address, owner in ports_of(top).items():
-        path = "/events" if address == page else f"/{token}/events"
+        path = None if address[0] != "127.0.0.1" else "/events" if address == page else f"/{token}/events"
         before = [hold_ms(page, key) for _ in range(5)]
-        began, during = time.monotonic(), []
+        began, during = time.monotonic(), list[float]()
         flood = threading.Event()
 
         def often(flood: threading.Event = flood, during: list[float] = during) -> None:
@@ -147,7 +150,7 @@ def main(count: int, options: list[str]) -> int:
             flood.set()
             watcher.join()
             after = [hold_ms(page, key) for _ in range(50)]
-            foreign = status(address, path, Origin="http://elsewhere.example")
+            foreign = None if path is None else status(address, path, Origin="http://elsewhere.example")
             job = [(p.num_fds(), p.num_threads()) for p in (top, *top.children(recursive=True))[:1]]
         with contextlib.suppress(OSError):
             status(page, "/act/go_on", "POST", **{"X-Weldcal-Key": key})
