@@ -143,7 +143,7 @@ def commands(dataset: Path, scenario: Path) -> dict[str, list[str]]:
 
 def main(times: int, seed: int) -> int:
     """Ends commands at random moments; returns the number of faults."""
-        rng, faults, codes = random.Random(seed), 0, Counter[str]()
+    rng, faults, codes = random.Random(seed), 0, Counter[str]()
     with tempfile.TemporaryDirectory() as place:
         scenario, dataset = Path(place) / "short.yaml", Path(place) / "dataset"
         scenario.write_text(QUICK)
