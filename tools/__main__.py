@@ -1,5 +1,15 @@
-"""`python -m weldcal.tools` is `weldcal`."""
+"""`python -m weldcal.tools` is `weldcal`: signals are answered before the imports, which take seconds."""
 
-from weldcal.tools.cli.app import main
+from weldcal.systems.interrupts import answer_signals
 
-main()
+
+def main() -> None:
+    """Entry point of the `weldcal` console script."""
+    answer_signals()
+    from weldcal.tools.cli.app import main as run
+
+    run()
+
+
+if __name__ == "__main__":
+    main()

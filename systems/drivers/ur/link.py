@@ -26,6 +26,7 @@ from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.wire.dashboard import stop_program
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
+from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus
 
 START_LIMIT_S = 20.0
@@ -97,7 +98,7 @@ class UrLink:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the link)
         command = [sys.executable, "-m", "weldcal.systems.drivers.ur.worker", str(descriptor)]
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(
+        self._process = started(
             command,
             stdin=subprocess.PIPE,
             stdout=self._errors,

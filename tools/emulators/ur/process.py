@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from weldcal.models.errors import InputError
+from weldcal.systems.interrupts import started
 from weldcal.tools.emulators.ur.addresses import PORTS, free_address, take_address
 
 CONTROL_PORT = 30090
@@ -149,7 +150,7 @@ def emulator_process(
 
 
 def _started(command: list[str], host: str, control_port: int) -> Emulator:
-    process = subprocess.Popen(
+    process = started(
         command,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.tools.connections import CONNECTIONS
+
 # A client that does not read is dropped after this long, as the controller does.
 UNREAD_LIMIT_S = 10.0
 MAX_QUEUED = 1 << 20
@@ -48,7 +50,7 @@ class Connection:
         self.sock = sock
         self.faults = LinkFaults()
         self.inbox = bytearray()
-        self.closed = False
+        self.closed = self.heard = False
         self.patient = False  # never dropped for not reading
         self._rng = rng
         self._waiting: deque[tuple[float, bytes]] = deque()
@@ -127,6 +129,7 @@ class Connection:
         except OSError:
             self.closed = True
             return b""
+        self.heard = self.heard or bool(data)
         if not data:
             self.closed = True
         return b"" if self.faults.deaf(now) else data
@@ -226,6 +229,8 @@ class Network:
                 self._accept(sock, now)
                 continue
             connection = by_socket[sock]
+            if connection not in self.connections:  # ended for one that has come
+                continue
             data = connection.receive(now)
             if connection.closed:
                 # at once: what this client has claimed is free for one that has just come
@@ -240,6 +245,13 @@ class Network:
             sock, _ = listener.accept()
         except OSError:
             return
+        if len(self.connections) >= CONNECTIONS:
+            # one more ends the oldest that has never asked for anything, as a client of RTDE or of the dashboard does
+            silent = next((c for c in self.connections if not c.heard), None)
+            if silent is None:
+                sock.close()
+                return
+            self._forget(silent)
         self._adopt(sock, server, now)
 
     def _adopt(self, sock: socket.socket, server: Server, now: float) -> None:

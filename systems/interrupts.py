@@ -1,0 +1,100 @@
+"""Answers Ctrl-C and SIGTERM from the start of the program to its end: one sentence, one exit code, no traceback, no process left."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum, auto
+from typing import Any
+
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C or SIGTERM ended."""
+NOTHING_BEGUN = "The operator ended the command before it began its work. Nothing was written and nothing has moved."
+SIGTERM = "SIGTERM"
+"""Argument of the KeyboardInterrupt of that signal."""
+
+
+class _Time(Enum):
+    BEFORE = auto()  # the program imports and reads its arguments: it ends at once
+    WORK = auto()  # KeyboardInterrupt is raised
+    AFTER = auto()  # the outcome is known: it is printed first
+
+
+_time = _Time.BEFORE
+_deferred = 0  # depth of the blocks in which a signal waits
+_waiting: set[int] = set()
+_count = 0
+
+
+def answer_signals() -> None:
+    """Install the handlers. To be called before the imports that take seconds."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _handle)
+    sys.unraisablehook = _again
+
+
+def received() -> bool:
+    """Whether a signal has come. A library in C may make another exception of the KeyboardInterrupt."""
+    return _count > 0
+
+
+@contextmanager
+def work() -> Iterator[None]:
+    """The work of a command: a signal raises KeyboardInterrupt within the block; after it, the outcome is printed first."""
+    global _time
+    _time = _Time.WORK
+    try:
+        yield
+    finally:
+        _time = _Time.AFTER
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Let signals wait until the end of the block. A process that is started within it never gets a Ctrl-C of the terminal."""
+    global _deferred
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a started process inherits this
+    _deferred += 1
+    try:
+        yield
+    finally:
+        _deferred -= 1
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if not _deferred:
+            for number in tuple(_waiting):
+                _waiting.discard(number)
+                os.kill(os.getpid(), number)
+
+
+def started(*arguments: Any, **named: Any) -> "subprocess.Popen[Any]":
+    """subprocess.Popen, for a process that Ctrl-C must not reach."""
+    with deferred():
+        return subprocess.Popen(*arguments, **named)
+
+
+def _handle(number: int, _: object) -> None:
+    global _count
+    if _deferred:
+        _waiting.add(number)
+        return
+    _count += 1
+    if _time is _Time.BEFORE:
+        if "--json" in sys.argv:
+            os.write(1, (json.dumps({"state": "failed", "reason": NOTHING_BEGUN}) + "\n").encode())
+        os.write(2, f"weldcal: {NOTHING_BEGUN}\n".encode())
+    elif _time is _Time.WORK:
+        raise KeyboardInterrupt(*([SIGTERM] if number == signal.SIGTERM else []))
+    elif _count < 3:
+        return
+    os._exit(INTERRUPTED)
+
+
+def _again(problem: Any) -> None:
+    """A KeyboardInterrupt that Python met where it cannot raise, as in a destructor, comes once more."""
+    if isinstance(problem.exc_value, KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGTERM if SIGTERM in problem.exc_value.args else signal.SIGINT)
+    elif not received():
+        sys.__unraisablehook__(problem)
