@@ -100,7 +100,7 @@ def find_way(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None) -> Ar
     ways = itertools.chain(((lean, None) for lean in leans), _postures(welder, seam) if welder.any_posture else ())
     for lean, seed in ways:
         try:
-            return _way(welder, seam, X_BP, lean, seed)
+            return way_on(welder, seam, X_BP, lean, seed)
         except InfeasiblePath as problem:
             first = first or problem
     assert first is not None
@@ -115,7 +115,7 @@ def _offer(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, may_deg
 
     def works(X: RigidTransform, lean: float = 0.0, seed: Array | None = None) -> bool:
         try:
-            _way(welder, seam.transformed(X), None if X_BP is None else X @ X_BP, lean, seed)
+            way_on(welder, seam.transformed(X), None if X_BP is None else X @ X_BP, lean, seed)
         except InfeasiblePath:
             return False
         return True
@@ -168,21 +168,23 @@ def _postures(welder: Welder, seam: SeamCurve) -> Iterator[tuple[float, Array]]:
     return ((0.0, q) for q in ranked[:_POSTURES])
 
 
-def _way(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: float, seed: Array | None) -> ArmWay:
+def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: float, seed: Array | None) -> ArmWay:
     """The checked way with a lean, on the branch of `seed` (6,) above the seam's start, else that of home."""
-    config, along = welder.leaning(lean), None
+    config, problem, along = welder.leaning(lean), None, None
     for share in HIGHER:
-        clearance_m = share * welder.clearance_m
-        q_near = welder.q_home if seed is None else seed
-        q_start, q_above, q_retract = arm_waypoints(welder.arm, welder.tool, seam, config, q_near, clearance_m)
-        along = along or tuple(check_path(welder.arm, q_start, seam_motions(welder.tool, seam, config)))
-        way = ArmWay(q_start, q_above, q_retract, lean, along)
         try:
+            q_near = welder.q_home if seed is None else seed
+            goals = arm_waypoints(welder.arm, welder.tool, seam, config, q_near, share * welder.clearance_m)
+            along = along or tuple(check_path(welder.arm, goals[0], seam_motions(welder.tool, seam, config)))
+            way = ArmWay(*goals, lean, along)
             _check_clear(welder, way, X_BP, seed is not None)
             break
-        except SeamObstructed:
-            if share == HIGHER[-1]:
-                raise
+        except (SeamObstructed, SeamOutOfReach) as found:
+            problem = (
+                problem or found
+            )  # what is in the way at the first height, not that the arm does not reach a higher one
+            if share == HIGHER[-1] or isinstance(problem, SeamOutOfReach):
+                raise problem from found
     if lean and welder.part is not None and X_BP is not None:
         tool = welder.tool
         try:
@@ -289,7 +291,7 @@ def arm_waypoints(
             far = float(np.linalg.norm(X_BF.translation())) > 0.5 * (abs(arm.dh.a2) + abs(arm.dh.a3))
             joint, to = ("elbow", "towards") if far else ("shoulder pan", "away from")
             raise SeamOutOfReach(
-                f"The arm cannot reach the seam with the tool upright, {where}: the {joint} is at its end",
+                f"The arm cannot reach the seam {where}, with the {joint} at its end",
                 f"move the workpiece {to} the robot",
             )
         solutions.append(found)
