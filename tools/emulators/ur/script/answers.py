@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
@@ -146,10 +147,10 @@ class Answers:
         X = arm.flange_goal(six(pose, "A pose").tolist())
         near = arm.q_target if q_near is None else six(q_near, "qnear")
         found = newton(arm.model, X, near)
-        if found is not None and float(np.abs(found - near).max()) < 1.0:
+        if found is not None and float(np.abs(found - near).max()) < 1.0 and _inside(arm.model, found):
             return found
         try:
-            R = RotationMatrix.ProjectToRotationMatrix(X[:3, :3])[0]
+            R = RotationMatrix.ProjectToRotationMatrix(X[:3, :3])
             return nearest_solution(arm.model, RigidTransform(R, X[:3, 3]), near)
         except InputError as error:
             raise ScriptError(str(error)) from error
@@ -176,5 +177,8 @@ class Answers:
     def is_within_safety_limits(self, pose: Any) -> bool:
         if isinstance(pose, Pose):
             return self._inverse(pose, None) is not None
-        q, model = six(pose, "is_within_safety_limits"), self._controller.arm.model
-        return bool((q >= model.position_lower).all() and (q <= model.position_upper).all())
+        return _inside(self._controller.arm.model, six(pose, "is_within_safety_limits"))
+
+
+def _inside(model: ArmModel, q: Array) -> bool:
+    return bool((q >= model.position_lower).all() and (q <= model.position_upper).all())
