@@ -15,9 +15,11 @@ from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
 from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of, rotation_matrix, rotation_vector
 from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS, Watchdog, register_index
 from weldcal.tools.emulators.ur.controller.state import ControllerState
-from weldcal.tools.emulators.ur.script.arithmetic import Pose
+from weldcal.tools.emulators.ur.script.arithmetic import Effort, Pose
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
+
+SLOW = 5000  # effort of inverse kinematics and of dynamics
 
 
 def six(values: Any, what: str) -> Array:
@@ -67,10 +69,10 @@ CALCULATIONS: dict[str, Callable[..., Any]] = {
     "pose_dist": lambda pose_from, pose_to: math.dist(pose_from[:3], pose_to[:3]),
     "point_dist": lambda p_from, p_to: math.dist(p_from[:3], p_to[:3]),
     "norm": lambda a: math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a)),
-    "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(l)],  # noqa: E741  (URScript's own name)
+    "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(min(l, 64))],  # noqa: E741  (URScript's own name)
     "d2r": lambda d: math.radians(d),
     "r2d": lambda r: math.degrees(r),
-    "pow": lambda base, exponent: float(base**exponent),
+    "pow": math.pow,
     "inv": lambda m: Pose(pose_of(inverse(matrix(m)))) if isinstance(m, Pose) else np.linalg.inv(m).tolist(),
     "floor": lambda f: math.floor(f),
     "ceil": lambda f: math.ceil(f),
@@ -144,6 +146,7 @@ class Answers:
 
     def _inverse(self, pose: Any, q_near: Any) -> Array | None:
         arm = self._controller.arm
+        Effort.spend(SLOW)
         X = arm.flange_goal(six(pose, "A pose").tolist())
         near = arm.q_target if q_near is None else six(q_near, "qnear")
         found = newton(arm.model, X, near)
