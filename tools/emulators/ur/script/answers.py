@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
@@ -59,6 +59,8 @@ READS: dict[str, Callable[[ControllerState], Any]] = {
     "get_target_payload_cog": lambda c: list(c.payload.center),
     "get_target_payload_inertia": lambda c: list(c.payload.inertia),
     "get_controller_temp": lambda c: 30.0,
+    "get_gravity": lambda c: list(c.gravity),
+    "random": lambda c: float(c.random.random()),
     "get_tool_accelerometer_reading": lambda c: [0.0, 0.0, 9.81],
     "is_steady": lambda c: c.arm.at_rest,
 }
@@ -74,6 +76,8 @@ CALCULATIONS: dict[str, Callable[..., Any]] = {
     "r2d": lambda r: math.degrees(r),
     "pow": math.pow,
     "inv": lambda m: Pose(pose_of(inverse(matrix(m)))) if isinstance(m, Pose) else np.linalg.inv(m).tolist(),
+    "rpy2rotvec": lambda rpy_vector: rotation_vector(_turned(rpy_vector).ToRotationMatrix().matrix()).tolist(),
+    "rotvec2rpy": lambda rotation_vector: _rpy(rotation_vector),
     "floor": lambda f: math.floor(f),
     "ceil": lambda f: math.ceil(f),
     "log": lambda b, f: math.log(f, b),
@@ -158,6 +162,21 @@ class Answers:
         except InputError as error:
             raise ScriptError(str(error)) from error
 
+    def get_joint_temp(self, j: int) -> float:
+        register_index(j, 6)
+        return 30.0
+
+    def normalize(self, v: Any) -> list[float]:
+        if not isinstance(v, list) or not (length := math.hypot(*v)):
+            raise ScriptError(f"normalize needs numbers that are not all zero, it got {v!r}.")
+        return [value / length for value in v]
+
+    def wrench_trans(self, T_from_to: Any, w_from: Any) -> list[float]:
+        """[M] T_from_to is the pose of the new point of view in the old one."""
+        X, w = matrix(six(T_from_to, "wrench_trans")), six(w_from, "wrench_trans")
+        force, torque = w[:3] @ X[:3, :3], (w[3:] - np.cross(X[:3, 3], w[:3])) @ X[:3, :3]
+        return [*force.tolist(), *torque.tolist()]
+
     def pose_add(self, p_1: Any, p_2: Any) -> Pose:
         X, Y = matrix(p_1), matrix(p_2)
         X[:3, :3] = X[:3, :3] @ Y[:3, :3]
@@ -181,6 +200,15 @@ class Answers:
         if isinstance(pose, Pose):
             return self._inverse(pose, None) is not None
         return _inside(self._controller.arm.model, six(pose, "is_within_safety_limits"))
+
+
+def _turned(rpy: Any) -> RollPitchYaw:
+    return RollPitchYaw(*(float(angle) for angle in rpy))
+
+
+def _rpy(vector: Any) -> list[float]:
+    R = RotationMatrix.ProjectToRotationMatrix(rotation_matrix(vector))
+    return [float(angle) for angle in RollPitchYaw(R).vector()]
 
 
 def _inside(model: ArmModel, q: Array) -> bool:

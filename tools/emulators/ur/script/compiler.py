@@ -160,6 +160,10 @@ class _Emitter:
         value = self.value(statement.value)
         if isinstance(statement.value, _SHARED):
             value = f"copied({value})"
+        if statement.name == "digital_out" and len(statement.indices) == 1:
+            # what older programs write; the name is the controller's
+            self.emit(depth, f"b_set_digital_out({self.value(statement.indices[0])}, {value})")
+            return
         if not statement.indices:
             self.emit(depth, f"v_{statement.name} = {value}")
             return

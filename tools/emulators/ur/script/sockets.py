@@ -86,6 +86,15 @@ class Sockets(Messages):
     def socket_send_byte(self, value: int, socket_name: str = NAME) -> bool:
         return self._send(bytes([int(value) & 0xFF]), socket_name)
 
+    def socket_set_var(self, name: str, value: int, socket_name: str = NAME) -> bool:
+        return self._send(f"SET {text_of(name)} {int(value)}\n".encode(), socket_name)
+
+    def socket_get_var(self, name: str, socket_name: str = NAME) -> Slices:
+        self._send(f"GET {text_of(name)}\n".encode(), socket_name)
+        answer = yield from self.socket_read_line(socket_name)
+        found = re.fullmatch(r"(\S+) (-?\d{1,10})", answer)
+        return int(found[2]) if found and found[1] == name else 0
+
     def socket_read_line(self, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
         line = yield from self._read(socket_name, timeout, lambda inbox: inbox.find(b"\n") + 1)
         return line.decode("utf-8", "replace").rstrip("\r\n")
