@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.places import ROOT
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.events import ScriptStopped
 from weldcal.tools.emulators.ur.controller.modes import SafetyMode
 from weldcal.tools.emulators.ur.controller.poses import matrix, pose_of, rotation_vector
 from weldcal.tools.emulators.ur.main import HOME
+from weldcal.tools.emulators.ur.script.builtins import script_functions
+from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.versions import parse_version
 
 
@@ -324,3 +329,34 @@ def test_variables_of_a_server_are_set_and_read() -> None:
             for _ in range(1100):  # longer than the two seconds after which the answer is 0
                 made.step()
     assert any(line.endswith("script: -30") for line in made.log)
+
+
+def named_on_the_page(mark: str) -> list[str]:
+    """The names in the block after a mark of docs/ur_emulator.md."""
+    page = (ROOT / "docs" / "ur_emulator.md").read_text()
+    return page.partition(f"<!-- {mark} -->\n```text\n")[2].partition("```")[0].split()
+
+
+def test_the_page_lists_all_functions_that_programs_can_call() -> None:
+    found: set[str] = set()
+
+    def functions(program: Program) -> tuple[Mapping[str, Any], Iterable[str]]:
+        named, blocking = script_functions(controller("5.23"), program)
+        found.update(named)
+        return named, blocking
+
+    Program("def empty():\nend\n", functions)
+    assert named_on_the_page("served") == sorted(found)
+
+
+@pytest.mark.parametrize("name", named_on_the_page("refused"))
+def test_a_function_that_is_missing_is_named_by_the_compiler(name: str) -> None:
+    made = controller("5.23")
+    assert not made.start(f"def call():\n  x = 1\n  y = {name}(1)\nend\n")
+    assert f"compile_error_name_not_found:{name}:" in made.log[-1]
+    (event,) = [event for event in made.events if isinstance(event, ScriptStopped)]
+    assert (event.line, event.column) == (3, 7)
+
+
+def test_the_functions_that_are_missing_are_as_many_as_the_page_says() -> None:
+    assert len(named_on_the_page("refused")) == len(set(named_on_the_page("refused"))) > 80
