@@ -1,6 +1,7 @@
 """Process of the emulator: opens every port and runs 500 control frames a second."""
 
 import argparse
+import dataclasses
 import gc
 import os
 import signal
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.addresses import loopback_address
 from weldcal.tools.emulators.ur.addresses import (
@@ -25,6 +26,7 @@ from weldcal.tools.emulators.ur.addresses import (
 )
 from weldcal.tools.emulators.ur.checker import Checker
 from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, Lockstep
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
@@ -56,6 +58,8 @@ def run_emulator(
     robot: str = "ur10e",
     kinematics: Path | None = None,
     q: tuple[float, ...] = HOME,
+    safety_limits: str = "",
+    operational_mode: str = "none",
     pace: float = 1.0,
     lockstep: float = 0.0,
     seed: int = 0,
@@ -71,6 +75,8 @@ def run_emulator(
         robot: name of the arm.
         kinematics: a robot's factory calibration; nominal where None.
         q: joint angles at the start (rad).
+        safety_limits: six joint ranges "LOWER:UPPER,..." (deg) in place of the arm's own; the arm's own where "".
+        operational_mode: none, manual or automatic, as the dashboard and the primary port report it.
         pace: controller seconds per host second, 0.05 to 1; below 1 every frame of 2 ms takes longer.
         lockstep: for so long (s of the host) time waits for a client that streams and is late; 0: never.
         seed: everything random follows from it.
@@ -81,14 +87,39 @@ def run_emulator(
         InputError: unknown arm or version, a pace, bound or address that is not allowed, or a port that is taken.
     """
     host = loopback_address(host)
-    if len(q) != 6:
+    if len(q) != 6 or not np.isfinite(q).all():
         raise InputError("Give six joint angles, in radians.")
     if not SLOWEST <= pace <= FASTEST:
         raise InputError(f"Give a pace from {SLOWEST} to {FASTEST:.0f}, not {pace}.")
     if not 0.0 <= lockstep <= LONGEST_WAIT_S:
         raise InputError(f"Give a lockstep bound from 0 to {LONGEST_WAIT_S:.0f} s, not {lockstep}.")
-    controller = Controller(load_arm(robot, kinematics), np.array(q, dtype=np.float64), parse_version(polyscope))
+    if (mode := operational_mode.upper()) not in OPERATIONAL_MODES:
+        raise InputError(f"Give none, manual or automatic as operational mode, not {operational_mode!r}.")
+    model = narrowed(load_arm(robot, kinematics), safety_limits)
+    controller = Controller(model, np.array(q, dtype=np.float64), parse_version(polyscope))
+    controller.operational_mode = mode
     Emulation(controller, host, control_port, pace, lockstep, seed).run(parent, ready)
+
+
+def narrowed(model: ArmModel, ranges: str) -> ArmModel:
+    """The arm with the joint ranges "LOWER:UPPER,..." (deg); the arm as it is where there are none.
+
+    Raises:
+        InputError: these are not six ranges inside the arm's own.
+    """
+    if not ranges:
+        return model
+    try:
+        lower, upper = np.deg2rad([[float(v) for v in pair.split(":")] for pair in ranges.split(",")]).T
+        inside = (model.position_lower - 1e-9 <= lower) & (lower < upper) & (upper <= model.position_upper + 1e-9)
+    except ValueError:
+        raise InputError(
+            f"Give six joint ranges LOWER:UPPER in degrees, with commas between, not {ranges!r}."
+        ) from None
+    if len(lower) != 6 or not inside.all():
+        most = np.rad2deg(model.position_upper).round().astype(int).tolist()
+        raise InputError(f"Each of six joint ranges is LOWER:UPPER with LOWER < UPPER, inside +-{most} deg.")
+    return dataclasses.replace(model, position_lower=lower, position_upper=upper)
 
 
 class Emulation:
@@ -248,6 +279,8 @@ def main() -> None:
     parser.add_argument("--robot", default="ur10e", help="the arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")
     parser.add_argument("--kinematics", type=Path, help="a robot's factory calibration (YAML)")
     parser.add_argument("--q", type=float, nargs=6, default=HOME, help="joint angles at the start (rad)")
+    parser.add_argument("--safety-limits", default="", help="six joint ranges LOWER:UPPER,... (deg)")
+    parser.add_argument("--operational-mode", default="none", help="none, manual or automatic")
     parser.add_argument("--pace", type=float, default=1.0, help="controller seconds per host second, 0.05 to 1")
     parser.add_argument("--lockstep", type=float, default=0.0, help="seconds for which time waits for a late client")
     parser.add_argument("--seed", type=int, default=0, help="everything random follows from this number")

@@ -19,6 +19,9 @@ from weldcal.tools.emulators.ur.versions import Version
 WORDS = ("stop program", "power on", "power off", "set robotmode run", "set unlock protective stop")
 
 
+MOST_SIDEKICKS = 20  # [M]
+
+
 class Controller(ControllerState):
     """Everything but the wire; the wire's faults live in the servers."""
 
@@ -79,6 +82,9 @@ class Controller(ControllerState):
             self.tell(ScriptStopped(str(error), error.line, error.column))
             return False
         self.script_count += 1
+        if program.kind == "sec" and len(self.sidekicks) >= MOST_SIDEKICKS:
+            self.note("program ignored: too many secondary programs run")
+            return False
         if program.kind == "sec":
             self.sidekicks.append(program)
             return True

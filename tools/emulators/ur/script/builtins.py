@@ -24,7 +24,7 @@ BLOCKING = frozenset(
     {
         *("movej", "movel", "movep", "movec", "optimovej", "optimovel", "speedj", "speedl", "servoj", "servoc"),
         *("stopj", "stopl", "direct_torque", "sync", "sleep", "popup"),
-        "socket_open",
+        *("socket_open", "socket_get_var"),
         *(f"socket_read_{what}" for what in ("line", "string", "ascii_float", "binary_integer", "byte_list")),
     }
 )

@@ -22,7 +22,7 @@ class Messages(Forces):
         """One that blocks waits until a person closes it: the dashboard's `close popup`."""
         c = self._controller
         c.note(f"popup: {title}: {text_of(s)}")
-        c.tell(Popup(text_of(s), title, warning, error, blocking))
+        c.tell(Popup(text_of(s), text_of(title), warning, error, blocking))
         c.popup_open = blocking
         while blocking and c.popup_open:
             yield

@@ -17,6 +17,7 @@ from weldcal.tools.emulators.ur.script.texts import text_of
 OPEN_LIMIT_S = 0.02
 OPEN_FRAMES = 4  # [M] how long a connection takes
 NAME = "socket_0"
+MOST_SOCKETS, MOST_UNREAD, MOST_NUMBERS = 20, 1 << 17, 1000  # [M]
 
 
 class ScriptSocket:
@@ -37,7 +38,7 @@ class ScriptSocket:
     def fill(self) -> None:
         """Takes in what has arrived."""
         with suppress(OSError):
-            while data := self._socket.recv(65536):
+            while len(self.inbox) < MOST_UNREAD and (data := self._socket.recv(65536)):
                 self.inbox += data
 
     def close(self) -> None:
@@ -55,10 +56,12 @@ class Sockets(Messages):
         return self._open(address, port, socket_name)
 
     def _open(self, address: str, port: int, socket_name: str) -> bool:
-        if not str(address).startswith("127."):
+        if not re.fullmatch(r"127(\.\d{1,3}){3}", str(address)):
             self._controller.note(f"socket_open: {address} is not on loopback")
             return False
         self.socket_close(socket_name)
+        if len(self._program.sockets) >= MOST_SOCKETS:
+            raise ScriptError(f"A program has no more than {MOST_SOCKETS} sockets.")
         try:
             self._program.sockets[socket_name] = ScriptSocket(str(address), int(port))
         except OSError as error:
@@ -83,6 +86,15 @@ class Sockets(Messages):
     def socket_send_byte(self, value: int, socket_name: str = NAME) -> bool:
         return self._send(bytes([int(value) & 0xFF]), socket_name)
 
+    def socket_set_var(self, name: str, value: int, socket_name: str = NAME) -> bool:
+        return self._send(f"SET {text_of(name)} {int(value)}\n".encode(), socket_name)
+
+    def socket_get_var(self, name: str, socket_name: str = NAME) -> Slices:
+        self._send(f"GET {text_of(name)}\n".encode(), socket_name)
+        answer = yield from self.socket_read_line(socket_name)
+        found = re.fullmatch(r"(\S+) (-?\d{1,10})", answer)
+        return int(found[2]) if found and found[1] == name else 0
+
     def socket_read_line(self, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
         line = yield from self._read(socket_name, timeout, lambda inbox: inbox.find(b"\n") + 1)
         return line.decode("utf-8", "replace").rstrip("\r\n")
@@ -104,17 +116,18 @@ class Sockets(Messages):
         return text.partition(prefix)[2].removesuffix(end) if prefix else text.removesuffix(end)
 
     def socket_read_ascii_float(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
+        _count(number)
         text = yield from self._read(socket_name, timeout, lambda inbox: inbox.find(b")") + 1)
         found = [float(value) for value in re.findall(rb"[-+]?\d*\.?\d+(?:[eE][-+]?\d+)?", text)]
         return [len(found), *found] if len(found) == number else [0, *[math.nan] * int(number)]
 
     def socket_read_binary_integer(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
-        size = 4 * int(number)
+        size = 4 * _count(number)
         data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
         return [int(number), *struct.unpack(f">{int(number)}i", data)] if data else [0, *[-1] * int(number)]
 
     def socket_read_byte_list(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
-        size = int(number)
+        size = _count(number)
         data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
         return [size, *data] if data else [0, *[-1] * size]
 
@@ -139,3 +152,10 @@ class Sockets(Messages):
                 return b""
             frames += 1
             yield
+
+
+def _count(number: Any) -> int:
+    """How many numbers a read asks for."""
+    if not 0 <= number <= MOST_NUMBERS:
+        raise ScriptError(f"A read has 0 to {MOST_NUMBERS} numbers, not {number!r}.")
+    return int(number)

@@ -20,6 +20,7 @@ from weldcal.tools.emulators.ur.wire.net import Connection, LinkFaults, Network,
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
 
 Request = Mapping[str, Any]
+LARGEST = 1e9  # of the numbers that a request may hold
 
 
 class World:
@@ -83,8 +84,8 @@ class ControlServer(Server):
             "set_analog_out": self._foreign_analog,
             "limiter": lambda r, now: setattr(c.terminals, "limiter", _number(r, "value")),
             "timestamp_jump": lambda r, now: setattr(c, "timestamp", max(0.0, c.timestamp + _number(r, "seconds"))),
-            "clock_skew": lambda r, now: setattr(c, "clock_rate", 1.0 + _number(r, "ppm") * 1e-6),
-            "jitter": lambda r, now: setattr(self._world, "jitter_s", _number(r, "seconds")),
+            "clock_skew": lambda r, now: setattr(c, "clock_rate", max(0.0, 1.0 + _number(r, "ppm") * 1e-6)),
+            "jitter": lambda r, now: setattr(self._world, "jitter_s", min(10.0, _number(r, "seconds"))),
             "reboot": self._reboot,
             "refuse_upload": lambda r, now: setattr(c, "refuse_upload", bool(r.get("on", True))),
             "slow_start": lambda r, now: setattr(c, "start_delay_s", _number(r, "seconds")),
@@ -135,8 +136,8 @@ class ControlServer(Server):
             if not isinstance(request, dict):
                 raise InputError("Send one JSON object a line.")
             return {"ok": True, "time": now, **self._act(request, now)}
-        except (InputError, ValueError, TypeError, KeyError) as error:
-            return {"ok": False, "time": now, "error": str(error)}
+        except Exception as error:  # nonsense must not end the controller
+            return {"ok": False, "time": now, "error": str(error) or type(error).__name__}
 
     def _act(self, request: Request, now: float) -> dict[str, Any]:
         if "fault" in request:
@@ -231,6 +232,8 @@ class ControlServer(Server):
         self._clear_links({}, now)
         self._rtde.release_elsewhere()
         c.stop_program()
+        while c.sidekicks:
+            c.sidekicks.pop().close()
         c.set_safety_mode(SafetyMode.NORMAL)
         c.robot_mode, c.remote, c.refuse_upload = RobotMode.RUNNING, True, False
         c.start_delay_s, c.clock_rate, c.tool_contact_steps = 0.0, 1.0, 0
@@ -276,26 +279,21 @@ class ControlServer(Server):
         """As the installation has it."""
         payload = self._controller.payload
         payload.mass = _number(request, "mass")
-        payload.center = [float(value) for value in request.get("cog", (0.0, 0.0, 0.0))]
+        payload.center = _several(request, "cog", 3, [0.0, 0.0, 0.0])
 
     def _foreign_output(self, request: Request, now: float) -> None:
         frames = max(1, round(_number(request, "seconds", 0.0) / STEP_S))
         until = self._controller.frame + frames
-        self._controller.terminals.foreign[int(_number(request, "n"))] = (bool(request.get("on", True)), until)
+        self._controller.terminals.foreign[_count(request, "n", 18)] = (bool(request.get("on", True)), until)
 
     def _digital_input(self, request: Request, now: float) -> None:
         """The level of a standard input, by whoever is wired there."""
-        n, terminals = int(_number(request, "n")), self._controller.terminals
-        if not 0 <= n < 8:
-            raise InputError("Give a number from 0 to 7 as 'n'.")
+        n, terminals = _count(request, "n", 8), self._controller.terminals
         terminals.digital_inputs = terminals.digital_inputs & ~(1 << n) | int(bool(request.get("on", True))) << n
 
     def _foreign_analog(self, request: Request, now: float) -> None:
         until = self._controller.frame + max(1, round(_number(request, "seconds", 0.0) / STEP_S))
-        n = int(_number(request, "n"))
-        if n not in (0, 1):
-            raise InputError("Give 0 or 1 as 'n'.")
-        self._controller.terminals.analog_foreign[n] = (_number(request, "share"), until)
+        self._controller.terminals.analog_foreign[_count(request, "n", 2)] = (_number(request, "share"), until)
 
     def _wrong_number(self, request: Request, now: float) -> None:
         name = str(request.get("output"))
@@ -310,10 +308,22 @@ class ControlServer(Server):
 
 
 def _number(request: Request, key: str, default: float | None = None) -> float:
-    value = request.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"Give a number as {key!r}.")
+    if key not in request and default is not None:
+        return default
+    return _finite(request.get(key), f"a number as {key!r}")
+
+
+def _finite(value: Any, what: str) -> float:
+    if type(value) not in (int, float) or not abs(value) <= LARGEST:
+        raise InputError(f"Give {what}.")
     return float(value)
+
+
+def _count(request: Request, key: str, count: int) -> int:
+    """A whole number from 0 to count - 1."""
+    if request.get(key) not in range(count):
+        raise InputError(f"Give a number from 0 to {count - 1} as {key!r}.")
+    return int(request[key])
 
 
 def _six(request: Request, key: str, default: list[float] | None = None) -> list[float]:
@@ -322,9 +332,10 @@ def _six(request: Request, key: str, default: list[float] | None = None) -> list
 
 def _several(request: Request, key: str, count: int, default: list[float] | None = None) -> list[float]:
     value = request.get(key, default)
-    if not isinstance(value, list) or len(value) != count or not all(type(v) in (int, float) for v in value):
-        raise InputError(f"Give {'six' if count == 6 else 'three'} numbers as {key!r}.")
-    return [float(v) for v in value]
+    what = f"{'six' if count == 6 else 'three'} numbers as {key!r}"
+    if not isinstance(value, list) or len(value) != count:
+        raise InputError(f"Give {what}.")
+    return [_finite(v, what) for v in value]
 
 
 def _required(done: bool, problem: str) -> None:

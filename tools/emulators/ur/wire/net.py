@@ -15,6 +15,7 @@ from weldcal.tools.connections import CONNECTIONS
 # A client that does not read is dropped after this long, as the controller does.
 UNREAD_LIMIT_S = 10.0
 MAX_QUEUED = 1 << 20
+MOST_CONNECTIONS = 200  # select() cannot watch more than about 1000
 DIAL_LIMIT_S = 0.02
 TORN_S = 0.001
 
@@ -136,10 +137,11 @@ class Connection:
 
     def lines(self, data: bytes) -> Iterator[bytes]:
         """The lines that are complete with these bytes, without their ends; the rest waits in the inbox."""
-        self.inbox += data
-        while b"\n" in self.inbox:
-            line, _, self.inbox[:] = bytes(self.inbox).partition(b"\n")
-            yield line
+        *lines, rest = (self.inbox + data).split(b"\n")
+        self.inbox[:] = rest
+        if len(rest) > MAX_QUEUED:
+            self.close(reset=True)
+        yield from map(bytes, lines)
 
     def readable(self, now: float) -> bool:
         """Whether the loop should look at this socket."""
@@ -255,6 +257,9 @@ class Network:
         self._adopt(sock, server, now)
 
     def _adopt(self, sock: socket.socket, server: Server, now: float) -> None:
+        if len(self.connections) >= MOST_CONNECTIONS:
+            sock.close()
+            return
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection = Connection(server.kind, sock, self._rng)

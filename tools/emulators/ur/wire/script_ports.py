@@ -10,6 +10,7 @@ from weldcal.tools.emulators.ur.controller.dh import dh_parameters
 from weldcal.tools.emulators.ur.controller.events import Event, SafetyChanged
 from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.script.lexer import split_programs
+from weldcal.tools.emulators.ur.script.program import LONGEST_SCRIPT
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
 from weldcal.tools.emulators.ur.wire.primary_messages import message_body
 
@@ -39,6 +40,9 @@ class ScriptServer(Server):
         connection.inbox += data
         programs, rest = split_programs(connection.inbox.decode("utf-8", "replace"))
         connection.inbox[:] = rest.encode()
+        if len(rest) > LONGEST_SCRIPT:
+            programs.append(connection.inbox.decode("utf-8", "replace"))
+            connection.inbox.clear()
         for program in programs:
             self._on_script(now)
             self._controller.submit(program)
