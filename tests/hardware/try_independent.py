@@ -151,7 +151,7 @@ def run_job(
     state = controller.state()
     late = {key: state["late"][key] - before["late"][key] for key in ("slips", "slipped_ms")}
     return {
-        "groove": name, "transport": transport, "seed": seed, "exit": running.returncode, **found, "said": said[-600:],
+        "groove": name, "by": transport, "seed": seed, "exit": running.returncode, **found, "said": said[-600:],
         "wall_s": time.monotonic() - began, "load": os.getloadavg()[0], "slips": late["slips"], "slipped_ms": late["slipped_ms"],
         "program_left": state["program"], "robot_travel_rad": state["travel"],
     }  # fmt: skip
@@ -162,7 +162,7 @@ def print_job(job: dict[str, Any]) -> None:
     mean, most = job.get("torch_mean_mm"), job.get("torch_max_mm")
     torch = "-" if mean is None else f"{mean:.3f} / {most:.3f}"
     print(
-        f"{job['groove']:16s} {job['transport']:8s} seed {job['seed']:<3d} {job.get('state', 'no result'):8s} torch {torch:15s} mm"
+        f"{job['groove']:16s} {job['by']:8s} seed {job['seed']:<3d} {job.get('state', 'no result'):8s} torch {torch:15s} mm"
         f"  {job['wall_s']:5.0f} s  load {job['load']:4.1f}  late {job.get('late_ms')}"
         f"  controller slipped {job['slips']:.0f} times, {job['slipped_ms']:.0f} ms",
         flush=True,
@@ -171,15 +171,23 @@ def print_job(job: dict[str, Any]) -> None:
         print(f"    {job.get('reason')} {job['said']}", flush=True)
 
 
-def jobs(names: list[str], transports: list[str], seeds: list[int], host: str | None, own_computer: bool) -> int:
+def jobs(
+    names: list[str],
+    transports: list[str],
+    seeds: list[int],
+    seam_mm: float | None,
+    host: str | None,
+    own_computer: bool,
+) -> int:
     """Run the jobs one after the other with one controller; returns how many were not done."""
     failed = 0
+    more = "" if seam_mm is None else f"\nwelding: {{seam_length_mm: {seam_mm}}}\n"
     home = np.deg2rad(load_scenario(names[0]).home_deg).tolist()
     with independent_controller(host, home, own_computer=own_computer) as controller:
         for seed in seeds:
             for name in names:
                 for transport in transports:
-                    job = run_job(name, controller, transport, seed)
+                    job = run_job(name, controller, transport, seed, more=more)
                     print_job(job)
                     failed += job.get("state") != "done"
         state = controller.state()
@@ -249,11 +257,12 @@ def main() -> int:
     parser.add_argument("--scenarios", nargs="+", default=list(GROOVES))
     parser.add_argument("--transports", nargs="+", default=["default"], help="default, native, ur_rtde")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--seam-mm", type=float, help="jobs: weld only so much of the seam")
     parser.add_argument("--job", help="faults: in the middle of a job of this scenario")
     parser.add_argument("--own-computer", action="store_true", help="the controller takes real-time priority")
     given = parser.parse_args()
     if given.what == "jobs":
-        return jobs(given.scenarios, given.transports, given.seeds, given.host, given.own_computer)
+        return jobs(given.scenarios, given.transports, given.seeds, given.seam_mm, given.host, given.own_computer)
     return sum(faults(given.host, given.job, given.own_computer, transport) for transport in given.transports)
 
 
