@@ -28,6 +28,7 @@ from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 
 GROOVES = ("straight_groove", "s_groove", "l_groove")
 FAST_RAD_S = 0.15
+LATE_S = 0.010
 WATCHED_S = 1.5  # after the repair and Play
 JOB_LIMIT_S = 1200.0
 
@@ -72,11 +73,13 @@ class Broken:
     rests_s: float
     resumed_rad: float
     process_on: bool
+    late: bool = False  # the controller's frames or the worker's passes came 10 ms late or more
 
 
 def break_session(controller: Controller, fault: Fault, **settings: Any) -> Broken:
     """Move, make the fault, wait for its name and for rest, repair, press Play, and measure what the arm then travels."""
     process = settings.get("process_output") is not None
+    slips = controller.state()["late"]["slips"]
     with session(controller, **settings) as link:
         assert move(link, 0.3, process=process) is None
         found: list[dict[str, Any]] = []
@@ -92,12 +95,12 @@ def break_session(controller: Controller, fault: Fault, **settings: Any) -> Brok
             link.command(np.full(6, 0.1))  # a cell that would go on
             time.sleep(0.01)
         state = controller.state()
+        late = state["late"]["slips"] > slips or link.state().worst_period_s > LATE_S
     controller.do("stop")
     controller.rests(2.0)
     assert found, "the arm did not come to rest"
-    return Broken(
-        str(named), found[0]["moved_at"] - found[0]["fault"]["at"], state["travel"], bool(state["digital_out"])
-    )
+    rests_s = found[0]["moved_at"] - found[0]["fault"]["at"]
+    return Broken(str(named), rests_s, state["travel"], bool(state["digital_out"]), late)
 
 
 def _break(controller: Controller, fault: Fault) -> dict[str, Any]:
@@ -151,7 +154,7 @@ def run_job(
     state = controller.state()
     late = {key: state["late"][key] - before["late"][key] for key in ("slips", "slipped_ms")}
     return {
-        "groove": name, "transport": transport, "seed": seed, "exit": running.returncode, **found, "said": said[-600:],
+        "groove": name, "by": transport, "seed": seed, "exit": running.returncode, **found, "said": said[-600:],
         "wall_s": time.monotonic() - began, "load": os.getloadavg()[0], "slips": late["slips"], "slipped_ms": late["slipped_ms"],
         "program_left": state["program"], "robot_travel_rad": state["travel"],
     }  # fmt: skip
@@ -162,7 +165,7 @@ def print_job(job: dict[str, Any]) -> None:
     mean, most = job.get("torch_mean_mm"), job.get("torch_max_mm")
     torch = "-" if mean is None else f"{mean:.3f} / {most:.3f}"
     print(
-        f"{job['groove']:16s} {job['transport']:8s} seed {job['seed']:<3d} {job.get('state', 'no result'):8s} torch {torch:15s} mm"
+        f"{job['groove']:16s} {job['by']:8s} seed {job['seed']:<3d} {job.get('state', 'no result'):8s} torch {torch:15s} mm"
         f"  {job['wall_s']:5.0f} s  load {job['load']:4.1f}  late {job.get('late_ms')}"
         f"  controller slipped {job['slips']:.0f} times, {job['slipped_ms']:.0f} ms",
         flush=True,
@@ -171,15 +174,23 @@ def print_job(job: dict[str, Any]) -> None:
         print(f"    {job.get('reason')} {job['said']}", flush=True)
 
 
-def jobs(names: list[str], transports: list[str], seeds: list[int], host: str | None, own_computer: bool) -> int:
+def jobs(
+    names: list[str],
+    transports: list[str],
+    seeds: list[int],
+    seam_mm: float | None,
+    host: str | None,
+    own_computer: bool,
+) -> int:
     """Run the jobs one after the other with one controller; returns how many were not done."""
     failed = 0
+    more = "" if seam_mm is None else f"\nwelding: {{seam_length_mm: {seam_mm}}}\n"
     home = np.deg2rad(load_scenario(names[0]).home_deg).tolist()
     with independent_controller(host, home, own_computer=own_computer) as controller:
         for seed in seeds:
             for name in names:
                 for transport in transports:
-                    job = run_job(name, controller, transport, seed)
+                    job = run_job(name, controller, transport, seed, more=more)
                     print_job(job)
                     failed += job.get("state") != "done"
         state = controller.state()
@@ -189,12 +200,12 @@ def jobs(names: list[str], transports: list[str], seeds: list[int], host: str | 
     return failed
 
 
-def faults(host: str | None, job: str | None, own_computer: bool, transport: str) -> int:
+def faults(host: str | None, job: str | None, own_computer: bool, transport: str, only: list[str]) -> int:
     """Make every fault in a session, or in the middle of a job; returns how many were not answered as they must be."""
     failed = 0
     print(f"transport {transport}")
     with independent_controller(host, own_computer=own_computer) as controller:
-        for fault in FAULTS:
+        for fault in [fault for fault in FAULTS if fault.name in only or not only]:
             settings = {} if transport == "default" else {"transport": transport}
             found = (
                 break_session(controller, fault, **settings)
@@ -205,7 +216,7 @@ def faults(host: str | None, job: str | None, own_computer: bool, transport: str
             failed += not right
             print(
                 f"{'ok ' if right else 'BAD'} {fault.name:24s} rest after {1e3 * found.rests_s:4.0f} ms, then {found.resumed_rad:.6f} rad"
-                f"  load {os.getloadavg()[0]:.1f}  {found.named}",
+                f"  load {os.getloadavg()[0]:.1f}{' (late)' if found.late else ''}  {found.named}",
                 flush=True,
             )
     return failed
@@ -249,12 +260,16 @@ def main() -> int:
     parser.add_argument("--scenarios", nargs="+", default=list(GROOVES))
     parser.add_argument("--transports", nargs="+", default=["default"], help="default, native, ur_rtde")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--seam-mm", type=float, help="jobs: weld only so much of the seam")
     parser.add_argument("--job", help="faults: in the middle of a job of this scenario")
+    parser.add_argument("--only", nargs="+", default=[], help="faults: their names")
     parser.add_argument("--own-computer", action="store_true", help="the controller takes real-time priority")
     given = parser.parse_args()
     if given.what == "jobs":
-        return jobs(given.scenarios, given.transports, given.seeds, given.host, given.own_computer)
-    return sum(faults(given.host, given.job, given.own_computer, transport) for transport in given.transports)
+        return jobs(given.scenarios, given.transports, given.seeds, given.seam_mm, given.host, given.own_computer)
+    return sum(
+        faults(given.host, given.job, given.own_computer, transport, given.only) for transport in given.transports
+    )
 
 
 if __name__ == "__main__":
