@@ -14,7 +14,7 @@ from weldcal.systems.drivers.ur.rtde import UrRtde, chosen_transport
 from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
 from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
-from weldcal.tools.worlds.robot.bench import Bench
+from weldcal.tools.worlds.robot.bench import OUTPUT, Bench
 
 POLYSCOPE = (5, 21, 1, 0)
 WIRE = AnalogSetPoint(at_full=10.0, value=5.0)
@@ -77,15 +77,17 @@ def test_ur_rtde_runs_the_guard_on_the_controller() -> None:
     with emulator_process(lockstep=LOCKSTEP_S) as emulator:
         config = UrRtde(host=emulator.host)
         assert chosen_transport(config, POLYSCOPE, True)[0] == UR_RTDE
-        bench = Bench(emulator, transport=UR_RTDE)
+        bench = Bench(emulator, torch={"gas_output": 2, "gas_before_s": 0.1, "gas_after_s": 0.2}, transport=UR_RTDE)
         bench.start(process=True)
         bench.cruise()
-        assert emulator.ask(ask="program")["source"].strip() == guard_script(True, 3).strip()
+        assert emulator.state()["digital_outputs"] == 1 << OUTPUT | 1 << 2
+        assert emulator.ask(ask="program")["source"].strip() == guard_script(True, OUTPUT, 2).strip()
         assert "rtde" in emulator.ask(ask="connections")["connections"]
         state = bench.stream.state
         assert state.process_on
         bench.end()
         assert emulator.wait("runtime_state", "STOPPED")["program"] is None
+        assert emulator.state()["digital_outputs"] == 0
         assert emulator.ask(check="summary")["moves_without_a_command"] == 0
 
 
