@@ -102,3 +102,16 @@ def test_a_register_that_only_ur_rtde_claims_makes_auto_native() -> None:
         assert chosen_transport(UrRtde(host=emulator.host), POLYSCOPE, True)[0] == UR_RTDE
         wired = UrRtde(host=emulator.host, process_output=3)
         assert chosen_transport(wired, POLYSCOPE, True)[0] == NATIVE
+
+
+@NEEDS_UR_RTDE
+def test_no_command_of_ur_rtde_waits_for_a_package() -> None:
+    # in a process of its own, as the worker's: its constructors hold the interpreter's lock
+    code = (
+        "import os, sys, weldcal.systems.drivers.ur.wire.ur_rtde_client as client; "
+        "held = client.UrRtdeTransport(sys.argv[1], ['timestamp'], True); "
+        "sys.stdout.write(str(client.send_at_once(30004))); sys.stdout.flush(); os._exit(0)"
+    )
+    with emulator_process() as emulator:
+        done = subprocess.run([sys.executable, "-c", code, emulator.host], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "0", "connections with Nagle's algorithm"
