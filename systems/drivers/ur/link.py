@@ -13,6 +13,7 @@ import time
 import weakref
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,7 @@ from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
-from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.wire.dashboard import stop_program
-from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
 from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus
@@ -118,48 +117,15 @@ class UrLink:
         self._finalizer = weakref.finalize(self, _kill, self._process)
 
     @classmethod
-    def start(
-        cls,
-        host: str,
-        arm: ArmModel,
-        limits: Limits,
-        *,
-        rate_hz: float = 250.0,
-        upper_registers: bool = True,
-        payload_kg: float = 0.0,
-        payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        process_output: int | None = None,
-        arc_input: int | None = None,
-        arc_fault_input: int | None = None,
-        gas_output: int | None = None,
-        gas_before_s: float = 0.0,
-        gas_after_s: float = 0.0,
-        levels: tuple[Level, ...] = (),
-        transport: str = NATIVE,
-    ) -> UrLink:
-        """Start the worker, upload the guard, and wait until it is active. The arm does not move, `process_output` is off.
+    def start(cls, host: str, arm: ArmModel, limits: Limits, **options: Any) -> UrLink:
+        """Start the worker, upload the guard, and wait until it is active. The arm does not move, the process output is off.
+
+        `options` are the other fields of WorkerConfig.
 
         Raises:
             RobotRefused: the message gives the operator action; worker and program are ended.
         """
-        config = WorkerConfig(
-            host=host,
-            arm=arm,
-            limits=limits,
-            rate_hz=rate_hz,
-            upper_registers=upper_registers,
-            payload_kg=payload_kg,
-            payload_cog_m=payload_cog_m,
-            parent=os.getpid(),
-            process_output=process_output,
-            arc_input=arc_input,
-            arc_fault_input=arc_fault_input,
-            gas_output=gas_output,
-            gas_before_s=gas_before_s,
-            gas_after_s=gas_after_s,
-            levels=levels,
-            transport=transport,
-        )
+        config = WorkerConfig(host=host, arm=arm, limits=limits, parent=os.getpid(), **options)
         link = cls(config)
         until = time.monotonic() + START_LIMIT_S / limits.pace
         while time.monotonic() < until:

@@ -84,11 +84,11 @@ class WorkerConfig:
     host: str
     arm: ArmModel
     limits: Limits
-    rate_hz: float
-    upper_registers: bool
-    payload_kg: float
-    payload_cog_m: tuple[float, float, float]
     parent: int
+    rate_hz: float = 250.0
+    upper_registers: bool = True
+    payload_kg: float = 0.0
+    payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     process_output: int | None = None
     arc_input: int | None = None
     arc_fault_input: int | None = None
@@ -269,33 +269,8 @@ class Worker:
 
     def refuse(self, refused: Refused) -> None:
         """Publish the fault that made the start fail."""
-        self._memory.state.write(
-            Published(
-                heartbeat=time.monotonic(),
-                phase=Phase.ENDED,
-                host_time=0.0,
-                robot_time=0.0,
-                q=np.zeros(6),
-                qd=np.zeros(6),
-                robot_mode=0,
-                safety_mode=0,
-                runtime_state=0,
-                speed_scaling=0.0,
-                fault=refused.fault,
-                detail=refused.detail,
-                fault_time=0.0,
-                number=0,
-                sent_time=0.0,
-                echo=0,
-                echo_latency=0.0,
-                worst_period=0.0,
-                late_periods=0,
-                process_on=False,
-                clock_residual=0.0,
-                clock_drift=0.0,
-                arc=0,
-            )
-        )
+        fault, detail = refused.fault, refused.detail
+        self._memory.state.write(Published(heartbeat=time.monotonic(), phase=Phase.ENDED, fault=fault, detail=detail))
 
 
 def main() -> None:

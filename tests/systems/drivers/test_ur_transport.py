@@ -14,7 +14,7 @@ from weldcal.systems.drivers.ur.rtde import UrRtde, chosen_transport
 from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
 from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
-from weldcal.tools.worlds.robot.bench import Bench
+from weldcal.tools.worlds.robot.bench import OUTPUT, Bench
 
 POLYSCOPE = (5, 21, 1, 0)
 WIRE = AnalogSetPoint(at_full=10.0, value=5.0)
@@ -77,15 +77,17 @@ def test_ur_rtde_runs_the_guard_on_the_controller() -> None:
     with emulator_process(lockstep=LOCKSTEP_S) as emulator:
         config = UrRtde(host=emulator.host)
         assert chosen_transport(config, POLYSCOPE, True)[0] == UR_RTDE
-        bench = Bench(emulator, transport=UR_RTDE)
+        bench = Bench(emulator, torch={"gas_output": 2, "gas_before_s": 0.1, "gas_after_s": 0.2}, transport=UR_RTDE)
         bench.start(process=True)
         bench.cruise()
-        assert emulator.ask(ask="program")["source"].strip() == guard_script(True, 3).strip()
+        assert emulator.state()["digital_outputs"] == 1 << OUTPUT | 1 << 2
+        assert emulator.ask(ask="program")["source"].strip() == guard_script(True, OUTPUT, 2).strip()
         assert "rtde" in emulator.ask(ask="connections")["connections"]
         state = bench.stream.state
         assert state.process_on
         bench.end()
         assert emulator.wait("runtime_state", "STOPPED")["program"] is None
+        assert emulator.state()["digital_outputs"] == 0
         assert emulator.ask(check="summary")["moves_without_a_command"] == 0
 
 
@@ -100,3 +102,16 @@ def test_a_register_that_only_ur_rtde_claims_makes_auto_native() -> None:
         assert chosen_transport(UrRtde(host=emulator.host), POLYSCOPE, True)[0] == UR_RTDE
         wired = UrRtde(host=emulator.host, process_output=3)
         assert chosen_transport(wired, POLYSCOPE, True)[0] == NATIVE
+
+
+@NEEDS_UR_RTDE
+def test_no_command_of_ur_rtde_waits_for_a_package() -> None:
+    # in a process of its own, as the worker's: its constructors hold the interpreter's lock
+    code = (
+        "import os, sys, weldcal.systems.drivers.ur.wire.ur_rtde_client as client; "
+        "held = client.UrRtdeTransport(sys.argv[1], ['timestamp'], True); "
+        "sys.stdout.write(str(client.send_at_once(30004))); sys.stdout.flush(); os._exit(0)"
+    )
+    with emulator_process() as emulator:
+        done = subprocess.run([sys.executable, "-c", code, emulator.host], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "0", "connections with Nagle's algorithm"

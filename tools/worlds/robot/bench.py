@@ -274,9 +274,10 @@ def main() -> None:
     """Moves the arm at argv[1] over the transport argv[2] until stdin closes or the process is killed; answers each line when it cruises, or why it does not."""
     host, transport = sys.argv[1:]
     arm, config = load_arm(), UrRtde(host=host)
-    x, y, z = config.payload_cog_m
-    payload = {"payload_kg": config.payload_kg, "payload_cog_m": (x, y, z)}
-    link = UrLink.start(host, arm, config.limits(arm), **payload, transport=transport)
+    load = tuple(config.payload_cog_m)
+    link = UrLink.start(
+        host, arm, config.limits(arm), payload_kg=config.payload_kg, payload_cog_m=load, transport=transport
+    )
     stream = Stream(link, arm, np.array(HOME))
     stream.start()
     for _ in sys.stdin:

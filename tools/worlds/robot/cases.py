@@ -3,7 +3,7 @@
 import signal
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -155,7 +155,15 @@ REAL_OUTPUTS = (
     "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "speed_scaling", "target_speed_fraction",
     "output_double_register_36", "output_double_register_37", "output_double_register_38",
 )  # fmt: skip
-SHORT_NUMBERS = (("actual_q", "nan"), ("actual_TCP_pose", "inf"), ("speed_scaling", "nan"), ("timestamp", "nan"))
+SHORT_NUMBERS = ("nan as actual_q", "inf as actual_TCP_pose", "nan as speed_scaling", "nan as timestamp")
+
+
+def _no_number(output: str, value: str, **settings: Any) -> Case:
+    """An output of real numbers that is not a finite number."""
+    name, throw = f"{value} as {output}", _fault("wrong_number", output=output, value=float(value))
+    named = name in SHORT_NUMBERS
+    return _stops(name, throw, Fault.STATE_NOT_FINITE, CLEAR, **({"random": named, "short": named} | settings))
+
 
 RUNNING: tuple[Case, ...] = (
     # the link
@@ -164,11 +172,7 @@ RUNNING: tuple[Case, ...] = (
     Case(name="10 % of the states lost", throw=_fault("drop_p", p=0.1), must=GO, repair=CLEAR),
     # ur_rtde drops a state as soon as the next one's header has arrived, and so never has a whole one
     Case(
-        name="states in torn pieces",
-        throw=_fault("partial_writes", bytes=7),
-        must=GO,
-        repair=CLEAR,
-        over_ur_rtde=LINK,
+        name="states in torn pieces", throw=_fault("partial_writes", bytes=7), must=GO, repair=CLEAR, over_ur_rtde=LINK
     ),
     Case(name="controller's frames jitter by 5 ms", throw=_fault("jitter", seconds=0.005), must=GO, repair=CLEAR),
     Case(name="controller's clock 100 ppm fast", throw=_fault("clock_skew", ppm=100), must=GO),
@@ -210,31 +214,8 @@ RUNNING: tuple[Case, ...] = (
     ),
     _stops("controller's clock jumps 10 s back", _fault("timestamp_jump", seconds=-10.0), Fault.CLOCK_JUMPED),
     # each output of real numbers that the driver reads; those of a register are the number, the time and the passes of the guard
-    *(
-        _stops(
-            f"{value} as {name}",
-            _fault("wrong_number", output=name, value=float(value)),
-            Fault.STATE_NOT_FINITE,
-            CLEAR,
-            random=(name, value) in SHORT_NUMBERS,
-            short=(name, value) in SHORT_NUMBERS,
-        )
-        for name in REAL_OUTPUTS
-        for value in ("nan", "inf")
-    ),
-    *(
-        _stops(
-            f"nan as {name}, process on",
-            _fault("wrong_number", output=name),
-            Fault.STATE_NOT_FINITE,
-            CLEAR,
-            process=True,
-            burns_s=0.06,
-            random=False,
-            short=name == "speed_scaling",
-        )
-        for name in ("speed_scaling", "target_speed_fraction")
-    ),
+    *(_no_number(output, value) for output in REAL_OUTPUTS for value in ("nan", "inf")),
+    replace(_no_number("speed_scaling", "nan", process=True, burns_s=0.06, short=True), name="nan, process on"),
     # the robot
     Case(name="reduced mode", throw=_fault("reduced"), must=GO, repair=(Action("normal"),)),
     Case(name="tool contact", throw=_fault("tool_contact", n=1), must=GO, short=False),
