@@ -25,7 +25,7 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import SENTENCES, RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.readiness import preflight as module
-from weldcal.systems.drivers.ur.readiness.kinematics_info import KinematicsInfo, read_kinematics
+from weldcal.systems.drivers.ur.readiness.kinematics_info import JointLimits, KinematicsInfo, read_kinematics
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
@@ -131,7 +131,13 @@ FAULTS: list[tuple[str, dict[str, Any], str, str, str]] = [
     ("speed_scaling", {"value": 0.35}, "speed slider", "35 %", "drag the slider"),
     ("wrong_tcp", {}, "TCP", "(0.0, 0.0, 100.0) mm", "Installation > General > TCP"),
     ("registers_in_use", {"names": ["input_double_register_30"]}, "registers", "double 30 in use", "EtherNet/IP"),
-    ("set_q", {"q": [0, -1.5, 3.1, -1.5, -1.5, 0]}, "joint limits", "2 deg of room (elbow)", "elbow joint"),
+    (
+        "set_q",
+        {"q": [0, -1.5, 3.1, -1.5, -1.5, 0]},
+        "joint limits",
+        "elbow 2 deg from its limit (the controller's; the safety limits may be narrower)",
+        "elbow joint",
+    ),
     ("local_mode", {}, "remote control", "local control", "Remote Control"),
 ]
 
@@ -317,9 +323,9 @@ def test_several_faults_come_in_the_order_in_which_they_are_mended(robot: Emulat
 
 
 def test_kinematics_that_are_not_the_controllers_are_refused(robot: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    def of_another_ur10e(host: str, timeout_s: float) -> KinematicsInfo:
-        info = read_kinematics(host, timeout_s)
-        return dataclasses.replace(info, a=info.a + np.array([0, 0, 6e-5, 0, 0, 0]))
+    def of_another_ur10e(host: str, timeout_s: float) -> tuple[KinematicsInfo, JointLimits | None]:
+        info, limits = read_kinematics(host, timeout_s)
+        return dataclasses.replace(info, a=info.a + np.array([0, 0, 6e-5, 0, 0, 0])), limits
 
     monkeypatch.setattr(module, "read_kinematics", of_another_ur10e)
     problem = preflight(robot.host).first_problem

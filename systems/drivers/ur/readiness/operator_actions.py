@@ -132,7 +132,7 @@ def model(told: str, wanted: str) -> str:
 
 def limits(joint: str) -> str:
     """The operator action where a joint is too near its limit."""
-    return f"The {joint} joint is less than 5 degrees from its limit: turn it back with the Move tab of the pendant."
+    return f"The {joint} joint is less than 5 degrees from its limit, or beyond it: turn it back with the Move tab of the pendant."
 
 
 def program(state: str, name: str) -> str:
