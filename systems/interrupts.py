@@ -36,6 +36,12 @@ def answer_signals() -> None:
     sys.unraisablehook = _again
 
 
+def ignore_signals() -> None:
+    """Let nothing interrupt the end of the interpreter, which would put the system's own handlers back."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def received() -> bool:
     """Whether a signal has come. A library in C may make another exception of the KeyboardInterrupt."""
     return _count > 0

@@ -344,6 +344,39 @@ def test_an_old_or_another_controller_is_refused(robot: Emulator, monkeypatch: p
         assert "PolyScope 5.12" in report.first_problem.operator_action
 
 
+def test_a_controller_of_protocol_1_is_told_to_update() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def refuse() -> None:
+            visitor, _ = server.accept()
+            with visitor:
+                visitor.recv(16)
+                visitor.sendall(bytes.fromhex("00045600"))
+
+        thread = threading.Thread(target=refuse, daemon=True)
+        thread.start()
+        with pytest.raises(RobotUnreachable, match=r"version 1 of RTDE only: update PolyScope to 5\.12"):
+            RtdeProbe("127.0.0.1", 2.0, server.getsockname()[1])
+        thread.join(5.0)
+
+
+def test_a_missing_output_of_a_new_polyscope_asks_for_no_update(
+    robot: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = RtdeProbe.read
+
+    def without(self: RtdeProbe, names: Sequence[str]) -> dict[str, Any]:
+        return {name: value for name, value in whole(self, names).items() if name != "target_speed_fraction"}
+
+    monkeypatch.setattr(RtdeProbe, "read", without)
+    problem = preflight(robot.host).first_problem
+    assert problem is not None
+    assert problem.name == "version"
+    assert "lacks target_speed_fraction" in problem.found
+    assert "install" not in problem.operator_action
+    assert "restart the control box" in problem.operator_action
+
+
 class Old(RtdeProbe):
     """A probe that hears of another version."""
 

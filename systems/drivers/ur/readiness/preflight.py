@@ -263,7 +263,7 @@ class _Look:
             claims = rtde.claim(register_names(self._offset, self._doubles))
             self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, GRAVITY_OUTPUT, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:
-            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.VERSION)
+            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.outputs(missing))
         return claims
 
     def _ok(self, name: str, found: str) -> None:
