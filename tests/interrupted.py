@@ -138,7 +138,7 @@ def commands(dataset: Path, moves: Path, scenario: Path) -> dict[str, list[str]]
         "demo, page": ["demo", "--scenario", str(moves), "--share"],
         "demo, emulated": ["demo", "--scenario", str(moves), "--no-browser", "--json", "--robot", "emulated"],
         "weld": ["weld", "--scenario", str(scenario), "--no-browser", "--record"],
-        "calibrate live": ["calibrate", "--scenario", str(scenario), "--no-browser", "--json"],
+        "calibrate live": ["calibrate", "--scenario", str(scenario), "--json"],
         "calibrate recorded": ["calibrate", str(dataset), "--json"],
     }
 
