@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # what is not loaded before the handlers are there cannot be 
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C or SIGTERM ended."""
 NOTHING_BEGUN = "The operator ended the command before it began its work. Nothing was written and nothing has moved."
+AGAIN_S = 0.01
 SIGTERM = "SIGTERM"
 """Argument of the KeyboardInterrupt of that signal."""
 
@@ -103,7 +104,10 @@ def _handle(number: int, _: object) -> None:
 
 def _again(problem: Any) -> None:
     """A KeyboardInterrupt that Python met where it cannot raise, as in a destructor, comes once more."""
+    import threading
+
     if isinstance(problem.exc_value, KeyboardInterrupt):
-        os.kill(os.getpid(), signal.SIGTERM if SIGTERM in problem.exc_value.args else signal.SIGINT)
+        number = signal.SIGTERM if SIGTERM in problem.exc_value.args else signal.SIGINT
+        threading.Timer(AGAIN_S, os.kill, (os.getpid(), number)).start()
     elif not received():
         sys.__unraisablehook__(problem)

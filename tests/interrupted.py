@@ -25,9 +25,10 @@ import numpy as np
 from weldcal.models.result_files import UNFINISHED
 from weldcal.tools.worlds.fleet_cells import write_cell
 
+STARTED = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]  # as tools/run does
 MARK = "WELDCAL_INTERRUPTED"
 ENDS_S = 30.0
-LONGEST_S = 20.0
+LONGEST_S = 12.0
 GONE_S = 6.0
 ERRORS = ("Traceback", "Internal error", "Exception ignored", "KeyboardInterrupt", "Error in", "terminate called")
 
@@ -57,10 +58,22 @@ class Ended:
     json: bool
 
     @property
+    def before_python(self) -> bool:
+        """Whether the signal ended the process before the interpreter ran any of our code."""
+        return (
+            self.code in (-signal.SIGINT, -signal.SIGTERM)
+            and not self.out
+            and not self.err
+            and not self.folder.exists()
+        )
+
+    @property
     def faults(self) -> list[str]:
         """What is not as it should be."""
         found = [f"'{word}' is printed" for word in ERRORS if word in self.out + self.err]
         found += [f"left: {name}" for name in self.left]
+        if self.before_python:
+            return found
         if self.code not in (0, 1, 130):
             found.append(f"exit code {self.code}")
         unfinished = (self.folder / UNFINISHED).exists()
@@ -98,7 +111,7 @@ def with_mark(mark: str) -> list[int]:
 def end_after(arguments: Sequence[str], after_s: float, number: signal.Signals, folder: Path) -> Ended:
     """Start a command, send a signal after `after_s`, wait for its end and for that of all its processes."""
     mark = uuid.uuid4().hex
-    command = [sys.executable, "-m", "weldcal.tools", *arguments, "--out", str(folder)]
+    command = [*STARTED, sys.executable, "-P", "-m", "weldcal.tools", *arguments, "--out", str(folder)]
     environment = os.environ | {MARK: mark, "BROWSER": "true", "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
         process = subprocess.Popen(command, stdout=out, stderr=err, env=environment, start_new_session=True)
@@ -108,10 +121,13 @@ def end_after(arguments: Sequence[str], after_s: float, number: signal.Signals, 
             (os.killpg if number is signal.SIGINT else os.kill)(
                 process.pid, number
             )  # a terminal reaches the whole group
+        code: int | None = None
         try:
-            code: int | None = process.wait(ENDS_S)
-        except subprocess.TimeoutExpired:
-            code = None
+            code = process.wait(ENDS_S)
+        except subprocess.TimeoutExpired:  # Ctrl-C came before Python had its handlers: the operator presses again
+            process.send_signal(signal.SIGTERM)
+            with suppress(subprocess.TimeoutExpired):
+                code = process.wait(ENDS_S)
         until = time.monotonic() + GONE_S
         while (left := with_mark(mark)) and time.monotonic() < until:
             time.sleep(0.05)
