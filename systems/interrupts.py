@@ -1,29 +1,29 @@
 """Answers Ctrl-C and SIGTERM from the start of the program to its end: one sentence, one exit code, no traceback, no process left."""
 
-import json
+from __future__ import annotations
+
 import os
 import signal
-import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import Enum, auto
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what is not loaded before the handlers are there cannot be interrupted
+    import subprocess
+    from collections.abc import Iterator
 
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C or SIGTERM ended."""
 NOTHING_BEGUN = "The operator ended the command before it began its work. Nothing was written and nothing has moved."
+AGAIN_S = 0.01
 SIGTERM = "SIGTERM"
 """Argument of the KeyboardInterrupt of that signal."""
 
 
-class _Time(Enum):
-    BEFORE = auto()  # the program imports and reads its arguments: it ends at once
-    WORK = auto()  # KeyboardInterrupt is raised
-    AFTER = auto()  # the outcome is known: it is printed first
-
-
-_time = _Time.BEFORE
+_BEFORE = 0  # the program imports and reads its arguments: it ends at once
+_WORK = 1  # KeyboardInterrupt is raised
+_AFTER = 2  # the outcome is known: it is printed first
+_time = _BEFORE
 _deferred = 0  # depth of the blocks in which a signal waits
 _waiting: set[int] = set()
 _count = 0
@@ -36,6 +36,12 @@ def answer_signals() -> None:
     sys.unraisablehook = _again
 
 
+def ignore_signals() -> None:
+    """Let nothing interrupt the end of the interpreter, which would put the system's own handlers back."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def received() -> bool:
     """Whether a signal has come. A library in C may make another exception of the KeyboardInterrupt."""
     return _count > 0
@@ -45,11 +51,11 @@ def received() -> bool:
 def work() -> Iterator[None]:
     """The work of a command: a signal raises KeyboardInterrupt within the block; after it, the outcome is printed first."""
     global _time
-    _time = _Time.WORK
+    _time = _WORK
     try:
         yield
     finally:
-        _time = _Time.AFTER
+        _time = _AFTER
 
 
 @contextmanager
@@ -69,8 +75,10 @@ def deferred() -> Iterator[None]:
                 os.kill(os.getpid(), number)
 
 
-def started(*arguments: Any, **named: Any) -> "subprocess.Popen[Any]":
+def started(*arguments: Any, **named: Any) -> subprocess.Popen[Any]:
     """subprocess.Popen, for a process that Ctrl-C must not reach."""
+    import subprocess
+
     with deferred():
         return subprocess.Popen(*arguments, **named)
 
@@ -81,11 +89,13 @@ def _handle(number: int, _: object) -> None:
         _waiting.add(number)
         return
     _count += 1
-    if _time is _Time.BEFORE:
+    if _time == _BEFORE:
         if "--json" in sys.argv:
+            import json
+
             os.write(1, (json.dumps({"state": "failed", "reason": NOTHING_BEGUN}) + "\n").encode())
         os.write(2, f"weldcal: {NOTHING_BEGUN}\n".encode())
-    elif _time is _Time.WORK:
+    elif _time == _WORK:
         raise KeyboardInterrupt(*([SIGTERM] if number == signal.SIGTERM else []))
     elif _count < 3:
         return
@@ -94,7 +104,10 @@ def _handle(number: int, _: object) -> None:
 
 def _again(problem: Any) -> None:
     """A KeyboardInterrupt that Python met where it cannot raise, as in a destructor, comes once more."""
+    import threading
+
     if isinstance(problem.exc_value, KeyboardInterrupt):
-        os.kill(os.getpid(), signal.SIGTERM if SIGTERM in problem.exc_value.args else signal.SIGINT)
+        number = signal.SIGTERM if SIGTERM in problem.exc_value.args else signal.SIGINT
+        threading.Timer(AGAIN_S, os.kill, (os.getpid(), number)).start()
     elif not received():
         sys.__unraisablehook__(problem)

@@ -210,6 +210,7 @@ def run_cell(
                 run.host = measure_host()
                 if not station.robot.waits:
                     require_timely_host(run.host)
+                progress(f"this computer: {run.host.words}", 0.0)
                 around.enter_context(short_turns())
                 if not run.clock.follows:  # a robot that waits needs no precedence, and shares this computer
                     precedence = around.enter_context(real_time_priority())

@@ -25,8 +25,10 @@ import numpy as np
 from weldcal.models.result_files import UNFINISHED
 from weldcal.tools.worlds.fleet_cells import write_cell
 
+STARTED = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]  # as tools/run does
 MARK = "WELDCAL_INTERRUPTED"
-ENDS_S = 20.0
+ENDS_S = 30.0
+LONGEST_S = 12.0
 GONE_S = 6.0
 ERRORS = ("Traceback", "Internal error", "Exception ignored", "KeyboardInterrupt", "Error in", "terminate called")
 
@@ -40,6 +42,7 @@ scanner: !RenderedScanner
 calibration: {minimum_scans: 4, maximum_scans: 4, correct_scanner: false, required_error_mm: 5.0}
 welding: {seam_length_mm: 10.0}
 """
+KNOWN = "job: {calibrate: false, X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}}\n"
 
 
 @dataclass(frozen=True)
@@ -55,10 +58,22 @@ class Ended:
     json: bool
 
     @property
+    def before_python(self) -> bool:
+        """Whether the signal ended the process before the interpreter ran any of our code."""
+        return (
+            self.code in (-signal.SIGINT, -signal.SIGTERM)
+            and not self.out
+            and not self.err
+            and not self.folder.exists()
+        )
+
+    @property
     def faults(self) -> list[str]:
         """What is not as it should be."""
         found = [f"'{word}' is printed" for word in ERRORS if word in self.out + self.err]
         found += [f"left: {name}" for name in self.left]
+        if self.before_python:
+            return found
         if self.code not in (0, 1, 130):
             found.append(f"exit code {self.code}")
         unfinished = (self.folder / UNFINISHED).exists()
@@ -96,7 +111,7 @@ def with_mark(mark: str) -> list[int]:
 def end_after(arguments: Sequence[str], after_s: float, number: signal.Signals, folder: Path) -> Ended:
     """Start a command, send a signal after `after_s`, wait for its end and for that of all its processes."""
     mark = uuid.uuid4().hex
-    command = [sys.executable, "-m", "weldcal.tools", *arguments, "--out", str(folder)]
+    command = [*STARTED, sys.executable, "-P", "-m", "weldcal.tools", *arguments, "--out", str(folder)]
     environment = os.environ | {MARK: mark, "BROWSER": "true", "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
         process = subprocess.Popen(command, stdout=out, stderr=err, env=environment, start_new_session=True)
@@ -106,10 +121,13 @@ def end_after(arguments: Sequence[str], after_s: float, number: signal.Signals, 
             (os.killpg if number is signal.SIGINT else os.kill)(
                 process.pid, number
             )  # a terminal reaches the whole group
+        code: int | None = None
         try:
-            code: int | None = process.wait(ENDS_S)
-        except subprocess.TimeoutExpired:
-            code = None
+            code = process.wait(ENDS_S)
+        except subprocess.TimeoutExpired:  # Ctrl-C came before Python had its handlers: the operator presses again
+            process.send_signal(signal.SIGTERM)
+            with suppress(subprocess.TimeoutExpired):
+                code = process.wait(ENDS_S)
         until = time.monotonic() + GONE_S
         while (left := with_mark(mark)) and time.monotonic() < until:
             time.sleep(0.05)
@@ -129,14 +147,14 @@ def _name(pid: int) -> str:
         return str(pid)
 
 
-def commands(dataset: Path, scenario: Path) -> dict[str, list[str]]:
+def commands(dataset: Path, moves: Path, scenario: Path) -> dict[str, list[str]]:
     """What is ended: each with the scenario that takes seconds."""
     return {
-        "demo": ["demo", "--scenario", str(scenario), "--no-browser", "--json"],
-        "demo, page": ["demo", "--scenario", str(scenario), "--share"],
-        "demo, emulated": ["demo", "--scenario", str(scenario), "--no-browser", "--json", "--robot", "emulated"],
+        "demo": ["demo", "--scenario", str(moves), "--no-browser", "--json"],
+        "demo, page": ["demo", "--scenario", str(moves), "--share"],
+        "demo, emulated": ["demo", "--scenario", str(moves), "--no-browser", "--json", "--robot", "emulated"],
         "weld": ["weld", "--scenario", str(scenario), "--no-browser", "--record"],
-        "calibrate live": ["calibrate", "--scenario", str(scenario), "--no-browser", "--json"],
+        "calibrate live": ["calibrate", "--scenario", str(scenario), "--json"],
         "calibrate recorded": ["calibrate", str(dataset), "--json"],
     }
 
@@ -145,20 +163,17 @@ def main(times: int, seed: int) -> int:
     """Ends commands at random moments; returns the number of faults."""
     rng, faults, codes = random.Random(seed), 0, Counter[str]()
     with tempfile.TemporaryDirectory() as place:
-        scenario, dataset = Path(place) / "short.yaml", Path(place) / "dataset"
+        moves, scenario, dataset = (Path(place) / name for name in ("moves.yaml", "short.yaml", "dataset"))
+        moves.write_text(QUICK + KNOWN)
         scenario.write_text(QUICK)
         write_cell(dataset, "fine", 1, np.random.default_rng(seed))
-        all_of = commands(next(dataset.glob("*/")), scenario)
-        longest = {}
-        for k, (name, arguments) in enumerate(all_of.items()):
-            began = time.monotonic()
-            whole = end_after(arguments, 300.0, signal.SIGTERM, Path(place) / f"whole-{k}")
-            longest[name] = time.monotonic() - began + 0.5
-            print(f"{name}: {longest[name]:.1f} s, exit code {whole.code}", flush=True)
+        all_of = commands(next(dataset.glob("*/")), moves, scenario)
         for k in range(times):
             name = rng.choice(list(all_of))
             number = rng.choice([signal.SIGINT, signal.SIGTERM])
-            ended = end_after(all_of[name], rng.uniform(0.0, longest[name]), number, Path(place) / f"run-{k}")
+            ended = end_after(
+                all_of[name], rng.uniform(0.0, rng.choice([3.0, LONGEST_S])), number, Path(place) / f"run-{k}"
+            )
             codes[f"{name} {number.name}: {ended.code}"] += 1
             for fault in ended.faults:
                 faults += 1

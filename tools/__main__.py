@@ -1,6 +1,6 @@
 """`python -m weldcal.tools` is `weldcal`: signals are answered before the imports, which take seconds."""
 
-from weldcal.systems.interrupts import answer_signals
+from weldcal.systems.interrupts import answer_signals, ignore_signals
 
 
 def main() -> None:
@@ -8,7 +8,10 @@ def main() -> None:
     answer_signals()
     from weldcal.tools.cli.app import main as run
 
-    run()
+    try:
+        run()
+    finally:
+        ignore_signals()
 
 
 if __name__ == "__main__":

@@ -42,7 +42,6 @@ class Limited(socketserver.ThreadingMixIn, socketserver.TCPServer):
         self._open: dict[
             socket.socket, bool
         ] = {}  # those with a thread, in the order of their requests; whether each is kept
-        self._turns = threading.BoundedSemaphore(2 * CONNECTIONS)  # threads of ended connections need a moment
         self._ends, self._ended = threading.Event(), threading.Event()
         super().__init__(*arguments, **named)
 
@@ -95,7 +94,6 @@ class Limited(socketserver.ThreadingMixIn, socketserver.TCPServer):
                 with suppress(OSError):
                     oldest.shutdown(socket.SHUT_RDWR)
             self._open[request] = False
-        self._turns.acquire()
         request.settimeout(TIMEOUT_S)
         super().process_request(request, client_address)
 
@@ -106,7 +104,6 @@ class Limited(socketserver.ThreadingMixIn, socketserver.TCPServer):
         finally:
             with self._lock:
                 self._open.pop(request, None)
-            self._turns.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that leaves, or is ended, is no news."""
@@ -141,7 +138,8 @@ def end_surplus(port: int) -> None:
         with suppress(OSError):
             if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
                 copy = socket.socket(fileno=os.dup(int(name)))
-                if copy.family in (socket.AF_INET, socket.AF_INET6) and copy.getsockname()[1] == port and _peer(copy):
+                there = copy.family in (socket.AF_INET, socket.AF_INET6) and copy.getsockname()[1] == port
+                if there and not copy.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
                     info = copy.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_BYTES_RECEIVED.size)
                     found.append((_TCP_BYTES_RECEIVED.unpack(info)[0], copy))
                 else:
@@ -153,13 +151,6 @@ def end_surplus(port: int) -> None:
                 connection.shutdown(socket.SHUT_RDWR)
             time.sleep(0.0)  # the control loop is not kept waiting
         connection.close()
-
-
-def _peer(connection: socket.socket) -> bool:
-    try:
-        return bool(connection.getpeername())
-    except OSError:  # the listening socket
-        return False
 
 
 def network_address() -> str:

@@ -62,17 +62,17 @@ def watched_host() -> Iterator[HostLateness]:
             with contextlib.suppress(OSError, EOFError):
                 pipe.send("end")
                 if pipe.poll(ANSWERS_WITHIN_S):
-                    counts, worst_ms = pipe.recv()
-                    late = found.lateness
-                    late.counts = [a + b for a, b in zip(late.counts, counts, strict=True)]
-                    late.worst_ms = max(late.worst_ms, worst_ms)
+                    one, late = pipe.recv(), found.lateness
+                    late.counts = [a + b for a, b in zip(late.counts, one.counts, strict=True)]
+                    late.worst_ms = max(late.worst_ms, one.worst_ms)
+                    late.delays += one.delays
             process.terminate()
             process.join()
 
 
 def probe(core: int, pipe: Connection) -> None:
     """Wake up every TICK_S on one core until something comes through the pipe. Says first whether it has precedence, and at the end
-    (counts, worst ms).
+    its lateness.
     """
     os.sched_setaffinity(0, {core})
     try:
@@ -85,5 +85,6 @@ def probe(core: int, pipe: Connection) -> None:
     while not pipe.poll(0.0):
         due = time.monotonic() + TICK_S
         time.sleep(TICK_S)
-        late.add(1e3 * max(time.monotonic() - due, 0.0))
-    pipe.send((late.counts, late.worst_ms))
+        now = time.monotonic()
+        late.add(1e3 * max(now - due, 0.0), now)
+    pipe.send(late)

@@ -58,7 +58,9 @@ class RtdeProbe:
         try:
             (accepted,) = self._unpack(">?", self._request(_PROTOCOL, struct.pack(">H", PROTOCOL_VERSION)))
             if not accepted:
-                raise self._line.nonsense()
+                raise RobotUnreachable(
+                    f"The controller at {host} speaks version 1 of RTDE only: update PolyScope to 5.12 or newer."
+                )
             major, minor, bugfix, build = self._unpack(">4I", self._request(_VERSION, b""))
         except BaseException:
             self._line.close()
