@@ -12,9 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.calibration.refinement.local_field import LocalField
-from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
@@ -29,7 +27,6 @@ from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.room import check_ends, check_room
-from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
@@ -69,24 +66,15 @@ TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the ch
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
-class SeamPlanning:
-    """What a seam is planned from besides the scan: arm, tool, nominal part and its expected pose, and the job's limits."""
+class SeamPlanning(Welder):
+    """What a seam is planned from besides the scan: what follows it, the nominal part and its expected pose, and the job's limits."""
 
-    arm: ArmModel
-    tool: WeldingTool
     workpiece: WeldPart
     X_BP_guess: RigidTransform
-    config: ServoConfig
-    q_near: Array
-    clearance_m: float
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
-    surroundings: Surroundings = dc.field(default_factory=Surroundings)
     local_field: LocalField | None = None
     arm_errors: Mapping[str, Any] | None = None  # as the refinement states them, where there is one
-    table_z_m: float = 0.0
-    lean_rad: float = 0.0  # that the job may use by itself
-    any_posture: bool = False
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -124,22 +112,7 @@ class SeamPlanning:
             check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
-        return find_way(self.welder(), seam, X_BP)
-
-    def welder(self) -> Welder:
-        """What follows the seam."""
-        return Welder(
-            arm=self.arm,
-            tool=self.tool,
-            config=self.config,
-            q_home=self.q_near,
-            clearance_m=self.clearance_m,
-            surroundings=self.surroundings,
-            part=self.workpiece.mesh,
-            table_z_m=self.table_z_m,
-            lean_rad=self.lean_rad,
-            any_posture=self.any_posture,
-        )
+        return find_way(self, seam, X_BP)
 
 
 class SeamPlanner(BackgroundSystem):

@@ -10,6 +10,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, plain_station, scenario
+from tests.systems.placements import Placement, draw, follow, offered, placed
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_drawn_seam
@@ -17,7 +18,6 @@ from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.tools.worlds.weld.budgets import PERFECT
-from weldcal.tools.worlds.weld.placements import Placement, draw, follow, offered, placed
 from weldcal.tools.worlds.weld.plant import groove_config, simulate
 from weldcal.tools.worlds.weld.seams import get_seam
 from weldcal.welding.seam.curve import SeamCurve

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.systems.placements import GuardedArm
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.systems.motion.guarded_path import GuardedMotion, InfeasiblePath, check_joints, check_path, straight
-from weldcal.tools.worlds.weld.placements import GuardedArm
 from weldcal.welding.servo.guards import GUARD
 
 ARM, X_FT = load_arm("ur10e"), RigidTransform([0.0, 0.0, 0.17])
