@@ -188,23 +188,30 @@ def plan_seam(
             points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
         )
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
-        way = planning.way(seam, found.X_BP)
-        share = planning.tip_to_torch(seam, way.q_start)
+        return dc.replace(
+            _planned(planning, scan.sequence, seam, found.X_BP),
+            rms_m=found.rms_m,
+            confidence=found.confidence,
+            points_B=points_B,
+            sigma_m=found.sigma_m,
+            summary=found.summary,
+        )
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
+
+
+def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: RigidTransform | None) -> PlannedSeam:
+    """The plan of a seam that has been found; raises WeldcalError where it cannot be welded."""
+    way = planning.way(seam, X_BP)
+    share = planning.tip_to_torch(seam, way.q_start)
     return PlannedSeam(
-        sequence=scan.sequence,
+        sequence=sequence,
         seam=seam,
-        X_BP=found.X_BP,
-        rms_m=found.rms_m,
-        confidence=found.confidence,
+        X_BP=X_BP,
         q_start=way.q_start,
         q_above=way.q_above,
         q_retract=way.q_retract,
         lean_rad=way.lean_rad,
-        points_B=points_B,
-        sigma_m=found.sigma_m,
-        summary=found.summary,
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
@@ -264,23 +271,12 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
     try:
         seam = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
-        way = planning.way(seam, planning.X_BP_guess)
-        share = planning.tip_to_torch(seam, way.q_start)
+        return dc.replace(
+            _planned(planning, sequence, seam, planning.X_BP_guess),
+            rms_m=0.0,
+            confidence=1.0,
+            points_B=np.asarray(seam.position(np.linspace(0.0, seam.length, 200))),
+            summary="the pose of the part is from the fixture's drawing; the scan was not used",
+        )
     except WeldcalError as error:
         return PlannedSeam(sequence=sequence, reason=str(error))
-    points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
-    return PlannedSeam(
-        sequence=sequence,
-        seam=seam,
-        X_BP=planning.X_BP_guess,
-        rms_m=0.0,
-        confidence=1.0,
-        q_start=way.q_start,
-        q_above=way.q_above,
-        q_retract=way.q_retract,
-        lean_rad=way.lean_rad,
-        points_B=points_B,
-        arm_sigma_m=share.sigma_m,
-        arm_turn_rad=share.turn_rad,
-        summary="the pose of the part is from the fixture's drawing; the scan was not used",
-    )

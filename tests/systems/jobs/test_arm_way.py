@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, plain_station, scenario
 from tests.systems.placements import Placement, draw, follow, offered, placed
 from weldcal.models.errors import InputError
+from weldcal.systems.jobs.weld.arm_way import find_way
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_drawn_seam
 from weldcal.systems.jobs.weld.settings import servo_config
@@ -26,6 +28,7 @@ from weldcal.welding.servo.state import Phase
 from weldcal.welding.servo.tool_axes import tool_path
 
 
+@cache
 def planning(*changes: str) -> SeamPlanning:
     found = scenario(SMALL_IDEAL_SCANNER, EXACT_PLATE, *changes)
     station = plain_station()
@@ -41,15 +44,12 @@ def numbers(text: str) -> list[float]:
     return [float(n) for n in re.findall(r"[-+]\d+", text)]
 
 
-def test_a_seam_beyond_the_arms_reach_is_refused_without_surroundings() -> None:
+def test_a_seam_beyond_the_arms_reach_is_refused_and_the_advised_move_works() -> None:
+    """Without surroundings, where nothing was checked between the seam's ends."""
     assert drawn(0.65, 90.0).reason is None
-    reason = drawn(1.2, 0.0).reason or ""
-    assert "The arm cannot reach the seam above its end, with the elbow at its end: " in reason
-
-
-def test_the_advised_move_of_the_part_works() -> None:
     refused = drawn(1.2, 0.0)
     assert refused.seam is None
+    assert "The arm cannot reach the seam above its end, with the elbow at its end: " in str(refused.reason)
     advised = numbers(str(refused.reason).partition("move the part by")[2])
     assert len(advised) == 3
     assert drawn(1.2, 0.0, move=RigidTransform(1e-3 * np.array(advised))).reason is None
@@ -81,10 +81,9 @@ def test_a_setting_that_is_none_is_refused(key: str, names: str) -> None:
         check_scenario(scenario(f"welding: {{{key}}}"))
 
 
-@pytest.mark.parametrize("name", ["s_r60", "l_r20_on_r150"])
-@pytest.mark.parametrize("lean_deg", [0.0, 8.0])
+@pytest.mark.parametrize(("name", "lean_deg"), [("s_r60", 8.0), ("l_r20_on_r150", 0.0)])
 def test_the_planned_path_is_the_servos(name: str, lean_deg: float) -> None:
-    """The servo itself, in a world without errors, holds the tool within 0.3 mm and 1 deg of the planned path once it tracks."""
+    """The servo itself, in a world without errors, holds the tool within 1.5 mm and 1.5 deg of the planned path."""
     seam = get_seam(name)
     config = ServoConfig(tool=ToolGeometry(torch_height_m=-0.0015), weld_speed_m_s=0.016)
     config = replace(config, torch=replace(config.torch, work_angle_rad=np.radians(lean_deg)))
@@ -125,6 +124,4 @@ def test_an_offered_turn_of_a_refused_placement_is_followed() -> None:
     X = RigidTransform(R, centre - R.multiply(centre))
     seam = replace(old.seam, points=X.multiply(old.seam.points.T).T, up=R.multiply(old.seam.up))
     new = Placement(seam, old.plan.transformed(X), old.welder)
-    from weldcal.systems.jobs.weld.arm_way import find_way
-
     assert follow(new, find_way(new.welder, new.plan, None).q_start, 12)["end"] == "done"
