@@ -164,9 +164,7 @@ class WeldingConfig:
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
-    posture: str = (
-        "home"  # branch of the arm's inverse kinematics: home, that of home_deg; any, another one where it must
-    )
+    posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
 
 

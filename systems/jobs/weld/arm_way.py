@@ -4,19 +4,20 @@ import dataclasses as dc
 import itertools
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
+from weldcal.calibration.planning.clearance import arm_bodies, path_clearance
 from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
-from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.motion.guarded_path import Followed, GuardedMotion, InfeasiblePath, check_path, straight
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.room import NoRoom, check_room
@@ -57,11 +58,11 @@ class Welder:
     """What follows a seam: arm, tool and servo, home, the cell around them, and what the job may change by itself.
 
     Attributes:
-        arm, tool, config: as in SeamPlanning.
-        q_home: (6,) rad.
+        arm, tool, config: the arm, the tool on its flange, and the servo's settings.
+        q_near: (6,) rad, home.
         clearance_m: of the approach above the seam.
+        workpiece: the nominal part; None: no move is checked against it.
         surroundings: obstacles.
-        part: the part's mesh in its own frame; None: no move is checked against it.
         table_z_m: height of the table over the base, m, for a move to another branch.
         lean_rad: largest lean across the chord that the job may use by itself.
         any_posture: whether the job may weld on another branch than that of home.
@@ -70,17 +71,13 @@ class Welder:
     arm: ArmModel
     tool: WeldingTool
     config: ServoConfig
-    q_home: Array
+    q_near: Array
     clearance_m: float
+    workpiece: WeldPart | None = None
     surroundings: Surroundings = dc.field(default_factory=Surroundings)
-    part: TriMesh | None = None
     table_z_m: float = 0.0
     lean_rad: float = 0.0
     any_posture: bool = False
-
-    def leaning(self, lean_rad: float) -> ServoConfig:
-        """The servo's settings with a lean."""
-        return leaning(self.config, lean_rad)
 
 
 def leaning(config: ServoConfig, lean_rad: float) -> ServoConfig:
@@ -135,45 +132,39 @@ def _offer(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, may_deg
 def _displacements(centre: Array, up: Array) -> Iterator[tuple[RigidTransform, str]]:
     """Moves and turns of the part in the base, the cheapest first, each with its sentence."""
     found = []
-    level = [d for d in itertools.product((-1, 0, 1), repeat=3) if abs(d[0]) + abs(d[1]) + abs(d[2]) in (1, 2)]
-    for mm, d in itertools.product(MOVES_MM, level):
-        way = mm * np.array(d)
-        words = f"move the part by {way[0]:+.0f}, {way[1]:+.0f}, {way[2]:+.0f} mm along x, y, z of the base"
-        found.append((float(np.linalg.norm(way)), RigidTransform(1e-3 * way), words))
-    for deg, sign in itertools.product(TURNS_DEG, (1.0, -1.0)):
-        X = _about(centre, sign * math.radians(deg) * up)
-        at = f"{1e3 * centre[0]:.0f}, {1e3 * centre[1]:.0f}"
-        words = f"turn the part by {sign * deg:+.0f} deg about the vertical through the seam's middle (x, y of the base {at} mm)"
-        found.append((MM_PER_DEG * deg, X, words))
+    for mm, d in itertools.product(MOVES_MM, itertools.product((-1, 0, 1), repeat=3)):
+        if np.count_nonzero(d) in (1, 2):
+            way = mm * np.array(d)
+            words = "move the part by {:+.0f}, {:+.0f}, {:+.0f} mm along x, y, z of the base".format(*way)
+            found.append((float(np.linalg.norm(way)), RigidTransform(1e-3 * way), words))
+    for deg in (*TURNS_DEG, *(-deg for deg in TURNS_DEG)):
+        R = RotationMatrix(AngleAxis(math.radians(deg), up))
+        at = "x, y of the base {:.0f}, {:.0f} mm".format(*(1e3 * centre[:2]))
+        words = f"turn the part by {deg:+.0f} deg about the vertical through the seam's middle ({at})"
+        found.append((MM_PER_DEG * abs(deg), RigidTransform(R, centre - R.multiply(centre)), words))
     return ((X, words) for _, X, words in sorted(found, key=lambda item: item[0]))
-
-
-def _about(centre: Array, turn: Array) -> RigidTransform:
-    angle = float(np.linalg.norm(turn))
-    R = RotationMatrix(AngleAxis(angle, turn / angle))
-    return RigidTransform(R, centre - R.multiply(centre))
 
 
 def _postures(welder: Welder, seam: SeamCurve) -> Iterator[tuple[float, Array]]:
     """Every other branch above the seam's start, whole turns of a joint included, the nearest to home first."""
-    arm, above = welder.arm, _lifted(welder, seam, 0.0, welder.clearance_m)
-    near = nearest_solution(arm, above, welder.q_home)
-    found: list[Array] = []
+    arm, home = welder.arm, welder.q_near
+    above = _lifted(arm, seam, touch_start_pose(seam, welder.config), welder.clearance_m) @ welder.tool.X_FT.inverse()
+    near, found = nearest_solution(arm, above, home), []
     for q in inverse_kinematics(arm, above):
-        q = q + 2.0 * np.pi * np.round((welder.q_home - q) / (2.0 * np.pi))
-        turned = [q + sign * 2.0 * np.pi * np.eye(6)[k] for k in (0, 3, 4, 5) for sign in (1.0, -1.0)]
-        found += [p for p in (q, *turned) if np.all((p > arm.position_lower) & (p < arm.position_upper))]
+        q = q + 2.0 * np.pi * np.round((home - q) / (2.0 * np.pi))
+        turns = np.vstack([np.zeros(6), *(sign * 2.0 * np.pi * np.eye(6)[[0, 3, 4, 5]] for sign in (1.0, -1.0))])
+        found += [p for p in q + turns if np.all((p > arm.position_lower) & (p < arm.position_upper))]
     others = (q for q in found if near is None or float(np.abs(q - near).max()) > 0.1)
-    ranked = sorted(others, key=lambda q: float(np.sum(((q - welder.q_home) / arm.velocity_limit) ** 2)))
+    ranked = sorted(others, key=lambda q: float(np.sum(((q - home) / arm.velocity_limit) ** 2)))
     return ((0.0, q) for q in ranked[:_POSTURES])
 
 
 def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: float, seed: Array | None) -> ArmWay:
     """The checked way with a lean, on the branch of `seed` (6,) above the seam's start, else that of home."""
-    config, problem, along = welder.leaning(lean), None, None
+    config, problem, along = leaning(welder.config, lean), None, None
     for share in HIGHER:
         try:
-            q_near = welder.q_home if seed is None else seed
+            q_near = welder.q_near if seed is None else seed
             goals = arm_waypoints(welder.arm, welder.tool, seam, config, q_near, share * welder.clearance_m)
             along = along or tuple(check_path(welder.arm, goals[0], seam_motions(welder.tool, seam, config)))
             way = ArmWay(*goals, lean, along)
@@ -185,10 +176,10 @@ def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: f
             )  # what is in the way at the first height, not that the arm does not reach a higher one
             if share == HIGHER[-1] or isinstance(problem, SeamOutOfReach):
                 raise problem from found
-    if lean and welder.part is not None and X_BP is not None:
+    if lean and welder.workpiece is not None and X_BP is not None:
         tool = welder.tool
         try:
-            check_room(welder.part, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
+            check_room(welder.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
         except NoRoom as problem:
             raise SeamObstructed(str(problem)) from problem
     return way
@@ -216,58 +207,42 @@ def seam_motions(tool: WeldingTool, seam: SeamCurve, config: ServoConfig) -> lis
 
 
 def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsewhere: bool) -> None:
-    """Check that the whole way keeps the arm and its tool clear of the surroundings, of itself and of the part.
+    """Check that the whole way keeps the arm and its tool clear of the surroundings and of itself, and the moves clear of the part.
 
-    A move to another branch is also checked against the table.
+    The moves to another branch and back are also checked against the table.
 
     Raises:
         SeamObstructed: with the place.
     """
-    arm, bodies, seam = welder.arm, arm_bodies(welder.arm, welder.tool.capsules()), way.along[-1]
+    arm, home, bodies, seam = welder.arm, welder.q_near, arm_bodies(welder.arm, welder.tool.capsules()), way.along[-1]
     places = [*range(0, len(seam.q) - 1, CHECKED_EVERY), len(seam.q) - 1]
-    weld = [
-        (f"at {1e3 * seam.along[b]:.0f} mm of the seam", seam.q[a], seam.q[b]) for a, b in itertools.pairwise(places)
-    ]
-    to, back = (
-        ("on its way to the seam", welder.q_home, way.q_above),
-        ("on its way from the seam", way.q_retract, welder.q_home),
-    )
-    for where, a, b in (
-        to,
-        ("above the seam", way.q_above, way.q_start),
-        *weld,
-        ("above the seam's end", seam.q[-1], way.q_retract),
-        back,
-    ):
+    moves = [("on its way to the seam", home, way.q_above), ("on its way from the seam", way.q_retract, home)]
+    weld = [(f"at {1e3 * seam.along[b]:.0f} mm of the seam", seam.q[a], seam.q[b]) for a, b in pairwise(places)]
+    ends = [("above the seam", way.q_above, way.q_start), ("above the seam's end", seam.q[-1], way.q_retract)]
+    part = Surroundings()
+    if X_BP is not None and welder.workpiece is not None:
+        part = Surroundings((Obstacle("part", welder.workpiece.mesh.transformed(X_BP), CLEAR_OF_PART_M),))
+    for move in (*moves, *ends, *weld):
+        where, a, b = move
         lowest, gap = path_clearance(arm, bodies, a, b)
         name = welder.surroundings.touched_on_path(arm, bodies, a, b) or ("the arm itself" if gap <= 0.0 else "")
-        if not name and elsewhere and where in (to[0], back[0]) and lowest <= welder.table_z_m:
+        if not name and elsewhere and move in moves and lowest <= welder.table_z_m:
             name = "the table"
         if name:
-            raise SeamObstructed(
-                f"The arm or its tool would come too close to '{name}' {where}",
-                "move it or the workpiece, or correct surroundings in the scenario",
-            )
-    if X_BP is not None and welder.part is not None:
-        _check_part(welder, Obstacle("part", welder.part.transformed(X_BP), CLEAR_OF_PART_M), bodies, (to, back))
+            problem = f"The arm or its tool would come too close to '{name}' {where}"
+            raise SeamObstructed(problem, "move it or the workpiece, or correct surroundings in the scenario")
+        if move in moves and part.touched_on_path(arm, bodies, a, b):
+            highest = f"{1e3 * HIGHER[-1] * welder.clearance_m:.0f} mm"
+            problem = f"The arm or its tool would touch the part {where}, even {highest} above the seam"
+            raise SeamObstructed(problem, "choose another home_deg, or turn the part")
 
 
-def _check_part(
-    welder: Welder, part: Obstacle, bodies: list[Body], moves: tuple[tuple[str, Array, Array], ...]
-) -> None:
-    for where, a, b in moves:
-        if Surroundings((part,)).touched_on_path(welder.arm, bodies, a, b):
-            raise SeamObstructed(
-                f"The arm or its tool would touch the part {where}, even {1e3 * HIGHER[-1] * welder.clearance_m:.0f} mm above the seam",
-                "choose another home_deg, or turn the part",
-            )
-
-
-def _lifted(welder: Welder, seam: SeamCurve, lean: float, clearance_m: float) -> RigidTransform:
-    """Pose of the flange above the seam's start."""
-    X_BT = touch_start_pose(seam, welder.leaning(lean))
-    up = clearance_m * _away(seam.frame(0.0).up, welder.arm.up)
-    return RigidTransform(X_BT.rotation(), X_BT.translation() + up) @ welder.tool.X_FT.inverse()
+def _lifted(arm: ArmModel, seam: SeamCurve, X_BT: RigidTransform, height_m: float, s: float = 0.0) -> RigidTransform:
+    """The tool's pose at X_BT raised out of the joint at arc length s m: up on a level face, else along the bisector."""
+    up = seam.frame(s).up
+    return RigidTransform(
+        X_BT.rotation(), X_BT.translation() + height_m * (arm.up if float(up @ arm.up) > _LEVEL else up)
+    )
 
 
 def arm_waypoints(
@@ -278,28 +253,23 @@ def arm_waypoints(
     Raises:
         SeamOutOfReach: where no inverse kinematics solution exists.
     """
-    X_BT = touch_start_pose(seam, config)
-    solutions = []
-    q = q_near
-    end = seam.frame(seam.length)
-    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + clearance_m * _away(seam.frame(0.0).up, arm.up))
-    X_BE = RigidTransform(X_BT.rotation(), end.position + (clearance_m + 0.05) * _away(end.up, arm.up))
-    for where, pose in (("above its start", lifted), ("at its start", X_BT), ("above its end", X_BE)):
+    X_BT, end = touch_start_pose(seam, config), seam.length
+    X_BE = RigidTransform(X_BT.rotation(), seam.frame(end).position)
+    goals = {
+        "above its start": _lifted(arm, seam, X_BT, clearance_m),
+        "at its start": X_BT,
+        "above its end": _lifted(arm, seam, X_BE, clearance_m + 0.05, end),
+    }
+    solutions, q = [], q_near
+    for where, pose in goals.items():
         X_BF = pose @ tool.X_FT.inverse()
         found = nearest_solution(arm, X_BF, q)
         if found is None:
             far = float(np.linalg.norm(X_BF.translation())) > 0.5 * (abs(arm.dh.a2) + abs(arm.dh.a3))
             joint, to = ("elbow", "towards") if far else ("shoulder pan", "away from")
-            raise SeamOutOfReach(
-                f"The arm cannot reach the seam {where}, with the {joint} at its end",
-                f"move the workpiece {to} the robot",
-            )
+            problem = f"The arm cannot reach the seam {where}, with the {joint} at its end"
+            raise SeamOutOfReach(problem, f"move the workpiece {to} the robot")
         solutions.append(found)
         q = found
     q_above, q_start, q_retract = solutions
     return q_start, q_above, q_retract
-
-
-def _away(up: Array, vertical: Array) -> Array:
-    """Direction (3,) out of a joint: vertical on a level face, along the bisector of a leaning joint."""
-    return vertical if float(up @ vertical) > _LEVEL else up

@@ -12,9 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.calibration.refinement.local_field import LocalField
-from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
@@ -29,7 +27,6 @@ from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.room import check_ends, check_room
-from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
@@ -69,24 +66,15 @@ TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the ch
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
-class SeamPlanning:
-    """What a seam is planned from besides the scan: arm, tool, nominal part and its expected pose, and the job's limits."""
+class SeamPlanning(Welder):
+    """What a seam is planned from besides the scan: what follows it, the nominal part and its expected pose, and the job's limits."""
 
-    arm: ArmModel
-    tool: WeldingTool
     workpiece: WeldPart
     X_BP_guess: RigidTransform
-    config: ServoConfig
-    q_near: Array
-    clearance_m: float
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
-    surroundings: Surroundings = dc.field(default_factory=Surroundings)
     local_field: LocalField | None = None
     arm_errors: Mapping[str, Any] | None = None  # as the refinement states them, where there is one
-    table_z_m: float = 0.0
-    lean_rad: float = 0.0  # that the job may use by itself
-    any_posture: bool = False
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -124,22 +112,7 @@ class SeamPlanning:
             check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
-        return find_way(self.welder(), seam, X_BP)
-
-    def welder(self) -> Welder:
-        """What follows the seam."""
-        return Welder(
-            arm=self.arm,
-            tool=self.tool,
-            config=self.config,
-            q_home=self.q_near,
-            clearance_m=self.clearance_m,
-            surroundings=self.surroundings,
-            part=self.workpiece.mesh,
-            table_z_m=self.table_z_m,
-            lean_rad=self.lean_rad,
-            any_posture=self.any_posture,
-        )
+        return find_way(self, seam, X_BP)
 
 
 class SeamPlanner(BackgroundSystem):
@@ -215,23 +188,30 @@ def plan_seam(
             points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
         )
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
-        way = planning.way(seam, found.X_BP)
-        share = planning.tip_to_torch(seam, way.q_start)
+        return dc.replace(
+            _planned(planning, scan.sequence, seam, found.X_BP),
+            rms_m=found.rms_m,
+            confidence=found.confidence,
+            points_B=points_B,
+            sigma_m=found.sigma_m,
+            summary=found.summary,
+        )
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
+
+
+def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: RigidTransform | None) -> PlannedSeam:
+    """The plan of a seam that has been found; raises WeldcalError where it cannot be welded."""
+    way = planning.way(seam, X_BP)
+    share = planning.tip_to_torch(seam, way.q_start)
     return PlannedSeam(
-        sequence=scan.sequence,
+        sequence=sequence,
         seam=seam,
-        X_BP=found.X_BP,
-        rms_m=found.rms_m,
-        confidence=found.confidence,
+        X_BP=X_BP,
         q_start=way.q_start,
         q_above=way.q_above,
         q_retract=way.q_retract,
         lean_rad=way.lean_rad,
-        points_B=points_B,
-        sigma_m=found.sigma_m,
-        summary=found.summary,
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
@@ -291,23 +271,12 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
     try:
         seam = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
-        way = planning.way(seam, planning.X_BP_guess)
-        share = planning.tip_to_torch(seam, way.q_start)
+        return dc.replace(
+            _planned(planning, sequence, seam, planning.X_BP_guess),
+            rms_m=0.0,
+            confidence=1.0,
+            points_B=np.asarray(seam.position(np.linspace(0.0, seam.length, 200))),
+            summary="the pose of the part is from the fixture's drawing; the scan was not used",
+        )
     except WeldcalError as error:
         return PlannedSeam(sequence=sequence, reason=str(error))
-    points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
-    return PlannedSeam(
-        sequence=sequence,
-        seam=seam,
-        X_BP=planning.X_BP_guess,
-        rms_m=0.0,
-        confidence=1.0,
-        q_start=way.q_start,
-        q_above=way.q_above,
-        q_retract=way.q_retract,
-        lean_rad=way.lean_rad,
-        points_B=points_B,
-        arm_sigma_m=share.sigma_m,
-        arm_turn_rad=share.turn_rad,
-        summary="the pose of the part is from the fixture's drawing; the scan was not used",
-    )

@@ -105,7 +105,7 @@ def draw(seed: int) -> Placement:
     )
     pan = (angle + rng.uniform(-0.8, 0.8) + math.pi) % (2.0 * math.pi) - math.pi
     home = np.r_[pan, np.deg2rad([-80.0, 110.0, -120.0, -90.0, 0.0])]
-    welder = Welder(arm=arm, tool=tool, config=groove_config(config), q_home=home, clearance_m=0.025)
+    welder = Welder(arm=arm, tool=tool, config=groove_config(config), q_near=home, clearance_m=0.025)
     return Placement(seam, planned_seam(seam, NOMINAL, np.random.default_rng(seed)), welder)
 
 
@@ -138,7 +138,7 @@ def placed(seed: int, drive: bool = True) -> dict[str, Any]:
     except InfeasiblePath as problem:
         row |= {"state": "refused", "reason": problem.problem}
         try:
-            q = arm_waypoints(welder.arm, welder.tool, plan, welder.config, welder.q_home, welder.clearance_m)[0]
+            q = arm_waypoints(welder.arm, welder.tool, plan, welder.config, welder.q_near, welder.clearance_m)[0]
         except SeamOutOfReach:
             return row | {"end": "no start"}
         drive = drive and seed % 2 == 0
