@@ -33,10 +33,9 @@ from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, Request, World
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer
-from weldcal.tools.emulators.ur.wire.external_control import ExternalControl
 from weldcal.tools.emulators.ur.wire.net import Connection, Network
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
-from weldcal.tools.emulators.ur.wire.script_ports import PrimaryServer, RealTimeServer
+from weldcal.tools.emulators.ur.wire.script_ports import ExternalControl, PrimaryServer, RealTimeServer
 
 # the elbow up, the tool down, away from every singularity
 HOME = (0.0, -1.5707963267948966, 1.5707963267948966, -1.5707963267948966, -1.5707963267948966, 0.0)

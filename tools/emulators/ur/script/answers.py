@@ -76,8 +76,10 @@ CALCULATIONS: dict[str, Callable[..., Any]] = {
     "r2d": lambda r: math.degrees(r),
     "pow": math.pow,
     "inv": lambda m: Pose(pose_of(inverse(matrix(m)))) if isinstance(m, Pose) else np.linalg.inv(m).tolist(),
-    "rpy2rotvec": lambda rpy_vector: rotation_vector(_turned(rpy_vector).ToRotationMatrix().matrix()).tolist(),
-    "rotvec2rpy": lambda rotation_vector: _rpy(rotation_vector),
+    "rpy2rotvec": lambda rpy_vector: rotation_vector(RollPitchYaw(rpy_vector).ToRotationMatrix().matrix()).tolist(),
+    "rotvec2rpy": lambda rotation_vector: (
+        RollPitchYaw(RotationMatrix(rotation_matrix(rotation_vector))).vector().tolist()
+    ),
     "floor": lambda f: math.floor(f),
     "ceil": lambda f: math.ceil(f),
     "log": lambda b, f: math.log(f, b),
@@ -200,15 +202,6 @@ class Answers:
         if isinstance(pose, Pose):
             return self._inverse(pose, None) is not None
         return _inside(self._controller.arm.model, six(pose, "is_within_safety_limits"))
-
-
-def _turned(rpy: Any) -> RollPitchYaw:
-    return RollPitchYaw(*(float(angle) for angle in rpy))
-
-
-def _rpy(vector: Any) -> list[float]:
-    R = RotationMatrix.ProjectToRotationMatrix(rotation_matrix(vector))
-    return [float(angle) for angle in RollPitchYaw(R).vector()]
 
 
 def _inside(model: ArmModel, q: Array) -> bool:

@@ -13,7 +13,6 @@ from weldcal.tools.emulators.ur.controller.state import ControllerState
 from weldcal.tools.emulators.ur.script.answers import CALCULATIONS, READS, REGISTERS, Answers
 from weldcal.tools.emulators.ur.script.dynamics import Dynamics
 from weldcal.tools.emulators.ur.script.forces import Forces
-from weldcal.tools.emulators.ur.script.messages import Messages
 from weldcal.tools.emulators.ur.script.motions import Motions
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.sockets import Sockets
@@ -54,7 +53,7 @@ def script_functions(
     named: dict[str, Callable[..., Any]] = {name: _no_effect(controller, name) for name in NO_EFFECT}
     named |= {
         name: getattr(functions, name)
-        for kind in (Motions, Sockets, Messages, Forces, Dynamics, TerminalFunctions, Answers)
+        for kind in (Motions, Sockets, Forces, Dynamics, TerminalFunctions, Answers)
         for name in vars(kind)
         if not name.startswith("_") and known(name)
     }

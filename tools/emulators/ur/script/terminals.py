@@ -17,14 +17,8 @@ class TerminalFunctions(Answers):
     def set_standard_digital_out(self, n: int, b: bool) -> None:
         self._set(STANDARD, register_index(n, 8), b)
 
-    def set_digital_out(self, n: int, b: bool) -> None:
-        self.set_standard_digital_out(n, b)
-
     def get_standard_digital_out(self, n: int) -> bool:
         return self._get(self._controller.terminals.digital_outputs, STANDARD, register_index(n, 8))
-
-    def get_digital_out(self, n: int) -> bool:
-        return self.get_standard_digital_out(n)
 
     def set_configurable_digital_out(self, n: int, b: bool) -> None:
         self._set(CONFIGURABLE, register_index(n, 8), b)
@@ -47,9 +41,6 @@ class TerminalFunctions(Answers):
     def get_standard_digital_in(self, n: int) -> bool:
         return self._get(self._controller.terminals.digital_inputs, STANDARD, register_index(n, 8))
 
-    def get_digital_in(self, n: int) -> bool:
-        return self.get_standard_digital_in(n)
-
     def get_configurable_digital_in(self, n: int) -> bool:
         return self._get(self._controller.terminals.digital_inputs, CONFIGURABLE, register_index(n, 8))
 
@@ -59,8 +50,12 @@ class TerminalFunctions(Answers):
     def set_standard_analog_out(self, n: int, f: float) -> None:
         self._controller.terminals.set_analog(register_index(n, 2), float(f))
 
-    def set_analog_out(self, n: int, f: float) -> None:
-        self.set_standard_analog_out(n, f)
+    set_digital_out, get_digital_out, get_digital_in = (
+        set_standard_digital_out,
+        get_standard_digital_out,
+        get_standard_digital_in,
+    )
+    set_analog_out = set_standard_analog_out
 
     def get_standard_analog_out(self, n: int) -> float:
         return self._controller.terminals.analog_outputs[register_index(n, 2)]
@@ -81,16 +76,14 @@ class TerminalFunctions(Answers):
 
     def set_payload(self, m: float, cog: Any = None) -> None:
         model = self._controller.arm.model.name
-        if (
-            not 0.0 <= float(m) <= (most := get_robot(model).payload_kg)
-        ):  # [M] what a controller answers is not documented
+        most = get_robot(model).payload_kg
+        if not 0.0 <= float(m) <= most:  # [M] what a controller answers is not documented
             raise ScriptError(f"The payload of a {model} is 0 to {most:g} kg, not {m!r}.")
         self._controller.payload.mass = float(m)
         if cog is not None:
             self.set_payload_cog(cog)
 
-    def set_payload_mass(self, m: float) -> None:
-        self.set_payload(m)
+    set_payload_mass = set_payload
 
     def set_payload_cog(self, CoG: Any) -> None:
         self._controller.payload.center = _numbers(CoG, 3, "The centre of gravity")

@@ -9,15 +9,15 @@ import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.checker import Checker
-from weldcal.tools.emulators.ur.controller.contact import ForceSensor, Surroundings
+from weldcal.tools.emulators.ur.controller.compliance import ForceSensor, Surroundings
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.lockstep import Lockstep
 from weldcal.tools.emulators.ur.wire.dashboard import IDLE_PROGRAM
-from weldcal.tools.emulators.ur.wire.external_control import CLIENT_PORT, ExternalControl
 from weldcal.tools.emulators.ur.wire.net import Connection, LinkFaults, Network, Server
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
+from weldcal.tools.emulators.ur.wire.script_ports import CLIENT_PORT, ExternalControl
 
 Request = Mapping[str, Any]
 LARGEST = 1e9  # of the numbers that a request may hold
