@@ -133,10 +133,9 @@ class Controller(ControllerState):
         self.inputs, self.outputs = Registers(), Registers()
         self.terminals.digital_outputs = 0
         self.terminals.analog_outputs = [0.0, 0.0]
-        for kept in (self.terminals.runstate, self.terminals.analog_runstate):
+        t = self.terminals
+        for kept in (t.runstate, t.analog_runstate, t.foreign, t.analog_foreign):
             kept.clear()
-        self.terminals.foreign.clear()
-        self.terminals.analog_foreign.clear()
         self.robot_mode, self.safety_mode = RobotMode.POWER_OFF, SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.timestamp = 0.0

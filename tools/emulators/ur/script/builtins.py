@@ -6,6 +6,7 @@ physics for (friction, conveyors) is accepted and noted in the log.
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 from weldcal.tools.emulators.ur.controller.registers import register_index
@@ -16,7 +17,7 @@ from weldcal.tools.emulators.ur.script.forces import Forces
 from weldcal.tools.emulators.ur.script.motions import Motions
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.sockets import Sockets
-from weldcal.tools.emulators.ur.script.terminals import TerminalFunctions
+from weldcal.tools.emulators.ur.script.terminals import DIGITAL, TerminalFunctions
 from weldcal.tools.emulators.ur.script.texts import TEXTS
 
 BLOCKING = frozenset(
@@ -57,9 +58,15 @@ def script_functions(
         for name in vars(kind)
         if not name.startswith("_") and known(name)
     }
-    named |= {name: _read(controller, name, read) for name, read in READS.items() if known(name)}
-    named |= {name: _register(controller, *bank) for name, bank in REGISTERS.items()}
-    named |= {name: _real(getattr(math, name)) for name in MATH} | CALCULATIONS | TEXTS
+    named |= {name: partial(read, controller) for name, read in READS.items() if known(name)}
+    named |= {f"set_{kind}_out": partial(functions._set, *group) for kind, group in DIGITAL.items()}
+    for way in ("in", "out"):
+        named |= {
+            f"get_{kind}_{way}": partial(functions._get, f"digital_{way}puts", *group)
+            for kind, group in DIGITAL.items()
+        }
+    named |= {name: partial(_register, controller, *bank) for name, bank in REGISTERS.items()}
+    named |= {name: getattr(math, name) for name in MATH} | CALCULATIONS | TEXTS
     return named, BLOCKING
 
 
@@ -75,23 +82,5 @@ def _no_effect(controller: ControllerState, name: str) -> Callable[..., None]:
     return function
 
 
-def _read(controller: ControllerState, name: str, read: Callable[[ControllerState], Any]) -> Callable[[], Any]:
-    def function() -> Any:
-        return read(controller)
-
-    function.__qualname__ = name
-    return function
-
-
-def _register(controller: ControllerState, bank: str, kind: str, count: int) -> Callable[[int], Any]:
-    def read_register(index: int) -> Any:
-        return getattr(getattr(controller, bank), kind)[register_index(index, count)]
-
-    return read_register
-
-
-def _real(function: Callable[..., float]) -> Callable[..., float]:
-    def wrapped(*arguments: float) -> float:
-        return function(*arguments)
-
-    return wrapped
+def _register(controller: ControllerState, bank: str, kind: str, count: int, index: int) -> Any:
+    return getattr(getattr(controller, bank), kind)[register_index(index, count)]

@@ -143,14 +143,15 @@ class Sockets(Forces):
         return [len(found), *found] if len(found) == number else [0, *[math.nan] * int(number)]
 
     def socket_read_binary_integer(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
-        size = 4 * _count(number)
-        data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
-        return [int(number), *struct.unpack(f">{int(number)}i", data)] if data else [0, *[-1] * int(number)]
+        return (yield from self._numbers(_count(number), "i", socket_name, timeout))
 
     def socket_read_byte_list(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
-        size = _count(number)
-        data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
-        return [size, *data] if data else [0, *[-1] * size]
+        return (yield from self._numbers(_count(number), "B", socket_name, timeout))
+
+    def _numbers(self, number: int, code: str, name: str, timeout: float) -> Slices:
+        size = struct.calcsize(f">{number}{code}")
+        data = yield from self._read(name, timeout, lambda inbox: size * (len(inbox) >= size))
+        return [number, *struct.unpack(f">{number}{code}", data)] if data else [0, *[-1] * number]
 
     def _send(self, data: bytes, name: str) -> bool:
         opened = self._program.sockets.get(name)

@@ -7,30 +7,13 @@ from weldcal.tools.emulators.ur.controller.registers import register_index
 from weldcal.tools.emulators.ur.script.answers import Answers
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
-STANDARD, CONFIGURABLE, TOOL = 0, 8, 16  # first bit of each group of digital terminals
+DIGITAL = {"standard_digital": (0, 8), "digital": (0, 8), "configurable_digital": (8, 8), "tool_digital": (16, 2)}
+"""First bit and number of the terminals of each group, as they are named in set_..._out, get_..._out and get_..._in."""
 TOOL_VOLTAGES = (0, 12, 24)
 
 
 class TerminalFunctions(Answers):
     """Outputs keep their level when the program ends, unless they follow its state."""
-
-    def set_standard_digital_out(self, n: int, b: bool) -> None:
-        self._set(STANDARD, register_index(n, 8), b)
-
-    def get_standard_digital_out(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_outputs, STANDARD, register_index(n, 8))
-
-    def set_configurable_digital_out(self, n: int, b: bool) -> None:
-        self._set(CONFIGURABLE, register_index(n, 8), b)
-
-    def get_configurable_digital_out(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_outputs, CONFIGURABLE, register_index(n, 8))
-
-    def set_tool_digital_out(self, n: int, b: bool) -> None:
-        self._set(TOOL, register_index(n, 2), b)
-
-    def get_tool_digital_out(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_outputs, TOOL, register_index(n, 2))
 
     def set_runstate_standard_digital_output_to_value(self, outputId: int, state: int) -> None:
         self._controller.terminals.runstate[register_index(outputId, 8)] = register_index(state, 8)
@@ -38,23 +21,9 @@ class TerminalFunctions(Answers):
     def set_runstate_standard_analog_output_to_value(self, outputId: int, state: int) -> None:
         self._controller.terminals.analog_runstate[register_index(outputId, 2)] = register_index(state, 8)
 
-    def get_standard_digital_in(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_inputs, STANDARD, register_index(n, 8))
-
-    def get_configurable_digital_in(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_inputs, CONFIGURABLE, register_index(n, 8))
-
-    def get_tool_digital_in(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_inputs, TOOL, register_index(n, 2))
-
     def set_standard_analog_out(self, n: int, f: float) -> None:
         self._controller.terminals.set_analog(register_index(n, 2), float(f))
 
-    set_digital_out, get_digital_out, get_digital_in = (
-        set_standard_digital_out,
-        get_standard_digital_out,
-        get_standard_digital_in,
-    )
     set_analog_out = set_standard_analog_out
 
     def get_standard_analog_out(self, n: int) -> float:
@@ -96,11 +65,11 @@ class TerminalFunctions(Answers):
     def set_gravity(self, d: Any) -> None:
         self._controller.gravity = _numbers(d, 3, "Gravity")
 
-    def _set(self, first: int, n: int, b: bool) -> None:
-        self._controller.terminals.set_digital(first, 1 << n, (1 if b else 0) << n)
+    def _set(self, first: int, count: int, n: int, b: bool) -> None:
+        self._controller.terminals.set_digital(first, 1 << register_index(n, count), (1 if b else 0) << n)
 
-    def _get(self, bits: int, first: int, n: int) -> bool:
-        return bool(bits >> (first + n) & 1)
+    def _get(self, bank: str, first: int, count: int, n: int) -> bool:
+        return bool(getattr(self._controller.terminals, bank) >> (first + register_index(n, count)) & 1)
 
 
 def _numbers(values: Any, count: int, what: str) -> list[float]:
