@@ -15,7 +15,7 @@ Joints = tuple[float, float, float, float, float, float]
 def emulate_ur(
     call: Call,
     polyscope: Annotated[str, option("--polyscope", "VERSION", "Controller version: 5.12, 5.21, 10.7 ...")] = "5.21",
-    arm: Annotated[str, option("--arm", "NAME", "The arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")] = "ur10e",
+    robot: Annotated[str, option("--arm", "NAME", "The arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")] = "ur10e",
     kinematics: Annotated[Path | None, option("--kinematics", "FILE", "A robot's factory calibration.")] = None,
     q: Annotated[Joints, option("--q", "RAD...", "Six joint angles at the start.")] = HOME,
     safety_limits: Annotated[
@@ -30,17 +30,5 @@ def emulate_ur(
     lockstep: Annotated[float, option("--lockstep", "S", "Seconds for which time waits for a late client.")] = 0.0,
 ) -> None:
     """Run a UR controller on loopback that executes the URScript it is sent, until it is interrupted."""
-    run_emulator(
-        host=host,
-        q=q,
-        safety_limits=safety_limits,
-        operational_mode=operational_mode,
-        control_port=control_port,
-        polyscope=polyscope,
-        robot=arm,
-        kinematics=kinematics,
-        pace=pace,
-        lockstep=lockstep,
-        seed=call.seed,
-        ready=typer.echo,
-    )
+    settings = {name: value for name, value in locals().items() if name != "call"}
+    run_emulator(**settings, seed=call.seed, ready=typer.echo)

@@ -51,7 +51,7 @@ def script_functions(
     def known(name: str) -> bool:
         return controller.version.at_least(*SINCE.get(name, FIRST))
 
-    named: dict[str, Callable[..., Any]] = {name: _no_effect(controller, name) for name in NO_EFFECT}
+    named: dict[str, Callable[..., Any]] = {name: partial(_no_effect, controller, name) for name in NO_EFFECT}
     named |= {
         name: getattr(functions, name)
         for kind in (Motions, Sockets, Forces, Dynamics, TerminalFunctions, Answers)
@@ -70,16 +70,9 @@ def script_functions(
     return named, BLOCKING
 
 
-def _no_effect(controller: ControllerState, name: str) -> Callable[..., None]:
-    noted = False
-
-    def function(*arguments: Any, **keywords: Any) -> None:
-        nonlocal noted
-        if not noted:
-            noted = True
-            controller.note(f"no effect here: {name}")
-
-    return function
+def _no_effect(controller: ControllerState, name: str, *arguments: Any, **keywords: Any) -> None:
+    if not any(line.endswith(name) for line in controller.log):
+        controller.note(f"no effect here: {name}")
 
 
 def _register(controller: ControllerState, bank: str, kind: str, count: int, index: int) -> Any:
