@@ -22,10 +22,10 @@ from weldcal.tools.emulators.ur.script.syntax import ScriptError
 SLOW = 5000  # effort of inverse kinematics and of dynamics
 
 
-def six(values: Any, what: str) -> Array:
-    """Six finite numbers out of a script; raises ScriptError where they are not."""
-    if not isinstance(values, list) or len(values) != 6:
-        raise ScriptError(f"{what} needs six numbers, it got {values!r}.")
+def six(values: Any, what: str, count: int = 6) -> Array:
+    """Six finite numbers out of a script, or as many as `count`; raises ScriptError where they are not."""
+    if not isinstance(values, list) or len(values) != count:
+        raise ScriptError(f"{what} needs {count} numbers, it got {values!r}.")
     array = np.array(values, dtype=np.float64)
     if not np.isfinite(array).all():
         raise ScriptError(f"{what} got a number that is not finite.")

@@ -4,7 +4,7 @@ from typing import Any
 
 from weldcal.models.robots import get_robot
 from weldcal.tools.emulators.ur.controller.registers import register_index
-from weldcal.tools.emulators.ur.script.answers import Answers
+from weldcal.tools.emulators.ur.script.answers import Answers, six
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 DIGITAL = {"standard_digital": (0, 8), "digital": (0, 8), "configurable_digital": (8, 8), "tool_digital": (16, 2)}
@@ -55,24 +55,18 @@ class TerminalFunctions(Answers):
     set_payload_mass = set_payload
 
     def set_payload_cog(self, CoG: Any) -> None:
-        self._controller.payload.center = _numbers(CoG, 3, "The centre of gravity")
+        self._controller.payload.center = six(CoG, "The centre of gravity", 3).tolist()
 
     def set_target_payload(self, m: float, cog: Any, inertia: Any = None, transition_time: float = 0.0) -> None:
         self.set_payload(m, cog)
         if inertia is not None:
-            self._controller.payload.inertia = _numbers(inertia, 6, "The inertia")
+            self._controller.payload.inertia = six(inertia, "The inertia", 6).tolist()
 
     def set_gravity(self, d: Any) -> None:
-        self._controller.gravity = _numbers(d, 3, "Gravity")
+        self._controller.gravity = six(d, "Gravity", 3).tolist()
 
     def _set(self, first: int, count: int, n: int, b: bool) -> None:
         self._controller.terminals.set_digital(first, 1 << register_index(n, count), (1 if b else 0) << n)
 
     def _get(self, bank: str, first: int, count: int, n: int) -> bool:
         return bool(getattr(self._controller.terminals, bank) >> (first + register_index(n, count)) & 1)
-
-
-def _numbers(values: Any, count: int, what: str) -> list[float]:
-    if not isinstance(values, list) or len(values) != count:
-        raise ScriptError(f"{what} needs {count} numbers, it got {values!r}.")
-    return [float(value) for value in values]
