@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -220,7 +221,7 @@ def programs(seed: int) -> Iterator[str]:
         yield mutated(bases[int(rng.integers(len(bases)))], rng)
 
 
-def sent(emulator: Emulator, source: str, port: int = REAL_TIME, frames: int = 10) -> dict[str, object]:
+def sent(emulator: Emulator, source: str, port: int = REAL_TIME, frames: int = 10) -> dict[str, Any]:
     """The state after some frames of a program, with how long the answers took; the program is stopped."""
     before, start = emulator.state(), time.monotonic()
     with socket.create_connection((emulator.host, port), timeout=LONGEST_S) as wire:
@@ -414,7 +415,7 @@ def mutants(emulator: Emulator, count: int, seed: int) -> tuple[Counter[str], fl
             sys.stderr.write(f"--- seed {seed}, after {sum(found.values())} programs:\n{source}\n")
             raise
         found["started" if state["started"] else "refused"] += 1
-        longest = max(longest, float(str(state["took"])))
+        longest = max(longest, float(state["took"]))
     return found, longest
 
 

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import gc
+import inspect
 import os
 import signal
 import sys
@@ -10,6 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,10 +35,9 @@ from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, Request, World
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer
-from weldcal.tools.emulators.ur.wire.external_control import ExternalControl
 from weldcal.tools.emulators.ur.wire.net import Connection, Network
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
-from weldcal.tools.emulators.ur.wire.script_ports import PrimaryServer, RealTimeServer
+from weldcal.tools.emulators.ur.wire.script_ports import ExternalControl, PrimaryServer, RealTimeServer
 
 # the elbow up, the tool down, away from every singularity
 HOME = (0.0, -1.5707963267948966, 1.5707963267948966, -1.5707963267948966, -1.5707963267948966, 0.0)
@@ -109,17 +110,15 @@ def narrowed(model: ArmModel, ranges: str) -> ArmModel:
     """
     if not ranges:
         return model
-    try:
+    with suppress(ValueError):
         lower, upper = np.deg2rad([[float(v) for v in pair.split(":")] for pair in ranges.split(",")]).T
         inside = (model.position_lower - 1e-9 <= lower) & (lower < upper) & (upper <= model.position_upper + 1e-9)
-    except ValueError:
-        raise InputError(
-            f"Give six joint ranges LOWER:UPPER in degrees, with commas between, not {ranges!r}."
-        ) from None
-    if len(lower) != 6 or not inside.all():
-        most = np.rad2deg(model.position_upper).round().astype(int).tolist()
-        raise InputError(f"Each of six joint ranges is LOWER:UPPER with LOWER < UPPER, inside +-{most} deg.")
-    return dataclasses.replace(model, position_lower=lower, position_upper=upper)
+        if inside.all() and len(lower) == 6:
+            return dataclasses.replace(model, position_lower=lower, position_upper=upper)
+    most = np.rad2deg(model.position_upper).round().astype(int).tolist()
+    raise InputError(
+        f"Give six joint ranges LOWER:UPPER in degrees, commas between, LOWER < UPPER, inside +-{most}, not {ranges!r}."
+    )
 
 
 class Emulation:
@@ -272,19 +271,20 @@ def _alive(process: int) -> bool:
 
 def main() -> None:
     """Entry point of `python -m weldcal.tools.emulators.ur`."""
-    parser = argparse.ArgumentParser(prog="python -m weldcal.tools.emulators.ur", description=__doc__)
-    parser.add_argument("--host", default=DEFAULT, help="loopback address to listen on")
-    parser.add_argument("--control-port", type=int, default=CONTROL_PORT, help="port of the control channel")
-    parser.add_argument("--polyscope", default="5.21", help="controller version: 5.12, 5.21, 10.7 ...")
-    parser.add_argument("--robot", default="ur10e", help="the arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")
-    parser.add_argument("--kinematics", type=Path, help="a robot's factory calibration (YAML)")
-    parser.add_argument("--q", type=float, nargs=6, default=HOME, help="joint angles at the start (rad)")
-    parser.add_argument("--safety-limits", default="", help="six joint ranges LOWER:UPPER,... (deg)")
-    parser.add_argument("--operational-mode", default="none", help="none, manual or automatic")
-    parser.add_argument("--pace", type=float, default=1.0, help="controller seconds per host second, 0.05 to 1")
-    parser.add_argument("--lockstep", type=float, default=0.0, help="seconds for which time waits for a late client")
-    parser.add_argument("--seed", type=int, default=0, help="everything random follows from this number")
-    parser.add_argument("--parent", type=int, help="end when this process ends")
+    parser = argparse.ArgumentParser(
+        prog="python -m weldcal.tools.emulators.ur",
+        description=run_emulator.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    kinds: dict[str, dict[str, Any]] = {
+        "q": {"type": float, "nargs": 6},
+        "kinematics": {"type": Path},
+        "parent": {"type": int},
+    }
+    for name, known in inspect.signature(run_emulator).parameters.items():
+        if name != "ready":
+            kind = kinds.get(name, {"type": type(known.default)})
+            parser.add_argument(f"--{name.replace('_', '-')}", default=known.default, **kind)
     options = parser.parse_args()
 
     def ready(sentence: str) -> None:

@@ -140,9 +140,15 @@ def emulator_process(
     ports = (*PORTS, control_port)
     with take_address(host, wait_for_lock_s) if host is not None else free_address(ports) as address:
         command = [sys.executable, "-m", "weldcal.tools.emulators.ur", "--parent", str(os.getpid()), "--host", address]
-        command += ["--control-port", str(control_port), "--polyscope", polyscope, "--robot", robot]
-        command += [f"--safety-limits={safety_limits}", "--operational-mode", operational_mode]
-        command += ["--pace", str(pace), "--lockstep", str(lockstep), "--seed", str(seed)]
+        given = {
+            "control-port": control_port,
+            "polyscope": polyscope,
+            "robot": robot,
+            "pace": pace,
+            "lockstep": lockstep,
+        }
+        given |= {"seed": seed, "safety-limits": safety_limits, "operational-mode": operational_mode}
+        command += [f"--{name}={value}" for name, value in given.items()]
         if q is not None:
             command += ["--q", *(repr(float(angle)) for angle in q)]
         if kinematics is not None:

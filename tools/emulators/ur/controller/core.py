@@ -82,12 +82,11 @@ class Controller(ControllerState):
             self.tell(ScriptStopped(str(error), error.line, error.column))
             return False
         self.script_count += 1
-        if program.kind == "sec" and len(self.sidekicks) >= MOST_SIDEKICKS:
-            self.note("program ignored: too many secondary programs run")
-            return False
         if program.kind == "sec":
-            self.sidekicks.append(program)
-            return True
+            if taken := len(self.sidekicks) < MOST_SIDEKICKS:
+                self.sidekicks.append(program)
+            self.note(f"secondary program {'started' if taken else 'ignored, too many run'}: {program.name}")
+            return taken
         self._drop_program()
         self.program, self.program_name = program, program.name
         self.runtime_state = RuntimeState.PLAYING
@@ -133,10 +132,9 @@ class Controller(ControllerState):
         self.inputs, self.outputs = Registers(), Registers()
         self.terminals.digital_outputs = 0
         self.terminals.analog_outputs = [0.0, 0.0]
-        for kept in (self.terminals.runstate, self.terminals.analog_runstate):
+        t = self.terminals
+        for kept in (t.runstate, t.analog_runstate, t.foreign, t.analog_foreign):
             kept.clear()
-        self.terminals.foreign.clear()
-        self.terminals.analog_foreign.clear()
         self.robot_mode, self.safety_mode = RobotMode.POWER_OFF, SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.timestamp = 0.0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
-from weldcal.tools.emulators.ur.controller.contact import ForceSensor, Surroundings
+from weldcal.tools.emulators.ur.controller.compliance import ForceSensor, Surroundings
 from weldcal.tools.emulators.ur.controller.events import ErrorCode, Event, SafetyChanged
 from weldcal.tools.emulators.ur.controller.modes import MOVING, POWERLESS, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S

@@ -22,10 +22,10 @@ from weldcal.tools.emulators.ur.script.syntax import ScriptError
 SLOW = 5000  # effort of inverse kinematics and of dynamics
 
 
-def six(values: Any, what: str) -> Array:
-    """Six finite numbers out of a script; raises ScriptError where they are not."""
-    if not isinstance(values, list) or len(values) != 6:
-        raise ScriptError(f"{what} needs six numbers, it got {values!r}.")
+def six(values: Any, what: str, count: int = 6) -> Array:
+    """Six finite numbers out of a script, or as many as `count`; raises ScriptError where they are not."""
+    if not isinstance(values, list) or len(values) != count:
+        raise ScriptError(f"{what} needs {count} numbers, it got {values!r}.")
     array = np.array(values, dtype=np.float64)
     if not np.isfinite(array).all():
         raise ScriptError(f"{what} got a number that is not finite.")
@@ -76,8 +76,10 @@ CALCULATIONS: dict[str, Callable[..., Any]] = {
     "r2d": lambda r: math.degrees(r),
     "pow": math.pow,
     "inv": lambda m: Pose(pose_of(inverse(matrix(m)))) if isinstance(m, Pose) else np.linalg.inv(m).tolist(),
-    "rpy2rotvec": lambda rpy_vector: rotation_vector(_turned(rpy_vector).ToRotationMatrix().matrix()).tolist(),
-    "rotvec2rpy": lambda rotation_vector: _rpy(rotation_vector),
+    "rpy2rotvec": lambda rpy_vector: rotation_vector(RollPitchYaw(rpy_vector).ToRotationMatrix().matrix()).tolist(),
+    "rotvec2rpy": lambda rotation_vector: (
+        RollPitchYaw(RotationMatrix(rotation_matrix(rotation_vector))).vector().tolist()
+    ),
     "floor": lambda f: math.floor(f),
     "ceil": lambda f: math.ceil(f),
     "log": lambda b, f: math.log(f, b),
@@ -200,15 +202,6 @@ class Answers:
         if isinstance(pose, Pose):
             return self._inverse(pose, None) is not None
         return _inside(self._controller.arm.model, six(pose, "is_within_safety_limits"))
-
-
-def _turned(rpy: Any) -> RollPitchYaw:
-    return RollPitchYaw(*(float(angle) for angle in rpy))
-
-
-def _rpy(vector: Any) -> list[float]:
-    R = RotationMatrix.ProjectToRotationMatrix(rotation_matrix(vector))
-    return [float(angle) for angle in RollPitchYaw(R).vector()]
 
 
 def _inside(model: ArmModel, q: Array) -> bool:

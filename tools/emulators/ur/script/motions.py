@@ -14,8 +14,10 @@ from weldcal.tools.emulators.ur.controller.motions import (
     Servo,
     Stop,
     ToolVelocity,
+    arc_path,
+    joint_path,
+    tool_path,
 )
-from weldcal.tools.emulators.ur.controller.paths import arc_path, joint_path, tool_path
 from weldcal.tools.emulators.ur.controller.poses import matrix
 from weldcal.tools.emulators.ur.script.answers import positive, six
 from weldcal.tools.emulators.ur.script.arithmetic import Pose

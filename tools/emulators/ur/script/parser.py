@@ -218,9 +218,9 @@ class _Parser:
     def primary(self) -> Expression:
         token = self.take()
         if token.kind == "number":
-            if (value := float(token.text)) >= LARGEST and (token.text.isdigit() or value == math.inf):
+            if (number := float(token.text)) >= LARGEST and (token.text.isdigit() or number == math.inf):
                 raise ScriptError(f"Line {token.line}: {token.text[:20]}... is too large.", token.line, token.column)
-            return syntax.Literal(int(token.text) if token.text.isdigit() else value)
+            return syntax.Literal(int(token.text) if token.text.isdigit() else number)
         if token.kind == "text":
             return syntax.Literal(token.text[1:-1])
         if token.text in ("True", "False"):

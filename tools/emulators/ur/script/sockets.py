@@ -1,4 +1,4 @@
-"""URScript socket functions: the script is a client on loopback and waits frame by frame."""
+"""URScript functions that speak: to people and clients of the primary port, and as a client of sockets on loopback."""
 
 import math
 import re
@@ -8,9 +8,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from weldcal.tools.emulators.ur.controller.events import Popup, Text
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.script.compiler import Slices
-from weldcal.tools.emulators.ur.script.messages import Messages
+from weldcal.tools.emulators.ur.script.forces import Forces
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 from weldcal.tools.emulators.ur.script.texts import text_of
 
@@ -46,8 +47,28 @@ class ScriptSocket:
         self._socket.close()
 
 
-class Sockets(Messages):
+class Sockets(Forces):
     """Sockets belong to their program and close with it; reads answer 0 values, then nan or -1, when time runs out."""
+
+    def textmsg(self, s1: Any, s2: Any = "") -> None:
+        text = text_of(s1) + text_of(s2)
+        self._controller.note(f"script: {text}")
+        self._controller.tell(Text(text))
+
+    def popup(
+        self, s: Any, title: str = "Popup", warning: bool = False, error: bool = False, blocking: bool = False
+    ) -> Slices:
+        """One that blocks waits until a person closes it: the dashboard's `close popup`."""
+        c = self._controller
+        c.note(f"popup: {title}: {text_of(s)}")
+        c.tell(Popup(text_of(s), text_of(title), warning, error, blocking))
+        c.popup_open = blocking
+        while blocking and c.popup_open:
+            yield
+
+    def protective_stop(self) -> None:
+        """The program stands still from its next frame on; one that has nothing left to do ends."""
+        self._controller.protective_stop("a protective stop was triggered", code=209)
 
     def socket_open(self, address: str, port: int, socket_name: str = NAME) -> Slices:
         # so that the other side sees the connections of a script in their order, as over a network
@@ -122,14 +143,15 @@ class Sockets(Messages):
         return [len(found), *found] if len(found) == number else [0, *[math.nan] * int(number)]
 
     def socket_read_binary_integer(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
-        size = 4 * _count(number)
-        data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
-        return [int(number), *struct.unpack(f">{int(number)}i", data)] if data else [0, *[-1] * int(number)]
+        return (yield from self._numbers(_count(number), "i", socket_name, timeout))
 
     def socket_read_byte_list(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
-        size = _count(number)
-        data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
-        return [size, *data] if data else [0, *[-1] * size]
+        return (yield from self._numbers(_count(number), "B", socket_name, timeout))
+
+    def _numbers(self, number: int, code: str, name: str, timeout: float) -> Slices:
+        size = struct.calcsize(f">{number}{code}")
+        data = yield from self._read(name, timeout, lambda inbox: size * (len(inbox) >= size))
+        return [number, *struct.unpack(f">{number}{code}", data)] if data else [0, *[-1] * number]
 
     def _send(self, data: bytes, name: str) -> bool:
         opened = self._program.sockets.get(name)

@@ -9,15 +9,15 @@ import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.checker import Checker
-from weldcal.tools.emulators.ur.controller.contact import ForceSensor, Surroundings
+from weldcal.tools.emulators.ur.controller.compliance import ForceSensor, Surroundings
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.lockstep import Lockstep
 from weldcal.tools.emulators.ur.wire.dashboard import IDLE_PROGRAM
-from weldcal.tools.emulators.ur.wire.external_control import CLIENT_PORT, ExternalControl
 from weldcal.tools.emulators.ur.wire.net import Connection, LinkFaults, Network, Server
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
+from weldcal.tools.emulators.ur.wire.script_ports import CLIENT_PORT, ExternalControl
 
 Request = Mapping[str, Any]
 LARGEST = 1e9  # of the numbers that a request may hold
@@ -90,8 +90,8 @@ class ControlServer(Server):
             "refuse_upload": lambda r, now: setattr(c, "refuse_upload", bool(r.get("on", True))),
             "slow_start": lambda r, now: setattr(c, "start_delay_s", _number(r, "seconds")),
             "tracking_lag": lambda r, now: setattr(c.arm, "lag_s", _number(r, "seconds")),
-            "wrong_tcp": lambda r, now: c.set_tcp(_six(r, "pose", [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])),
-            "set_q": lambda r, now: c.arm.displace(np.array(_six(r, "q"))),
+            "wrong_tcp": lambda r, now: c.set_tcp(_several(r, "pose", 6, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])),
+            "set_q": lambda r, now: c.arm.displace(np.array(_several(r, "q", 6))),
             "wrong_number": self._wrong_number,
             "tool_contact": lambda r, now: setattr(c, "tool_contact_steps", int(_number(r, "n", 1))),
         }
@@ -107,8 +107,8 @@ class ControlServer(Server):
             "unlock": lambda r, now: _required(c.unlock_protective_stop(), "the protective stop is younger than 5 s"),
             "power_on": lambda r, now: c.release_brakes(),
             "external_control": self._external_control,
-            "set_tcp": lambda r, now: c.set_tcp(_six(r, "pose")),
-            "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
+            "set_tcp": lambda r, now: c.set_tcp(_several(r, "pose", 6)),
+            "set_q": lambda r, now: c.arm.place(np.array(_several(r, "q", 6))),
             "set_payload": self._payload,
             "set_digital_in": self._digital_input,
             "set_gravity": lambda r, now: setattr(c, "gravity", _several(r, "gravity", 3)),
@@ -122,6 +122,21 @@ class ControlServer(Server):
             "note_fault": lambda r, now: checker.fault(str(r["what"]), now),
             "reset_checker": lambda r, now: checker.reset(),
             "quit": lambda r, now: setattr(self._world, "quit", True),
+        }
+        self._checks: dict[str, Callable[[Request], dict[str, Any]]] = {
+            "at_rest_after": lambda r: checker.at_rest_after(
+                _number(r, "fault_time"), _number(r, "within", 0.3), _number(r, "speed", 1e-3)
+            ),
+            "output_after": lambda r: checker.output_after(_number(r, "fault_time"), int(_number(r, "output"))),
+            "output_on_after": lambda r: checker.output_on_after(_number(r, "fault_time"), int(_number(r, "output"))),
+            "summary": lambda r: checker.summary(),
+        }
+        self._questions: dict[str, Callable[[Request], dict[str, Any]]] = {
+            "state": lambda r: c.state() | {"overruns": world.overruns, "lockstep": lockstep.state()},
+            "time": lambda r: {"timestamp": c.timestamp},
+            "log": lambda r: {"log": list(c.log)},
+            "program": lambda r: {"source": c.program.source if c.program else None},
+            "connections": lambda r: {"connections": [link.kind for link in network.of_kind("all")]},
         }
 
     def arrived(self, connection: Connection, data: bytes, now: float) -> None:
@@ -140,43 +155,17 @@ class ControlServer(Server):
             return {"ok": False, "time": now, "error": str(error) or type(error).__name__}
 
     def _act(self, request: Request, now: float) -> dict[str, Any]:
-        if "fault" in request:
-            name = str(request["fault"])
-            if name not in self._faults:
-                raise InputError(f"There is no fault {name!r}; choose one of: {', '.join(sorted(self._faults))}.")
-            self._faults[name](request, now)
-            if request.get("latch", True):
-                self._checker.fault(name, now)
-            return {}
-        if "do" in request:
-            name = str(request["do"])
-            if name not in self._actions:
-                raise InputError(f"There is no action {name!r}; choose one of: {', '.join(sorted(self._actions))}.")
-            self._actions[name](request, now)
-            return {}
-        if request.get("check") == "at_rest_after":
-            return self._checker.at_rest_after(
-                _number(request, "fault_time"), _number(request, "within", 0.3), _number(request, "speed", 1e-3)
-            )
-        if request.get("check") == "output_after":
-            return self._checker.output_after(_number(request, "fault_time"), int(_number(request, "output")))
-        if request.get("check") == "output_on_after":
-            return self._checker.output_on_after(_number(request, "fault_time"), int(_number(request, "output")))
-        if request.get("check") == "summary":
-            return self._checker.summary()
-        if request.get("ask") == "state":
-            return self._controller.state() | {
-                "overruns": self._world.overruns,
-                "lockstep": self._lockstep.state(),
-            }
-        if request.get("ask") == "time":
-            return {"timestamp": self._controller.timestamp}
-        if request.get("ask") == "log":
-            return {"log": list(self._controller.log)}
-        if request.get("ask") == "program":
-            return {"source": self._controller.program.source if self._controller.program else None}
-        if request.get("ask") == "connections":
-            return {"connections": [c.kind for c in self._network.of_kind("all")]}
+        for kind, known in (("fault", self._faults), ("do", self._actions)):
+            if kind in request:
+                if (name := str(request[kind])) not in known:
+                    raise InputError(f"There is no {kind} {name!r}; choose one of: {', '.join(sorted(known))}.")
+                known[name](request, now)
+                if kind == "fault" and request.get("latch", True):
+                    self._checker.fault(name, now)
+                return {}
+        for kind, questions in (("check", self._checks), ("ask", self._questions)):
+            if request.get(kind) in questions:
+                return questions[request[kind]](request)
         raise InputError(
             "Send fault, do, check (at_rest_after, output_after, output_on_after, summary) or ask (state, log, program, connections)."
         )
@@ -324,10 +313,6 @@ def _count(request: Request, key: str, count: int) -> int:
     if request.get(key) not in range(count):
         raise InputError(f"Give a number from 0 to {count - 1} as {key!r}.")
     return int(request[key])
-
-
-def _six(request: Request, key: str, default: list[float] | None = None) -> list[float]:
-    return _several(request, key, 6, default)
 
 
 def _several(request: Request, key: str, count: int, default: list[float] | None = None) -> list[float]:
