@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -360,3 +361,22 @@ def test_a_function_that_is_missing_is_named_by_the_compiler(name: str) -> None:
 
 def test_the_functions_that_are_missing_are_as_many_as_the_page_says() -> None:
     assert len(named_on_the_page("refused")) == len(set(named_on_the_page("refused"))) > 80
+
+
+def test_a_flood_of_messages_does_not_end_its_reader() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5.0)
+        made = controller()
+        reads = 'while True:\na = socket_read_binary_integer(1, "g")\nn = n + 1\nend'
+        body = f'global n = 0\nsocket_open("127.0.0.1", {server.getsockname()[1]}, "g")\n{reads}'
+        assert made.start(f"def flooded():\n{body}\nend\n"), made.log
+        for _ in range(6):
+            made.step()
+        wire, _ = server.accept()
+        with wire:
+            wire.setblocking(False)
+            for _ in range(20):
+                with suppress(BlockingIOError):
+                    wire.send(b"\0" * 40_000)
+                made.step()
+            assert made.program is not None, made.log

@@ -10,6 +10,7 @@ from typing import Any
 
 from weldcal.tools.emulators.ur.controller.events import Popup, Text
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.script.arithmetic import EFFORT, Effort
 from weldcal.tools.emulators.ur.script.compiler import Slices
 from weldcal.tools.emulators.ur.script.forces import Forces
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
@@ -169,6 +170,8 @@ class Sockets(Forces):
             if length > 0:
                 data = bytes(opened.inbox[:length])
                 del opened.inbox[:length]
+                if 2 * Effort.left < EFFORT:
+                    yield  # a client that sends faster than its program reads costs the program frames, and does not end it
                 return data
             if timeout > 0.0 and frames * STEP_S >= timeout:
                 return b""
