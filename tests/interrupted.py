@@ -1,6 +1,6 @@
 """Ends a command at a random moment, as Ctrl-C in its terminal or as SIGTERM, and judges what it leaves.
 
-python -m tests.interrupted [TIMES] [SEED]     prints one line for each time that is not as it should be, and the counts
+python -m tests.interrupted [TIMES] [SEED] [LONGEST_S]     prints one line for each time that is not as it should be, and the counts
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from weldcal.tools.worlds.fleet_cells import write_cell
 STARTED = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]  # as tools/run does
 MARK = "WELDCAL_INTERRUPTED"
 ENDS_S = 30.0
-LONGEST_S = 12.0
 GONE_S = 6.0
 ERRORS = ("Traceback", "Internal error", "Exception ignored", "KeyboardInterrupt", "Error in", "terminate called")
 
@@ -159,8 +158,8 @@ def commands(dataset: Path, moves: Path, scenario: Path) -> dict[str, list[str]]
     }
 
 
-def main(times: int, seed: int) -> int:
-    """Ends commands at random moments; returns the number of faults."""
+def main(times: int, seed: int, longest_s: float) -> int:
+    """End commands at random moments, half of them within the first 3 s; returns the number of faults."""
     rng, faults, codes = random.Random(seed), 0, Counter[str]()
     with tempfile.TemporaryDirectory() as place:
         moves, scenario, dataset = (Path(place) / name for name in ("moves.yaml", "short.yaml", "dataset"))
@@ -172,7 +171,7 @@ def main(times: int, seed: int) -> int:
             name = rng.choice(list(all_of))
             number = rng.choice([signal.SIGINT, signal.SIGTERM])
             ended = end_after(
-                all_of[name], rng.uniform(0.0, rng.choice([3.0, LONGEST_S])), number, Path(place) / f"run-{k}"
+                all_of[name], rng.uniform(0.0, rng.choice([3.0, longest_s])), number, Path(place) / f"run-{k}"
             )
             codes[f"{name} {number.name}: {ended.code}"] += 1
             for fault in ended.faults:
@@ -184,6 +183,5 @@ def main(times: int, seed: int) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(
-        min(main(int(sys.argv[1]) if len(sys.argv) > 1 else 200, int(sys.argv[2]) if len(sys.argv) > 2 else 0), 1)
-    )
+    given = [*sys.argv[1:], *("200", "0", "12")[len(sys.argv) - 1 :]]
+    raise SystemExit(min(main(int(given[0]), int(given[1]), float(given[2])), 1))

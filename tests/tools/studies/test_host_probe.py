@@ -34,7 +34,8 @@ def test_every_core_is_watched_and_a_pause_is_seen() -> None:
     job.add(20.0, begin - 10.0)  # long before
     job.add(5.0, begin + 0.5 * (end - begin))  # too little late to be judged
     assert job.over(8.0) == 2
-    assert job.shared_with(late, 8.0) == 1
+    assert host.caused([job]) == 1
+    assert host.judged([job]) == "2 of 3 velocities over 8 ms late, 1 of them by this computer itself"
 
 
 def test_the_probes_end_with_the_watch() -> None:

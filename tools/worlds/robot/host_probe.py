@@ -6,7 +6,7 @@ A module of its own: its processes import it, and must be ready within seconds o
 import contextlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -33,6 +33,15 @@ class HostLateness:
             f"{late.on_time_percent:.3f} % of {sum(late.counts)} wake-ups of a program above all others under 4 ms, "
             f"{late.over(8.0)} over 8 ms, latest {late.worst_ms:.1f} ms"
         )
+
+    def caused(self, jobs: Sequence[Lateness]) -> int:
+        """How many velocities of these jobs were over 8 ms late while the program above all others was not woken up in time either."""
+        return sum(job.shared_with(self.lateness, 8.0) for job in jobs)
+
+    def judged(self, jobs: Sequence[Lateness]) -> str:
+        """How many velocities of these jobs were over 8 ms late, and for how many this computer itself was the cause."""
+        late, all_of = sum(job.over(8.0) for job in jobs), sum(sum(job.counts) for job in jobs)
+        return f"{late} of {all_of} velocities over 8 ms late, {self.caused(jobs)} of them by this computer itself"
 
     def summary(self) -> dict[str, object]:
         """The JSON object."""
