@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:  # what is not loaded before the handlers are there cannot be interrupted
     import subprocess
@@ -23,10 +23,15 @@ SIGTERM = "SIGTERM"
 _BEFORE = 0  # the program imports and reads its arguments: it ends at once
 _WORK = 1  # KeyboardInterrupt is raised
 _AFTER = 2  # the outcome is known: it is printed first
-_time = _BEFORE
-_deferred = 0  # depth of the blocks in which a signal waits
-_waiting: set[int] = set()
-_count = 0
+
+
+class _Now:
+    """What the handler must know."""
+
+    time = _BEFORE
+    deferred = 0  # depth of the blocks in which a signal waits
+    waiting: ClassVar[set[int]] = set()
+    count = 0
 
 
 def answer_signals() -> None:
@@ -44,34 +49,32 @@ def ignore_signals() -> None:
 
 def received() -> bool:
     """Whether a signal has come. A library in C may make another exception of the KeyboardInterrupt."""
-    return _count > 0
+    return _Now.count > 0
 
 
 @contextmanager
 def work() -> Iterator[None]:
     """The work of a command: a signal raises KeyboardInterrupt within the block; after it, the outcome is printed first."""
-    global _time
-    _time = _WORK
+    _Now.time = _WORK
     try:
         yield
     finally:
-        _time = _AFTER
+        _Now.time = _AFTER
 
 
 @contextmanager
 def deferred() -> Iterator[None]:
     """Let signals wait until the end of the block. A process that is started within it never gets a Ctrl-C of the terminal."""
-    global _deferred
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a started process inherits this
-    _deferred += 1
+    _Now.deferred += 1
     try:
         yield
     finally:
-        _deferred -= 1
+        _Now.deferred -= 1
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if not _deferred:
-            for number in tuple(_waiting):
-                _waiting.discard(number)
+        if not _Now.deferred:
+            for number in tuple(_Now.waiting):
+                _Now.waiting.discard(number)
                 os.kill(os.getpid(), number)
 
 
@@ -84,20 +87,19 @@ def started(*arguments: Any, **named: Any) -> subprocess.Popen[Any]:
 
 
 def _handle(number: int, _: object) -> None:
-    global _count
-    if _deferred:
-        _waiting.add(number)
+    if _Now.deferred:
+        _Now.waiting.add(number)
         return
-    _count += 1
-    if _time == _BEFORE:
+    _Now.count += 1
+    if _Now.time == _BEFORE:
         if "--json" in sys.argv:
             import json
 
             os.write(1, (json.dumps({"state": "failed", "reason": NOTHING_BEGUN}) + "\n").encode())
         os.write(2, f"weldcal: {NOTHING_BEGUN}\n".encode())
-    elif _time == _WORK:
+    elif _Now.time == _WORK:
         raise KeyboardInterrupt(*([SIGTERM] if number == signal.SIGTERM else []))
-    elif _count < 3:
+    elif _Now.count < 3:
         return
     os._exit(INTERRUPTED)
 
