@@ -21,16 +21,8 @@ from rtde_receive import RTDEReceiveInterface
 
 from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.torch.set_points import Level
+from weldcal.systems.drivers.ur.wire import transport
 from weldcal.systems.drivers.ur.wire.rtde_client import RTDE_PORT, NotFinite
-from weldcal.systems.drivers.ur.wire.transport import (
-    LOOK_S,
-    NO_COMMAND,
-    SET_PAYLOAD,
-    SPEED_STOP,
-    STOP_SCRIPT,
-    VELOCITY,
-    Switch,
-)
 
 READS = 5  # of a state, until no package arrives meanwhile
 WAKES_S = 0.0005
@@ -119,11 +111,11 @@ class UrRtdeTransport:
     def send(self, *values: float) -> None:
         """See Transport. The number of a velocity is in ur_rtde's `time`, which it does not check."""
         command, *numbers = values
-        if command == VELOCITY:
+        if command == transport.VELOCITY:
             self._control.speedJ(numbers[:6], numbers[6], numbers[7])
-        elif command == STOP_SCRIPT:
+        elif command == transport.STOP_SCRIPT:
             self._control.stopScript()
-        elif command == NO_COMMAND:
+        elif command == transport.NO_COMMAND:
             self._control.kickWatchdog()
         else:
             raise ValueError(f"ur_rtde sends no command {command}")
@@ -131,9 +123,9 @@ class UrRtdeTransport:
     def once(self, until: float, *values: float) -> bool:
         """See Transport. ur_rtde waits for the answer itself, at most as long as the program runs."""
         command, *numbers = values
-        if command == SET_PAYLOAD:
+        if command == transport.SET_PAYLOAD:
             return bool(self._control.setPayload(numbers[0], numbers[1:4]))
-        if command == SPEED_STOP:
+        if command == transport.SPEED_STOP:
             return bool(self._control.speedStop(numbers[0]))
         raise ValueError(f"ur_rtde gives no command {command}")
 
@@ -147,12 +139,12 @@ class UrRtdeTransport:
             file.flush()
             self._control.setCustomScriptFile(file.name)
             while time.monotonic() < until:
-                self.wait(LOOK_S)
+                self.wait(transport.LOOK_S)
                 if started():
                     return True
         return False
 
-    def switch(self, output: int, gas: int | None, levels: Sequence[Level]) -> Switch:
+    def switch(self, output: int, gas: int | None, levels: Sequence[Level]) -> transport.Switch:
         """See Transport."""
         if levels:
             raise RobotRefused("ur_rtde cannot write the set points.")
