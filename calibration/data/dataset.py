@@ -122,10 +122,16 @@ class Dataset:
         return None if g is None else RigidTransform(unit_quaternion(g.wxyz, "scanner_guess"), g.xyz)
 
     def joints(self, names: tuple[str, ...] = JOINTS) -> dict[str, Array]:
-        """Joint angles (6,) rad by id, of poses.csv; empty where it has none. Raises DatasetError for bad numbers."""
+        """Joint angles (6,) rad by id, of poses.csv; empty where it has none. Raises DatasetError for bad or missing numbers."""
         path = self.folder / "poses.csv"
         rows = table_rows(path, ("id",)) if path.is_file() else []
-        if not all(row.get(name) for row in rows for name in names):
+        missing = [(row["id"], name) for row in rows for name in names if not row.get(name)]
+        if missing and len(missing) < len(rows) * len(names):
+            raise DatasetError(
+                f"{path} has no {missing[0][1]} of '{missing[0][0]}', although it has other joint angles. "
+                f"Add it, or remove the columns {names[0]} to {names[-1]}."
+            )
+        if missing:
             return {}
         return {row["id"]: np.array(row_numbers(row, names, path)) for row in rows}
 

@@ -19,6 +19,7 @@ PAGE = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
 EVERYWHERE = {"state", "first_screen"}
 COMMANDS = {
     "calibrate": ("`calibrate FOLDER`", "calibrate three_scans --out my-calibration"),
+    "carried": ("`calibrate FOLDER` of a scanner that an arm carries", "calibrate my_wrist_scans --out carried"),
     "verify": ("`verify RESULT FOLDER`", "verify my-calibration other_scans"),
     "verify pairs": ("`verify RESULT PAIRS`", "verify eMc.yaml pairs.npz"),
     "import": ("`import`", "import samples.npz"),

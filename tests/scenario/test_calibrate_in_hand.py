@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
@@ -17,12 +19,13 @@ from tests.documents.scans import WRIST_POSES, write_wrist_scans
 from tests.documents.scans import X_FC as X_WRIST
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
-from weldcal.calibration.errors import DatasetError, UndeterminedPoses
+from weldcal.calibration.errors import DatasetError, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.motion.estimate import estimate_in_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import ROBOT, Moves, closed_moves, recorded_stream
 from weldcal.models.arms.chain import chain_inverse, load_chain
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
@@ -152,3 +155,38 @@ def test_scans_at_rest_of_the_foot_place_a_scanner_on_the_wrist(tmp_path: Path, 
     assert result.correction.scale == pytest.approx(1.0 / scale, abs=3e-4)
     assert result.held_out.rms_translation < 1e-4
     assert report.first.verdict == "use it"
+
+
+def test_a_wrong_guess_is_named_with_its_distance(tmp_path: Path) -> None:
+    folder = write_wrist_scans(tmp_path / "scans")
+    header = yaml.safe_load((folder / "dataset.yaml").read_text())
+    header["scanner_guess"]["xyz"][0] += 0.3
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
+    with pytest.raises(
+        TooFewPoses, match=r"a circle lies \d+ mm .* or write radius_m: 0.25 in scanner_guess"
+    ) as caught:
+        calibrate_carried(folder, tmp_path / "out")
+    off = int(re.findall(r"lies (\d+) mm", str(caught.value))[0])
+    assert 270 <= off <= 330
+    header["scanner_guess"]["radius_m"] = 0.25
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
+    report = calibrate_carried(folder, tmp_path / "out")
+    assert report.result is not None
+    assert np.linalg.norm(report.result.X.translation() - X_WRIST.translation()) < 2e-4
+
+
+def test_a_missing_joint_angle_is_named(tmp_path: Path) -> None:
+    folder = write_wrist_scans(tmp_path / "scans")
+    first, *rows = (folder / "poses.csv").read_text().splitlines()
+    lines = [f"{first},q1,q2,elbow,q4,q5,q6", *(f"{row},0.1,0.1,0.1,0.1,0.1,0.1" for row in rows)]
+    (folder / "poses.csv").write_text("\n".join(lines))
+    with pytest.raises(DatasetError, match="has no q3 of '"):
+        calibrate_carried(folder, tmp_path / "out")
+
+
+def test_a_link_that_does_not_carry_the_scanner_is_refused(tmp_path: Path) -> None:
+    folder = write_wrist_scans(tmp_path / "scans")
+    header = yaml.safe_load((folder / "dataset.yaml").read_text()) | {"scanner_link": "forearm"}
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
+    with pytest.raises(InputError, match="Remove scanner_link"):
+        calibrate_carried(folder, tmp_path / "out")

@@ -1,8 +1,10 @@
 """Runs `weldcal hand-eye live`, a calibration in any mounting, and `weldcal calibrate` on its recorded scans."""
 
+import contextlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +25,7 @@ from weldcal.calibration.planning.mounting_estimate import (
     SeenCircle,
     expected_error,
     fewest,
+    off_prediction,
     see_circle,
     solve_mounting,
 )
@@ -47,6 +50,8 @@ from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 
 _HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])  # joints that a dataset does not state are taken near these
+_WIDER_M = 0.25  # radius of the search about a guess that may be wrong
+_TRIED_AGAIN = 3  # scans
 _SAME = 1e-4  # m, and as a matrix: what a controller rounds
 
 
@@ -196,10 +201,7 @@ def calibrate_carried(
         if again or not left or result is None:
             break
     if result is None:
-        why = "; ".join(f"{id}: {text}" for id, text in list(refused.items())[:3])
-        raise TooFewPoses(
-            f"Only {len(seen)} scans show the circle, and {fewest(scene)} are needed. {f'Refused: {why}' if why else ''}".strip()
-        )
+        raise TooFewPoses(_too_few(data, scene, joints, circle, len(seen), refused))
     progress("cross-validating", 0.8)
     report = recorded_report(
         scene, seen, tuple(refused.items()), limit_mm=limit_mm, started=started, folder=out,
@@ -207,6 +209,31 @@ def calibrate_carried(
     )  # fmt: skip
     write_mounting(report)
     return report
+
+
+def _too_few(
+    data: Dataset,
+    scene: MountingScene,
+    joints: Mapping[str, tuple[Array, Array | None]],
+    circle: Circle,
+    seen: int,
+    refused: Mapping[str, str],
+) -> str:
+    """The sentence where too few scans show the circle; a wider search says how far off the guess is."""
+    begin = f"{seen} scan{'' if seen == 1 else 's'} show the circle, and {fewest(scene)} are needed."
+    for id in list(refused)[:_TRIED_AGAIN]:
+        with contextlib.suppress(FlangeNotFound, CloudError):
+            found = see_circle(data.cloud(id), scene, id, *joints[id], replace(circle, guess_radius_m=_WIDER_M))
+            off, turn = off_prediction(scene, found, None)
+            return (
+                f"{begin} In '{id}' a circle lies {1e3 * off:.0f} mm and {np.degrees(turn):.0f} degrees from where dataset.yaml "
+                f"expects it. Correct scanner_guess or configuration, or write radius_m: {_WIDER_M} in scanner_guess."
+            )
+    why = "; ".join(f"{id}: {text}" for id, text in list(refused.items())[:3])
+    return (
+        f"{begin} {f'Refused: {why}' if why else ''} Record more scans that show the whole circle, or check configuration and "
+        "scanner_guess in dataset.yaml."
+    )
 
 
 def recorded_report(
@@ -245,6 +272,11 @@ def recorded_scene(data: Dataset, robot: str, flange: str) -> tuple[MountingScen
     if on_arm and header.scanner_link not in LINKS[:-1]:
         raise InputError(
             f"dataset.yaml must name the link that carries the scanner: scanner_link, one of {', '.join(LINKS[:-1])}."
+        )
+    if header.scanner_link and not on_arm:
+        raise InputError(
+            f"dataset.yaml has scanner_link: {header.scanner_link}, but with the configuration {header.configuration} the "
+            f"flange carries the scanner. Remove scanner_link, or write a configuration that begins with eye_on_arm."
         )
     second = header.second_robot
     if (second is not None) != (header.configuration == "co_manipulation"):
