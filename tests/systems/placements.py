@@ -1,6 +1,8 @@
 """Random placements of part, tool and arm: whether the path check accepts them, and how the arm then follows the seam."""
 
 import math
+import sys
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -170,3 +172,22 @@ def offered(seed: int) -> str:
     except InfeasiblePath as problem:
         return str(problem)
     return ""
+
+
+def main(first: int, last: int) -> None:
+    """Print how many placements of the seeds first to last - 1 are accepted and refused, how the drives end, and what disagrees."""
+    ends: Counter[tuple[str, str]] = Counter()
+    for seed in range(first, last):
+        row = placed(seed)
+        ends[row["state"], row["end"]] += 1
+        if (row["state"], row["end"]) in [
+            ("refused", "done"),
+            *(("accepted", end) for end in ("guard", "joint limit", "slowed", "fault")),
+        ]:
+            print(seed, row)
+    for (state, end), count in sorted(ends.items()):
+        print(f"{state:10} {end or 'not driven':12} {count}")
+
+
+if __name__ == "__main__":
+    main(*(int(word) for word in sys.argv[1:3]))

@@ -11,10 +11,10 @@ import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.planning.clearance import arm_bodies, path_clearance
+from weldcal.calibration.planning.clearance import arm_bodies, path_clearance, self_distance
 from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart
@@ -219,13 +219,15 @@ def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsew
     moves = [("on its way to the seam", home, way.q_above), ("on its way from the seam", way.q_retract, home)]
     weld = [(f"at {1e3 * seam.along[b]:.0f} mm of the seam", seam.q[a], seam.q[b]) for a, b in pairwise(places)]
     ends = [("above the seam", way.q_above, way.q_start), ("above the seam's end", seam.q[-1], way.q_retract)]
+    # the arm stands at home: as far as its capsules overlap there, they are larger than its bodies
+    least = min(0.0, self_distance(bodies, link_frames(arm, home)))
     part = Surroundings()
     if X_BP is not None and welder.workpiece is not None:
         part = Surroundings((Obstacle("part", welder.workpiece.mesh.transformed(X_BP), CLEAR_OF_PART_M),))
     for move in (*moves, *ends, *weld):
         where, a, b = move
         lowest, gap = path_clearance(arm, bodies, a, b)
-        name = welder.surroundings.touched_on_path(arm, bodies, a, b) or ("the arm itself" if gap <= 0.0 else "")
+        name = welder.surroundings.touched_on_path(arm, bodies, a, b) or ("the arm itself" if gap < least else "")
         if not name and elsewhere and move in moves and lowest <= welder.table_z_m:
             name = "the table"
         if name:
