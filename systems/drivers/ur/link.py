@@ -34,6 +34,10 @@ HEARTBEAT_LIMIT_S = 0.15
 PLAYING, PAUSING, PAUSED = 2, 3, 4
 
 
+class StartFailed(RobotRefused):
+    """The worker process ended, or did not start in time; nothing has moved."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinkState:
     """The worker's newest state. Times in s of the host's monotonic clock, except `robot_time` (the controller's clock)."""
@@ -142,7 +146,7 @@ class UrLink:
             time.sleep(0.01)
         said = link._said()
         link._end()
-        raise RobotRefused(sentence(Fault.START_FAILED) + (f" It said: {said}" if said else ""))
+        raise StartFailed(sentence(Fault.START_FAILED) + (f" It said: {said}" if said else ""))
 
     def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
         """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number. Never blocks."""

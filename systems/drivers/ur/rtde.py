@@ -1,6 +1,9 @@
 """Driver of a UR robot: reads the link in an update event and sends in a publish event."""
 
+import contextlib
 import dataclasses as dc
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,11 +18,13 @@ from weldcal.systems.addresses import controller_address, is_loopback
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
-from weldcal.systems.drivers.ur.link import UrLink, status_of
+from weldcal.systems.drivers.ur.faults import RobotRefused
+from weldcal.systems.drivers.ur.link import StartFailed, UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.supervisor import Limits
 from weldcal.systems.drivers.ur.torch.set_points import SETTLES_S, AnalogSetPoint, levels_of
+from weldcal.systems.drivers.ur.wire.dashboard import stop_program
 from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose, installed, taken
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.wall_clock import WallClock
@@ -208,6 +213,22 @@ def chosen_transport(config: UrRtde, version: tuple[int, ...], upper: bool) -> t
     return name, why
 
 
+def start_link(start: Callable[..., UrLink], config: UrRtde, transport: str, why: str) -> tuple[UrLink, str]:
+    """The link over this transport, and why over this one: where `auto` took ur_rtde and it does not start, native follows.
+
+    Raises:
+        RobotRefused: the link does not start.
+    """
+    try:
+        return start(transport=transport), why
+    except StartFailed:
+        if config.transport != AUTO or transport != UR_RTDE:
+            raise
+    with contextlib.suppress(RobotRefused):
+        stop_program(config.host)  # of the guard, which may run
+    return start(transport=NATIVE), "Transport native: ur_rtde did not start."
+
+
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not move.
 
@@ -253,7 +274,8 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         raise RuntimeError("the pre-flight passed without the robot's kinematics")
     transport, why = chosen_transport(config, report.version or (), report.upper_registers)
     x, y, z = config.payload_cog_m
-    link = UrLink.start(
+    start = partial(
+        UrLink.start,
         config.host,
         arm,
         config.limits(arm),
@@ -268,8 +290,8 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         gas_before_s=config.gas_before_s,
         gas_after_s=config.gas_after_s,
         levels=levels,
-        transport=transport,
     )
+    link, why = start_link(start, config, transport, why)
     clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
     return PreparedRobot(arm, link.state().q, link, clock, config.lockstep, why)
 

@@ -9,6 +9,8 @@ import pytest
 
 from tests.ur_rtde import NEEDS_UR_RTDE
 from weldcal.models.errors import InputError
+from weldcal.systems.drivers.ur import rtde
+from weldcal.systems.drivers.ur.link import StartFailed
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import UrRtde, chosen_transport
 from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
@@ -115,3 +117,26 @@ def test_no_command_of_ur_rtde_waits_for_a_package() -> None:
     with emulator_process() as emulator:
         done = subprocess.run([sys.executable, "-c", code, emulator.host], capture_output=True, text=True, timeout=60)
     assert done.stdout == "0", "connections with Nagle's algorithm"
+
+
+@pytest.mark.parametrize("wanted", ["auto", "ur_rtde"])
+def test_auto_starts_natively_where_ur_rtde_does_not_start(wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[str] = []
+
+    def start(transport: str) -> str:
+        tried.append(transport)
+        if transport == "ur_rtde":
+            raise StartFailed("the worker ended")
+        return "a link"
+
+    stopped: list[str] = []
+    monkeypatch.setattr(rtde, "stop_program", stopped.append)
+    config = UrRtde(host="127.0.0.1", transport=wanted)
+    if wanted == "ur_rtde":
+        with pytest.raises(StartFailed):
+            rtde.start_link(start, config, "ur_rtde", "")
+        assert (tried, stopped) == (["ur_rtde"], [])
+        return
+    link, why = rtde.start_link(start, config, "ur_rtde", "")
+    assert (link, why) == ("a link", "Transport native: ur_rtde did not start.")
+    assert (tried, stopped) == (["ur_rtde", "native"], ["127.0.0.1"])
