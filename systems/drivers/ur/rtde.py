@@ -42,7 +42,7 @@ class UrRtde(DriverConfig):
     FOR: ClassVar[tuple[str, ...]] = ("robot",)
 
     host: str = ""
-    transport: str = AUTO  # ur_rtde, native (weldcal's own client), or auto: ur_rtde where nothing is lost with it
+    transport: str = AUTO  # ur_rtde, native (weldcal's own client), or auto: ur_rtde where it can be used
     rate_hz: float = 250.0  # of the worker's loop
     pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
     lockstep: bool = False  # only for the emulator: its time waits for this computer
