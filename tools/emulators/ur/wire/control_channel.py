@@ -288,7 +288,7 @@ class ControlServer(Server):
         name = str(request.get("output"))
         if name not in self._rtde.real_outputs():
             raise InputError(f"There is no output of real numbers {name!r}.")
-        self._rtde.wrong[name] = _number(request, "value", math.nan)
+        self._rtde.wrong[name] = float(request.get("value", math.nan))  # not finite: that is the fault
 
     def _reboot(self, request: Request, now: float) -> None:
         self._network.unplug(self)
