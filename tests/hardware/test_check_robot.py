@@ -135,7 +135,7 @@ FAULTS: list[tuple[str, dict[str, Any], str, str, str]] = [
         "set_q",
         {"q": [0, -1.5, 3.1, -1.5, -1.5, 0]},
         "joint limits",
-        "elbow 2 deg from its limit (the controller's; the safety limits may be narrower)",
+        "elbow 2 deg away; the pendant's may be nearer",
         "elbow joint",
     ),
     ("local_mode", {}, "remote control", "local control", "Remote Control"),

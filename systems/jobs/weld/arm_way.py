@@ -226,6 +226,10 @@ def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsew
         part = Surroundings((Obstacle("part", welder.workpiece.mesh.transformed(X_BP), CLEAR_OF_PART_M),))
     for move in (*moves, *ends, *weld):
         where, a, b = move
+        if move in moves and part.touched_on_path(arm, bodies, a, b):
+            highest = f"{1e3 * HIGHER[-1] * welder.clearance_m:.0f} mm"
+            problem = f"The arm or its tool would touch the part {where}, even {highest} above the seam"
+            raise SeamObstructed(problem, "choose another home_deg, or turn the part")
         lowest, gap = path_clearance(arm, bodies, a, b)
         name = welder.surroundings.touched_on_path(arm, bodies, a, b) or ("the arm itself" if gap < least else "")
         if not name and elsewhere and move in moves and lowest <= welder.table_z_m:
@@ -233,10 +237,6 @@ def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsew
         if name:
             problem = f"The arm or its tool would come too close to '{name}' {where}"
             raise SeamObstructed(problem, "move it or the workpiece, or correct surroundings in the scenario")
-        if move in moves and part.touched_on_path(arm, bodies, a, b):
-            highest = f"{1e3 * HIGHER[-1] * welder.clearance_m:.0f} mm"
-            problem = f"The arm or its tool would touch the part {where}, even {highest} above the seam"
-            raise SeamObstructed(problem, "choose another home_deg, or turn the part")
 
 
 def _lifted(arm: ArmModel, seam: SeamCurve, X_BT: RigidTransform, height_m: float, s: float = 0.0) -> RigidTransform:

@@ -194,7 +194,7 @@ class _Look:
         self._kinematics: KinematicsInfo | None = None
         self._arm: ArmModel | None = None
         self._error: tuple[float, float] | None = None
-        self._whose_limits = f"the {nominal.name}'s; the controller reports none"
+        self._whose_limits = "the controller reports none"
         self._dashboard = True
         self._upper = True
 
@@ -334,9 +334,7 @@ class _Look:
         worst = int(np.argmin(margin))
         joint = arm.joint_names[worst].removesuffix("_joint").replace("_", " ")
         degrees = np.rad2deg(margin[worst])
-        found = (
-            f"{joint} {abs(degrees):.0f} deg {'from' if degrees >= 0.0 else 'beyond'} its limit ({self._whose_limits})"
-        )
+        found = f"{joint} {abs(degrees):.0f} deg {'away' if degrees >= 0.0 else 'beyond'}; {self._whose_limits}"
         self._state("joint limits", bool(margin[worst] >= LIMIT_MARGIN_RAD), found, actions.limits(joint))
 
     def _check_tcp(self) -> None:
@@ -389,7 +387,7 @@ class _Look:
             self._bad("kinematics", f"not a {self._nominal.name}'s", str(problem))
             return
         if limits is not None:
-            self._whose_limits = "the controller's; the safety limits may be narrower"
+            self._whose_limits = "the pendant's may be nearer"  # its safety limits: what is reported may not hold them
         found = "factory calibration" if self._kinematics.calibrated else "nominal, as URSim or an emulator has it"
         self._ok("kinematics", found)
         pose, offset = self._vector("actual_TCP_pose"), self._vector("tcp_offset")

@@ -128,7 +128,7 @@ def choose(wanted: str, found: Situation) -> tuple[str, str]:
         return NATIVE, "Transport native: the scenario asks for it."
     if why:
         return NATIVE, f"Transport native: {why}."
-    asked = "the scenario asks for it" if wanted == UR_RTDE else "this controller and these outputs allow it"
+    asked = "the scenario asks for it" if wanted == UR_RTDE else "this controller allows it"
     return UR_RTDE, f"Transport ur_rtde: {asked}."
 
 
