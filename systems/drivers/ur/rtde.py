@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses as dc
+import os
 from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
@@ -203,6 +204,7 @@ def chosen_transport(config: UrRtde, version: tuple[int, ...], upper: bool) -> t
         own_time=config.pace != FULL_PACE or config.lockstep,
         set_points=config.set_points,
         installed=installed(),
+        cores=len(os.sched_getaffinity(0)),
     )
     name, why = choose(config.transport, found)
     if name == UR_RTDE:

@@ -30,6 +30,7 @@ WIRE = AnalogSetPoint(at_full=10.0, value=5.0)
         ({"version": (10, 10, 0, 0)}, "PolyScope X"),
         ({"set_points": True}, "set points"),
         ({"taken": ("speed_slider_mask",)}, "not free"),
+        ({"cores": 2}, "fewer than 4 cores"),
     ],
 )
 def test_auto_is_native_where_ur_rtde_would_lose_something(found: dict[str, object], why: str) -> None:
@@ -41,6 +42,7 @@ def test_auto_is_native_where_ur_rtde_would_lose_something(found: dict[str, obje
 def test_auto_is_ur_rtde_where_nothing_is_lost() -> None:
     assert choose(AUTO, Situation(version=POLYSCOPE))[0] == UR_RTDE
     assert choose(NATIVE, Situation(version=POLYSCOPE))[0] == NATIVE
+    assert choose(UR_RTDE, Situation(version=POLYSCOPE, cores=2))[0] == UR_RTDE
 
 
 @pytest.mark.parametrize(
@@ -75,9 +77,10 @@ def test_each_state_that_is_read_is_in_the_type_table_of_ur_rtde() -> None:
 
 
 @NEEDS_UR_RTDE
-def test_ur_rtde_runs_the_guard_on_the_controller() -> None:
+def test_ur_rtde_runs_the_guard_on_the_controller(monkeypatch: pytest.MonkeyPatch) -> None:
     with emulator_process(lockstep=LOCKSTEP_S) as emulator:
         config = UrRtde(host=emulator.host)
+        monkeypatch.setattr("os.sched_getaffinity", lambda pid: range(4))
         assert chosen_transport(config, POLYSCOPE, True)[0] == UR_RTDE
         bench = Bench(emulator, torch={"gas_output": 2, "gas_before_s": 0.1, "gas_after_s": 0.2}, transport=UR_RTDE)
         bench.start(process=True)
@@ -94,7 +97,8 @@ def test_ur_rtde_runs_the_guard_on_the_controller() -> None:
 
 
 @NEEDS_UR_RTDE
-def test_a_register_that_only_ur_rtde_claims_makes_auto_native() -> None:
+def test_a_register_that_only_ur_rtde_claims_makes_auto_native(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: range(4))
     with emulator_process() as emulator:
         emulator.fault("registers_in_use", names=["input_double_register_40"])
         name, sentence = chosen_transport(UrRtde(host=emulator.host), POLYSCOPE, True)

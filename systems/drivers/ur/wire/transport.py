@@ -20,6 +20,8 @@ READY, DONE = 1, 2
 PLAYING = 2
 LINE_LIMIT_S = 2.0
 LOOK_S = 0.01
+# On two cores jobs over ur_rtde had 115 of 50,702 velocities over 8 ms late, natively 6 of 50,376 (docs/hardware.md); three were not tried.
+ENOUGH_CORES = 4
 
 
 class Switch(Protocol):
@@ -109,6 +111,7 @@ class Situation:
     set_points: bool = False
     taken: tuple[str, ...] = ()  # inputs that ur_rtde claims and that are not free
     installed: bool = True
+    cores: int = 4  # of this computer, that the program may use
 
 
 # What ur_rtde cannot do, in the order in which a user reads it.
@@ -128,6 +131,8 @@ def choose(wanted: str, found: Situation) -> tuple[str, str]:
         return NATIVE, "Transport native: the scenario asks for it."
     if why:
         return NATIVE, f"Transport native: {why}."
+    if wanted == AUTO and found.cores < ENOUGH_CORES:
+        return NATIVE, f"Transport native: ur_rtde is late on fewer than {ENOUGH_CORES} cores."
     asked = "the scenario asks for it" if wanted == UR_RTDE else "this controller allows it"
     return UR_RTDE, f"Transport ur_rtde: {asked}."
 
