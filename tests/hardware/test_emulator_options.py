@@ -113,6 +113,7 @@ def test_what_is_no_set_of_joint_ranges_is_one_sentence(ranges: str) -> None:
     ("arguments", "sentence"),
     [
         (["--q", "0", "1", "2", "3", "4", "nan"], "Give six joint angles, in radians"),
+        (["--q", "0", "-90", "90", "-90", "-90", "0"], "looks like degrees"),
         (["--safety-limits", "0:1"], "six joint ranges"),
         (["--operational-mode", "sideways"], "Give none, manual or automatic"),
     ],

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import gc
 import inspect
+import math
 import os
 import signal
 import sys
@@ -90,6 +91,10 @@ def run_emulator(
     host = loopback_address(host)
     if len(q) != 6 or not np.isfinite(q).all():
         raise InputError("Give six joint angles, in radians.")
+    if max(map(abs, q)) > 2.0 * math.pi:  # a joint's range in UR's manuals
+        raise InputError(
+            f"Give the joint angles in radians, from -6.28 to 6.28: {max(q, key=abs):g} looks like degrees."
+        )
     if not SLOWEST <= pace <= FASTEST:
         raise InputError(f"Give a pace from {SLOWEST} to {FASTEST:.0f}, not {pace}.")
     if not 0.0 <= lockstep <= LONGEST_WAIT_S:
