@@ -15,15 +15,14 @@ from OCP.Bnd import Bnd_Box
 from OCP.BRep import BRep_Tool
 from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
 from OCP.BRepBndLib import BRepBndLib
-from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeVertex
 from OCP.BRepClass3d import BRepClass3d_SolidClassifier
-from OCP.BRepExtrema import BRepExtrema_DistShapeShape
 from OCP.collections import IndexedDataMap_TopoDS_Shape_List_TopoDS_Shape_TopTools_ShapeMapHasher as EdgeFaces
 from OCP.GeomAbs import GeomAbs_CurveType, GeomAbs_SurfaceType
 from OCP.GeomAPI import GeomAPI_IntCS, GeomAPI_IntSS, GeomAPI_ProjectPointOnCurve
 from OCP.GeomLProp import GeomLProp_SLProps
 from OCP.gp import gp_Dir, gp_Lin, gp_Pnt, gp_Vec
 from OCP.IntCurvesFace import IntCurvesFace_ShapeIntersector
+from OCP.IntTools import IntTools_FClass2d
 from OCP.ShapeAnalysis import ShapeAnalysis_Surface
 from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_State
 from OCP.TopExp import TopExp, TopExp_Explorer
@@ -40,6 +39,8 @@ LEAST_MM = 0.5  # length of a piece
 FLUSH_MM = 0.2  # between two faces in one plane
 IN_MM = 0.4  # a point is taken inside a body or a face this far from its edge
 FREE_MM = 2.0  # the joint is open at least this far: a clearance is no joint
+CHORDS, NEWTON = 64, 6  # of a bent edge; steps from the nearest chord to the nearest point
+RAYS = np.array([(0.5257, 0.3411, 0.7793), (-0.2113, 0.8271, -0.5208)])  # along no direction that parts are drawn in
 NARROW_RAD = math.radians(80.0)  # a V or HV is narrower
 
 
@@ -95,10 +96,50 @@ class Face:
         n = GeomLProp_SLProps(self.surface, at.X(), at.Y(), 1, 1e-9).Normal()
         return self.sign * np.array([n.X(), n.Y(), n.Z()])
 
+    @cached_property
+    def _inside(self) -> Any:
+        return IntTools_FClass2d(self.face, EXACT_MM)
+
+    @cached_property
+    def _border(self) -> tuple[list[Any], Floats, Floats, Floats, npt.NDArray[np.int64]]:
+        """The curves of the edges; chords of them by their starts, (N,3) vectors, (N,2) parameters and curves."""
+        edges = [TopoDS.Edge(edge) for edge in parts_of(self.face, TopAbs_ShapeEnum.TopAbs_EDGE)]
+        curves = [BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge)]
+        starts, chords, parameters, of = [], [], [], []
+        for k, curve in enumerate(curves):
+            straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
+            at = np.linspace(curve.FirstParameter(), curve.LastParameter(), 2 if straight else CHORDS + 1)
+            points = np.array([_array(curve.Value(t)) for t in at])
+            starts.append(points[:-1])
+            chords.append(np.diff(points, axis=0))
+            parameters.append(np.stack([at[:-1], at[1:]], axis=1))
+            of.append(np.full(len(at) - 1, k))
+        return curves, np.vstack(starts), np.vstack(chords), np.vstack(parameters), np.concatenate(of)
+
     def foot(self, p: Floats) -> Floats:
-        """The point of the face that is nearest to a point."""
-        vertex = BRepBuilderAPI_MakeVertex(gp_Pnt(*p)).Vertex()
-        return _array(BRepExtrema_DistShapeShape(vertex, self.face).PointOnShape2(1))
+        """The point of the face that is nearest to a point; of a bent face one at which the distance is least in its vicinity."""
+        at = self.by_point.ValueOfUV(gp_Pnt(*p), EXACT_MM)
+        if self._inside.Perform(at) in (TopAbs_State.TopAbs_IN, TopAbs_State.TopAbs_ON):
+            return _array(self.surface.Value(at.X(), at.Y()))
+        curves, starts, chords, parameters, of = self._border
+        share = np.clip(np.vecdot(p - starts, chords) / np.vecdot(chords, chords), 0.0, 1.0)
+        nearest = int(np.argmin(np.linalg.norm(starts + share[:, None] * chords - p, axis=1)))
+        curve, (low, high) = curves[of[nearest]], parameters[nearest]
+        t = low + share[nearest] * (high - low)
+        if curve.GetType() == GeomAbs_CurveType.GeomAbs_Line:
+            return np.asarray(starts[nearest] + share[nearest] * chords[nearest])
+        point, along, bend = gp_Pnt(), gp_Vec(), gp_Vec()
+        for _ in range(NEWTON):
+            curve.D2(t, point, along, bend)
+            away, d = _array(point) - p, _array(along)
+            t = float(
+                np.clip(
+                    t - away @ d / max(d @ d + away @ _array(bend), 0.1 * float(d @ d)),
+                    curve.FirstParameter(),
+                    curve.LastParameter(),
+                )
+            )
+        return _array(curve.Value(t))
 
 
 class _Body:
@@ -116,14 +157,21 @@ class _Body:
         """Whether a point is inside."""
         if (p < self.low).any() or (p > self.high).any():
             return False
+        hits = [self._hits(p, along) for along in RAYS]
+        odd = [len(one) % 2 == 1 for one in hits]
+        if odd[0] == odd[1]:  # else one ray crosses an edge, which may count twice or not at all
+            return odd[0]
         self._classifier.Perform(gp_Pnt(*p), 1e-6)
         return bool(self._classifier.State() == TopAbs_State.TopAbs_IN)
 
+    def _hits(self, p: Floats, along: Floats) -> list[float]:
+        """Where a ray from a point crosses the skin, mm from the point."""
+        self._rays.Perform(gp_Lin(gp_Pnt(*p), gp_Dir(*along)), 0.0, 1e5)
+        return [self._rays.WParameter(k + 1) for k in range(self._rays.NbPnt())]
+
     def through(self, p: Floats, along: Floats) -> float:
         """How far a ray from a point stays in the material before it leaves."""
-        self._rays.Perform(gp_Lin(gp_Pnt(*p), gp_Dir(*along)), 1e-3, 1e5)
-        found = [self._rays.WParameter(k + 1) for k in range(self._rays.NbPnt())]
-        return float(min(found, default=0.0))
+        return min((hit for hit in self._hits(p, along) if hit > 1e-3), default=0.0)
 
 
 def parts_of(shape: Any, kind: Any) -> list[Any]:

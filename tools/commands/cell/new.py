@@ -17,7 +17,7 @@ from pydrake.math import RotationMatrix
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.result_files import write_atomic
-from weldcal.models.tools.loading import WELDING
+from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
@@ -32,6 +32,7 @@ from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, S
 from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
+from weldcal.tools.commands.cell.part import ranked
 from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
@@ -355,19 +356,26 @@ def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
 
 
 def _candidates(shape: PartShape, part: Path) -> list[list[PartEdge]]:
-    """The best seams of a part, at most MOST_TRIED, each by its edges; a seam with corners is taken edge by edge."""
-    chains = [[shape.edge(id) for id in j.edges] for j in shape.joints if j.gap_m > 0.0 or j.angle_rad < FLUSH_RAD]
-    if not shape.joints:
-        chains = [[edge] for edge in shape.edges if edge.kind == "concave"]
-    bent = [chain for chain in chains if all(len(edge.points_P) > 2 for edge in chain)]
-    found = bent + [[edge] for chain in chains if chain not in bent for edge in chain]
+    """The seams to try, at most MOST_TRIED, each by its edges: those that open upwards first, of these those that the shipped tool fits.
+
+    A seam with corners is taken edge by edge.
+    """
+    found = []
+    for seam in ranked(shape, load_tool(WELDING).tool):
+        chain = [shape.edge(id) for id in seam.joint.edges]
+        if seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
+            bent = all(len(edge.points_P) > 2 for edge in chain)
+            found += [chain] if bent else [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]
+    if shape.joints:
+        found.sort(key=lambda chain: not (chain[0].up_P is not None and chain[0].up_P[2] > OPEN_ABOVE))
+    else:
+        concave = sorted((edge for edge in shape.edges if edge.kind == "concave"), key=lambda edge: -edge.length_m)
+        found = [[edge] for edge in concave]
+        if first := next((chain for chain in found if _open_above(shape, chain[0])), None):
+            found.insert(0, found.pop(found.index(first)))
     if not found:
         raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
-    found.sort(key=lambda chain: -sum(edge.length_m for edge in chain))
-    above = [chain for chain in found if chain[0].up_P is not None and chain[0].up_P[2] > OPEN_ABOVE]
-    if not shape.joints:
-        above = [next((chain for chain in found if _open_above(shape, chain[0])), found[0])]
-    return (above + [chain for chain in found if chain not in above])[:MOST_TRIED]
+    return found[:MOST_TRIED]
 
 
 def _open_above(shape: PartShape, edge: PartEdge) -> bool:
