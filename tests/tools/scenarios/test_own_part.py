@@ -91,7 +91,7 @@ def test_edges_and_joint_can_be_chosen(angle: Path, tmp_path: Path) -> None:
 
 
 def test_a_part_that_cannot_begin_a_cell_is_refused_in_a_sentence(angle: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"angle.obj has no edge 99: see weldcal part"):
+    with pytest.raises(InputError, match=r"'angle.obj' has no edge 99: its edges are 1 to 18"):
         write_cell(tmp_path / "a", "s_groove", OwnPart(angle, (99,)))
     box = tmp_path / "box.obj"
     box.write_text(extrude(ANGLE[[0, 1, 2]], 0.0, 20.0).to_obj())

@@ -208,10 +208,10 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     if part is not None:
         assert scenario.workpiece is not None
         standing, nearest = scenario.workpiece.pose_guess, ""
-        for seam, joint in candidates:
+        for seam, joint in candidates:  # the reason is that of the first one
             scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
             _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
-            scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)))
+            scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)), not nearest)
             nearest = nearest or reason
             if not reason:
                 break
@@ -296,10 +296,11 @@ def add_part(scenario: Scenario, folder: Path, part: OwnPart) -> list[tuple[Seam
     return found
 
 
-def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
+def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig, str]:
     """The first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
 
-    Where there is none: the scenario's own pose, and the reason of the try in which the most seams could be welded.
+    Where there is none: the scenario's own pose, and the reason of the try in which the most seams could be welded; `advises`:
+    with what would help.
     """
     assert scenario.workpiece is not None
     own = scenario.workpiece.pose_guess
@@ -307,7 +308,7 @@ def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
         station = make_station(scenario, 0)
     except WeldcalError as error:
         return own, str(error)
-    nearest = (-1, "")
+    nearest, nearest_pose = (-1, ""), own
     try:
         part = station.cad
         if not isinstance(part, Part) or station.tool is None:
@@ -324,17 +325,23 @@ def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
                 if not reason:
                     return guess, ""
                 if welded > nearest[0]:
-                    nearest = welded, reason
+                    nearest, nearest_pose = (welded, reason), guess
+        if advises:
+            nearest = _first_refusal(scenario, station, seams, nearest_pose, advises=True)
     finally:
         station.close()
     return own, nearest[1]
 
 
-def _first_refusal(scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig) -> tuple[int, str]:
+def _first_refusal(
+    scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig, advises: bool = False
+) -> tuple[int, str]:
     """The number of seams before the first that the arm cannot weld with the part in a pose, and why; all, and "" for none."""
     for number, part in enumerate(seams):
         config = servo_config(scenario, station, number)
-        planning = dc.replace(seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose())
+        planning = dc.replace(
+            seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=advises
+        )
         reason = plan_drawn_seam(planning, 0).reason
         if reason is not None:
             return number, reason
