@@ -5,42 +5,42 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from OCP.Bnd import Bnd_Box
 from OCP.BRep import BRep_Tool
-from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
-from OCP.BRepBndLib import BRepBndLib
-from OCP.BRepClass3d import BRepClass3d_SolidClassifier
-from OCP.collections import IndexedDataMap_TopoDS_Shape_List_TopoDS_Shape_TopTools_ShapeMapHasher as EdgeFaces
-from OCP.GeomAbs import GeomAbs_CurveType, GeomAbs_SurfaceType
+from OCP.BRepAdaptor import BRepAdaptor_Curve
+from OCP.GeomAbs import GeomAbs_CurveType
 from OCP.GeomAPI import GeomAPI_IntCS, GeomAPI_IntSS, GeomAPI_ProjectPointOnCurve
-from OCP.GeomLProp import GeomLProp_SLProps
-from OCP.gp import gp_Dir, gp_Lin, gp_Pnt, gp_Vec
-from OCP.IntCurvesFace import IntCurvesFace_ShapeIntersector
-from OCP.IntTools import IntTools_FClass2d
-from OCP.ShapeAnalysis import ShapeAnalysis_Surface
-from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_State
-from OCP.TopExp import TopExp, TopExp_Explorer
+from OCP.gp import gp_Pnt, gp_Vec
+from OCP.TopAbs import TopAbs_ShapeEnum
 from OCP.TopoDS import TopoDS
+
+from weldcal.models.workpieces.brep import (
+    BRIDGED_MM,
+    EXACT_MM,
+    IN_MM,
+    Body,
+    Face,
+    array_of,
+    faces_at,
+    length_of,
+    middle_of,
+    parts_of,
+    sampled,
+    unit,
+)
 
 Floats = npt.NDArray[np.float64]
 
 GAP_MM, OVERLAP_MM = 3.05, 2.05  # between bodies; an overlap counts where two faces are flush
 REACH_MM = 12.0  # from the root of a narrow V to its walls
-EXACT_MM = 1e-4  # between curves of OpenCascade
 CHAINED_MM = 0.05  # between the ends of pieces of one seam
-BRIDGED_MM = 1.0  # clearance beside a tab, along a straight line
 LEAST_MM = 0.5  # length of a piece
 FLUSH_MM = 0.2  # between two faces in one plane
-IN_MM = 0.4  # a point is taken inside a body or a face this far from its edge
 FREE_MM = 2.0  # the joint is open at least this far: a clearance is no joint
-CHORDS, NEWTON = 64, 6  # of a bent edge; steps from the nearest chord to the nearest point
-RAYS = np.array([(0.5257, 0.3411, 0.7793), (-0.2113, 0.8271, -0.5208)])  # along no direction that parts are drawn in
 NARROW_RAD = math.radians(80.0)  # a V or HV is narrower
 
 
@@ -70,138 +70,13 @@ class Piece:
     pipe: str = ""
 
 
-class Face:
-    """A face with its surface, box and normal."""
-
-    def __init__(self, face: Any) -> None:
-        self.face = face
-        self.surface = BRep_Tool.Surface_s(face)
-        self.low, self.high = _box(face)
-        self.sign = -1.0 if face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else 1.0
-        self.by_point = ShapeAnalysis_Surface(self.surface)
-        adaptor = BRepAdaptor_Surface(face)
-        self.round = adaptor.GetType() == GeomAbs_SurfaceType.GeomAbs_Cylinder
-        self.flat = adaptor.GetType() == GeomAbs_SurfaceType.GeomAbs_Plane
-        self.axis: Any = adaptor.Cylinder().Axis() if self.round else None
-
-    @cached_property
-    def ends(self) -> list[tuple[Any, tuple[Floats, Floats, Floats]]]:
-        """The edges at which a flush face could go on: see `_end_of`."""
-        edges = [TopoDS.Edge(edge) for edge in parts_of(self.face, TopAbs_ShapeEnum.TopAbs_EDGE)]
-        return [(edge, end) for edge in edges if (end := _end_of(self, edge)) is not None]
-
-    def normal(self, p: Floats) -> Floats:
-        """Out of the material (3,), of the surface or its continuation at a point."""
-        at = self.by_point.ValueOfUV(gp_Pnt(*p), EXACT_MM)
-        n = GeomLProp_SLProps(self.surface, at.X(), at.Y(), 1, 1e-9).Normal()
-        return self.sign * np.array([n.X(), n.Y(), n.Z()])
-
-    @cached_property
-    def _inside(self) -> Any:
-        return IntTools_FClass2d(self.face, EXACT_MM)
-
-    @cached_property
-    def _border(self) -> tuple[list[Any], Floats, Floats, Floats, npt.NDArray[np.int64]]:
-        """The curves of the edges; chords of them by their starts, (N,3) vectors, (N,2) parameters and curves."""
-        edges = [TopoDS.Edge(edge) for edge in parts_of(self.face, TopAbs_ShapeEnum.TopAbs_EDGE)]
-        curves = [BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge)]
-        starts, chords, parameters, of = [], [], [], []
-        for k, curve in enumerate(curves):
-            straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
-            at = np.linspace(curve.FirstParameter(), curve.LastParameter(), 2 if straight else CHORDS + 1)
-            points = np.array([_array(curve.Value(t)) for t in at])
-            starts.append(points[:-1])
-            chords.append(np.diff(points, axis=0))
-            parameters.append(np.stack([at[:-1], at[1:]], axis=1))
-            of.append(np.full(len(at) - 1, k))
-        return curves, np.vstack(starts), np.vstack(chords), np.vstack(parameters), np.concatenate(of)
-
-    def foot(self, p: Floats) -> Floats:
-        """The point of the face that is nearest to a point; of a bent face one at which the distance is least in its vicinity."""
-        at = self.by_point.ValueOfUV(gp_Pnt(*p), EXACT_MM)
-        if self._inside.Perform(at) in (TopAbs_State.TopAbs_IN, TopAbs_State.TopAbs_ON):
-            return _array(self.surface.Value(at.X(), at.Y()))
-        curves, starts, chords, parameters, of = self._border
-        share = np.clip(np.vecdot(p - starts, chords) / np.vecdot(chords, chords), 0.0, 1.0)
-        nearest = int(np.argmin(np.linalg.norm(starts + share[:, None] * chords - p, axis=1)))
-        curve, (low, high) = curves[of[nearest]], parameters[nearest]
-        t = low + share[nearest] * (high - low)
-        if curve.GetType() == GeomAbs_CurveType.GeomAbs_Line:
-            return np.asarray(starts[nearest] + share[nearest] * chords[nearest])
-        point, along, bend = gp_Pnt(), gp_Vec(), gp_Vec()
-        for _ in range(NEWTON):
-            curve.D2(t, point, along, bend)
-            away, d = _array(point) - p, _array(along)
-            t = float(
-                np.clip(
-                    t - away @ d / max(d @ d + away @ _array(bend), 0.1 * float(d @ d)),
-                    curve.FirstParameter(),
-                    curve.LastParameter(),
-                )
-            )
-        return _array(curve.Value(t))
-
-
-class _Body:
-    """A solid with its faces and with what answers whether a point is inside."""
-
-    def __init__(self, solid: Any) -> None:
-        self.solid = solid
-        self.faces = [Face(TopoDS.Face(face)) for face in parts_of(solid, TopAbs_ShapeEnum.TopAbs_FACE)]
-        self.low, self.high = _box(solid)
-        self._classifier = BRepClass3d_SolidClassifier(solid)
-        self._rays = IntCurvesFace_ShapeIntersector()
-        self._rays.Load(solid, 1e-6)
-
-    def holds(self, p: Floats) -> bool:
-        """Whether a point is inside."""
-        if (p < self.low).any() or (p > self.high).any():
-            return False
-        hits = [self._hits(p, along) for along in RAYS]
-        odd = [len(one) % 2 == 1 for one in hits]
-        if odd[0] == odd[1]:  # else one ray crosses an edge, which may count twice or not at all
-            return odd[0]
-        self._classifier.Perform(gp_Pnt(*p), 1e-6)
-        return bool(self._classifier.State() == TopAbs_State.TopAbs_IN)
-
-    def _hits(self, p: Floats, along: Floats) -> list[float]:
-        """Where a ray from a point crosses the skin, mm from the point."""
-        self._rays.Perform(gp_Lin(gp_Pnt(*p), gp_Dir(*along)), 0.0, 1e5)
-        return [self._rays.WParameter(k + 1) for k in range(self._rays.NbPnt())]
-
-    def through(self, p: Floats, along: Floats) -> float:
-        """How far a ray from a point stays in the material before it leaves."""
-        return min((hit for hit in self._hits(p, along) if hit > 1e-3), default=0.0)
-
-
-def parts_of(shape: Any, kind: Any) -> list[Any]:
-    """The parts of a shape of one kind, in the file's order."""
-    explorer, found = TopExp_Explorer(shape, kind), []
-    while explorer.More():
-        found.append(explorer.Current())
-        explorer.Next()
-    return found
-
-
-def faces_at(shape: Any, faces: list[Face]) -> list[tuple[Any, list[Face]]]:
-    """The edges of a shape in the file's order, each with those of its faces that meet there; none within one face."""
-    faces_of, found = EdgeFaces(), []
-    TopExp.MapShapesAndAncestors_s(shape, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_FACE, faces_of)
-    for k in range(faces_of.Extent()):
-        edge, met = TopoDS.Edge(faces_of.FindKey(k + 1)), list(faces_of.FindFromIndex(k + 1))
-        own = [face for face in faces if any(face.face.IsSame(one) for one in met)]
-        if not BRep_Tool.Degenerated_s(edge) and (len(own) > 1 or len(met) == 1):
-            found.append((edge, own))
-    return found
-
-
 def joints_of(shape: Any) -> list[list[Piece]]:
     """The joints between the solids of a shape, and where there are none those inside each solid, each as its pieces in the order of travel.
 
     Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece may
     end; each stretch between two crossings is a joint or is none.
     """
-    bodies = [_Body(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)]
+    bodies = [Body(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)]
     found: list[list[Piece]] = []
     for i, j in combinations(range(len(bodies)), 2):
         a, b = bodies[i], bodies[j]
@@ -221,7 +96,7 @@ def joints_of(shape: Any) -> list[list[Piece]]:
     return [_named(chain, found) for chain in found]
 
 
-def _within(bodies: list[_Body], k: int) -> Iterable[Piece]:
+def _within(bodies: list[Body], k: int) -> Iterable[Piece]:
     """The pieces along the concave edges of one body."""
     for edge, met in faces_at(bodies[k].solid, bodies[k].faces):
         if len(met) != 2:
@@ -256,11 +131,11 @@ def _named(chain: list[Piece], all_of_them: list[list[Piece]]) -> list[Piece]:
     return [replace(piece, side="left" if left else "right") for piece in chain]
 
 
-def _far(a: Face | _Body, b: Face | _Body) -> bool:
+def _far(a: Face | Body, b: Face | Body) -> bool:
     return bool((np.maximum(a.low, b.low) > np.minimum(a.high, b.high) + GAP_MM).any())
 
 
-def _met(bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
+def _met(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces meet in a concave joint."""
     if f.round and g.round and f.axis.IsCoaxial(g.axis, 0.01, GAP_MM):
         return  # a pin in its hole
@@ -289,7 +164,7 @@ def _met(bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face) -> Iterab
 
 
 def _breaks(
-    bodies: list[_Body], curve: Any, low: Floats, high: Floats, own: tuple[Face, Face]
+    bodies: list[Body], curve: Any, low: Floats, high: Floats, own: tuple[Face, Face]
 ) -> tuple[list[float], bool]:
     """Ascending parameters between which a curve is a joint as a whole or not at all, and whether it is closed."""
     closed = bool(curve.IsClosed())
@@ -298,7 +173,7 @@ def _breaks(
         origin, along = gp_Pnt(), gp_Vec()
         curve.D1(0.0, origin, along)
         corners = np.array([[(low, high)[c >> k & 1][k] for k in range(3)] for c in range(8)])
-        at = (corners - _array(origin)) @ _array(along)
+        at = (corners - array_of(origin)) @ array_of(along)
         begin, end = float(at.min()), float(at.max())
     found = [begin, end]
     for body in bodies:
@@ -316,7 +191,7 @@ def _breaks(
         found = [begin + (t - begin) % (end - begin) for t in found[2:]]
         found = [*found, min(found) + end - begin] if found else [begin, end]
     inside = sorted(t for t in found if begin - 1e-9 <= t and (closed or t <= end + 1e-9))
-    points = [_array(curve.Value(t)) for t in inside]
+    points = [array_of(curve.Value(t)) for t in inside]
     kept = [0]
     for k in range(1, len(inside)):
         period = closed and k == len(inside) - 1
@@ -327,19 +202,8 @@ def _breaks(
     return [inside[k] for k in kept], closed
 
 
-def middle_of(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, float]:
-    """The middle of a stretch of a curve, its direction there, and how far from it a wall may end, along it.
-
-    A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
-    """
-    point, along = gp_Pnt(), gp_Vec()
-    curve.D1(0.5 * (begin + end), point, along)
-    length = (end - begin) * along.Magnitude()
-    return _array(point), _unit(_array(along)), 0.5 * length if length <= BRIDGED_MM else 0.0
-
-
 def _cut(
-    bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face, x: Floats, t: Floats, slack: float
+    bodies: list[Body], pair: tuple[int, int], f: Face, g: Face, x: Floats, t: Floats, slack: float
 ) -> dict[str, Any] | None:
     """The joint of two faces in the cut at one point of their curve; None where they form no concave joint there."""
     normals = f.normal(x), g.normal(x)
@@ -347,7 +211,7 @@ def _cut(
     if abs(cos) > math.cos(math.radians(10.0)):
         return None
     # Along each wall, away from the root, and how far from the root the wall begins.
-    ways = _unit(normals[1] - cos * normals[0]), _unit(normals[0] - cos * normals[1])
+    ways = unit(normals[1] - cos * normals[0]), unit(normals[0] - cos * normals[1])
     feet = f.foot(x), g.foot(x)
     begins = [float(np.linalg.norm(foot - x)) for foot in feet]
     if max(begins) > REACH_MM or max(abs(float((foot - x) @ t)) for foot in feet) > CHAINED_MM + slack:
@@ -360,7 +224,7 @@ def _cut(
     gap = min(float(np.linalg.norm(other.foot(foot) - foot)) for other, foot in ((g, feet[0]), (f, feet[1])))
     if gap > GAP_MM or 2.0 * slack > gap + CHAINED_MM:
         return None
-    up = _unit(normals[0] + normals[1])
+    up = unit(normals[0] + normals[1])
     if any(body.holds(x + s * up) for body in bodies for s in (IN_MM, FREE_MM)):
         return None
     two = bodies[pair[0]], bodies[pair[1]]
@@ -393,12 +257,12 @@ def _cut(
     return {"up": up, "type": kind, "angle": angle, "gap": gap, "side": side, "walls": walls, "pipe": pipe}
 
 
-def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[_Body, _Body]) -> str:
+def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[Body, Body]) -> str:
     """The joint of a pipe, "" for none: along a cylinder's axis it is as between plates."""
     axes = [(face, face.axis) for face in (f, g) if face.round]
     if len(axes) == 2:
         return "" if axes[0][1].IsParallel(axes[1][1], 0.1) else "pipe on pipe"
-    if abs(float(_array(axes[0][1].Direction()) @ t)) > 0.99:
+    if abs(float(array_of(axes[0][1].Direction()) @ t)) > 0.99:
         return ""
     pipe, plate = (f, two[1]) if f.round else (g, two[0])
     coaxial = two[0] is not two[1] and any(
@@ -407,7 +271,7 @@ def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[_Body, _Body]) -> str:
     return "flange on pipe" if coaxial else "pipe on plate"
 
 
-def _flush(bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
+def _flush(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces go on in each other: a square butt, the outside of a corner, an edge joint."""
     two = bodies[pair[0]], bodies[pair[1]]
     if f.flat != g.flat or f.round != g.round or not (f.flat or f.round):
@@ -438,33 +302,16 @@ def _flush(bodies: list[_Body], pair: tuple[int, int], f: Face, g: Face) -> Iter
             )
 
 
-def _facing(two: tuple[_Body, _Body], x: Floats, n: Floats, m: Floats, gap: float, depth: float) -> bool:
+def _facing(two: tuple[Body, Body], x: Floats, n: Floats, m: Floats, gap: float, depth: float) -> bool:
     """Whether both bodies are as near to each other below the flush faces: a groove is wider there."""
     down = x - min(1.0, 0.5 * depth) * n
     return all(two[k].holds(down + s * (0.5 * abs(gap) + 0.3) * m) for k, s in ((0, -1.0), (1, 1.0)))
 
 
-def _end_of(face: Face, edge: Any) -> tuple[Floats, Floats, Floats] | None:
-    """Middle of a straight or round edge, the face's normal there, and the way out of the face in its plane."""
-    curve = BRepAdaptor_Curve(edge)
-    straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
-    if BRep_Tool.Degenerated_s(edge) or not (
-        straight if face.flat else curve.GetType() == GeomAbs_CurveType.GeomAbs_Circle
-    ):
-        return None
-    point, along = gp_Pnt(), gp_Vec()
-    curve.D1(0.5 * (curve.FirstParameter() + curve.LastParameter()), point, along)
-    p, t = _array(point), _unit(_array(along))
-    n = face.normal(p)
-    m = np.cross(t, n)
-    inner = face.foot(p + IN_MM * m)
-    return p, n, m if np.linalg.norm(inner - p - IN_MM * m) > 0.5 * IN_MM else -m
-
-
 def _shared(first: Any, second: Any, m: Floats, gap: float) -> Floats | None:
     """The line midway between two edges as far as both run beside each other; None where they do not."""
     a, b = BRepAdaptor_Curve(first), BRepAdaptor_Curve(second)
-    ends = [[_array(c.Value(u)) for u in (c.FirstParameter(), c.LastParameter())] for c in (a, b)]
+    ends = [[array_of(c.Value(u)) for u in (c.FirstParameter(), c.LastParameter())] for c in (a, b)]
     if a.GetType() != GeomAbs_CurveType.GeomAbs_Line:
         apart = [min(float(np.linalg.norm(p + gap * m - q)) for q in ends[1]) for p in ends[0]]
         centred = a.IsClosed() and b.IsClosed()
@@ -473,7 +320,7 @@ def _shared(first: Any, second: Any, m: Floats, gap: float) -> Floats | None:
             return None
         return sampled(a, a.FirstParameter(), a.LastParameter()) + 0.5 * gap * m
     start, stop = ends[0]
-    t = _unit(stop - start)
+    t = unit(stop - start)
     low, high = sorted(float((q - start) @ t) for q in ends[1])
     low, high = max(0.0, low), min(float((stop - start) @ t), high)
     return np.array([start + s * t for s in (low, high)]) + 0.5 * gap * m if high > low else None
@@ -508,31 +355,3 @@ def closes(chain: list[Piece]) -> bool:
     """Whether a seam ends where it begins."""
     apart = float(np.linalg.norm(chain[0].line[0] - chain[-1].line[-1]))
     return apart < CHAINED_MM and sum(len(piece.line) for piece in chain) > 4
-
-
-def sampled(curve: Any, begin: float, end: float) -> Floats:
-    """Points (N,3) on a stretch of a curve, 0.5 mm apart on a bent one."""
-    steps = np.linspace(begin, end, 33)
-    points = np.array([_array(curve.Value(u)) for u in steps])
-    length = length_of(points)
-    if abs(length - float(np.linalg.norm(points[-1] - points[0]))) < EXACT_MM:
-        return points[[0, -1]]
-    return np.array([_array(curve.Value(u)) for u in np.linspace(begin, end, max(9, math.ceil(2.0 * length) + 1))])
-
-
-def _box(shape: Any) -> tuple[Floats, Floats]:
-    box = Bnd_Box()
-    BRepBndLib.AddOptimal_s(shape, box, False, False)
-    return _array(box.CornerMin()), _array(box.CornerMax())
-
-
-def length_of(line: Floats) -> float:
-    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-
-
-def _array(p: Any) -> Floats:
-    return np.array([p.X(), p.Y(), p.Z()])
-
-
-def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.linalg.norm(v))

@@ -16,7 +16,7 @@ from weldcal.models.mesh import TriMesh, merge
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
 
 if TYPE_CHECKING:
-    from weldcal.models.workpieces.joints import Face
+    from weldcal.models.workpieces.brep import Face
 
 Floats = npt.NDArray[np.float64]
 
@@ -148,7 +148,7 @@ def _edges(shape: Any) -> tuple[PartEdge, ...]:
     from OCP.TopAbs import TopAbs_ShapeEnum
     from OCP.TopoDS import TopoDS
 
-    from weldcal.models.workpieces.joints import Face, faces_at, length_of, parts_of, sampled
+    from weldcal.models.workpieces.brep import Face, faces_at, length_of, parts_of, sampled
 
     faces = [Face(TopoDS.Face(face)) for face in parts_of(shape, TopAbs_ShapeEnum.TopAbs_FACE)]
     found: list[PartEdge] = []
@@ -168,7 +168,7 @@ def _met(curve: Any, edge: Any, first: Face, second: Face) -> tuple[str, float]:
     """Kind of an edge between two faces, and the angle between these, rad."""
     from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum
 
-    from weldcal.models.workpieces.joints import middle_of, parts_of
+    from weldcal.models.workpieces.brep import middle_of, parts_of
 
     point, tangent, _ = middle_of(curve, curve.FirstParameter(), curve.LastParameter())
     # The orientation of the edge as it stands in the first face: the face lies to its left.
@@ -185,7 +185,8 @@ def _met(curve: Any, edge: Any, first: Face, second: Face) -> tuple[str, float]:
 
 def _with_joints(edges: tuple[PartEdge, ...], shape: Any) -> tuple[tuple[PartEdge, ...], tuple[PartJoint, ...]]:
     """The edges of a part with those of its joints that are no edge of a body added at the end, and its joints."""
-    from weldcal.models.workpieces.joints import closes, joints_of, length_of
+    from weldcal.models.workpieces.brep import length_of
+    from weldcal.models.workpieces.joints import closes, joints_of
 
     known, joints = list(edges), []
     for chain in joints_of(shape):
@@ -217,7 +218,7 @@ def _with_joints(edges: tuple[PartEdge, ...], shape: Any) -> tuple[tuple[PartEdg
 
 def _is(edge: PartEdge, line: Floats) -> bool:
     """Whether an edge is this line (N,3) m."""
-    from weldcal.models.workpieces.joints import length_of
+    from weldcal.models.workpieces.brep import length_of
 
     p, q = edge.points_P, line
     if abs(edge.length_m - length_of(q)) > 2e-5:
