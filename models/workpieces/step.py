@@ -25,6 +25,9 @@ CHORD_MM, FACET_RAD = 0.02, 0.05  # largest distance and angle between the mesh 
 LEAST_EDGE_MM = 1e-6
 SMOOTH_RAD = math.radians(2.0)
 _MERGED_M = 1e-7
+_EXTERNAL = re.compile(
+    rb"DOCUMENT_FILE\s*\(\s*'([^']*\.st(?:e?p))'", re.IGNORECASE
+)  # ISO 10303-44: parts in files of their own
 _STRINGS, _HELD, _NAMED = re.compile(rb"'(?:[^']|'')*'"), re.compile(rb"#(\d+)\s*="), re.compile(rb"#(\d+)")
 _UNIT_NAMES = {"MILLIMETRE": "mm", "MILLIMETER": "mm", "METRE": "m", "METER": "m", "INCH": "inch"}
 
@@ -36,13 +39,37 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
         InputError: no OpenCascade, not a STEP file, no solid in it, or another unit than `units`.
     """
     file_size(path, LARGEST_STEP)
-    _check_text(path)
+    for file in (path, *referenced(path)):
+        _check_text(file)
     shape, unit = _transferred(path)
     if units is not None and unit is not None and unit != units:
         raise InputError(f"'{path.name}' is in {unit}, not in {units}: give units {unit}.")
     mesh, bodies = _mesh(shape, path)
     edges, joints = _with_joints(_edges(shape), shape)
     return PartShape(path.name, mesh, edges, UNITS_M[unit or units or "mm"], bodies, joints)
+
+
+def referenced(path: Path) -> list[Path]:
+    """The STEP files beside a part's file from which it takes bodies, by its own and their external references.
+
+    Raises:
+        InputError: one of them is not there.
+    """
+    found, asked = list[Path](), [path]
+    while asked:
+        one = asked.pop()
+        if one.suffix.lower() not in (".step", ".stp"):
+            continue
+        for name in _EXTERNAL.findall(read_bytes(one, LARGEST_STEP)):
+            other = path.parent / Path(name.decode(errors="replace").replace("\\", "/")).name
+            if not other.is_file():
+                raise InputError(
+                    f"'{one.name}' takes a body from '{other.name}': put that file beside it, or export the assembly as one file."
+                )
+            if other not in (path, *found):
+                found.append(other)
+                asked.append(other)
+    return found
 
 
 def _check_text(path: Path) -> None:
@@ -88,8 +115,10 @@ def _transferred(path: Path) -> tuple[Any, str | None]:
         reader.FileUnits(lengths, angles, solids)
         names = {lengths.Value(k + 1).ToCString().upper() for k in range(lengths.Length())}
         reader.SetSystemLengthUnit(1.0)
-        reader.TransferRoots()
-        shape = reader.OneShape()
+        shape = _assembled(path) if referenced(path) else None
+        if shape is None:
+            reader.TransferRoots()
+            shape = reader.OneShape()
     except InputError:
         raise
     except Exception as error:  # OpenCascade raises several types
@@ -100,6 +129,20 @@ def _transferred(path: Path) -> tuple[Any, str | None]:
     if len(known) > 1:
         raise InputError(f"'{path.name}' mixes the units {', '.join(sorted(known))}: export it in one unit.")
     return shape, next(iter(known), None)
+
+
+def _assembled(path: Path) -> Any:
+    """The shape of an assembly whose bodies are in other files, in millimetres."""
+    from OCP.STEPCAFControl import STEPCAFControl_Reader
+    from OCP.TCollection import TCollection_ExtendedString
+    from OCP.TDocStd import TDocStd_Document
+    from OCP.XCAFDoc import XCAFDoc_DocumentTool
+
+    document = TDocStd_Document(TCollection_ExtendedString("assembly"))
+    reader = STEPCAFControl_Reader()
+    reader.ReadFile(str(path))
+    reader.Transfer(document)
+    return XCAFDoc_DocumentTool.ShapeTool_s(document.Main()).GetOneShape()
 
 
 def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:

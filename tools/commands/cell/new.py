@@ -22,6 +22,7 @@ from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.shape import PartEdge, PartShape
+from weldcal.models.workpieces.step import referenced
 from weldcal.systems.drivers.config import DEVICES, NoDevice
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
@@ -292,7 +293,8 @@ def add_part(scenario: Scenario, folder: Path, part: OwnPart) -> list[tuple[Seam
         located_by="scan",
         placement_error=ErrorConfig(OFF_MM, OFF_DEG),
     )
-    shutil.copyfile(part.file, folder / part.file.name)
+    for file in (part.file, *referenced(part.file)):
+        shutil.copyfile(file, folder / file.name)
     return found
 
 
