@@ -14,9 +14,10 @@ from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import proj3d
 from typer.testing import CliRunner
 
+from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.cell.part import edges_picture
+from weldcal.tools.commands.cell.part import edges_picture, ranked
 from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, write_step
 
 
@@ -64,20 +65,39 @@ def test_a_mistake_is_a_sentence(step: Path, arguments: list[str], says: str, tm
     assert not (tmp_path / "out").exists()
 
 
+def write_pipe(path: Path, radius: float) -> None:
+    """A pipe of 80 mm on a plate."""
+    pipe = less(cylinder((0, 0, 0), radius, 80), cylinder((0, 0, -1), radius - 30, 90))
+    write_step(assembly(box((-150, -150, -10), (300, 300, 10)), pipe), path)
+
+
 def test_each_seam_says_whether_the_tool_fits_it(tmp_path: Path) -> None:
-    pipe = less(cylinder((0, 0, 0), 60, 80), cylinder((0, 0, -1), 30, 90))
-    write_step(assembly(box((-90, -90, -10), (180, 180, 10)), pipe), tmp_path / "pipe.step")
+    write_pipe(tmp_path / "pipe.step", 80)
     result = CliRunner().invoke(app, ["part", str(tmp_path / "pipe.step"), "--json", "--out", str(tmp_path / "out")])
     outside, inside = json.loads(result.stdout.splitlines()[-1])["seams"]
     assert [outside["type"], outside["weldable"]] == ["pipe on plate", True]
-    assert outside["length_mm"] == pytest.approx(2.0 * math.pi * 60.0, abs=0.05)
-    assert [outside["least_radius_mm"], inside["least_radius_mm"]] == pytest.approx([60.0, 30.0])
+    assert outside["length_mm"] == pytest.approx(2.0 * math.pi * 80.0, abs=0.05)
+    assert [outside["least_radius_mm"], inside["least_radius_mm"]] == pytest.approx([80.0, 50.0])
     assert outside["closed"]
     assert not inside["weldable"]
     assert re.search(r"tool does not fit: .* \(-\d+\.\d mm\)", inside["reason"])
     text = CliRunner().invoke(app, ["part", str(tmp_path / "pipe.step"), "--out", str(tmp_path / "text")]).stdout
-    assert re.search(r"pipe on plate +377\.0 +90\.0 .*  yes", text)
+    assert re.search(r"pipe on plate +502\.7 +90\.0 .*  yes", text)
     assert "Seams</h2>" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_least_pipe_that_a_tool_can_weld_is_named(tmp_path: Path) -> None:
+    tool = load_tool(WELDING).tool
+    reasons = []
+    for radius in (70, 75):
+        write_pipe(tmp_path / f"{radius}.step", radius)
+        shape = read_shape(tmp_path / f"{radius}.step")
+        outside = max(shape.joints, key=lambda joint: joint.length_m)
+        reasons.append(next(seam.reason for seam in ranked(shape, tool) if seam.joint is outside))
+    assert reasons[1] == ""
+    least = re.search(r"least pipe for this tool is (\d+) mm across", reasons[0])
+    assert least is not None
+    assert 140 <= int(least[1]) <= 150
 
 
 def test_the_numbers_in_the_picture_do_not_overlap(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, S
 from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
-from weldcal.tools.commands.cell.part import ranked
+from weldcal.tools.commands.cell.part import least_pipe, ranked, unit_hint
 from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
@@ -217,8 +217,8 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
             if not reason:
                 break
         if reason:
-            several = f"None of {len(candidates)} seams can be welded; the first one: " if len(candidates) > 1 else ""
-            reason = several + nearest
+            several = f"None of {len(candidates)} seams can be welded; the nearest one: " if len(candidates) > 1 else ""
+            reason = _with_advice(read_shape(part.file, part.units), candidates[0][0], several + nearest)
             seam, joint = candidates[0]
             scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
             words = "\n# ".join(textwrap.wrap(reason, WIDTH - 2))
@@ -298,6 +298,15 @@ def add_part(scenario: Scenario, folder: Path, part: OwnPart) -> list[tuple[Seam
     return found
 
 
+def _with_advice(shape: PartShape, seam: SeamConfig, reason: str) -> str:
+    """Why no seam of a part can be welded, with what its size and a round seam say of that."""
+    ring = next((joint for joint in shape.joints if list(joint.edges) == seam.edges), None)
+    least = (
+        "" if ring is None or "tool does not fit" not in reason else least_pipe(shape, ring, load_tool(WELDING).tool)
+    )
+    return f"{unit_hint(shape)} {reason}{least}".strip()
+
+
 def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig, str]:
     """The first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
 
@@ -365,18 +374,21 @@ def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
 
 
 def _candidates(shape: PartShape, part: Path) -> list[list[PartEdge]]:
-    """The seams to try, at most MOST_TRIED, each by its edges: those that open upwards first, of these those that the shipped tool fits.
+    """The seams to try, at most MOST_TRIED, each by its edges, a seam with corners edge by edge.
 
-    A seam with corners is taken edge by edge.
+    Those that the shipped tool fits come first, then those that it nearly fits; of these first what opens upwards.
     """
-    found = []
+    found, order = [], []
     for seam in ranked(shape, load_tool(WELDING).tool):
         chain = [shape.edge(id) for id in seam.joint.edges]
         if seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
             bent = all(len(edge.points_P) > 2 for edge in chain)
-            found += [chain] if bent else [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]
+            for edges in [chain] if bent else [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]:
+                found.append(edges)
+                above = edges[0].up_P is not None and edges[0].up_P[2] > OPEN_ABOVE
+                order.append((bool(seam.reason), round(seam.short_m, 3), not above))
     if shape.joints:
-        found.sort(key=lambda chain: not (chain[0].up_P is not None and chain[0].up_P[2] > OPEN_ABOVE))
+        found = [found[k] for k in sorted(range(len(found)), key=lambda k: order[k])]
     else:
         concave = sorted((edge for edge in shape.edges if edge.kind == "concave"), key=lambda edge: -edge.length_m)
         found = [[edge] for edge in concave]
