@@ -7,7 +7,8 @@ the scanner, the outermost points of the face lie a share of a point distance in
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from weldcal.welding.locate.part.model import PartModel, SharpEdges
-from weldcal.welding.locate.part.scan import PreparedScan
+from weldcal.welding.locate.part.scan import PreparedScan, View
 
 Floats = npt.NDArray[np.float64]
 
@@ -25,7 +26,11 @@ HIDDEN_COS = math.cos(math.radians(77.0))  # a face seen at a larger angle is no
 INSET, INSET_SIGMA = 0.35, 0.2  # of the outermost points of a face, in point distances
 RIM_SIGMA = 0.40  # of one of them, in point distances
 RIM_GATE, STILL_M = 4.5, 2e-5  # in point distances; a step smaller than this is the last with one gate
-LEAST_OWN, BEHIND_M = 0.15, 0.002  # share of the rims with something behind them; how far behind
+LEAST_OWN, BEHIND_M, BEHIND = (
+    0.15,
+    0.002,
+    0.55,
+)  # share of the rims with something behind them; how far, or of a sheet's thickness
 SHARED_M = 0.08
 RIM_FLOOR = 0.15  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
@@ -107,15 +112,39 @@ def contour(model: PartModel, eye: Floats) -> SharpEdges:
     )
 
 
+_Rows = TypeVar("_Rows", SharpEdges, Equations)
+
+
+def contours(model: PartModel, X_BP: RigidTransform, scan: PreparedScan) -> list[SharpEdges]:
+    """The contour from each of the scanner's positions."""
+    return [contour(model, eye) for eye in into(X_BP, scan.eyes)]
+
+
+def joined(parts: list[_Rows]) -> _Rows:
+    """Edges, or equations, of several scans as one; the clusters of equations stay apart."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = [np.concatenate([getattr(one, f.name) for one in parts]) for f in fields(parts[0])]
+    if isinstance(parts[0], Equations):
+        rows[3] = rows[3] + 100_000 * np.repeat(np.arange(len(parts)), [len(one.residual) for one in parts])
+    return type(parts[0])(*rows)
+
+
 def rim_rows(
-    p: Floats, edges: SharpEdges, gate: float, band: float, scan: PreparedScan, X_BP: RigidTransform
+    p: Floats,
+    edges: SharpEdges,
+    gate: float,
+    band: float,
+    view: View,
+    pitch: float,
+    behind: float,
+    X_BP: RigidTransform,
 ) -> Equations | None:
     """Equations of the outermost points of the faces among p (N,3) in P against the edges that end them.
 
     A face may also end where something hides it, or where nothing was measured. So just beyond its outermost point the scan has to
     show something behind it; where no edge does, for nothing lies in the scanner's range behind the part, all edges are used.
     """
-    pitch = scan.pitch_m
     if len(edges.point) < 4 or not len(p):
         return None
     away, k = (
@@ -136,7 +165,7 @@ def rim_rows(
     if len(good) < 4:
         return None
     beyond = edges.point[good] + (last[good] + 1.5 * pitch)[:, None] * edges.outward[good]
-    own = _ends_itself(beyond, edges.normal[good], scan, X_BP)
+    own = _ends_itself(beyond, edges.normal[good], view, pitch, behind, X_BP)
     if np.count_nonzero(own) > max(4, LEAST_OWN * len(good)):
         good = good[own]
     m, at = edges.outward[good], edges.point[good]
@@ -144,18 +173,20 @@ def rim_rows(
     return Equations(-np.hstack([np.cross(at, m), m]), r, np.ones(len(r)), _shared(edges, good))
 
 
-def _ends_itself(beyond: Floats, normal: Floats, scan: PreparedScan, X_BP: RigidTransform) -> npt.NDArray[np.bool_]:
+def _ends_itself(
+    beyond: Floats, normal: Floats, view: View, pitch: float, behind: float, X_BP: RigidTransform
+) -> npt.NDArray[np.bool_]:
     """Whether around points (N,3) of P, just beyond the rims of faces with normals (N,3), the scan shows something behind the
     faces and nothing before them."""
-    tree = scan.rays
+    tree = view.rays
     R = X_BP.rotation().matrix()
     at = beyond @ R.T + X_BP.translation()
-    d = at - scan.eye
+    d = at - view.eye
     away = np.linalg.norm(d, axis=1)
-    _, k = tree.query(d / away[:, None], k=9, distance_upper_bound=2.5 * scan.pitch_m / float(np.median(away)))
-    found = np.asarray(k) < len(scan.measured)
-    height = np.einsum("ijk,ik->ij", scan.measured[np.where(found, k, 0)] - at[:, None], normal @ R.T)
-    return np.asarray((found & (height < -BEHIND_M)).any(axis=1) & ~(found & (height > BEHIND_M)).any(axis=1))
+    _, k = tree.query(d / away[:, None], k=9, distance_upper_bound=2.5 * pitch / float(np.median(away)))
+    found = np.asarray(k) < len(view.measured)
+    height = np.einsum("ijk,ik->ij", view.measured[np.where(found, k, 0)] - at[:, None], normal @ R.T)
+    return np.asarray((found & (height < -behind)).any(axis=1) & ~(found & (height > BEHIND_M)).any(axis=1))
 
 
 def _shared(edges: SharpEdges, index: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -234,13 +265,14 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
     points, normals = scan.points[near], scan.normals[near]
     stride = max(1.0, len(points) / MOST_POINTS)
     few = (np.arange(int(len(points) / stride)) * stride).astype(int)
-    every = scan.measured[_within(scan.measured, middle, around)]
+    every = [v.measured[_within(v.measured, middle, around)] for v in scan.views]
+    behind = min(BEHIND_M, BEHIND * model.thickness_m)
     sigma = 0.5e-3
     surface, rims = None, None
     for g, steps in ((gate, 3), (0.5 * gate, 3), (0.004, 3), (0.002, 6)):
-        edges = contour(model, into(X, scan.eye[None])[0])
+        edges = contours(model, X, scan)
         rim_gate = max(g, RIM_GATE * pitch)
-        beside = _beside(into(X, every), edges, 2.0 * rim_gate)
+        beside = [p[_beside(into(X, p), e, 2.0 * rim_gate)] for p, e in zip(every, edges, strict=True)]
         some = few if g <= 0.002 else few[:: max(1, len(few) // EARLY_POINTS)]
         for _ in range(steps):
             near_m = max(g, 3.5 * pitch) if g > 0.002 else max(0.001, 8.0 * sigma)
@@ -249,7 +281,13 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
                 return None
             sigma = max(SIGMA_FLOOR_M, 1.4826 * float(np.median(np.abs(surface.residual))))
             # A narrower gate would only let through the rims that agree with the pose already.
-            rims = rim_rows(into(X, every[beside]), edges, rim_gate, max(4.0 * sigma, 0.0004), scan, X)
+            band = max(4.0 * sigma, 0.0004)
+            found = [
+                rim_rows(into(X, p), e, rim_gate, band, v, pitch, behind, X)
+                for p, e, v in zip(beside, edges, scan.views, strict=True)
+            ]
+            some_rims = [one for one in found if one is not None]
+            rims = joined(some_rims) if some_rims else None
             reach = rim_gate if g > 0.002 else 0.0
             xi = step(surface, rims, max(4.0 * sigma, 0.0004), sigma, pitch, reach)
             if xi is None:

@@ -84,12 +84,20 @@ class PartModel:
         return np.asarray(normals)
 
     def ranges(self, eye: Floats, directions: Floats) -> tuple[Floats, Floats]:
-        """Distances (N,) m from the eye (3,) along unit directions (N,3), inf where the part is missed, and the normals there."""
+        """Distances (N,) m from eyes (3,) or (N,3) along unit directions (N,3), inf where the part is missed, and the normals there."""
         rays = np.hstack([np.broadcast_to(eye, directions.shape), directions]).astype(np.float32)
         hit = self._scene.cast_rays(self._tensor(rays))
         index = hit["primitive_ids"].numpy().astype(np.int64)
         index[index >= len(self.mesh.triangles)] = 0
         return hit["t_hit"].numpy().astype(np.float64), self.mesh.normals[index]
+
+    @cached_property
+    def thickness_m(self) -> float:
+        """Thickness under the thinnest fifth of the surface."""
+        p, n = self.points[::20], self.normals[::20]
+        through = self.ranges(p - 2e-5 * n, -n)[0]
+        through = through[np.isfinite(through) & (through > 1e-4)]
+        return float(np.percentile(through, 20)) if len(through) else 0.1
 
     @cached_property
     def directions(self) -> list[Floats]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 
 from weldcal.models.mesh import TriMesh
-from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near
+from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near, views_off
 from weldcal.welding.locate.part.fit import Fit, coarse_fit, fine_fit
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.result import AmbiguousPart, PartConfig, PartNotFound, PartRegistration
@@ -28,10 +29,11 @@ from weldcal.welding.locate.part.search import rough_places
 Floats = npt.NDArray[np.float64]
 
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
-COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
+COARSE_TOLERANCE_M, TOLERANCE_M, SHEET_TOLERANCE_M, SHEET = 0.004, 0.0010, 0.0004, 0.5
 FINE_PLACES, FINE_RIVALS = 10, 5
-NEAR_HINT_DEG = 40.0
+NEAR_HINT_DEG, LARGE_M = 40.0, 0.4
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
+LARGER = 0.9  # size of a part that one scan does not show, in what the scan shows
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
 
 
@@ -46,7 +48,7 @@ class _Judged:
 
 
 def register_part(
-    points_B: npt.NDArray[np.floating],
+    points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]],
     mesh: TriMesh,
     X_BP_guess: RigidTransform | None = None,
     eye_B: npt.ArrayLike | None = None,
@@ -55,10 +57,10 @@ def register_part(
     matters_P: Floats | None = None,
     config: PartConfig | None = None,
 ) -> PartRegistration:
-    """Register a part to a scan (N,3) or (H,W,3), m in base, NaN where unmeasured.
+    """Register a part to a scan (N,3) or (H,W,3), or to a list of scans of one scene, m in base, NaN where unmeasured.
 
-    mesh: the part in its frame P, m. X_BP_guess: search only near it (config.reach_m, reach_rad). eye_B (3,): the scanner's position.
-    X_BP_hint: decides between poses that look the same, and is not used else. matters_P (N,3), the seam: a direction that is free
+    mesh: the part in its frame P, m. X_BP_guess: search only near it (config.reach_m, reach_rad). eye_B (3,): the scanner's
+    position, of a list (V,3).     X_BP_hint: decides between poses that look the same, and is not used else. matters_P (N,3), the seam: a direction that is free
     but leaves these points, as a set, where they are is no reason to refuse.
 
     Raises:
@@ -104,7 +106,15 @@ def register_prepared(
         if better:
             rivals = [f for f in (best, *rivals) if f is not better[0]]
             best = better[0]
-    _check_fit(best, config)
+    _check_fused(best, scan, model)
+    try:
+        _check_fit(best, scan, model, config)
+    except PartNotFound:
+        if X_BP_guess is None and _mirror_image_fits(scan, model, best, config):
+            raise PartNotFound(
+                "The scan shows the part's mirror image: use the file of the other hand, or put the other part in."
+            ) from None
+        raise
     _check_known(best, model, matters_P, config)
     best, runner_up = _decided(best, rivals, scan, model, hint, matters_P, config)
     return _result(best, runner_up, model, matters_P)
@@ -112,8 +122,7 @@ def register_prepared(
 
 def _check_size(scan: PreparedScan, model: PartModel) -> None:
     """Raise PartNotFound where the part is far too large or too small to be seen in the scan."""
-    seen = float(np.linalg.norm(np.percentile(scan.coarse, 98, axis=0) - np.percentile(scan.coarse, 2, axis=0)))
-    size = 2.0 * model.radius
+    seen, size = _extent(scan), 2.0 * model.radius
     if size > LARGEST * seen or size < SMALLEST * scan.pitch_m:
         raise PartNotFound(
             f"The part is {size:.3g} m across, and the scan shows {seen:.3g} m with {1e3 * scan.pitch_m:.2g} mm between its points: "
@@ -121,21 +130,37 @@ def _check_size(scan: PreparedScan, model: PartModel) -> None:
         )
 
 
+def _extent(scan: PreparedScan) -> float:
+    """How far the scan shows the scene across, m."""
+    return float(np.linalg.norm(np.percentile(scan.coarse, 98, axis=0) - np.percentile(scan.coarse, 2, axis=0)))
+
+
 def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[RigidTransform]:
     """Poses from the search, fitted to the coarse points, best first."""
     scored: list[tuple[float, RigidTransform]] = []
     for place in rough_places(scan, model, config):
-        # A flat part may slide along itself in the coarse fit, so the pose before it is compared too.
-        tried = (place.X_BP, coarse_fit(scan, model, place.X_BP, COARSE_GATES))
-        some = [
-            (agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score, X)
-            for X in tried
-            if X is not None and not any(same_pose(X, Y, model) for _, Y in scored)
-        ]
-        if some:
-            scored.append(max(some, key=lambda one: one[0]))
+        # A flat part may slide along itself in the coarse fit, and a fixture may pull it: the pose before it is a start too.
+        gates = (0.053 * model.radius, 0.04 * model.radius, *COARSE_GATES) if model.radius > LARGE_M else COARSE_GATES
+        for X in (place.X_BP, coarse_fit(scan, model, place.X_BP, gates)):
+            if X is not None and not any(same_pose(X, Y, model) for _, Y in scored):
+                rays = rays_near(scan, model, X)[::5]
+                scored.append((agreement(rays, scan, model, X, COARSE_TOLERANCE_M).score, X))
     scored.sort(key=lambda s: -s[0])
     return [X for _, X in scored]
+
+
+def _mirror_image_fits(scan: PreparedScan, model: PartModel, best: _Judged, config: PartConfig) -> bool:
+    """Whether the part's mirror image fits the scan, and better than the part itself."""
+    mesh = model.mesh
+    mirrored = PartModel(TriMesh(mesh.vertices * [-1.0, 1.0, 1.0], mesh.triangles[:, ::-1].copy()), config.seed)
+    fits = _fine(scan, mirrored, _starts(scan, mirrored, config), FINE_PLACES)
+    if not fits or fits[0].agreement.score < best.agreement.score:
+        return False
+    try:
+        _check_fit(fits[0], scan, mirrored, config)
+    except PartNotFound:
+        return False
+    return True
 
 
 def _near_starts(scan: PreparedScan, model: PartModel, guess: RigidTransform) -> list[RigidTransform]:
@@ -175,15 +200,20 @@ def _fine(
         if fit is None or any(same_pose(fit.X_BP, j.X_BP, model) for j in judged):
             continue
         rays = rays_near(scan, model, fit.X_BP)
-        judged.append(_Judged(fit, agreement(rays, scan, model, fit.X_BP, TOLERANCE_M)))
+        judged.append(_Judged(fit, agreement(rays, scan, model, fit.X_BP, _tolerance(model))))
     judged.sort(key=lambda j: -j.agreement.score)
     return judged
+
+
+def _tolerance(model: PartModel) -> float:
+    """How far a ray may end from the part that it meets, m: less than a sheet's thickness, for beneath it lies the table."""
+    return min(TOLERANCE_M, max(SHEET_TOLERANCE_M, SHEET * model.thickness_m))
 
 
 def _evidence(a: _Judged, b: _Judged, scan: PreparedScan, model: PartModel) -> tuple[int, int, int]:
     """Numbers of rays that speak for a and for b where the two differ, and of those that meet a."""
     rays = np.unique(np.vstack([rays_near(scan, model, a.X_BP), rays_near(scan, model, b.X_BP)]), axis=0)
-    va, vb = (agreement(rays, scan, model, x.X_BP, TOLERANCE_M).verdict.astype(int) for x in (a, b))
+    va, vb = (agreement(rays, scan, model, x.X_BP, _tolerance(model)).verdict.astype(int) for x in (a, b))
     return int(np.sum(va > vb)), int(np.sum(vb > va)), int(np.sum(va == 1))
 
 
@@ -215,16 +245,31 @@ def _rotvec(X: RigidTransform) -> Floats:
     return np.asarray(Rotation.from_matrix(X.rotation().matrix()).as_rotvec())
 
 
-def _check_fit(best: _Judged, config: PartConfig) -> None:
+def _check_fused(best: _Judged, scan: PreparedScan, model: PartModel) -> None:
+    """Raise PartNotFound where one of several scans shows the part elsewhere than the others."""
+    off = views_off(scan, model, best.X_BP, _tolerance(model)) if len(scan.views) > 1 else []
+    if off and len(off) < len(scan.views):
+        numbers = ", ".join(str(k + 1) for k in off)
+        raise PartNotFound(
+            f"Of the {len(scan.views)} scans number {numbers} shows the part elsewhere than the others: the arm, the scanner or the part "
+            "moved, or X_BC is wrong. Scan again."
+        )
+
+
+def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: PartConfig) -> None:
     """Raise PartNotFound where the best pose does not agree with the scan."""
     a = best.agreement
+    shown, size = _extent(scan), 2.0 * model.radius
+    advice = "clear the view, or scan it from elsewhere"
+    if size > LARGER * shown:
+        advice = f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: give a list of several scans along it"
     if a.n_met < config.min_points:
         raise PartNotFound(
-            f"The scan shows only {a.n_met} points of the part, and {config.min_points} are needed: clear the view, or scan from nearer."
+            f"The scan shows only {a.n_met} points of the part, and {config.min_points} are needed: {advice}."
         )
     if a.seen < config.min_seen:
         raise PartNotFound(
-            f"The scan shows only {100 * a.seen:.0f} % of the part's visible surface ({a.n_met} points): clear the view or scan from elsewhere."
+            f"The scan shows only {100 * a.seen:.0f} % of the part's visible surface ({a.n_met} points): {advice}."
         )
     if a.goes_on > config.max_goes_on:
         raise PartNotFound(
