@@ -63,6 +63,12 @@ def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_
     sine = np.minimum(1.0, (model.radius + reach_m) / far)
     towards = (middle / far[:, None])[scan.view]
     near = np.flatnonzero(np.vecdot(scan.sight, towards) > np.sqrt(1.0 - sine**2)[scan.view])
+    eye = into(X_BP, scan.eyes)[scan.view[near]]
+    d = into(X_BP, scan.points[near]) - eye
+    low, high = model.mesh.bounds
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (low - reach_m - eye) / d, (high + reach_m - eye) / d
+    near = near[np.minimum(a, b).max(axis=1) <= np.maximum(a, b).min(axis=1)]
     stride = max(1.0, len(near) / MOST_RAYS)
     near = near[(np.arange(int(len(near) / stride)) * stride).astype(int)]
     return np.hstack([scan.points[near], scan.eyes[scan.view[near]]])

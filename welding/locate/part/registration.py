@@ -24,15 +24,16 @@ from weldcal.welding.locate.part.rivals import (
     turned_poses,
 )
 from weldcal.welding.locate.part.scan import PreparedScan, finite_points, prepare
-from weldcal.welding.locate.part.search import rough_places
+from weldcal.welding.locate.part.search import LARGE_M, rough_places
 
 Floats = npt.NDArray[np.float64]
 
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M, SHEET_TOLERANCE_M, SHEET = 0.004, 0.0010, 0.0004, 0.5
 FINE_PLACES, FINE_RIVALS = 10, 5
-NEAR_HINT_DEG, LARGE_M = 40.0, 0.4
+NEAR_HINT_DEG = 40.0
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
+CLEAR = 0.25  # of the best pose's rays: a rival with less is worse by few rays already
 LARGER = 0.9  # size of a part that one scan does not show, in what the scan shows
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
 
@@ -122,17 +123,12 @@ def register_prepared(
 
 def _check_size(scan: PreparedScan, model: PartModel) -> None:
     """Raise PartNotFound where the part is far too large or too small to be seen in the scan."""
-    seen, size = _extent(scan), 2.0 * model.radius
+    seen, size = scan.extent_m, 2.0 * model.radius
     if size > LARGEST * seen or size < SMALLEST * scan.pitch_m:
         raise PartNotFound(
             f"The part is {size:.3g} m across, and the scan shows {seen:.3g} m with {1e3 * scan.pitch_m:.2g} mm between its points: "
             "check the unit of the part's file."
         )
-
-
-def _extent(scan: PreparedScan) -> float:
-    """How far the scan shows the scene across, m."""
-    return float(np.linalg.norm(np.percentile(scan.coarse, 98, axis=0) - np.percentile(scan.coarse, 2, axis=0)))
 
 
 def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[RigidTransform]:
@@ -259,7 +255,7 @@ def _check_fused(best: _Judged, scan: PreparedScan, model: PartModel) -> None:
 def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: PartConfig) -> None:
     """Raise PartNotFound where the best pose does not agree with the scan."""
     a = best.agreement
-    shown, size = _extent(scan), 2.0 * model.radius
+    shown, size = scan.extent_m, 2.0 * model.radius
     advice = "clear the view, or scan it from elsewhere"
     if size > LARGER * shown:
         advice = f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: give a list of several scans along it"
@@ -312,7 +308,9 @@ def _decided(
             or rival.agreement.score_of_rest < ELSEWHERE * best.agreement.score_of_rest
         ):
             continue
-        if for_best - for_rival < max(30, 0.008 * met) or share > config.rival:
+        # A small lug is a small difference: it decides where hardly a ray speaks against it.
+        least = max(30, (0.004 if share < CLEAR else 0.008) * met)
+        if for_best - for_rival < least or share > config.rival:
             alike.append(rival)
     harmful = [r for r in alike if not same_set(matters_P, best.X_BP.InvertAndCompose(r.X_BP))]
     if hint is not None and alike:

@@ -79,6 +79,11 @@ class PreparedScan:
         return np.asarray(d / np.linalg.norm(d, axis=1)[:, None])
 
     @cached_property
+    def extent_m(self) -> float:
+        """How far the scan shows the scene across."""
+        return float(np.linalg.norm(np.subtract(*np.percentile(self.coarse, (98, 2), axis=0))))
+
+    @cached_property
     def eyes(self) -> Floats:
         """The scanners' positions (V,3)."""
         return np.array([v.eye for v in self.views])

@@ -25,9 +25,11 @@ MOST_CELLS = 150  # along a side of the scene's map
 SAME_HEIGHT_M = 0.007
 RING_CELLS, RING_SHARE = 3, 0.5
 PEAKS, MOST_PLACES, MOST_UPS = 3, 24, 4
+GROUND_SHARE, LARGE_M = 0.85, 0.4  # of the scan's extent, for a part of a larger radius
+WIDE_CELLS = 3.0  # in the usual cell
 RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, and of a turn at its ends
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
-_BOX = {n: np.ones((n, n), np.uint8) for n in (3, 2 * RING_CELLS + 1)}
+_BOX = {n: np.ones((n, n), np.uint8) for n in (1, 3, 2 * RING_CELLS + 1)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,10 @@ def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> li
     """Rough poses of the part in the scan, best first, at most MOST_PLACES."""
     ups: list[tuple[Floats, Plane | None]] = []
     if scan.planes:
-        large = [p for p in scan.planes if p.extent_m > GROUND_EXTENT * model.radius]
+        least = GROUND_EXTENT * model.radius
+        if model.radius > LARGE_M:
+            least = min(least, GROUND_SHARE * scan.extent_m)
+        large = [p for p in scan.planes if p.extent_m > least]
         for plane in [*large, *scan.planes]:
             # The part lies on a large plane, a tilted positioner's too, or a smaller plane is a face of the part.
             is_ground = plane in large
@@ -102,6 +107,10 @@ def _places_for(
     order = order[np.argsort(q[order, 2])]
     top[i[order, 1], i[order, 0]] = q[order, 2]  # the highest is written last
     body_seen = np.isfinite(top)
+    # In the wide cells of a large part a web may lie in the next cell: heights are compared with those around.
+    around = _BOX[3] if cell > WIDE_CELLS * config.cell_m else _BOX[1]
+    lowest = cv2.erode(np.where(body_seen, top, np.float32(np.inf)), around)
+    highest = cv2.dilate(np.where(body_seen, top, np.float32(-np.inf)), around)
     mask = body_seen.astype(np.float32) - (known & ~body_seen).astype(np.float32)
     scene_body, scene_seen = fft.rfft2(mask, s=full), fft.rfft2(body_seen.astype(np.float32), s=full)
     places: list[Place] = []
@@ -133,11 +142,15 @@ def _places_for(
                 best = max(best, value)
                 cv2.circle(match, (column, row), 3, -1.0, -1)
                 difference = top[row + rows, column + columns] - heights
-                difference = difference[np.isfinite(difference)]
+                shown = np.isfinite(difference)
+                difference = difference[shown]
                 if len(difference) < 0.2 * n:
                     continue
                 lift = float(np.median(difference))
-                same = np.abs(difference - lift) < SAME_HEIGHT_M
+                below, above_it = (
+                    (at[row + rows, column + columns] - heights)[shown] - lift for at in (lowest, highest)
+                )
+                same = (below < SAME_HEIGHT_M) & (above_it > -SAME_HEIGHT_M)
                 score = float(value) - float(len(difference) - np.count_nonzero(same)) / n
                 middle = corner + (np.array([column, row]) + reach + 0.5) * cell
                 R = R_BU @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_UP
