@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,7 @@ COARSE_TOLERANCE_M, TOLERANCE_M, SHEET_TOLERANCE_M, SHEET = 0.004, 0.0010, 0.000
 FINE_PLACES, FINE_RIVALS = 10, 5
 NEAR_HINT_DEG = 40.0
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
+COMPARABLE = 0.5  # of the best score, of a rival that may be better in the rays where they differ
 CLEAR = 0.25  # of the best pose's rays: a rival with less is worse by few rays already
 LARGER = 0.9  # size of a part that one scan does not show, in what the scan shows
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
@@ -117,8 +118,8 @@ def register_prepared(
             ) from None
         raise
     _check_known(best, model, matters_P, config)
-    best, runner_up = _decided(best, rivals, scan, model, hint, matters_P, config)
-    return _result(best, runner_up, model, matters_P)
+    best, runner_up, note = _decided(best, rivals, scan, model, hint, matters_P, config)
+    return _result(best, runner_up, note, model, matters_P)
 
 
 def _check_size(scan: PreparedScan, model: PartModel) -> None:
@@ -214,6 +215,9 @@ def _evidence(a: _Judged, b: _Judged, scan: PreparedScan, model: PartModel) -> t
 
 
 def _better(rival: _Judged, best: _Judged, scan: PreparedScan, model: PartModel) -> bool:
+    # Rays that meet a table speak for any pose on it: its score must be comparable too.
+    if rival.agreement.score < COMPARABLE * best.agreement.score:
+        return False
     more, less, met = _evidence(rival, best, scan, model)
     return more > less + max(30, 0.01 * met)
 
@@ -291,8 +295,12 @@ def _decided(
     hint: RigidTransform | None,
     matters_P: Floats | None,
     config: PartConfig,
-) -> tuple[_Judged, float]:
-    """The pose among those that look the same, and how good the best other one is; raise AmbiguousPart where nothing decides."""
+) -> tuple[_Judged, float, str]:
+    """The pose among those that look the same, how good the best other one is, and where an equal part lies.
+
+    Raises:
+        AmbiguousPart: nothing decides.
+    """
     alike: list[_Judged] = []
     runner_up = 0.0
     for rival in rivals:
@@ -318,7 +326,10 @@ def _decided(
         cost = np.array([_away(f.X_BP, hint, model) for f in family])
         order = np.argsort(cost)
         if cost[order[1]] - cost[order[0]] > math.radians(20.0):
-            return family[int(order[0])], runner_up
+            best = family[int(order[0])]
+            places = [f.X_BP.multiply(model.center) for f in family]
+            far = [p for p in places if np.linalg.norm(p - best.X_BP.multiply(model.center)) > model.radius]
+            return best, runner_up, f"; an equal part lies near {_in_mm(far[0])}" if far else ""
     if harmful:
         motion = best.X_BP.InvertAndCompose(harmful[0].X_BP)
         near = float(np.linalg.norm(motion.multiply(model.center) - model.center)) < 0.5 * model.radius
@@ -326,12 +337,16 @@ def _decided(
             raise AmbiguousPart(
                 f"The part's pose is ambiguous: {describe_turn(motion)}; give a guess of its pose, or scan it from where its sides differ."
             )
-        a, b = (1e3 * x.X_BP.multiply(model.center) for x in (best, harmful[0]))
+        a, b = (_in_mm(x.X_BP.multiply(model.center)) for x in (best, harmful[0]))
         raise AmbiguousPart(
-            f"Two places in the scan look equally like the part: near ({a[0]:.0f}, {a[1]:.0f}, {a[2]:.0f}) and "
-            f"({b[0]:.0f}, {b[1]:.0f}, {b[2]:.0f}) mm; cover or remove one, or give a guess of where the part is."
+            f"Two places in the scan look equally like the part: near {a} and {b}; cover or remove one, or give a guess of where the part is."
         )
-    return best, runner_up
+    return best, runner_up, ""
+
+
+def _in_mm(p: Floats) -> str:
+    """A place (3,) m, in words."""
+    return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * p))
 
 
 def _check_known(best: _Judged, model: PartModel, matters_P: Floats | None, config: PartConfig) -> None:
@@ -345,7 +360,7 @@ def _check_known(best: _Judged, model: PartModel, matters_P: Floats | None, conf
         )
 
 
-def _result(best: _Judged, runner_up: float, model: PartModel, matters_P: Floats | None) -> PartRegistration:
+def _result(best: _Judged, runner_up: float, note: str, model: PartModel, matters_P: Floats | None) -> PartRegistration:
     a = best.agreement
     confidence = float(
         np.clip((a.met / max(1e-9, 1.0 - a.hidden) - a.passed) * (1.0 - max(0.0, runner_up - 0.7)), 0.0, 1.0)
@@ -367,16 +382,6 @@ def _result(best: _Judged, runner_up: float, model: PartModel, matters_P: Floats
     what = "the part" if matters_P is None else "the drawn seam"
     summary = (
         f"{word} confidence {confidence:.2f}: {100 * a.met:.0f} % of the rays that should meet the part do, {100 * a.passed:.0f} % pass through it, "
-        f"{100 * a.seen:.0f} % of its visible surface is seen; {what} is known to {1e3 * sigma:.2f} mm"
+        f"{100 * a.seen:.0f} % of its visible surface is seen; {what} is known to {1e3 * sigma:.2f} mm{note}"
     )
-    return PartRegistration(
-        X_BP=best.X_BP,
-        covariance=best.fit.covariance,
-        rms_m=best.fit.rms_m,
-        agreement=a.met,
-        violation=a.passed,
-        seen=a.seen,
-        confidence=confidence,
-        runner_up=runner_up,
-        summary=summary,
-    )
+    return replace(found, summary=summary)

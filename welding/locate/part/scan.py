@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +21,7 @@ FINE_POINTS, COARSE_CELL_M = 160_000, 0.004
 FLAT_COS, FLAT_SHARE = 0.985, 0.6
 PLANE_BAND_M, PLANE_TRIALS, MOST_PLANES = 0.0025, 150, 6
 LEVEL_M = (0.0004, 0.0025)  # least and greatest height over a plane that is no longer its own
+LEAST_LEVEL, LEVEL_COS = 300, math.cos(math.radians(1.0))  # points of such a plane, and its turn by them
 EYE_ABOVE_M = 1.0  # assumed where the scanner's position is not given
 
 
@@ -27,13 +29,15 @@ EYE_ABOVE_M = 1.0  # assumed where the scanner's position is not given
 class Plane:
     """Points x with normal . x = level, the normal towards the scanner.
 
-    extent_m: how far the scan shows the plane across; own_m: height over it within which a point is its own.
+    extent_m: how far the scan shows the plane across; filled: share of the square over this diagonal that its points fill;
+    own_m: height over it within which a point is its own.
     """
 
     normal: Floats
     level: float
     extent_m: float
-    own_m: float
+    filled: float
+    own_m: float = PLANE_BAND_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +160,14 @@ def _own_level(plane: Plane, points: Floats) -> Plane:
     for above in (1.5, 1.2, 1.0, 0.8, 0.6, 0.5, 0.4, 0.4, 0.4):
         height = band @ normal - level
         low = band[height < np.percentile(height, 10) + 1e-3 * above]
+        if len(low) < LEAST_LEVEL:
+            return plane
         middle = low.mean(axis=0)
         towards = np.linalg.svd(np.cov((low - middle).T))[0][:, 2]
         normal = towards * (1.0 if towards @ normal > 0.0 else -1.0)
         level = float(normal @ middle)
+    if normal @ plane.normal < LEVEL_COS:
+        return plane
     sigma = 1.4826 * float(np.median(np.abs(low @ normal - level)))
     return replace(plane, normal=normal, level=level, own_m=min(max(LEVEL_M[0], 4.0 * sigma), LEVEL_M[1]))
 
@@ -194,7 +202,8 @@ def _planes(points: Floats, normals: Floats, rng: np.random.Generator) -> list[P
         # A plane that cuts across several surfaces is none.
         if np.count_nonzero(along) >= FLAT_SHARE * len(on):
             extent = float(np.linalg.norm(np.percentile(on, 98, axis=0) - np.percentile(on, 2, axis=0)))
-            found.append(Plane(np.asarray(normal), float(normal @ middle), extent, PLANE_BAND_M))
+            filled = 2.0 * len(on) * COARSE_CELL_M**2 / max(extent, 1e-9) ** 2
+            found.append(Plane(np.asarray(normal), float(normal @ middle), extent, filled))
     return found
 
 

@@ -25,6 +25,7 @@ MOST_CELLS = 150  # along a side of the scene's map
 SAME_HEIGHT_M = 0.007
 RING_CELLS, RING_SHARE = 3, 0.5
 PEAKS, MOST_PLACES, MOST_UPS = 3, 24, 4
+LEAST_FILLED = 0.4  # of a ground, by its points: a plane that cuts across several things is none
 GROUND_SHARE, LARGE_M = 0.85, 0.4  # of the scan's extent, for a part of a larger radius
 WIDE_CELLS = 3.0  # in the usual cell
 RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, and of a turn at its ends
@@ -54,11 +55,13 @@ def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> li
         least = GROUND_EXTENT * model.radius
         if model.radius > LARGE_M:
             least = min(least, GROUND_SHARE * scan.extent_m)
-        large = [p for p in scan.planes if p.extent_m > least]
+        large = [p for p in scan.planes if p.extent_m > least and p.filled > LEAST_FILLED]
         for plane in [*large, *scan.planes]:
             # The part lies on a large plane, a tilted positioner's too, or a smaller plane is a face of the part.
             is_ground = plane in large
             known = [g for u, g in ups if float(plane.normal @ u) > math.cos(math.radians(7.0))]
+            if not is_ground and ups and float(plane.normal @ ups[0][0]) < math.cos(math.radians(50.0)):
+                continue
             if is_ground:
                 known = [g for g in known if g is plane or g is None or abs(g.level - plane.level) < SAME_HEIGHT_M]
             if len(ups) < MOST_UPS and not known:
