@@ -36,6 +36,7 @@ RIM_FLOOR = 0.15  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
 PATCHES = 14.0  # size of a patch whose points share their error, in point distances
 SIGMA_FLOOR_M, CREEP_M, SLOW_M = 2e-5, 2e-5, 3e-5
+CLUSTERS = 100_000  # more than one scan has
 MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
 
 
@@ -121,13 +122,13 @@ def contours(model: PartModel, X_BP: RigidTransform, scan: PreparedScan) -> list
 
 
 def joined(parts: list[_Rows]) -> _Rows:
-    """Edges, or equations, of several scans as one; the clusters of equations stay apart."""
+    """Edges, or equations, of several scans as one; their chains, or clusters, stay apart."""
     if len(parts) == 1:
         return parts[0]
-    rows = [np.concatenate([getattr(one, f.name) for one in parts]) for f in fields(parts[0])]
-    if isinstance(parts[0], Equations):
-        rows[3] = rows[3] + 100_000 * np.repeat(np.arange(len(parts)), [len(one.residual) for one in parts])
-    return type(parts[0])(*rows)
+    rows = {f.name: np.concatenate([getattr(one, f.name) for one in parts]) for f in fields(parts[0])}
+    last = fields(parts[0])[-1].name
+    rows[last] += CLUSTERS * np.repeat(np.arange(len(parts)), [len(getattr(one, last)) for one in parts])
+    return type(parts[0])(**rows)
 
 
 def rim_rows(
