@@ -61,7 +61,7 @@ def test_a_beam_of_three_scans_is_found() -> None:
         register_part(s.scans, mesh, eye_B=s.X_BC[0][:3, 3])
 
 
-@pytest.mark.parametrize("kind", ["mirrored", "two_unnamed", "fused_wrongly"])
+@pytest.mark.parametrize("kind", ["two_unnamed", "fused_wrongly"])
 def test_a_refusal_names_its_cause(kind: str) -> None:
     found = judge(of(kind, 7000))
     assert found.verdict == "right", found

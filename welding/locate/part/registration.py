@@ -109,14 +109,7 @@ def register_prepared(
             rivals = [f for f in (best, *rivals) if f is not better[0]]
             best = better[0]
     _check_fused(best, scan, model)
-    try:
-        _check_fit(best, scan, model, config)
-    except PartNotFound:
-        if X_BP_guess is None and _mirror_image_fits(scan, model, best, config):
-            raise PartNotFound(
-                "The scan shows the part's mirror image: use the file of the other hand, or put the other part in."
-            ) from None
-        raise
+    _check_fit(best, scan, model, config)
     _check_known(best, model, matters_P, config)
     best, runner_up, note = _decided(best, rivals, scan, model, hint, matters_P, config)
     return _result(best, runner_up, note, model, matters_P)
@@ -144,20 +137,6 @@ def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Ri
                 scored.append((agreement(rays, scan, model, X, COARSE_TOLERANCE_M).score, X))
     scored.sort(key=lambda s: -s[0])
     return [X for _, X in scored]
-
-
-def _mirror_image_fits(scan: PreparedScan, model: PartModel, best: _Judged, config: PartConfig) -> bool:
-    """Whether the part's mirror image fits the scan, and better than the part itself."""
-    mesh = model.mesh
-    mirrored = PartModel(TriMesh(mesh.vertices * [-1.0, 1.0, 1.0], mesh.triangles[:, ::-1].copy()), config.seed)
-    fits = _fine(scan, mirrored, _starts(scan, mirrored, config), FINE_PLACES)
-    if not fits or fits[0].agreement.score < best.agreement.score:
-        return False
-    try:
-        _check_fit(fits[0], scan, mirrored, config)
-    except PartNotFound:
-        return False
-    return True
 
 
 def _near_starts(scan: PreparedScan, model: PartModel, guess: RigidTransform) -> list[RigidTransform]:
