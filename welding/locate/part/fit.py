@@ -52,13 +52,11 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A pose with its covariance (6,6), of the motion in P; rms_m of the surface; n_points on it; n_rims points on edges."""
+    """A pose with its covariance (6,6), of the motion in P; rms_m of the surface."""
 
     X_BP: RigidTransform
     covariance: Floats
     rms_m: float
-    n_points: int
-    n_rims: int
 
 
 def moved(X: RigidTransform, xi: Floats) -> RigidTransform:
@@ -301,8 +299,6 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
         X,
         covariance(surface, rims, sigma, pitch),
         float(np.sqrt(np.mean(np.square(surface.residual[np.abs(surface.residual) < max(4.0 * sigma, 0.0004)])))),
-        len(surface.residual),
-        0 if rims is None else len(rims.residual),
     )
 
 

@@ -126,8 +126,7 @@ class PartModel:
     def edges(self) -> SharpEdges:
         """The convex sharp edges."""
         t, n = self.mesh.triangles, self.mesh.normals
-        v, key = np.unique(np.round(self.mesh.vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
-        del v
+        _, key = np.unique(np.round(self.mesh.vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
         key = key.ravel()
         pair = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
         face = np.tile(np.arange(len(t)), 3)
