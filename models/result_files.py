@@ -60,11 +60,15 @@ def whole_result(folder: Path) -> Iterator[None]:
     """
     folder = folder.absolute()
     before = _RESULTS.set((*_RESULTS.get(), folder))
+    mark = folder / UNFINISHED
     try:
         yield
+    except BaseException as problem:
+        if mark.exists() and str(folder) not in getattr(problem, "__notes__", ()):
+            problem.add_note(str(folder))  # for the sentence that names it
+        raise
     finally:
         _RESULTS.reset(before)
-    mark = folder / UNFINISHED
     if mark.exists():
         mark.unlink()
         _to_disk(folder)

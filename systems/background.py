@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
 from weldcal.models.errors import WeldcalError
+from weldcal.systems.interrupts import deferred
 from weldcal.systems.messages import Message
 
 Found = TypeVar("Found")
@@ -108,25 +109,30 @@ class OwnProcess:
             1, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_process
         )
     )
-    waiting_since: float | None = None  # wall clock (monotonic) of the newest question, while it has no answer
     waits: bool = False  # whether the caller may wait for its answers, because its robot waits for it
     _preparing: "list[Future[Any]]" = field(default_factory=list)
+    _newest: "tuple[Future[Any], float] | None" = None  # the newest question, and when it was asked
 
     def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
         """See Background."""
-        self._preparing.append(self._pool.submit(function, *arguments))
+        with deferred():  # the first one starts the process
+            self._preparing.append(self._pool.submit(function, *arguments))
 
     def ask(self, function: Callable[..., Found], *arguments: Any) -> Answer[Found]:
         """See Background."""
-        answer = Answer(self._pool.submit(function, *arguments))
-        self.waiting_since = time.monotonic()
-        answer.future.add_done_callback(self._answered)
+        with deferred():
+            future = self._pool.submit(function, *arguments)
+        self._newest = (future, time.monotonic())
         if self.waits:
-            wait([answer.future])
-        return answer
+            wait([future])
+        return Answer(future)
 
-    def _answered(self, _: "Future[Any]") -> None:
-        self.waiting_since = None
+    @property
+    def waiting_since(self) -> float | None:
+        """See Background."""
+        if self._newest is None or self._newest[0].done():
+            return None
+        return self._newest[1]
 
     def settle(self) -> None:
         """See Background."""

@@ -228,6 +228,9 @@ class PlannedSeam(Message):
     # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and torch at one place
     arm_sigma_m: float = np.nan
     arm_turn_rad: float = np.nan
+    lean_rad: float = (
+        0.0  # of the tool across the line from torch to tip, to the seam's right, so that the arm can follow
+    )
 
 
 def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:

@@ -16,6 +16,7 @@ from pydrake.systems.sensors import RgbdSensor
 from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.host_timing import HostTiming, measure_host, require_timely_host
+from weldcal.systems.interrupts import SIGTERM, deferred
 from weldcal.systems.messages import JobCommand, Scan
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
 from weldcal.systems.person import KEYS
@@ -116,6 +117,8 @@ class Run(Generic[JobOf]):
             found |= self.clock.summary()
         if self.host is not None:
             found["host_timing"] = self.host.summary()
+        if self.cell.station.robot.transport:
+            found["transport"] = self.cell.station.robot.transport
         if self.held_by_person:
             found["held_by_person"] = self.held_by_person
         return found
@@ -207,17 +210,21 @@ def run_cell(
                 run.host = measure_host()
                 if not station.robot.waits:
                     require_timely_host(run.host)
+                progress(f"this computer: {run.host.words}", 0.0)
                 around.enter_context(short_turns())
                 if not run.clock.follows:  # a robot that waits needs no precedence, and shares this computer
                     precedence = around.enter_context(real_time_priority())
             simulator.Initialize()
             simulator.AdvanceTo(cell.job.maximum_time_s + OVERTIME_S)
     except KeyboardInterrupt as stop:
-        who = "The operating system ended the run (SIGTERM)" if "SIGTERM" in stop.args else STOPPED_BY_OPERATOR
+        if not run.phases:  # nothing has begun that could be held
+            raise
+        who = "The operating system ended the run (SIGTERM)" if SIGTERM in stop.args else STOPPED_BY_OPERATOR
         run.interrupted = f"{who}, in the phase '{run.command.phase}'."
     finally:
         simulator.clear_monitor()  # it knows the run, and the run the simulator: C++ would keep both
-        station.close()
+        with deferred():  # the arm comes to rest first
+            station.close()
     run.wall_seconds = time.perf_counter() - start
     ended(run)
     if meshcat is not None:

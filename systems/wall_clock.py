@@ -59,13 +59,19 @@ STOPPED = 0.02  # the rate at which a held path stands: at 1 rad/s the arm stops
 
 @dataclass
 class Lateness:
-    """A histogram of how late velocities left the Diagram while the arm moved, in robot time."""
+    """A histogram of how late velocities left the Diagram while the arm moved, in robot time.
+
+    `delays`: from when to when (s of the host) those were waited for that were not on time.
+    """
 
     counts: list[int] = field(default_factory=lambda: [0] * (len(LIMITS_MS) + 1))
     worst_ms: float = 0.0
+    delays: list[tuple[float, float]] = field(default_factory=list)
 
-    def add(self, late_ms: float) -> None:
-        """Count one velocity."""
+    def add(self, late_ms: float, left_s: float | None = None) -> None:
+        """Count one velocity; `left_s` is the host's time (s) at which it left."""
+        if left_s is not None and late_ms >= ON_TIME_MS:
+            self.delays.append((left_s - 1e-3 * late_ms, left_s))
         self.counts[sum(late_ms >= limit for limit in LIMITS_MS)] += 1
         self.worst_ms = max(self.worst_ms, late_ms)
 
@@ -78,6 +84,11 @@ class Lateness:
     def over(self, limit_ms: float) -> int:
         """How many were this late (one of LIMITS_MS) or later."""
         return sum(self.counts[LIMITS_MS.index(limit_ms) + 1 :])
+
+    def shared_with(self, other: "Lateness", limit_ms: float) -> int:
+        """How many that were `limit_ms` late or later were waited for while one of `other` was waited for."""
+        longest = [(begin, end) for begin, end in self.delays if 1e3 * (end - begin) >= limit_ms - 1e-6]
+        return sum(any(begin < there and here < end for here, there in other.delays) for begin, end in longest)
 
     def summary(self) -> dict[str, object]:
         """The JSON object: limits and counts of the bins (one more than limits), the share on time, and the worst."""
@@ -209,7 +220,7 @@ class WallClock:
     def velocity_leaves(self, late_s: float, moving: bool) -> None:
         """Count how late a velocity left the Diagram; one at rest is not counted."""
         if moving and self._at is not None:
-            self.lateness.add(1e3 * late_s)
+            self.lateness.add(1e3 * late_s, self._clock())
 
     def _set_rate(self, step: float, late: float, moving: bool) -> None:
         wanted = min(max(1.0 - (late - SLOW_FROM_S) / SLOW_SPAN_S, SLOWEST), 1.0)

@@ -12,7 +12,7 @@ from xdist.scheduler.loadfile import LoadFileScheduling
 STREAMING = (
     *("test_same_job.py", "test_other_jobs.py", "test_fault_matrix.py", "test_station_backends.py"),
     *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py", "test_hold_and_go_on.py"),
-    *("test_wired_cell.py", "test_wired_profiler.py"),
+    *("test_wired_cell.py", "test_wired_profiler.py", "test_independent_controller.py"),
 )
 # They wait for a browser, a page or a folder and need next to no processor: beside a stream they leave the cores to what computes.
 WAITING = ("test_dashboard.py", "test_panels.py", "test_folder_scanner.py", "test_tablet_page.py")

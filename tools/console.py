@@ -16,6 +16,7 @@ from pathlib import Path
 import typer
 
 from weldcal.models.errors import WeldcalError
+from weldcal.systems.interrupts import INTERRUPTED, received
 
 Progress = Callable[[str, float], None]
 """Called with the stage and the completed fraction (0 to 1)."""
@@ -182,10 +183,6 @@ def emit_address(name: str, url: str) -> None:
     typer.secho(f"{name}  {url}", err=True, bold=True)
 
 
-INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C or SIGTERM ended."""
-
-
 @contextmanager
 def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
     """Turns every failure inside the block into one sentence on stderr and exit code 1; with --json, into JSON too.
@@ -197,11 +194,8 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
     code = 1
     try:
         yield
-    except KeyboardInterrupt:
-        code = INTERRUPTED
-        sentence = (
-            "The operator ended the command. A result folder that it had begun is not complete: run the command again."
-        )
+    except KeyboardInterrupt as problem:
+        code, sentence = INTERRUPTED, _ended(problem)
     except WeldcalError as problem:
         sentence, details = str(problem), getattr(problem, "details", {})
     except OSError as problem:
@@ -218,12 +212,21 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
             traceback.print_exc()
         advice = "" if debug else " Run the command again with --debug and report the traceback."
         sentence = f"Internal error of weldcal: {type(problem).__name__}: {problem}.{advice}"
+        if received():
+            code, sentence = INTERRUPTED, _ended(problem)
     else:
         return
     if json_wanted:
         emit_json({"state": "failed", "reason": sentence, **details})
     typer.secho(_sentence(sentence), err=True, fg=typer.colors.RED)
     raise typer.Exit(code)
+
+
+def _ended(problem: BaseException) -> str:
+    """The sentence of a command that a signal ended; it names the folder whose result is not complete."""
+    folders = getattr(problem, "__notes__", ())
+    begun = f"The result in '{folders[0]}' is not complete (UNFINISHED): run the command again." if folders else ""
+    return f"The operator ended the command. {begun or 'It leaves no incomplete result.'}"
 
 
 SHARE_TOLD = 0.1

@@ -26,7 +26,8 @@ class PreparedRobot:
     """The state of the robot before the station is built, as the driver's `PrepareRobot` returns it.
 
     `q_start` (6,) rad is the arm's present configuration. `clock` paces the Diagram by the wall clock; None: the Diagram may run
-    as fast as possible. `waits`: the robot is emulated, and its time waits for this computer.
+    as fast as possible. `waits`: the robot is emulated, and its time waits for this computer. `transport`: a sentence about the
+    connection to its controller.
     """
 
     arm: ArmModel
@@ -34,6 +35,7 @@ class PreparedRobot:
     handle: Closable | None = None
     clock: WallClock | None = None
     waits: bool = False
+    transport: str = ""
 
     @property
     def pace(self) -> float | None:

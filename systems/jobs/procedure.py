@@ -14,11 +14,9 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, Message, UrStatus
-from weldcal.welding.servo.guards import ArmGuardConfig, guarded_joint_velocity
+from weldcal.welding.servo.guards import GUARD, SPEED_SHARE, guarded_joint_velocity
 
 ENDS = ("done", "held")
-GUARD = ArmGuardConfig()
-SPEED_SHARE = 0.5  # of the joints' speed limits, which a guarded motion may use, as in the SingularityGuard
 SLOWED = (
     "The arm was slowed near a singular position or at a joint's speed limit: choose another home_deg, or move the "
     "target."

@@ -7,7 +7,7 @@ from pydrake.systems.framework import BasicVector, Context
 from weldcal.models.arms.compiled_kinematics import tick_jacobian
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.leaf_system import LeafSystem
-from weldcal.welding.servo.guards import ArmGuardConfig, guarded_joint_velocity
+from weldcal.welding.servo.guards import GUARD, SPEED_SHARE, ArmGuardConfig, guarded_joint_velocity
 
 
 class SingularityGuard(LeafSystem):
@@ -30,11 +30,15 @@ class SingularityGuard(LeafSystem):
     """
 
     def __init__(
-        self, arm: ArmModel, X_FT: RigidTransform, config: ArmGuardConfig | None = None, speed_share: float = 0.5
+        self,
+        arm: ArmModel,
+        X_FT: RigidTransform,
+        config: ArmGuardConfig | None = None,
+        speed_share: float = SPEED_SHARE,
     ) -> None:
         super().__init__()
         self._arm, self._p_FT = arm, np.array(X_FT.translation())
-        self._config, self._limit = config or ArmGuardConfig(), speed_share * arm.velocity_limit
+        self._config, self._limit = config or GUARD, speed_share * arm.velocity_limit
         # the first call loads machine code, which no tick has time for
         guarded_joint_velocity(np.eye(6), np.zeros(6), self._limit, self._config)
         self._V = self.DeclareVectorInputPort("V_BT", 6)

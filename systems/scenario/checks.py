@@ -273,6 +273,10 @@ def check_scenario(scenario: Scenario) -> None:
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
     get_law(scenario.welding.law)
+    if not 0.0 <= scenario.welding.lean_deg <= 10.0:
+        raise InputError(f"welding.lean_deg must be from 0 to 10, not {scenario.welding.lean_deg:g}.")
+    if scenario.welding.posture not in ("home", "any"):
+        raise InputError(f"welding.posture must be home or any, not '{scenario.welding.posture}'.")
     workpiece, farthest = scenario.workpiece, get_robot(scenario.arm).reach_m + BEYOND_REACH_M
     if workpiece is not None:
         check_workpiece(workpiece)

@@ -162,6 +162,9 @@ class WeldingConfig:
     clearance_mm: float = 25.0  # height above the seam at which the approach ends
     seam_length_mm: float | None = None  # arc length to weld; the groove may go on past it; null: the whole seam
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
+    # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
+    lean_deg: float = 0.0
+    posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
 
 

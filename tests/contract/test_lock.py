@@ -77,9 +77,10 @@ def test_users_get_no_developers_tools(python: str) -> None:
     assert not tools & pinned(USERS, python).keys()
 
 
-def test_a_client_of_the_emulator_is_left_out_where_it_has_no_wheel() -> None:
-    assert "ur-rtde" in pinned(DEVELOPERS, "3.12")
-    assert "ur-rtde" not in pinned(DEVELOPERS, "3.13")
+@pytest.mark.parametrize("lock", [USERS, DEVELOPERS])
+def test_ur_rtde_is_left_out_where_it_has_no_wheel(lock: str) -> None:
+    assert "ur-rtde" in pinned(lock, "3.12")
+    assert "ur-rtde" not in pinned(lock, "3.13")
 
 
 @pytest.mark.parametrize("lock", [USERS, DEVELOPERS])

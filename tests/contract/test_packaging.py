@@ -104,7 +104,7 @@ def test_the_wheel_has_its_command_and_its_licences(built: Built) -> None:
         commands = wheel.read("weldcal-0.2.0.dist-info/entry_points.txt").decode()
         metadata = wheel.read("weldcal-0.2.0.dist-info/METADATA").decode()
         licences = {name.rsplit("/", 1)[-1] for name in wheel.namelist() if "/licenses/" in name}
-    assert "weldcal = weldcal.tools.cli.app:main" in commands
+    assert "weldcal = weldcal.tools.__main__:main" in commands
     assert "License-Expression: BSD-3-Clause" in metadata
     assert licences == {"LICENSE", "NOTICE"}
 

@@ -1,15 +1,47 @@
-"""Cells with a robot compute in a process beside them; the cells of these tests share one, because each takes seconds to start."""
+"""The option --controller of these tests; and one process beside all cells with a robot, because each takes seconds to start.
+
+`./tools/run test tests/hardware --controller ADDRESS` runs the tests that hold for every UR controller against the one at that
+address. All others are skipped, and say why.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from weldcal.systems import background
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
+
+HERE = Path(__file__).parent
+OTHERS = "injects faults, looks inside the emulator or sets one up: this cannot be done at --controller"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """--controller."""
+    parser.addoption("--controller", metavar="ADDRESS", help="test the UR controller at this address; its arm moves")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """At a controller that is not ours only what holds for every controller is tested."""
+    if config.getoption("--controller", None):
+        for item in items:
+            if HERE in item.path.parents and "controller_address" not in getattr(item, "fixturenames", ()):
+                item.add_marker(pytest.mark.skip(reason=OTHERS))
+
+
+@pytest.fixture(scope="session")
+def controller_address(request: pytest.FixtureRequest) -> Iterator[str]:
+    """The address of --controller, or of an emulator."""
+    if address := request.config.getoption("--controller", None):
+        yield address
+        return
+    with emulator_process(lockstep=LOCKSTEP_S) as made:
+        yield made.host
 
 
 class Kept:

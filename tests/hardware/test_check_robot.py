@@ -25,7 +25,7 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import SENTENCES, RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.readiness import preflight as module
-from weldcal.systems.drivers.ur.readiness.kinematics_info import KinematicsInfo, read_kinematics
+from weldcal.systems.drivers.ur.readiness.kinematics_info import JointLimits, KinematicsInfo, read_kinematics
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
@@ -131,7 +131,13 @@ FAULTS: list[tuple[str, dict[str, Any], str, str, str]] = [
     ("speed_scaling", {"value": 0.35}, "speed slider", "35 %", "drag the slider"),
     ("wrong_tcp", {}, "TCP", "(0.0, 0.0, 100.0) mm", "Installation > General > TCP"),
     ("registers_in_use", {"names": ["input_double_register_30"]}, "registers", "double 30 in use", "EtherNet/IP"),
-    ("set_q", {"q": [0, -1.5, 3.1, -1.5, -1.5, 0]}, "joint limits", "2 deg of room (elbow)", "elbow joint"),
+    (
+        "set_q",
+        {"q": [0, -1.5, 3.1, -1.5, -1.5, 0]},
+        "joint limits",
+        "elbow 2 deg away; the pendant's may be nearer",
+        "elbow joint",
+    ),
     ("local_mode", {}, "remote control", "local control", "Remote Control"),
 ]
 
@@ -317,9 +323,9 @@ def test_several_faults_come_in_the_order_in_which_they_are_mended(robot: Emulat
 
 
 def test_kinematics_that_are_not_the_controllers_are_refused(robot: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    def of_another_ur10e(host: str, timeout_s: float) -> KinematicsInfo:
-        info = read_kinematics(host, timeout_s)
-        return dataclasses.replace(info, a=info.a + np.array([0, 0, 6e-5, 0, 0, 0]))
+    def of_another_ur10e(host: str, timeout_s: float) -> tuple[KinematicsInfo, JointLimits | None]:
+        info, limits = read_kinematics(host, timeout_s)
+        return dataclasses.replace(info, a=info.a + np.array([0, 0, 6e-5, 0, 0, 0])), limits
 
     monkeypatch.setattr(module, "read_kinematics", of_another_ur10e)
     problem = preflight(robot.host).first_problem
@@ -336,6 +342,39 @@ def test_an_old_or_another_controller_is_refused(robot: Emulator, monkeypatch: p
         assert report.first_problem.name == "version"
         assert set(states(report).values()) == {"ok", "to change", "?"}
         assert "PolyScope 5.12" in report.first_problem.operator_action
+
+
+def test_a_controller_of_protocol_1_is_told_to_update() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def refuse() -> None:
+            visitor, _ = server.accept()
+            with visitor:
+                visitor.recv(16)
+                visitor.sendall(bytes.fromhex("00045600"))
+
+        thread = threading.Thread(target=refuse, daemon=True)
+        thread.start()
+        with pytest.raises(RobotUnreachable, match=r"version 1 of RTDE only: update PolyScope to 5\.12"):
+            RtdeProbe("127.0.0.1", 2.0, server.getsockname()[1])
+        thread.join(5.0)
+
+
+def test_a_missing_output_of_a_new_polyscope_asks_for_no_update(
+    robot: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = RtdeProbe.read
+
+    def without(self: RtdeProbe, names: Sequence[str]) -> dict[str, Any]:
+        return {name: value for name, value in whole(self, names).items() if name != "target_speed_fraction"}
+
+    monkeypatch.setattr(RtdeProbe, "read", without)
+    problem = preflight(robot.host).first_problem
+    assert problem is not None
+    assert problem.name == "version"
+    assert "lacks target_speed_fraction" in problem.found
+    assert "install" not in problem.operator_action
+    assert "restart the control box" in problem.operator_action
 
 
 class Old(RtdeProbe):
@@ -520,7 +559,7 @@ def test_the_command_prints_a_table_that_fits_a_terminal(robot: Emulator, capsys
     assert finished.returncode == 0, finished.stderr
     lines = finished.stdout.splitlines()
     assert lines[0] == f"{robot.host}: ready"
-    assert [line.split()[0] for line in lines[1:]] == ["ok"] * (len(CHECKS) + 1)
+    assert [line.split()[0] for line in lines[1:]] == ["ok"] * (len(CHECKS) + 2)
     assert finished.stderr == ""
     for fault, values in (
         ("local_mode", {}),

@@ -65,7 +65,7 @@ def test_the_preflight_wants_the_scenarios_arm() -> None:
         assert refused.first_problem.name == "model"
         assert "connect a ur10e, or write this robot's arm in the scenario" in refused.first_problem.operator_action
         assert "not a ur10e" in refused.checks[CHECKS.index("kinematics")].found
-        assert read_kinematics(robot.host).a[1] == pytest.approx(load_arm("ur20").dh.a2)
+        assert read_kinematics(robot.host)[0].a[1] == pytest.approx(load_arm("ur20").dh.a2)
     assert get_robot("ur20").flange == "iso9409-1-80-6-m8"
 
 

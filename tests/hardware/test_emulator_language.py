@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import socket
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from tests.places import ROOT
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.events import ScriptStopped
 from weldcal.tools.emulators.ur.controller.modes import SafetyMode
 from weldcal.tools.emulators.ur.controller.poses import matrix, pose_of, rotation_vector
 from weldcal.tools.emulators.ur.main import HOME
+from weldcal.tools.emulators.ur.script.builtins import script_functions
+from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.versions import parse_version
 
 
@@ -205,3 +213,170 @@ def test_the_terminals_of_the_tool_and_the_payload_are_set_by_script() -> None:
     assert terminals.digital_outputs == 1 << 17 | 1 << 10
     assert (terminals.tool_voltage, terminals.analog_outputs) == (24, [0.0, 0.25])
     assert (made.gravity, made.payload.center) == ([0.0, 9.82, 0.0], [0.0, 0.0, 0.1])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_roll_pitch_yaw_is_what_scipy_computes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rpy = rng.uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1])
+    vector = Rotation.from_euler("xyz", rpy).as_rotvec()
+    made = controller()
+    run = f"a = rpy2rotvec({rpy.tolist()})\nb = rotvec2rpy({vector.tolist()})\n"
+    writes = "".join(
+        f"write_output_float_register({i + k}, {n}[{i}])\n" for k, n in ((0, "a"), (3, "b")) for i in range(3)
+    )
+    assert made.start(f"def turn():\n{run}{writes}end\n")
+    made.step()
+    np.testing.assert_allclose(made.outputs.doubles[:3], vector, atol=1e-12)
+    np.testing.assert_allclose(made.outputs.doubles[3:6], rpy, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),  # the script manual's own examples
+    [
+        ("rotvec2rpy([3.14, 1.57, 0])", [-2.80856, -0.16202, 0.9]),
+        ("rpy2rotvec([3.14, 1.57, 0])", [2.22153, 0.00177, -2.21976]),
+        ("normalize([0, 5, 0])", [0.0, 1.0, 0.0]),
+        ("normalize([0, 1, 1])", [0.0, 0.707, 0.707]),
+        ("get_gravity()", [0.0, 0.0, 9.82]),
+    ],
+)
+def test_a_vector_is_what_the_manual_says(value: str, said: list[float]) -> None:
+    (text,) = said_by(f"textmsg({value})")
+    np.testing.assert_allclose([float(part) for part in text.strip("[]").split(",")], said, atol=5e-4)
+
+
+def test_normalize_of_zeros_is_a_runtime_error() -> None:
+    made = controller()
+    made.start("def zero():\nx = normalize([0, 0, 0])\nend\n")
+    made.step()
+    assert "runtime error in line 2" in made.log[-2]
+
+
+def test_a_wrench_from_a_new_point_of_view_does_the_same_work() -> None:
+    """The power of a wrench on a moving body is the same from every point of view."""
+    rng = np.random.default_rng(3)
+    p, turn, wrench, twist = rng.normal(size=3), rng.normal(size=3), rng.normal(size=6), rng.normal(size=6)
+    made = controller()
+    pose = f"p{[*p.tolist(), *turn.tolist()]}"
+    writes = "".join(f"write_output_float_register({i}, w[{i}])\n" for i in range(6))
+    assert made.start(f"def move():\nw = wrench_trans({pose}, {wrench.tolist()})\n{writes}end\n")
+    made.step()
+    R = Rotation.from_rotvec(turn).as_matrix()
+    seen = np.concatenate([R.T @ (twist[:3] + np.cross(twist[3:], p)), R.T @ twist[3:]])
+    assert np.dot(made.outputs.doubles[:6], seen) == pytest.approx(np.dot(wrench, twist))
+    np.testing.assert_allclose(made.outputs.doubles[:3], R.T @ wrench[:3], atol=1e-12)
+
+
+def test_random_numbers_lie_between_0_and_1_and_repeat_after_a_start() -> None:
+    rows = [said_by("i = 0\nwhile i < 50:\ntextmsg(random())\ni = i + 1\nend") for _ in range(2)]
+    assert rows[0] == rows[1]
+    values = np.array(rows[0], dtype=float)
+    assert len(set(rows[0])) == 50
+    assert values.min() >= 0.0
+    assert values.max() < 1.0
+    assert 0.3 < values.mean() < 0.7
+
+
+def test_an_old_assignment_sets_a_digital_output() -> None:
+    made = controller()
+    made.submit("digital_out[2]=True\n")
+    made.step()
+    assert made.terminals.digital_outputs == 0b100
+    made.submit("digital_out[2]=False\n")
+    made.step()
+    assert made.terminals.digital_outputs == 0
+
+
+def test_a_least_time_of_a_velocity_is_its_time() -> None:
+    made = controller()
+    assert made.start(
+        "def go():\nspeedl([0.02, 0, 0, 0, 0, 0], a=0.5, t_min=0.2)\nspeedj([0, 0, 0, 0, 0, 0.1], 1, t_min=0.1)\nend\n"
+    )
+    frames = 0
+    while made.program is not None:
+        made.step()
+        frames += 1
+        assert frames < 1000
+    assert frames == pytest.approx(150, abs=3)
+
+
+def test_joint_temperatures_are_of_six_joints() -> None:
+    assert said_by("textmsg(get_joint_temp(5))") == ["30"]
+    made = controller()
+    made.start("def hot():\nx = get_joint_temp(6)\nend\n")
+    made.step()
+    assert "runtime error" in made.log[-2]
+
+
+def test_variables_of_a_server_are_set_and_read() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5.0)
+        made = controller()
+        port = server.getsockname()[1]
+        body = f'socket_open("127.0.0.1", {port}, "g")\nsocket_set_var("POS", 255, "g")\n'
+        body += 'a = socket_get_var("STA", "g")\nb = socket_get_var("STA", "g")\ntextmsg(a, b)\nsync()'
+        assert made.start(f"def gripper():\n{body}\nend\n"), made.log
+        for _ in range(6):
+            made.step()
+        wire, _ = server.accept()
+        with wire:
+            wire.settimeout(5.0)
+            assert wire.recv(100) == b"SET POS 255\nGET STA\n"
+            wire.sendall(b"STA -3\n")
+            for _ in range(20):
+                made.step()
+            assert wire.recv(100) == b"GET STA\n"
+            for _ in range(1100):  # longer than the two seconds after which the answer is 0
+                made.step()
+    assert any(line.endswith("script: -30") for line in made.log)
+
+
+def named_on_the_page(mark: str) -> list[str]:
+    """The names in the block after a mark of docs/ur_emulator.md."""
+    page = (ROOT / "docs" / "ur_emulator.md").read_text()
+    return page.partition(f"<!-- {mark} -->\n```text\n")[2].partition("```")[0].split()
+
+
+def test_the_page_lists_all_functions_that_programs_can_call() -> None:
+    found: set[str] = set()
+
+    def functions(program: Program) -> tuple[Mapping[str, Any], Iterable[str]]:
+        named, blocking = script_functions(controller("5.23"), program)
+        found.update(named)
+        return named, blocking
+
+    Program("def empty():\nend\n", functions)
+    assert named_on_the_page("served") == sorted(found)
+
+
+@pytest.mark.parametrize("name", named_on_the_page("refused"))
+def test_a_function_that_is_missing_is_named_by_the_compiler(name: str) -> None:
+    made = controller("5.23")
+    assert not made.start(f"def call():\n  x = 1\n  y = {name}(1)\nend\n")
+    assert f"compile_error_name_not_found:{name}:" in made.log[-1]
+    (event,) = [event for event in made.events if isinstance(event, ScriptStopped)]
+    assert (event.line, event.column) == (3, 7)
+
+
+def test_the_functions_that_are_missing_are_as_many_as_the_page_says() -> None:
+    assert len(named_on_the_page("refused")) == len(set(named_on_the_page("refused"))) > 80
+
+
+def test_a_flood_of_messages_does_not_end_its_reader() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5.0)
+        made = controller()
+        reads = 'while True:\na = socket_read_binary_integer(1, "g")\nn = n + 1\nend'
+        body = f'global n = 0\nsocket_open("127.0.0.1", {server.getsockname()[1]}, "g")\n{reads}'
+        assert made.start(f"def flooded():\n{body}\nend\n"), made.log
+        for _ in range(6):
+            made.step()
+        wire, _ = server.accept()
+        with wire:
+            wire.setblocking(False)
+            for _ in range(20):
+                with suppress(BlockingIOError):
+                    wire.send(b"\0" * 40_000)
+                made.step()
+            assert made.program is not None, made.log

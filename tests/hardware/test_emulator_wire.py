@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import struct
 import time
@@ -306,6 +307,21 @@ def test_a_first_axis_that_is_not_the_bases_cannot_be_said(tmp_path: Path) -> No
     tilted.write_text(tilted.read_text().replace("z: 0.1810\n    roll: 0.0", "z: 0.1810\n    roll: 1e-4"))
     with pytest.raises(InputError, match="first joint"):
         dh_parameters(load_arm("ur10e", tilted))
+
+
+def test_idle_connections_keep_no_client_away_and_end_nothing(shared: Emulator) -> None:
+    client = Rtde(shared.host).watch("timestamp", hz=125.0)
+    with client.socket, contextlib.ExitStack() as idle:
+        for port in (29999, 30001, 30002, 30003, 30004):
+            for _ in range(60):
+                with contextlib.suppress(OSError):
+                    idle.enter_context(socket.create_connection((shared.host, port), timeout=0.2))
+        late = socket.create_connection((shared.host, 30004), timeout=5.0)
+        late.sendall(bytes.fromhex("0005560002"))
+        late.settimeout(5.0)
+        assert late.recv(16) == bytes.fromhex("00045601")
+        assert client.during(0.1), "a client that has asked for something stays"
+        late.close()
 
 
 def test_a_plane_and_a_hand_are_put_on_the_control_channel(shared: Emulator) -> None:

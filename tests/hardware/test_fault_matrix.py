@@ -7,7 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.ur_rtde import NEEDS_UR_RTDE
 from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.wire.transport import NATIVE, UR_RTDE
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, GO, REFUSE, RUNNING, STOP, Case
@@ -17,11 +19,11 @@ from weldcal.tools.worlds.robot.sequences import run_sequence
 CASES = [case for case in RUNNING + AT_START if case.short]
 
 
-@pytest.fixture(scope="module")
-def bench() -> Iterator[Bench]:
+@pytest.fixture(scope="module", params=[NATIVE, pytest.param(UR_RTDE, marks=NEEDS_UR_RTDE)])
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     """One controller for all faults: that each one starts is what the one before must leave behind."""
     with emulator_process(lockstep=LOCKSTEP_S) as emulator:
-        yield Bench(emulator)
+        yield Bench(emulator, transport=request.param)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

@@ -61,6 +61,18 @@ def test_asking_does_not_wait_for_the_answer(own_process: OwnProcess) -> None:
     assert asked.ready
 
 
+def test_the_answer_to_an_older_question_leaves_the_newest_open(own_process: OwnProcess) -> None:
+    first = own_process.ask(time.sleep, 0.2)
+    asked = time.monotonic()
+    newest = own_process.ask(time.sleep, 0.6)
+    _ = first.value
+    time.sleep(0.05)
+    assert not newest.ready
+    assert own_process.waiting_since == pytest.approx(asked, abs=0.1)
+    _ = newest.value
+    assert own_process.waiting_since is None
+
+
 def test_the_process_uses_one_thread_for_linear_algebra(own_process: OwnProcess) -> None:
     pools = own_process.ask(threadpool_info).value
     assert [pool["num_threads"] for pool in pools if pool["user_api"] == "blas"] != []

@@ -229,6 +229,8 @@ welding:
   seam_length_mm: 100.0
   process: {name: TIG, current_A: 90.0, voltage_V: 11.0, efficiency: 0.55, wire_feed_m_min: 1.2}
   law: fixed
+  lean_deg: 4.0
+  posture: any
 job:
   calibrate: false
   weld: false
@@ -314,6 +316,7 @@ def test_overrides_change_what_they_name_and_nothing_else() -> None:
 ROBOT_OF_ITS_OWN = """
 robot: !UrRtde
   host: 192.168.1.10
+  transport: native
   rate_hz: 500.0
   pace: 0.5
   lockstep: true

@@ -1,6 +1,5 @@
 """The command line: every command that is found, in its group, in the order of the help text."""
 
-import signal
 from collections.abc import Iterable, Iterator, MutableMapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -9,6 +8,7 @@ import typer
 import typer.main
 from typer.core import TyperGroup
 
+from weldcal.systems.interrupts import answer_signals
 from weldcal.tools import console
 from weldcal.tools.cli.discovery import Entry, find_commands
 
@@ -114,15 +114,8 @@ class CommandGroup(TyperGroup):
 
 
 def main() -> None:
-    """Entry point of the `weldcal` console script and of `python -m weldcal.tools`.
-
-    SIGTERM ends a command as Ctrl-C does: a run is held and leaves its result folder.
-    """
-
-    def end(*_: object) -> None:
-        raise KeyboardInterrupt("SIGTERM")
-
-    signal.signal(signal.SIGTERM, end)
+    """Run the command line. SIGTERM ends a command as Ctrl-C does: a run is held and leaves its result folder."""
+    answer_signals()
     app(prog_name="weldcal")
 
 

@@ -14,6 +14,7 @@ import typer
 
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import whole_result
+from weldcal.systems.interrupts import work
 from weldcal.tools import console
 from weldcal.tools.cli.result_folder import claimed
 
@@ -250,7 +251,7 @@ def command(
             shared = {name: given.pop(name) for name in names}
             json, debug = shared.get("json", False), shared["debug"]
             with ExitStack() as pages:
-                with console.boundary(json_wanted=json, debug=debug), ExitStack() as stack:
+                with console.boundary(json_wanted=json, debug=debug), work(), ExitStack() as stack:
                     call = Call(title, shared, stack)
                     pages.callback(call.close_page)
                     if call.out is not None:

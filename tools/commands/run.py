@@ -46,6 +46,7 @@ from weldcal.tools.cli.options import (
     LIVE,
     Call,
 )
+from weldcal.tools.connections import guard
 from weldcal.tools.dashboard.facts import facts_of
 from weldcal.tools.dashboard.recording import with_overlay
 from weldcal.tools.dashboard.source import DashboardSource
@@ -138,6 +139,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
             meshcat = Meshcat(
                 MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}", show_stats_plot=False)
             )
+            guard(meshcat)
         recorder = RunRecorder(scenario, options, robot.title) if options.record else None
         open_sink = None if recorder is None else recorder.open_sink
         with _dashboard(person, meshcat, options) as source:

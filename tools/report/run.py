@@ -68,6 +68,7 @@ def robot_timing(run: Run[Any]) -> dict[str, object]:
             "sentence": (
                 f"{fixed(late.on_time_percent, 2)} % of {sum(late.counts)} velocities left less than {ON_TIME_MS:.0f} ms late "
                 f"while the arm moved; the latest {fixed(late.worst_ms, 1)} ms. {slowed}"
+                + ("" if run.host is None else f" This computer before the first motion: {run.host.words}.")
             ),
             "behind": clock.sentence(),
         }

@@ -36,10 +36,12 @@ def check_room(
     capsules: Sequence[Capsule],
     X_FT: RigidTransform,
     chord_m: float,
+    lean_rad: float = 0.0,
 ) -> None:
     """Check the distance between the tool's capsules (in the flange frame) and the part's surface along the seam.
 
-    The tool stands as the servo holds it: its axis along the mean of the bisectors at tip and torch.
+    The tool stands as the servo holds it: its axis along the mean of the bisectors at tip and torch, and leaning from it across the chord by
+    `lean_rad`.
 
     Raises:
         NoRoom: less than 1 mm, with the place.
@@ -53,7 +55,8 @@ def check_room(
         up = unit(tip.up + torch.up, tip.up)
         x = tip.position - torch.position
         x = unit(x - (x @ up) * up, tip.tangent)
-        R = np.column_stack([x, np.cross(up, x), up])
+        y = math.cos(lean_rad) * np.cross(up, x) + math.sin(lean_rad) * up
+        R = np.column_stack([x, y, np.cross(x, y)])
         points_T = (points_B - tip.position) @ R
         for a, b, radius in spans:
             near = float(_distances(points_T, a, b).min()) - radius

@@ -65,6 +65,12 @@ class ArmGuardConfig:
         return np.array([1.0, 1.0, 1.0, *([1.0 / self.characteristic_length_m] * 3)])
 
 
+GUARD = ArmGuardConfig()
+"""The thresholds of every guarded motion, and of the check of its path before it starts."""
+SPEED_SHARE = 0.5
+"""Share of the joints' speed limits that a guarded motion may use."""
+
+
 @dataclass(frozen=True)
 class GuardedVelocity:
     """The joint velocity that the guard allows.

@@ -1,11 +1,14 @@
-"""Computes the tool's chord and axes on the seam, and the roll rate that holds the work angle."""
+"""Computes the tool's chord and axes on the seam, the roll rate that holds the work angle, and the tool's path along a seam."""
 
 import math
 from typing import NamedTuple
 
+import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.welding.numerics import Array, clip, cross, dot, norm, unit
+from weldcal.welding.numerics import Array, clip, cross, dot, norm, pose, unit
+from weldcal.welding.seam.chord_map import chord_map
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
 
 
@@ -64,3 +67,45 @@ def roll_rate(axes: ToolAxes, torch_up: Array, config: ServoConfig) -> float:
     torch = config.torch
     lean = math.asin(clip(dot(axes.left, torch_up), -1.0, 1.0)) - torch.work_angle_rad
     return clip(-torch.k_roll * lean, -0.3, 0.3)
+
+
+class ToolPath(NamedTuple):
+    """The tool along a whole seam, one row a place: arc lengths of torch and tip (n,) m, time (n,) s, and poses of T in B."""
+
+    s_torch: Array
+    s_tip: Array
+    time: Array
+    X_BT: list[RigidTransform]
+
+
+def tool_path(plan: SeamCurve, config: ServoConfig) -> ToolPath:
+    """Compute how the servo moves the tool along a planned seam, from the touch to the torch at the seam's end.
+
+    The tip's rest point leads: it is pressed aside and down by the wanted deflections. The torch trails by the chord, at its height. The
+    lean across the chord is the wanted work angle against the surface at the torch.
+
+    Args:
+        plan: the planned seam in B.
+        config: settings.
+    """
+    tool, press = config.tool, config.deflection
+    line = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan
+    chart = chord_map(line, tool.torch_offset_m, config.weld_speed_m_s, spacing=1e-3, tip_left=press.delta_d_m)
+    tip, torch = chart.s_tip, chart.s_torch
+    rest = line.position(tip) + press.delta_d_m * line.normal(tip) - press.axial_d_m * line.up(tip)
+    up = line.up(torch)
+    wire = line.position(torch) + config.clearance_m * up + tool.side_offset_m * line.normal(torch)
+    u = rest - wire
+    u = u / np.linalg.norm(u, axis=1, keepdims=True)
+    y = np.cross(up, u)
+    y = y / np.linalg.norm(y, axis=1, keepdims=True)
+    lean = config.torch.work_angle_rad
+    y = math.cos(lean) * y + math.sin(lean) * np.cross(u, y)
+    # in T the chord is (d, 0, -h), and (h, 0, d) is square to it and to y
+    e, d, h = np.cross(u, y), tool.torch_offset_m, tool.torch_height_m
+    x, z = (d * u + h * e) / math.hypot(d, h), (d * e - h * u) / math.hypot(d, h)
+    poses = [pose(np.column_stack([x[k], y[k], z[k]]), rest[k]) for k in range(len(tip))]
+    steps = np.hypot(np.diff(tip), np.diff(torch))
+    speed = np.maximum(np.hypot(chart.tip_speed, chart.torch_speed), 1e-6)
+    time = np.concatenate([[0.0], np.cumsum(2.0 * steps / (speed[1:] + speed[:-1]))])
+    return ToolPath(torch, tip, time, poses)

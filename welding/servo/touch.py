@@ -1,5 +1,6 @@
 """The TOUCH phase: descend next to the planned seam and search sideways until the tip is seated in the groove."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +29,9 @@ def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
     behind = plan.frame(touch.arc_m - tool.torch_offset_m)
     x = frame.position - behind.position
     x = unit(x - dot(x, frame.up) * frame.up, frame.tangent)
-    R = np.column_stack([x, np.cross(frame.up, x), frame.up])
+    y, lean = np.cross(frame.up, x), config.torch.work_angle_rad
+    y = math.cos(lean) * y + math.sin(lean) * frame.up
+    R = np.column_stack([x, y, np.cross(x, y)])
     height = tool.tip_seat_height_m + tool.tip_drop_m + touch.height_m
     p_BT = frame.position + height * frame.up + touch.offset_m * frame.normal
     return pose(R, p_BT)

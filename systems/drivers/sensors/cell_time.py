@@ -1,6 +1,7 @@
 """The clock by which devices are judged to be silent or late: the host's, or that of an emulated robot that the cell follows."""
 
 import math
+import threading
 import time
 from collections.abc import Callable
 from typing import Protocol
@@ -19,7 +20,7 @@ class CellTime(Protocol):
         """Its time at a time of the host."""
 
     def look(self) -> None:
-        """Note its time now; called often, in one thread."""
+        """Note its time now; called often."""
 
 
 class HostTime:
@@ -38,11 +39,14 @@ class HostTime:
 
 
 class FollowedTime:
-    """The clock of a robot that the cell follows: its world may be slower than real time, and stands while it waits for the cell."""
+    """The clock of a robot that the cell follows: its world may be slower than real time, and stands while it waits for the cell.
+
+    The threads of the acquisition and of the Diagram both ask it.
+    """
 
     def __init__(self, robot_time: Callable[[], float]) -> None:
         self._robot_time = robot_time
-        self._times = DiagramTime()
+        self._times, self._lock = DiagramTime(), threading.Lock()
         self._first = robot_time()
 
     def now(self) -> float:
@@ -51,13 +55,15 @@ class FollowedTime:
 
     def at(self, host_s: float) -> float:
         """See CellTime; the first noted time before it."""
-        self.look()
-        found = self._times.at(host_s)
+        with self._lock:
+            self._times.add(time.monotonic(), self._robot_time())
+            found = self._times.at(host_s)
         return found if math.isfinite(found) else self._first
 
     def look(self) -> None:
         """See CellTime."""
-        self._times.add(time.monotonic(), self._robot_time())
+        with self._lock:
+            self._times.add(time.monotonic(), self._robot_time())
 
 
 def cell_time(build: StationBuild) -> CellTime:

@@ -10,6 +10,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from weldcal.systems.drivers.sensors.acquisition import POLL_S, Delivery, DeviceFault, DeviceLost, Garbage, Source
+from weldcal.systems.interrupts import deferred
 
 Datum = TypeVar("Datum")
 OPEN_S = 30.0  # the process imports its libraries first
@@ -71,7 +72,8 @@ class OwnProcess(Source[Datum]):
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, self._make, self._arguments), daemon=True)
-        process.start()
+        with deferred():
+            process.start()
         theirs.close()
         self._process = process
         self._end = weakref.finalize(self, _stop, process, self._pipe)
@@ -122,7 +124,7 @@ def _serve(pipe: Connection, make: Callable[..., Source[Any]], arguments: tuple[
     """The process: follows the commands of the pipe until it is told to end, or nobody is at its other end."""
     source, is_open = make(*arguments), False
     parent = os.getppid()
-    with suppress(EOFError, OSError, KeyboardInterrupt):
+    with suppress(EOFError, OSError):
         while os.getppid() == parent:
             try:
                 if pipe.poll(0.0 if is_open else 0.2):

@@ -24,6 +24,7 @@ class Fault(IntEnum):
     CLOCK_JUMPED = 5
     STATE_IMPLAUSIBLE = 6
     STATE_DAMAGED = 7
+    STATE_NOT_FINITE = 8
     SET_POINT = 9
     COMMAND_LATE = 10
     COMMAND_NOT_FINITE = 11
@@ -64,6 +65,8 @@ SENTENCES = {
     Fault.STATE_IMPLAUSIBLE: "LINK: a joint was reported {detail:.3f} rad from where it was 4 ms before; check the network and start again.",
     Fault.STATE_DAMAGED: "LINK: the controller's mode was reported as {detail:.0f}, which does not exist: its packages arrive damaged; check the "
     "cable, the switch and the network card, and start again.",
+    Fault.STATE_NOT_FINITE: "LINK: the controller reported {reason} as not a finite number; check the network, restart the control box, and "
+    "start again.",
     Fault.COMMAND_LATE: "COMMAND LATE: the cell gave no new velocity for {detail:.0f} ms while the arm moved or the process was on; "
     "close other programs here and start again.",
     Fault.COMMAND_NOT_FINITE: "COMMAND: a velocity that is not a number was refused; this is a mistake of the program, report it.",
@@ -111,7 +114,18 @@ GUARD_REASONS = {
 OUTPUT_REASONS = {0: "is off although it should be on", 1: "went on although it should be off"}
 
 
+# the detail of a STATE_NOT_FINITE fault: what the output's name begins with
+REPORTED = ("an output", "actual_q", "actual_qd", "actual_TCP_pose", "speed_scaling", "target_speed_fraction", "timestamp",
+            "output_double_register", "standard_analog_output", "tcp_offset", "payload")  # fmt: skip
+
+
+def reported_as(name: str) -> float:
+    """The detail of a STATE_NOT_FINITE fault for this RTDE output."""
+    return float(max(k for k, start in enumerate(REPORTED) if k == 0 or name.startswith(start)))
+
+
 def sentence(fault: Fault, detail: float = 0.0) -> str:
     """The message of a fault, with the operator action."""
-    reasons = OUTPUT_REASONS if fault is Fault.PROCESS_OUTPUT else GUARD_REASONS
+    lists = {Fault.PROCESS_OUTPUT: OUTPUT_REASONS, Fault.STATE_NOT_FINITE: dict(enumerate(REPORTED))}
+    reasons = lists.get(fault, GUARD_REASONS)
     return SENTENCES[fault].format(detail=detail, reason=reasons.get(int(detail), "for an unknown reason"))

@@ -13,6 +13,7 @@ import time
 import weakref
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +23,19 @@ from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
-from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.wire.dashboard import stop_program
 from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
+from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus
 
 START_LIMIT_S = 20.0
 CLOSE_LIMIT_S = 5.0
 HEARTBEAT_LIMIT_S = 0.15
 PLAYING, PAUSING, PAUSED = 2, 3, 4
+
+
+class StartFailed(RobotRefused):
+    """The worker process ended, or did not start in time; nothing has moved."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,7 +101,7 @@ class UrLink:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the link)
         command = [sys.executable, "-m", "weldcal.systems.drivers.ur.worker", str(descriptor)]
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(
+        self._process = started(
             command,
             stdin=subprocess.PIPE,
             stdout=self._errors,
@@ -116,46 +121,15 @@ class UrLink:
         self._finalizer = weakref.finalize(self, _kill, self._process)
 
     @classmethod
-    def start(
-        cls,
-        host: str,
-        arm: ArmModel,
-        limits: Limits,
-        *,
-        rate_hz: float = 250.0,
-        upper_registers: bool = True,
-        payload_kg: float = 0.0,
-        payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        process_output: int | None = None,
-        arc_input: int | None = None,
-        arc_fault_input: int | None = None,
-        gas_output: int | None = None,
-        gas_before_s: float = 0.0,
-        gas_after_s: float = 0.0,
-        levels: tuple[Level, ...] = (),
-    ) -> UrLink:
-        """Start the worker, upload the guard, and wait until it is active. The arm does not move, `process_output` is off.
+    def start(cls, host: str, arm: ArmModel, limits: Limits, **options: Any) -> UrLink:
+        """Start the worker, upload the guard, and wait until it is active. The arm does not move, the process output is off.
+
+        `options` are the other fields of WorkerConfig.
 
         Raises:
             RobotRefused: the message gives the operator action; worker and program are ended.
         """
-        config = WorkerConfig(
-            host=host,
-            arm=arm,
-            limits=limits,
-            rate_hz=rate_hz,
-            upper_registers=upper_registers,
-            payload_kg=payload_kg,
-            payload_cog_m=payload_cog_m,
-            parent=os.getpid(),
-            process_output=process_output,
-            arc_input=arc_input,
-            arc_fault_input=arc_fault_input,
-            gas_output=gas_output,
-            gas_before_s=gas_before_s,
-            gas_after_s=gas_after_s,
-            levels=levels,
-        )
+        config = WorkerConfig(host=host, arm=arm, limits=limits, parent=os.getpid(), **options)
         link = cls(config)
         until = time.monotonic() + START_LIMIT_S / limits.pace
         while time.monotonic() < until:
@@ -172,7 +146,7 @@ class UrLink:
             time.sleep(0.01)
         said = link._said()
         link._end()
-        raise RobotRefused(sentence(Fault.START_FAILED) + (f" It said: {said}" if said else ""))
+        raise StartFailed(sentence(Fault.START_FAILED) + (f" It said: {said}" if said else ""))
 
     def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
         """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number. Never blocks."""

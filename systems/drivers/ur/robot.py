@@ -1,6 +1,5 @@
 """The worker's interface to the robot: connect, upload the guard, read samples, send numbered velocities."""
 
-import contextlib
 import sys
 import threading
 import time
@@ -11,15 +10,24 @@ from importlib.resources import files
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
-from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, RobotUnreachable
+from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, RobotUnreachable, reported_as
 from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, SET_POINTS, UPPER_OFFSET, register_names
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
 from weldcal.systems.drivers.ur.torch.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
-from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Level, OffSwitch, apart
-from weldcal.systems.drivers.ur.wire.dashboard import SCRIPT_PORT
-from weldcal.systems.drivers.ur.wire.line import Line
-from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe, Value
-from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream
+from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Level, apart
+from weldcal.systems.drivers.ur.wire.rtde_client import NotFinite, RtdeProbe, Value
+from weldcal.systems.drivers.ur.wire.transport import (
+    NATIVE,
+    NO_COMMAND,
+    SET_PAYLOAD,
+    SPEED_STOP,
+    STOP_SCRIPT,
+    UR_RTDE,
+    VELOCITY,
+    NativeTransport,
+    Switch,
+    Transport,
+)
 
 BIN_S = 0.5
 BINS = 60  # half a minute of bins
@@ -83,12 +91,8 @@ class ClockMap:
         return robot_time / self._pace + self._offset + self.drift * (robot_time - self._origin)
 
 
-# of the guard: commands in the integer register, with at most eight numbers; what it answers
-NO_COMMAND, VELOCITY, SPEED_STOP, SET_PAYLOAD, STOP_SCRIPT = 0, 9, 15, 17, 255
-READY, DONE = 1, 2
 OUTPUTS = "actual_digital_output_bits"
 INPUTS = "actual_digital_input_bits"
-LINE_LIMIT_S = 2.0
 FIRST_LIMIT_S = 2.0
 ANSWER_LIMIT_S = 2.0
 START_LIMIT_S = 8.0
@@ -113,9 +117,9 @@ def same_payload(found: Mapping[str, Value], mass_kg: float, cog_m: Sequence[flo
 class Refused(Exception):
     """The start failed, with the fault that caused it."""
 
-    def __init__(self, fault: Fault) -> None:
+    def __init__(self, fault: Fault, detail: float = 0.0) -> None:
         super().__init__(fault.name)
-        self.fault = fault
+        self.fault, self.detail = fault, detail
 
 
 def guard_script(
@@ -158,6 +162,7 @@ class Robot:
         arc_inputs: ArcInputs | None = None,
         gas: int | None = None,
         levels: Sequence[Level] = (),
+        transport: str = NATIVE,
     ) -> None:
         self._host, self._levels = host, tuple(levels)
         base = UPPER_OFFSET if upper else 0
@@ -166,10 +171,10 @@ class Robot:
         self._doubles = DOUBLES + (SET_POINTS if levels else 0)
         self._arc_inputs = arc_inputs or ArcInputs()
         self.clock = ClockMap(pace)
-        self._answer, self._latch = f"output_int_register_{base}", f"output_int_register_{base + 12}"
+        self._latch = f"output_int_register_{base + 12}"
         # echo of the newest command number, the time for which the guard kept the arm from moving, its passes
         self._told = tuple(f"output_double_register_{base + 12 + i}" for i in range(3))
-        names = [*ALWAYS, "actual_TCP_pose", self._answer, self._latch, *self._told]
+        names = [*ALWAYS, "actual_TCP_pose", self._latch, *self._told]
         names += [] if output is None else [OUTPUTS]
         names += [INPUTS] if self._arc_inputs.wired else []
         # of each set point: what the guard gives its output, and what the output shows
@@ -179,12 +184,13 @@ class Robot:
         ]
         names += [ANALOG_TYPES, *(name for pair in self._points for name in pair)] if levels else []
         try:
-            self._stream = RtdeStream(host, names, register_names(base, self._doubles))
-            self._stream.first(FIRST_LIMIT_S)
+            self._stream = self._connected(transport, names, base)
+        except NotFinite as error:
+            raise Refused(Fault.STATE_NOT_FINITE, reported_as(error.output)) from error
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.CONTROL_REFUSED) from error
-        self._switch = None if output is None else self._off_switch(host, output, gas)
+        self._switch = None if output is None else self._off_switch(output, gas)
         self._fresh_at, self._robot_time = time.monotonic(), -1.0
         self._excused = 0.0
         self._sent: dict[float, float] = {}
@@ -193,9 +199,17 @@ class Robot:
         self._heard = self._first_unheard = 0.0
         self.echo_latency = 0.0
 
-    def _off_switch(self, host: str, output: int, gas: int | None) -> OffSwitch:
+    def _connected(self, transport: str, names: list[str], base: int) -> Transport:
+        if transport == UR_RTDE:
+            from weldcal.systems.drivers.ur.wire.ur_rtde_client import UrRtdeTransport
+
+            return UrRtdeTransport(self._host, names, base == UPPER_OFFSET)
+        answer = f"output_int_register_{base}"
+        return NativeTransport(self._host, [*names, answer], register_names(base, self._doubles), answer, FIRST_LIMIT_S)
+
+    def _off_switch(self, output: int, gas: int | None) -> Switch:
         try:
-            return OffSwitch(host, output, gas, self._levels)
+            return self._stream.switch(output, gas, self._levels)
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.OUTPUT_IN_USE) from error
@@ -203,34 +217,28 @@ class Robot:
     def start_guard(self) -> None:
         """Clear the command register, upload the guard and wait until it is active."""
         self.forget()
-        until = time.monotonic() + START_LIMIT_S / self._pace
-        with Line(self._host, SCRIPT_PORT, "Script", LINE_LIMIT_S) as line:
-            line.send(self._script.encode())
-            # the connection stays open until the program runs: to close one with unread data would reset it
-            while time.monotonic() < until:
-                self._stream.wait(0.01)
-                line.drain()
-                if self._stream.number(self._latch) == STALE_REGISTER:
-                    raise Refused(Fault.GUARD_REFUSED)
-                if (
-                    self._playing
-                    and self._stream.number(self._latch) == 1
-                    and self._stream.number(self._answer) == READY
-                ):
-                    return
-        raise Refused(Fault.UPLOAD_REFUSED)
+        if not self._stream.upload(self._script, self._started, time.monotonic() + START_LIMIT_S / self._pace):
+            raise Refused(Fault.UPLOAD_REFUSED)
+
+    def _started(self) -> bool:
+        if self._stream.number(self._latch) == STALE_REGISTER:
+            raise Refused(Fault.GUARD_REFUSED)
+        return self._playing and self._stream.number(self._latch) == 1
 
     def set_load(self, mass_kg: float, cog_m: list[float]) -> None:
         """Set the payload, then read it back, and the TCP, which the guard has set to zero."""
         if not self._once(SET_PAYLOAD, mass_kg, *cog_m):
             raise Refused(Fault.START_FAILED)
         found: dict[str, Value] = {}
-        reader = threading.Thread(target=self._read_back, args=(found, mass_kg, cog_m), daemon=True)
+        wrong: list[str] = []  # an output that is not finite
+        reader = threading.Thread(target=self._read_back, args=(found, wrong, mass_kg, cog_m), daemon=True)
         reader.start()
         while reader.is_alive():
             self.forget()
             self._stream.poll()
             reader.join(0.01)
+        if wrong:
+            raise Refused(Fault.STATE_NOT_FINITE, reported_as(wrong[0]))
         if np.abs(np.array(found.get("tcp_offset", np.inf))).max() > 1e-6:
             raise Refused(Fault.TCP_NOT_ZERO)
         if not same_payload(found, mass_kg, cog_m):
@@ -238,39 +246,31 @@ class Robot:
 
     def _once(self, command: int, *arguments: float) -> bool:
         """Give a command that the guard answers once; returns whether it did."""
-        until = time.monotonic() + ANSWER_LIMIT_S / self._pace
-        while self._stream.connected and self._playing and time.monotonic() < until:
-            self._write(command, *arguments)
-            self._stream.wait(0.01)
-            if self._stream.number(self._answer) == DONE:
-                break
-        else:
-            return False
-        while self._stream.connected and self._playing and time.monotonic() < until:
-            self.forget()
-            self._stream.wait(0.01)
-            if self._stream.number(self._answer) == READY:
-                return True
-        return False
+        return self._stream.once(time.monotonic() + ANSWER_LIMIT_S / self._pace, command, *arguments)
 
     def _write(self, command: int, *arguments: float, armed: bool = False) -> None:
         """Write a command; `armed`: with the set points of the power source."""
-        numbers = [*arguments, *[0.0] * (self._doubles - len(arguments))]
+        points = [0.0] * (self._doubles - DOUBLES)
         for level in self._levels if armed else ():
-            numbers[DOUBLES + level.output] = level.share
-        self._stream.send(command, *numbers)
+            points[level.output] = level.share
+        self._stream.send(command, *arguments, *points)
 
-    def _read_back(self, found: dict[str, Value], mass_kg: float, cog_m: list[float]) -> None:
+    def _read_back(self, found: dict[str, Value], wrong: list[str], mass_kg: float, cog_m: list[float]) -> None:
         """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the guard
         waits for a package.
         """
         until = time.monotonic() + READ_BACK_LIMIT_S / self._pace
-        with contextlib.suppress(RobotUnreachable), RtdeProbe(self._host) as probe:
-            while True:
-                found.update(probe.read(READ_BACK))
-                if same_payload(found, mass_kg, cog_m) or time.monotonic() > until:
-                    return
-                time.sleep(0.01)
+        try:
+            with RtdeProbe(self._host) as probe:
+                while True:
+                    found.update(probe.read(READ_BACK))
+                    if same_payload(found, mass_kg, cog_m) or time.monotonic() > until:
+                        return
+                    time.sleep(0.01)
+        except NotFinite as error:
+            wrong.append(error.output)
+        except RobotUnreachable:
+            return
 
     def sample(self, now: float) -> RobotSample:
         """The newest sample, all fields of one package."""
@@ -298,6 +298,7 @@ class Robot:
             speed_scaling=stream.number("speed_scaling") * stream.number("target_speed_fraction"),
             guard=int(stream.number(self._latch)),
             connected=stream.connected,
+            not_finite=stream.not_finite,
             pose_error_m=float(
                 np.linalg.norm(
                     kinematics_and_jacobian(self._arm, q)[1] - np.array(stream.vector("actual_TCP_pose")[:3])

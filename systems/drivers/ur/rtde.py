@@ -1,6 +1,10 @@
 """Driver of a UR robot: reads the link in an update event and sends in a publish event."""
 
+import contextlib
 import dataclasses as dc
+import os
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,11 +19,14 @@ from weldcal.systems.addresses import controller_address, is_loopback
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
-from weldcal.systems.drivers.ur.link import UrLink, status_of
+from weldcal.systems.drivers.ur.faults import RobotRefused
+from weldcal.systems.drivers.ur.link import StartFailed, UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.supervisor import Limits
 from weldcal.systems.drivers.ur.torch.set_points import SETTLES_S, AnalogSetPoint, levels_of
+from weldcal.systems.drivers.ur.wire.dashboard import stop_program
+from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose, installed, taken
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.wall_clock import WallClock
 
@@ -36,6 +43,7 @@ class UrRtde(DriverConfig):
     FOR: ClassVar[tuple[str, ...]] = ("robot",)
 
     host: str = ""
+    transport: str = AUTO  # ur_rtde, native (weldcal's own client), or auto: ur_rtde where it can be used
     rate_hz: float = 250.0  # of the worker's loop
     pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
     lockstep: bool = False  # only for the emulator: its time waits for this computer
@@ -182,6 +190,47 @@ class UrRtdeArm(LeafSystem):
         output.set_value(status_of(tuple(context.get_discrete_state(self._codes).value())))
 
 
+def chosen_transport(config: UrRtde, version: tuple[int, ...], upper: bool) -> tuple[str, str]:
+    """The transport for this controller, `native` or `ur_rtde`, and why in a sentence.
+
+    Raises:
+        InputError: there is no such transport, or ur_rtde is asked for and cannot be used.
+        RobotUnreachable: the controller does not answer.
+    """
+    if config.transport not in (AUTO, NATIVE, UR_RTDE):
+        raise InputError(f"robot.transport must be {AUTO}, {NATIVE} or {UR_RTDE}, not '{config.transport}'.")
+    found = Situation(
+        version=version,
+        own_time=config.pace != FULL_PACE or config.lockstep,
+        set_points=config.set_points,
+        installed=installed(),
+        cores=len(os.sched_getaffinity(0)),
+    )
+    name, why = choose(config.transport, found)
+    if name == UR_RTDE:
+        claimed = taken(config.host, upper, config.process_output is not None)
+        name, why = choose(config.transport, dc.replace(found, taken=claimed))
+    if config.transport == UR_RTDE != name:
+        raise InputError(f"robot.transport cannot be {UR_RTDE} here. {why} Leave it at {AUTO}.")
+    return name, why
+
+
+def start_link(start: Callable[..., UrLink], config: UrRtde, transport: str, why: str) -> tuple[UrLink, str]:
+    """The link over this transport, and why over this one: where `auto` took ur_rtde and it does not start, native follows.
+
+    Raises:
+        RobotRefused: the link does not start.
+    """
+    try:
+        return start(transport=transport), why
+    except StartFailed:
+        if config.transport != AUTO or transport != UR_RTDE:
+            raise
+    with contextlib.suppress(RobotRefused):
+        stop_program(config.host)  # of the guard, which may run
+    return start(transport=NATIVE), "Transport native: ur_rtde did not start."
+
+
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not move.
 
@@ -225,8 +274,10 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     arm = report.arm
     if arm is None:
         raise RuntimeError("the pre-flight passed without the robot's kinematics")
+    transport, why = chosen_transport(config, report.version or (), report.upper_registers)
     x, y, z = config.payload_cog_m
-    link = UrLink.start(
+    start = partial(
+        UrLink.start,
         config.host,
         arm,
         config.limits(arm),
@@ -242,8 +293,9 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         gas_after_s=config.gas_after_s,
         levels=levels,
     )
+    link, why = start_link(start, config, transport, why)
     clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
-    return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)
+    return PreparedRobot(arm, link.state().q, link, clock, config.lockstep, why)
 
 
 def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:

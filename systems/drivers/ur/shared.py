@@ -190,29 +190,29 @@ class Given:
 class Published:
     """The state that the worker publishes in each pass; times in s."""
 
-    heartbeat: float  # host time of the worker's last pass
-    phase: int  # Phase of the worker
-    host_time: float  # host time at which the robot took the sample
-    robot_time: float
-    q: Array = field(metadata=JOINTS)
-    qd: Array = field(metadata=JOINTS)
-    robot_mode: int
-    safety_mode: int
-    runtime_state: int
-    speed_scaling: float
-    fault: int
-    detail: float  # of the fault
-    fault_time: float
-    number: float  # of the newest command that was sent on
-    sent_time: float
-    echo: float  # newest number that the guard script has read
-    echo_latency: float
-    worst_period: float
-    late_periods: int  # passes that came more than 20 ms late
-    process_on: bool  # the process output, as the controller reports it
-    clock_residual: float  # of the clock fit
-    clock_drift: float
-    arc: int  # 1 established, 0 not, -1: not wired
+    heartbeat: float = 0.0  # host time of the worker's last pass
+    phase: int = 0  # Phase of the worker
+    host_time: float = 0.0  # host time at which the robot took the sample
+    robot_time: float = 0.0
+    q: Array = field(default_factory=lambda: np.zeros(6), metadata=JOINTS)
+    qd: Array = field(default_factory=lambda: np.zeros(6), metadata=JOINTS)
+    robot_mode: int = 0
+    safety_mode: int = 0
+    runtime_state: int = 0
+    speed_scaling: float = 0.0
+    fault: int = 0
+    detail: float = 0.0  # of the fault
+    fault_time: float = 0.0
+    number: float = 0.0  # of the newest command that was sent on
+    sent_time: float = 0.0
+    echo: float = 0.0  # newest number that the guard script has read
+    echo_latency: float = 0.0
+    worst_period: float = 0.0
+    late_periods: int = 0  # passes that came more than 20 ms late
+    process_on: bool = False  # the process output, as the controller reports it
+    clock_residual: float = 0.0  # of the clock fit
+    clock_drift: float = 0.0
+    arc: int = 0  # 1 established, 0 not, -1: not wired
 
 
 class Memory:

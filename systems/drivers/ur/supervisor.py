@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.faults import Fault, reported_as
 from weldcal.systems.drivers.ur.torch.set_points import apart
 
 NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
@@ -49,6 +49,7 @@ ACTIONS = {
     **dict.fromkeys((Fault.LINK_STALE, Fault.LINK_CLOSED, Fault.CONTROLLER_DEAF, Fault.CLOCK_JUMPED), Action.LEAVE),
     Fault.STATE_IMPLAUSIBLE: Action.LEAVE,
     Fault.STATE_DAMAGED: Action.LEAVE,
+    Fault.STATE_NOT_FINITE: Action.LEAVE,
     **{fault: Action.BRAKE for fault in Fault if Fault.COMMAND_LATE <= fault < Fault.PROTECTIVE_STOP},
     **{fault: Action.STOP for fault in Fault if fault >= Fault.PROTECTIVE_STOP},
     Fault.ARC_FAULT: Action.BRAKE,
@@ -141,6 +142,7 @@ class RobotSample:
     speed_scaling: float  # the product of the slider's and the limiter's
     guard: int
     connected: bool
+    not_finite: str = ""  # an output of a package that arrived since the last sample, which was dropped
     pose_error_m: float = 0.0
     unheard_s: float = 0.0  # time for which the guard script has read no newer command
     lost_s: float = 0.0  # time for which the guard script has kept the arm from moving, since its start
@@ -240,6 +242,8 @@ class Supervisor:
         limits, last = self._limits, self._last
         if not robot.connected:
             return Fault.LINK_CLOSED, 0.0
+        if robot.not_finite:
+            return Fault.STATE_NOT_FINITE, reported_as(robot.not_finite)
         if now - robot.fresh_at > (limits.stale_process_s if self._command.process else limits.stale_s):
             return Fault.LINK_STALE, 1e3 * (now - robot.fresh_at)
         if (blind := command.number - self._seen_number) > limits.blind_commands:

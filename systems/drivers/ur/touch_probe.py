@@ -15,6 +15,7 @@ from weldcal.systems.drivers.sensors.cell_time import CellTime, cell_time
 from weldcal.systems.drivers.sensors.preflight import Sensed
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.drivers.ur.faults import Fault, reported_as, sentence
 from weldcal.systems.drivers.ur.readiness.preflight import Check
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream
@@ -141,6 +142,8 @@ class ProbeInput:
                 f"TOUCH PROBE: digital input {n} changed more than {CHATTER_CHANGES} times in {CHATTER_S:g} s; look for a loose plug, a "
                 "broken shield or a worn contact of the probe, and start again."
             )
+        if self._stream.not_finite:
+            return sentence(Fault.STATE_NOT_FINITE, reported_as(self._stream.not_finite))
         if not self._stream.connected:
             return (
                 f"TOUCH PROBE: the controller {host} closed the connection that reads the probe's input; start again."

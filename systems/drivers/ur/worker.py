@@ -32,6 +32,7 @@ from weldcal.systems.drivers.ur.supervisor import (
     Supervisor,
 )
 from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas, Level, SetPoints, apart
+from weldcal.systems.drivers.ur.wire.transport import NATIVE
 
 FRESH_S = 0.012  # of robot time; three periods of the commands
 ZERO_S = 0.050
@@ -83,11 +84,11 @@ class WorkerConfig:
     host: str
     arm: ArmModel
     limits: Limits
-    rate_hz: float
-    upper_registers: bool
-    payload_kg: float
-    payload_cog_m: tuple[float, float, float]
     parent: int
+    rate_hz: float = 250.0
+    upper_registers: bool = True
+    payload_kg: float = 0.0
+    payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     process_output: int | None = None
     arc_input: int | None = None
     arc_fault_input: int | None = None
@@ -95,6 +96,7 @@ class WorkerConfig:
     gas_before_s: float = 0.0
     gas_after_s: float = 0.0
     levels: tuple[Level, ...] = ()
+    transport: str = NATIVE
 
 
 class Worker:
@@ -265,35 +267,10 @@ class Worker:
             )
         )
 
-    def refuse(self, fault: Fault) -> None:
+    def refuse(self, refused: Refused) -> None:
         """Publish the fault that made the start fail."""
-        self._memory.state.write(
-            Published(
-                heartbeat=time.monotonic(),
-                phase=Phase.ENDED,
-                host_time=0.0,
-                robot_time=0.0,
-                q=np.zeros(6),
-                qd=np.zeros(6),
-                robot_mode=0,
-                safety_mode=0,
-                runtime_state=0,
-                speed_scaling=0.0,
-                fault=fault,
-                detail=0.0,
-                fault_time=0.0,
-                number=0,
-                sent_time=0.0,
-                echo=0,
-                echo_latency=0.0,
-                worst_period=0.0,
-                late_periods=0,
-                process_on=False,
-                clock_residual=0.0,
-                clock_drift=0.0,
-                arc=0,
-            )
-        )
+        fault, detail = refused.fault, refused.detail
+        self._memory.state.write(Published(heartbeat=time.monotonic(), phase=Phase.ENDED, fault=fault, detail=detail))
 
 
 def main() -> None:
@@ -313,11 +290,12 @@ def main() -> None:
             arc_inputs=ArcInputs(config.arc_input, config.arc_fault_input),
             gas=config.gas_output,
             levels=config.levels,
+            transport=config.transport,
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))
     except Refused as refused:
-        worker.refuse(refused.fault)
+        worker.refuse(refused)
         os._exit(1)
     os._exit(worker.run(robot))
 

@@ -31,6 +31,7 @@ from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.simulated.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
 from weldcal.systems.jobs.profiler.config import ProfilerJob, edge_as_thought, pose_of
 from weldcal.systems.messages import Message
+from weldcal.systems.motion.guarded_path import GuardedMotion, InfeasiblePath, check_path, straight
 from weldcal.welding.seam.curve import SeamCurve
 
 # along a move, between the configurations that are checked against table, surroundings and the arm itself
@@ -292,7 +293,7 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
         tip = planning.center + (planning.radius_m + 1e-3 * stage.gap_mm) * n
         X = RigidTransform(R, tip - R.multiply(planning.p_FTip))
         found = planning.joints(X, planning.q_home)
-        if found is not None and planning.gap(X) > 0.5e-3 * stage.gap_mm:
+        if found is not None and planning.gap(X) > 0.5e-3 * stage.gap_mm and _descends(planning, found, -n):
             q.append(found)
             normals.append(n)
         if len(q) == stage.touches:
@@ -303,6 +304,18 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
         Goal("via" if k < 0 else "touch", at, None if k < 0 else -normals[k])
         for at, k in planning.route(q_from, np.array(q))
     ]
+
+
+def _descends(planning: PlanningContext, q: Array, way: Array) -> bool:
+    """Whether the guard lets the torch descend along ``way`` (3,) from joints q (6,) rad to the deepest place of a touch."""
+    stage, X_FP = planning.job.sphere, RigidTransform(planning.p_FTip)
+    way = 1e-3 * (stage.gap_mm + stage.deepest_mm) * way
+    X_BP = forward_kinematics(planning.arm, q) @ X_FP
+    try:
+        check_path(planning.arm, q, [straight("the descent", X_BP, way, 1e-3 * stage.descent_mm_s, X_FP)])
+    except InfeasiblePath:
+        return False
+    return True
 
 
 def plan_pass(planning: PlanningContext, q_from: Array) -> list[Goal]:
@@ -392,19 +405,22 @@ def _along(
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
     even = np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M)))
     chosen = np.unique(np.searchsorted(length, even).clip(0, len(at) - 1))
-    joints: list[Array] = []
-    q = planning.q_home
-    for k in chosen:
-        found = planning.joints(flange[k], q)
-        if found is None:
-            raise InputError("The arm cannot follow the seam at its nominal pose: move the workpiece nearer.")
-        if joints and float(np.abs(found - q).max()) > 0.5:
-            raise InputError("The arm would have to change its configuration along the seam: move the workpiece.")
-        joints.append(found)
-        q = found
+    first = planning.joints(flange[0], planning.q_home)
+    if first is None:
+        raise InputError("The arm cannot reach the seam at its nominal pose: move the workpiece nearer.")
+    X_FP = RigidTransform(planning.p_FTip)
+    motion = GuardedMotion(
+        name="the seam",
+        every_pose=True,
+        X_BT=[flange[k] @ X_FP for k in chosen],
+        time=length[chosen] / speed,
+        X_FT=X_FP,
+        along=length[chosen],
+    )
+    joints = check_path(planning.arm, first, [motion])[0].q
     raised = RigidTransform([0.0, 0.0, 0.05]) @ flange[0]
     above = planning.joints(raised, joints[0])
     ways = [] if above is None else [Goal("via", above)]
     if above is not None and not planning.clear_way(q_from, above):
         ways = [Goal("via", planning.q_home), *ways]
-    return [*ways, Goal(kind, joints[0], path=JointPath(length[chosen], np.array(joints), speed))]
+    return [*ways, Goal(kind, joints[0], path=JointPath(length[chosen], joints, speed))]

@@ -20,6 +20,7 @@ from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.tablet.config import TabletConfig, TabletTruth, WristPicture, check_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.motion.clear_moves import clear_move
+from weldcal.systems.motion.guarded_path import check_path, straight
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S, JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario
@@ -63,11 +64,12 @@ def plan_tablet(scenario: Scenario, arm: ArmModel) -> TabletPlan:
     """Plan the camera pose and the descents onto each landmark from nominal poses.
 
     Raises:
-        InputError: the scenario has no tablet, or a pose is out of reach.
+        InputError: the scenario has no tablet, or a pose is out of reach. InfeasiblePath: so is a descent.
     """
     tablet, X_FC = tablet_of(scenario), camera_of(scenario).nominal()
     q_home = np.deg2rad(scenario.home_deg)
     X_BT, page, p_FP = tablet.pose(), tablet.landmarks_m(), np.array(tablet.pen.tip_m)
+    X_FP = RigidTransform(p_FP)
     middle = X_BT.multiply(np.r_[0.5 * page.max(axis=0), 0.0])
     R_BC = X_BT.rotation() @ RotationMatrix(RollPitchYaw(*_LOOK_ASLANT_RAD, 0.0))
     X_BC = RigidTransform(R_BC, middle - R_BC.multiply(np.array([0.0, 0.0, 1e-3 * tablet.look_distance_mm])))
@@ -80,7 +82,10 @@ def plan_tablet(scenario: Scenario, arm: ArmModel) -> TabletPlan:
         turn = start + np.deg2rad(tablet.turn_deg) * (k - 0.5 * (len(page) - 1))
         R = RollPitchYaw(np.pi + lean[0], lean[1], turn).ToRotationMatrix()
         tip = X_BT.multiply(np.r_[p, 0.0]) + np.array([0.0, 0.0, 1e-3 * tablet.clearance_mm])
-        q = nearest_joints(arm, RigidTransform(R, tip - R.multiply(p_FP)), q)
+        X_BP = RigidTransform(R, tip)
+        q = nearest_joints(arm, X_BP @ X_FP.inverse(), q)
+        way = np.array([0.0, 0.0, -1e-3 * (tablet.clearance_mm + tablet.deepest_mm)])
+        check_path(arm, q, [straight(f"the descent to landmark {k + 1}", X_BP, way, 1e-3 * tablet.descent_mm_s, X_FP)])
         above.append(q)
     slower = 1.0 / scenario.job.speed_factor
     return TabletPlan(

@@ -19,14 +19,10 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice
-from weldcal.systems.jobs.weld.seam_planner import (
-    CLEAR_OF_PART_M,
-    SeamObstructed,
-    SeamOutOfReach,
-    SeamPlanning,
-    plan_root_anyhow,
-)
+from weldcal.systems.jobs.weld.arm_way import CLEAR_OF_PART_M, SeamObstructed, SeamOutOfReach
+from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_root_anyhow
 from weldcal.systems.messages import JobCommand, Message, Scan
+from weldcal.systems.motion.guarded_path import check_path, straight
 from weldcal.systems.scenario.schema import FILE, Scenario
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -172,7 +168,16 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
             near = places[-1].q_above if places else seam.q_near
             q = nearest_solution(seam.arm, RigidTransform(R_BT, p_BT) @ seam.tool.X_FT.inverse(), near)
             if q is None:
-                raise SeamOutOfReach(f"The arm cannot reach place {k + 1} of the part: move it towards the robot.")
+                raise SeamOutOfReach(f"The arm cannot reach place {k + 1} of the part", "move it towards the robot")
+            way = -1e-3 * (config.clearance_mm + config.deepest_mm) * n_B
+            descent = straight(
+                f"the descent to place {k + 1}",
+                RigidTransform(R_BT, p_BT),
+                way,
+                1e-3 * config.descent_mm_s,
+                seam.tool.X_FT,
+            )
+            check_path(seam.arm, q, [descent])
             places.append(Place(q, face[0], face[1], face[2], np.asarray(p_B), np.asarray(n_B)))
         if found.X_BP is not None:
             _check_moves(planning, found.X_BP, [seam.q_near, *(p.q_above for p in places), seam.q_near])
@@ -187,7 +192,7 @@ def _face(raw: Array, points_B: Array, p_B: Array, up: Array) -> tuple[Array, Ar
     height = away @ up
     column = (np.linalg.norm(away - height[:, None] * up, axis=1) < _COLUMN_M) & (np.abs(height) < 0.03)
     if column.sum() < _LEAST_COLUMN:
-        raise SeamObstructed("The scan does not show the face beside the groove: change touch.aside_mm.")
+        raise SeamObstructed("The scan does not show the face beside the groove", "change touch.aside_mm")
     seed = raw[column][np.argmin(np.abs(height[column] - np.median(height[column])))]
     return fit_touched_plane(around(raw, seed, _FLAT_M, "beside the groove", _LEAST_FLAT))
 
@@ -201,6 +206,6 @@ def _check_moves(planning: TouchPlanning, X_BP: RigidTransform, way: list[Joints
     for a, b in itertools.pairwise(way):
         if name := around_it.touched_on_path(seam.arm, bodies, a, b):
             raise SeamObstructed(
-                f"The arm or its tool would come too close to '{name}' between two touches: raise touch.clearance_mm, or choose another "
-                "home_deg."
+                f"The arm or its tool would come too close to '{name}' between two touches",
+                "raise touch.clearance_mm, or choose another home_deg",
             )

@@ -317,6 +317,9 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         seam_length_m=None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
         method=scenario.planning.planning_method(),
         surroundings=station.surroundings,
+        table_z_m=scenario.table_height_m(),
+        lean_rad=np.deg2rad(welding.lean_deg),
+        any_posture=welding.posture == "any",
     )
 
 

@@ -1,24 +1,18 @@
 """SeamPlanner: plans the seam in the base, and the arm's approach, from a scan of the workpiece."""
 
 import dataclasses as dc
-import itertools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.planning.clearance import arm_bodies
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.calibration.refinement.local_field import LocalField
-from weldcal.models.arms.inverse import nearest_solution
-from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
@@ -26,13 +20,13 @@ from weldcal.models.workpieces.part import WeldPart, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.room import check_ends, check_room
-from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
@@ -68,26 +62,17 @@ def plan_root_anyhow(
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
-CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
-CLEAR_OF_PART_M = 0.002
 TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
-HIGHER = (1.0, 2.0, 4.0)  # of the clearance above the seam, until the moves are clear
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
-class SeamPlanning:
-    """What a seam is planned from besides the scan: arm, tool, nominal part and its expected pose, and the job's limits."""
+class SeamPlanning(Welder):
+    """What a seam is planned from besides the scan: what follows it, the nominal part and its expected pose, and the job's limits."""
 
-    arm: ArmModel
-    tool: WeldingTool
     workpiece: WeldPart
     X_BP_guess: RigidTransform
-    config: ServoConfig
-    q_near: Array
-    clearance_m: float
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
-    surroundings: Surroundings = dc.field(default_factory=Surroundings)
     local_field: LocalField | None = None
     arm_errors: Mapping[str, Any] | None = None  # as the refinement states them, where there is one
 
@@ -111,12 +96,15 @@ class SeamPlanning:
         """What errors of the arm do between tip and torch along a seam."""
         return tip_to_torch(self.arm, self.tool, seam, q_start, self.arm_errors)
 
-    def waypoints(self, seam: SeamCurve, X_BP: RigidTransform | None) -> tuple[Array, Array, Array]:
-        """Joint positions of the approach; see arm_waypoints. Beside a high part they are higher above the seam than the clearance.
+    def way(self, seam: SeamCurve, X_BP: RigidTransform | None) -> ArmWay:
+        """The arm's way to the seam, along it and back; checked as a whole before anything moves.
+
+        Where the upright tool on the branch of home cannot follow, the job leans it or changes the branch as far as the scenario allows.
+        Beside a high part the approach is higher above the seam than the clearance.
 
         Raises:
-            WeldcalError: the seam is too short or not feasible, the tool has no room beside the part at X_BP, it is out of reach, or
-                something is in the arm's way.
+            InfeasiblePath: with the place, the joint, and the change that makes the seam feasible, where one was found.
+            WeldcalError: the seam is too short or not feasible, or the tool has no room beside the part at X_BP.
         """
         check_length(seam, self.config)
         if X_BP is not None:
@@ -124,20 +112,7 @@ class SeamPlanning:
             check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
-        for share in HIGHER:
-            clearance_m = share * self.clearance_m
-            q_start, q_above, q_retract = arm_waypoints(
-                self.arm, self.tool, seam, self.config, self.q_near, clearance_m
-            )
-            try:
-                check_weld_path(self, seam, q_start, q_above, q_retract)
-                if X_BP is not None:
-                    check_moves(self, X_BP, q_above, q_retract)
-                break
-            except SeamObstructed:
-                if share == HIGHER[-1]:
-                    raise
-        return q_start, q_above, q_retract
+        return find_way(self, seam, X_BP)
 
 
 class SeamPlanner(BackgroundSystem):
@@ -213,84 +188,33 @@ def plan_seam(
             points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
         )
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
-        q_start, q_above, q_retract = planning.waypoints(seam, found.X_BP)
-        share = planning.tip_to_torch(seam, q_start)
+        return dc.replace(
+            _planned(planning, scan.sequence, seam, found.X_BP),
+            rms_m=found.rms_m,
+            confidence=found.confidence,
+            points_B=points_B,
+            sigma_m=found.sigma_m,
+            summary=found.summary,
+        )
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
+
+
+def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: RigidTransform | None) -> PlannedSeam:
+    """The plan of a seam that has been found; raises WeldcalError where it cannot be welded."""
+    way = planning.way(seam, X_BP)
+    share = planning.tip_to_torch(seam, way.q_start)
     return PlannedSeam(
-        sequence=scan.sequence,
+        sequence=sequence,
         seam=seam,
-        X_BP=found.X_BP,
-        rms_m=found.rms_m,
-        confidence=found.confidence,
-        q_start=q_start,
-        q_above=q_above,
-        q_retract=q_retract,
-        points_B=points_B,
-        sigma_m=found.sigma_m,
-        summary=found.summary,
+        X_BP=X_BP,
+        q_start=way.q_start,
+        q_above=way.q_above,
+        q_retract=way.q_retract,
+        lean_rad=way.lean_rad,
         arm_sigma_m=share.sigma_m,
         arm_turn_rad=share.turn_rad,
     )
-
-
-_LEVEL = math.cos(math.radians(20.0))
-
-
-def check_weld_path(planning: SeamPlanning, seam: SeamCurve, q_start: Array, q_above: Array, q_retract: Array) -> None:
-    """Check that approach, weld and retreat keep away from the cell's surroundings.
-
-    Raises:
-        SeamObstructed: something is in the way; SeamOutOfReach: the arm cannot follow the seam.
-    """
-    if not planning.surroundings.obstacles:
-        return
-    X_BT = touch_start_pose(seam, planning.config)
-    along, q = [planning.q_near, q_above, q_start], q_start
-    first = seam.frame(0.0)
-    last = min(seam.drawn_m, seam.length + planning.tool.chord_m)
-    for s in np.arange(CHECKED_EVERY_M, last, CHECKED_EVERY_M):
-        at = seam.frame(float(s))
-        turn = math.atan2(
-            float(np.dot(np.cross(first.tangent, at.tangent), first.up)), float(np.dot(first.tangent, at.tangent))
-        )
-        R = RotationMatrix(AngleAxis(turn, np.asarray(first.up) / np.linalg.norm(first.up))) @ X_BT.rotation()
-        found = nearest_solution(planning.arm, RigidTransform(R, at.position) @ planning.tool.X_FT.inverse(), q)
-        if found is None:
-            raise SeamOutOfReach(f"The arm cannot follow the seam at {1e3 * s:.0f} mm: move the workpiece.")
-        along.append(found)
-        q = found
-    bodies = arm_bodies(planning.arm, planning.tool.capsules())
-    for a, b in itertools.pairwise([*along, q_retract, planning.q_near]):
-        if name := planning.surroundings.touched_on_path(planning.arm, bodies, a, b):
-            raise SeamObstructed(
-                f"The arm or its tool would come too close to '{name}' on its way along the seam: move it or the workpiece, or "
-                "correct surroundings in the scenario."
-            )
-
-
-def check_moves(planning: SeamPlanning, X_BP: RigidTransform, q_above: Array, q_retract: Array) -> None:
-    """Check that the moves to the seam and from it, to other seams too, keep clear of the part.
-
-    Raises:
-        SeamObstructed: the arm or its tool would touch it.
-    """
-    part = Surroundings((Obstacle("part", planning.workpiece.mesh.transformed(X_BP), CLEAR_OF_PART_M),))
-    bodies = arm_bodies(planning.arm, planning.tool.capsules())
-    for way, a, b in (("to the seam", planning.q_near, q_above), ("from the seam", q_retract, planning.q_near)):
-        if part.touched_on_path(planning.arm, bodies, a, b):
-            raise SeamObstructed(
-                f"The arm or its tool would touch the part on its way {way}, even {1e3 * HIGHER[-1] * planning.clearance_m:.0f} mm "
-                "above the seam: choose another home_deg, or turn the part."
-            )
-
-
-class SeamObstructed(WeldcalError):
-    """Something in the cell's surroundings is in the arm's way along the seam."""
-
-
-class SeamOutOfReach(WeldcalError):
-    """The arm cannot hold the tool along the seam."""
 
 
 def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
@@ -322,37 +246,6 @@ def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_
     return _cut(plan.root + height * ups, ups, tool, length_m)
 
 
-def arm_waypoints(
-    arm: ArmModel, tool: WeldingTool, seam: SeamCurve, config: ServoConfig, q_near: Array, clearance_m: float
-) -> tuple[Array, Array, Array]:
-    """Joint positions (6,) rad at the touch start, above it, and above the far end.
-
-    Raises:
-        SeamOutOfReach: where no inverse kinematics solution exists along the seam.
-    """
-    X_BT = touch_start_pose(seam, config)
-    solutions = []
-    q = q_near
-    end = seam.frame(seam.length)
-    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + clearance_m * _away(seam.frame(0.0).up, arm.up))
-    X_BE = RigidTransform(X_BT.rotation(), end.position + (clearance_m + 0.05) * _away(end.up, arm.up))
-    for pose in (lifted, X_BT, X_BE):
-        found = nearest_solution(arm, pose @ tool.X_FT.inverse(), q)
-        if found is None:
-            raise SeamOutOfReach(
-                "The arm cannot reach the seam with the tool upright: move the workpiece towards the robot."
-            )
-        solutions.append(found)
-        q = found
-    q_above, q_start, q_retract = solutions
-    return q_start, q_above, q_retract
-
-
-def _away(up: Array, vertical: Array) -> Array:
-    """Direction (3,) out of a joint: vertical on a level face, along the bisector of a leaning joint."""
-    return vertical if float(up @ vertical) > _LEVEL else up
-
-
 class DrawnSeamPlanner(SeamPlanner):
     """A SeamPlanner that uses the fixture's drawing, for parts whose shape the plate's registration does not support.
 
@@ -378,22 +271,12 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
     try:
         seam = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
-        q_start, q_above, q_retract = planning.waypoints(seam, planning.X_BP_guess)
-        share = planning.tip_to_torch(seam, q_start)
+        return dc.replace(
+            _planned(planning, sequence, seam, planning.X_BP_guess),
+            rms_m=0.0,
+            confidence=1.0,
+            points_B=np.asarray(seam.position(np.linspace(0.0, seam.length, 200))),
+            summary="the pose of the part is from the fixture's drawing; the scan was not used",
+        )
     except WeldcalError as error:
         return PlannedSeam(sequence=sequence, reason=str(error))
-    points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
-    return PlannedSeam(
-        sequence=sequence,
-        seam=seam,
-        X_BP=planning.X_BP_guess,
-        rms_m=0.0,
-        confidence=1.0,
-        q_start=q_start,
-        q_above=q_above,
-        q_retract=q_retract,
-        points_B=points_B,
-        arm_sigma_m=share.sigma_m,
-        arm_turn_rad=share.turn_rad,
-        summary="the pose of the part is from the fixture's drawing; the scan was not used",
-    )

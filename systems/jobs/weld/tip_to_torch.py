@@ -21,10 +21,12 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.tool import WeldingTool
-from weldcal.welding.numerics import pose, unit
 from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry
+from weldcal.welding.servo.tool_axes import tool_path
 
-EVERY_M = 0.01
+EVERY = 10  # places of the tool's path: 10 mm of tip and torch together
+_UNPRESSED_M = 1e-9
 _DIFFERENCE = 1e-2  # of the prior's standard deviation: micrometres
 
 
@@ -71,37 +73,18 @@ def tip_to_torch(
 def _held(
     arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array
 ) -> tuple[Array, Array, list[RigidTransform], Array] | None:
-    """Arcs (n,) of torch and tip, poses of T and joint angles (n, 6), with the tool as the servo holds it: its left square to the torch's up."""
-    places = np.arange(-tool.chord_m, seam.length + EVERY_M, EVERY_M)
-    tips, poses, joints, q = [], [], [], q_near
-    for s in places:
-        torch = seam.frame(float(s))
-        s_tip = _chord_ahead(seam, float(s), tool.chord_m)
-        tip = seam.frame(s_tip)
-        x = unit(tip.position - torch.position, tip.tangent)
-        y = unit(np.cross(torch.up, x), torch.normal)
-        X_BT = pose(np.column_stack([x, y, np.cross(x, y)]), tip.position)
-        found = nearest_solution(arm, X_BT @ tool.X_FT.inverse(), q)
+    """Arcs (n,) of torch and tip, poses of T and joint angles (n, 6), with the tool as the servo holds it, both ends on the line."""
+    geometry = ToolGeometry(torch_offset_m=tool.chord_m, torch_clearance_m=0.0)
+    unpressed = DeflectionControl(delta_d_m=_UNPRESSED_M, axial_d_m=_UNPRESSED_M)
+    path = tool_path(seam, ServoConfig(tool=geometry, deflection=unpressed))
+    rows, joints, q = [*range(0, len(path.time) - 1, EVERY), len(path.time) - 1], [], q_near
+    for k in rows:
+        found = nearest_solution(arm, path.X_BT[k] @ tool.X_FT.inverse(), q)
         if found is None:
             return None
         q = found
-        tips.append(s_tip)
-        poses.append(X_BT)
         joints.append(found)
-    return places, np.array(tips), poses, np.array(joints)
-
-
-def _chord_ahead(seam: SeamCurve, s: float, chord_m: float) -> float:
-    """Arc length of the first point as far ahead as the chord is long."""
-    start = seam.frame(s).position
-    low, high = s, s + chord_m
-    while float(np.linalg.norm(seam.frame(high).position - start)) < chord_m and high - s < 2.0 * chord_m:
-        low, high = high, high + 0.1 * chord_m
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        short = float(np.linalg.norm(seam.frame(middle).position - start)) < chord_m
-        low, high = (middle, high) if short else (low, middle)
-    return 0.5 * (low + high)
+    return path.s_torch[rows], path.s_tip[rows], [path.X_BT[k] for k in rows], np.array(joints)
 
 
 def _sensitivities(arm: ArmModel, tool: WeldingTool, q: Array, prior: FactoryPrior) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, State
 from weldcal.models.arms.compiled_kinematics import tick_flange_pose
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
+from weldcal.systems.jobs.weld.arm_way import leaning
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, believed_arm
@@ -115,7 +116,7 @@ class WeldingVelocityServo(LeafSystem):
         arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else WeldingState()
-        config = self._configs[min(job.seam, len(self._configs) - 1)]
+        config = leaning(self._configs[min(job.seam, len(self._configs) - 1)], planned.lean_rad)
         holds = self._hold.HasValue(context) and bool(self._hold.Eval(context)[0] > 0.5)
         memory, held, command = interruptible_step(memory, old.interruption, sample, planned.seam, config, holds)
         report = ServoReport(

@@ -14,15 +14,18 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, link_frames, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KINEMATICS_TOLERANCE_M,
     KINEMATICS_TOLERANCE_RAD,
+    JointLimits,
     KinematicsInfo,
     calibrated_arm,
     cross_check,
+    limited_arm,
     read_kinematics,
 )
 
@@ -184,16 +187,56 @@ def test_the_numbers_come_off_the_wire_unchanged_however_the_bytes_drip() -> Non
             time.sleep(0.001)
 
     with listener(drip) as port:
-        read = read_kinematics("127.0.0.1", 2.0, port)
+        read, limits = read_kinematics("127.0.0.1", 2.0, port)
     for name in ("theta", "a", "d", "alpha"):
         np.testing.assert_array_equal(getattr(read, name), getattr(info, name))
+    assert limits is None
     assert read.calibrated
     assert read.checksum == "calib_0000000100000002000000030000000400000005ffffffff"
 
 
 def test_exact_numbers_are_not_called_a_calibration() -> None:
     with listener(lambda visitor: visitor.sendall(package(16, part(5, body(nominal_info()))))) as port:
-        assert not read_kinematics("127.0.0.1", 2.0, port).calibrated
+        assert not read_kinematics("127.0.0.1", 2.0, port)[0].calibrated
+
+
+NARROW = np.deg2rad([[-90.0, 45.0], [-180.0, 0.0], [0.0, 150.0], [-360.0, 360.0], [-720.0, 720.0], [-10.0, 10.0]])
+MOVES = np.array([[1.0, 40.0]] * 6)
+
+
+def configured(limits: Array, moves: Array = MOVES) -> bytes:
+    """ConfigurationData as UR's client library reads it: limits by joint, then speed and acceleration by joint."""
+    return struct.pack(">24d", *limits.ravel(), *moves.ravel()) + b"\0" * 256
+
+
+def read_with(configuration: bytes) -> JointLimits | None:
+    state = package(16, part(6, configuration) + part(5, body(nominal_info())))
+    with listener(lambda visitor: visitor.sendall(state)) as port:
+        return read_kinematics("127.0.0.1", 2.0, port)[1]
+
+
+def test_planning_stays_within_the_arms_limits_and_the_controllers() -> None:
+    arm = limited_arm(ARM, read_with(configured(NARROW)))
+    np.testing.assert_allclose(np.rad2deg(arm.position_lower), [-90.0, -180.0, 0.0, -360.0, -360.0, -10.0])
+    np.testing.assert_allclose(np.rad2deg(arm.position_upper), [45.0, 0.0, 150.0, 360.0, 360.0, 10.0])
+    np.testing.assert_allclose(arm.velocity_limit, 1.0)
+    reachable = inverse_kinematics(ARM, forward_kinematics(ARM, [0.1, -1.2, 1.3, -1.4, -1.5, 0.3]))
+    assert any(abs(q[5]) > np.deg2rad(10.0) for q in reachable)
+    for q in inverse_kinematics(arm, forward_kinematics(ARM, [0.1, -1.2, 1.3, -1.4, -1.5, 0.3])):
+        assert np.all((q >= arm.position_lower) & (q <= arm.position_upper))
+
+
+@pytest.mark.parametrize("numbers", [NARROW * np.nan, NARROW * 0.0, NARROW[:, ::-1]], ids=["nan", "zero", "reversed"])
+def test_numbers_that_are_no_limits_are_none(numbers: Array) -> None:
+    assert read_with(configured(numbers)) is None
+    assert limited_arm(ARM, None) is ARM
+
+
+def test_limits_of_another_arm_are_refused() -> None:
+    far = NARROW.copy()
+    far[2] = np.deg2rad([200.0, 300.0])
+    with pytest.raises(InputError, match="elbow_joint that are outside the ur10e's own"):
+        limited_arm(ARM, read_with(configured(far)))
 
 
 def test_an_arm_without_power_has_no_kinematics_yet() -> None:

@@ -109,7 +109,7 @@ class Stream:
 
     def __init__(self, *_: object) -> None:
         self.arrived: list[tuple[float, ...]] = []
-        self.connected, self.closed = True, False
+        self.connected, self.closed, self.not_finite = True, False, ""
 
     def put(self, time: float, bits: int, q: Array, qd: Array) -> None:
         self.arrived.append((1.0, time, float(bits), *q, *qd))

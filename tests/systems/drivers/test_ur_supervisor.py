@@ -106,6 +106,7 @@ OF_THE_SAMPLE = [
     ({"robot_time": 150.0}, Fault.CLOCK_JUMPED),
     ({"q": np.full(6, 0.5)}, Fault.STATE_IMPLAUSIBLE),
     ({"q": np.full(6, np.nan)}, Fault.STATE_IMPLAUSIBLE),
+    ({"not_finite": "speed_scaling"}, Fault.STATE_NOT_FINITE),
     ({"unheard_s": 0.201}, Fault.CONTROLLER_DEAF),
     ({"guard_silent_s": 0.081}, Fault.CONTROLLER_DEAF),
     ({"safety_mode": PROTECTIVE}, Fault.PROTECTIVE_STOP),

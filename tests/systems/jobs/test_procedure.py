@@ -16,7 +16,7 @@ from tests.systems.cells import Q_HOME, TOOL, the_arm
 from weldcal.models.arms.kinematics import jacobian
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
-from weldcal.systems.jobs.procedure import SLOWED, SPEED_SHARE, Inputs, Procedure, ProcedureState
+from weldcal.systems.jobs.procedure import SLOWED, Inputs, Procedure, ProcedureState
 from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.jobs.profiler.plan import Goal, JointPath, PlanningContext
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
@@ -27,6 +27,7 @@ from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, To
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.welding.servo.guards import SPEED_SHARE
 
 DOWN = np.array([0.0, 0.0, -1.0])
 ASLANT = np.array([0.48, 0.64, -0.6])

@@ -13,14 +13,8 @@ from pydrake.systems.analysis import Simulator
 from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.systems.jobs.weld.seam_planner import (
-    SeamOutOfReach,
-    SeamPlanner,
-    SeamPlanning,
-    arm_waypoints,
-    plan_drawn_seam,
-    tip_seam,
-)
+from weldcal.systems.jobs.weld.arm_way import SeamOutOfReach, arm_waypoints
+from weldcal.systems.jobs.weld.seam_planner import SeamPlanner, SeamPlanning, plan_drawn_seam, tip_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod

@@ -22,9 +22,9 @@ from weldcal.models.errors import InputError
 from weldcal.systems.jobs.touch.job import AddedTouches
 from weldcal.systems.jobs.touch.planner import Place, PlannedTouches, TouchConfig, TouchPlanning, plan_touches
 from weldcal.systems.jobs.touch.procedure import FRAMES, Felt, TouchInputs, TouchMotion, TouchProcedure, TouchState
+from weldcal.systems.jobs.weld.arm_way import CLEAR_OF_PART_M
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import CLEAR_OF_PART_M
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import Scan, UrStatus
 from weldcal.systems.scenario.checks import check_scenario

@@ -8,6 +8,7 @@ import signal
 import time
 
 from weldcal.systems.host_timing import TICK_S
+from weldcal.systems.wall_clock import Lateness
 from weldcal.tools.worlds.robot.host_probe import watched_host
 
 PAUSE_S = 0.1
@@ -27,6 +28,14 @@ def test_every_core_is_watched_and_a_pause_is_seen() -> None:
     assert sum(late.counts) >= cores
     assert late.worst_ms > 1e3 * (PAUSE_S - TICK_S) * 0.9
     assert host.summary()["over_8_ms"] == late.over(8.0) > 0
+    begin, end = max(late.delays, key=lambda delay: delay[1] - delay[0])
+    job = Lateness()
+    job.add(20.0, begin + 0.5 * (end - begin))  # while the computer paused
+    job.add(20.0, begin - 10.0)  # long before
+    job.add(5.0, begin + 0.5 * (end - begin))  # too little late to be judged
+    assert job.over(8.0) == 2
+    assert host.caused([job]) == 1
+    assert host.judged([job]) == "2 of 3 velocities over 8 ms late, 1 of them by this computer itself"
 
 
 def test_the_probes_end_with_the_watch() -> None:

@@ -12,9 +12,8 @@ import numpy as np
 import typer
 
 from weldcal.models.arms.kinematics import load_arm
-from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
-from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.drivers.ur.rtde import UrRtde, chosen_transport
 from weldcal.systems.host_timing import measure_host
 from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
@@ -37,22 +36,35 @@ def check_robot(
 ) -> Outcome:
     """Check whether a robot and this computer are ready: what is right and what to change. Nothing moves or is written."""
     nominal = nominal_arm(load_scenario(scenario)) if scenario is not None else load_arm(arm)
-    report = with_host(preflight(host, nominal=nominal, load=expected_load(host, scenario)))
+    config = configured(host, scenario)
+    report = preflight(
+        host,
+        nominal=nominal,
+        load=config.load("the welding tool" if scenario is None else f"the scenario {Path(scenario).stem}"),
+    )
+    report = with_transport(with_host(report), config)
     problem = "" if report.first_problem is None else report.first_problem.operator_action
     return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
 
 
-def expected_load(host: str, name: str | None) -> ExpectedLoad:
-    """The payload of a scenario; that of the welding tool, which most scenarios have, where none is named.
+def configured(host: str, name: str | None) -> UrRtde:
+    """The robot of a scenario at this address; with the welding tool, which most scenarios have, where none is named.
 
     Raises:
         InputError: there is no such scenario.
     """
     if name is None:
-        return UrRtde(host=host).load("the welding tool")
+        return UrRtde(host=host)
     scenario = load_scenario(name)
-    config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
-    return config.load(f"the scenario {Path(name).stem}")
+    return replace(scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario), host=host)
+
+
+def with_transport(report: Preflight, config: UrRtde) -> Preflight:
+    """The report of a controller that is ready, with a further row: how the driver will reach it, and why so."""
+    if not report.ok:
+        return report
+    _, why = chosen_transport(config, report.version or (), report.upper_registers)
+    return replace(report, checks=(*report.checks, Check("transport", True, why.removeprefix("Transport "))))
 
 
 def with_host(report: Preflight) -> Preflight:

@@ -16,6 +16,7 @@ import typer
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import is_loopback, own_address
 from weldcal.tools.cli.options import Call, check_writable, command, option
+from weldcal.tools.connections import Limited, network_address
 from weldcal.tools.report.render import write_atomic
 
 LARGEST_CSV = 1_000_000
@@ -43,13 +44,11 @@ def page() -> str:
     return files("weldcal.tools.commands.tablet").joinpath("tablet.html").read_text(encoding="utf-8")
 
 
-class TabletServer(ThreadingHTTPServer):
+class TabletServer(Limited, ThreadingHTTPServer):
     """Serves one page under a path that nobody can guess and receives touches, each written to the next free file name.
 
     It answers only requests that name its own address, so that a foreign page cannot reach it under another name.
     """
-
-    daemon_threads = True
 
     def __init__(self, host: str, port: int, folder: Path, said: Callable[[str], None]) -> None:
         self.folder, self.said = folder, said
@@ -75,7 +74,6 @@ class TabletServer(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     server: TabletServer
-    timeout = 10
     server_version, sys_version = "weldcal", ""
 
     def do_GET(self) -> None:
@@ -164,13 +162,7 @@ def tablet_host(host: str) -> str:
     """The address of this machine to open on the tablet, for a server that listens on `host`."""
     if not ipaddress.ip_address(host).is_unspecified:
         return host
-    # connecting a datagram socket sends nothing, and tells which of this machine's addresses would be used
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))
-            return str(probe.getsockname()[0])
-        except OSError:  # no network at all
-            return "127.0.0.1"
+    return network_address()
 
 
 def _in_url(host: str) -> str:

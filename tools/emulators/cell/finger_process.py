@@ -17,6 +17,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.tool import FingerCamera, WeldingTool
 from weldcal.systems.drivers.simulated.rendered_finger_camera import with_noise
 from weldcal.systems.drivers.simulated.tag_view import TagView
+from weldcal.tools.connections import Limited
 
 QUALITY = 97
 BOUNDARY = "picture"
@@ -72,9 +73,8 @@ class Stream:
             return (self._number, self._part) if self._number > after else (after, b"")
 
 
-class _Server(socketserver.ThreadingTCPServer):
+class _Server(Limited, socketserver.ThreadingTCPServer):
     allow_reuse_address = True
-    daemon_threads = True
 
 
 def _handler(stream: Stream) -> type[BaseHTTPRequestHandler]:
@@ -84,6 +84,8 @@ def _handler(stream: Stream) -> type[BaseHTTPRequestHandler]:
             self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
+            assert isinstance(self.server, _Server)
+            self.server.keep(self.connection)
             with contextlib.suppress(OSError), stream.client() as number:
                 while True:
                     number, part = stream.next(number)

@@ -1,7 +1,10 @@
 """Process of the emulator: opens every port and runs 500 control frames a second."""
 
 import argparse
+import dataclasses
 import gc
+import inspect
+import math
 import os
 import signal
 import sys
@@ -9,10 +12,11 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.addresses import loopback_address
 from weldcal.tools.emulators.ur.addresses import (
@@ -25,16 +29,16 @@ from weldcal.tools.emulators.ur.addresses import (
 )
 from weldcal.tools.emulators.ur.checker import Checker
 from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, Lockstep
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, Request, World
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer
-from weldcal.tools.emulators.ur.wire.external_control import ExternalControl
 from weldcal.tools.emulators.ur.wire.net import Connection, Network
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
-from weldcal.tools.emulators.ur.wire.script_ports import PrimaryServer, RealTimeServer
+from weldcal.tools.emulators.ur.wire.script_ports import ExternalControl, PrimaryServer, RealTimeServer
 
 # the elbow up, the tool down, away from every singularity
 HOME = (0.0, -1.5707963267948966, 1.5707963267948966, -1.5707963267948966, -1.5707963267948966, 0.0)
@@ -56,6 +60,8 @@ def run_emulator(
     robot: str = "ur10e",
     kinematics: Path | None = None,
     q: tuple[float, ...] = HOME,
+    safety_limits: str = "",
+    operational_mode: str = "none",
     pace: float = 1.0,
     lockstep: float = 0.0,
     seed: int = 0,
@@ -71,6 +77,8 @@ def run_emulator(
         robot: name of the arm.
         kinematics: a robot's factory calibration; nominal where None.
         q: joint angles at the start (rad).
+        safety_limits: six joint ranges "LOWER:UPPER,..." (deg) in place of the arm's own; the arm's own where "".
+        operational_mode: none, manual or automatic, as the dashboard and the primary port report it.
         pace: controller seconds per host second, 0.05 to 1; below 1 every frame of 2 ms takes longer.
         lockstep: for so long (s of the host) time waits for a client that streams and is late; 0: never.
         seed: everything random follows from it.
@@ -81,14 +89,41 @@ def run_emulator(
         InputError: unknown arm or version, a pace, bound or address that is not allowed, or a port that is taken.
     """
     host = loopback_address(host)
-    if len(q) != 6:
+    if len(q) != 6 or not np.isfinite(q).all():
         raise InputError("Give six joint angles, in radians.")
+    if max(map(abs, q)) > 2.0 * math.pi:  # a joint's range in UR's manuals
+        raise InputError(
+            f"Give the joint angles in radians, from -6.28 to 6.28: {max(q, key=abs):g} looks like degrees."
+        )
     if not SLOWEST <= pace <= FASTEST:
         raise InputError(f"Give a pace from {SLOWEST} to {FASTEST:.0f}, not {pace}.")
     if not 0.0 <= lockstep <= LONGEST_WAIT_S:
         raise InputError(f"Give a lockstep bound from 0 to {LONGEST_WAIT_S:.0f} s, not {lockstep}.")
-    controller = Controller(load_arm(robot, kinematics), np.array(q, dtype=np.float64), parse_version(polyscope))
+    if (mode := operational_mode.upper()) not in OPERATIONAL_MODES:
+        raise InputError(f"Give none, manual or automatic as operational mode, not {operational_mode!r}.")
+    model = narrowed(load_arm(robot, kinematics), safety_limits)
+    controller = Controller(model, np.array(q, dtype=np.float64), parse_version(polyscope))
+    controller.operational_mode = mode
     Emulation(controller, host, control_port, pace, lockstep, seed).run(parent, ready)
+
+
+def narrowed(model: ArmModel, ranges: str) -> ArmModel:
+    """The arm with the joint ranges "LOWER:UPPER,..." (deg); the arm as it is where there are none.
+
+    Raises:
+        InputError: these are not six ranges inside the arm's own.
+    """
+    if not ranges:
+        return model
+    with suppress(ValueError):
+        lower, upper = np.deg2rad([[float(v) for v in pair.split(":")] for pair in ranges.split(",")]).T
+        inside = (model.position_lower - 1e-9 <= lower) & (lower < upper) & (upper <= model.position_upper + 1e-9)
+        if inside.all() and len(lower) == 6:
+            return dataclasses.replace(model, position_lower=lower, position_upper=upper)
+    most = np.rad2deg(model.position_upper).round().astype(int).tolist()
+    raise InputError(
+        f"Give six joint ranges LOWER:UPPER in degrees, commas between, LOWER < UPPER, inside +-{most}, not {ranges!r}."
+    )
 
 
 class Emulation:
@@ -241,17 +276,20 @@ def _alive(process: int) -> bool:
 
 def main() -> None:
     """Entry point of `python -m weldcal.tools.emulators.ur`."""
-    parser = argparse.ArgumentParser(prog="python -m weldcal.tools.emulators.ur", description=__doc__)
-    parser.add_argument("--host", default=DEFAULT, help="loopback address to listen on")
-    parser.add_argument("--control-port", type=int, default=CONTROL_PORT, help="port of the control channel")
-    parser.add_argument("--polyscope", default="5.21", help="controller version: 5.12, 5.21, 10.7 ...")
-    parser.add_argument("--robot", default="ur10e", help="the arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")
-    parser.add_argument("--kinematics", type=Path, help="a robot's factory calibration (YAML)")
-    parser.add_argument("--q", type=float, nargs=6, default=HOME, help="joint angles at the start (rad)")
-    parser.add_argument("--pace", type=float, default=1.0, help="controller seconds per host second, 0.05 to 1")
-    parser.add_argument("--lockstep", type=float, default=0.0, help="seconds for which time waits for a late client")
-    parser.add_argument("--seed", type=int, default=0, help="everything random follows from this number")
-    parser.add_argument("--parent", type=int, help="end when this process ends")
+    parser = argparse.ArgumentParser(
+        prog="python -m weldcal.tools.emulators.ur",
+        description=run_emulator.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    kinds: dict[str, dict[str, Any]] = {
+        "q": {"type": float, "nargs": 6},
+        "kinematics": {"type": Path},
+        "parent": {"type": int},
+    }
+    for name, known in inspect.signature(run_emulator).parameters.items():
+        if name != "ready":
+            kind = kinds.get(name, {"type": type(known.default)})
+            parser.add_argument(f"--{name.replace('_', '-')}", default=known.default, **kind)
     options = parser.parse_args()
 
     def ready(sentence: str) -> None:

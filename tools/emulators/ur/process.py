@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from weldcal.models.errors import InputError
+from weldcal.systems.interrupts import started
 from weldcal.tools.emulators.ur.addresses import PORTS, free_address, take_address
 
 CONTROL_PORT = 30090
@@ -106,6 +107,8 @@ def emulator_process(
     polyscope: str = "5.21",
     robot: str = "ur10e",
     q: Sequence[float] | None = None,
+    safety_limits: str = "",
+    operational_mode: str = "none",
     kinematics: Path | None = None,
     pace: float = 1.0,
     lockstep: float = 0.0,
@@ -123,6 +126,8 @@ def emulator_process(
         polyscope: controller version, such as 5.12, 5.21 or 10.7.
         robot: name of the arm.
         q: joint angles at the start (6,) (rad); the emulator's home where None.
+        safety_limits: six joint ranges "LOWER:UPPER,..." (deg) that are reported and obeyed; the arm's own where "".
+        operational_mode: none, manual or automatic.
         kinematics: a robot's factory calibration; nominal where None.
         pace: controller seconds per host second, 0.05 to 1.
         lockstep: for so long (s of the host) its time waits for a client that streams and is late; 0: never.
@@ -135,8 +140,15 @@ def emulator_process(
     ports = (*PORTS, control_port)
     with take_address(host, wait_for_lock_s) if host is not None else free_address(ports) as address:
         command = [sys.executable, "-m", "weldcal.tools.emulators.ur", "--parent", str(os.getpid()), "--host", address]
-        command += ["--control-port", str(control_port), "--polyscope", polyscope, "--robot", robot]
-        command += ["--pace", str(pace), "--lockstep", str(lockstep), "--seed", str(seed)]
+        given = {
+            "control-port": control_port,
+            "polyscope": polyscope,
+            "robot": robot,
+            "pace": pace,
+            "lockstep": lockstep,
+        }
+        given |= {"seed": seed, "safety-limits": safety_limits, "operational-mode": operational_mode}
+        command += [f"--{name}={value}" for name, value in given.items()]
         if q is not None:
             command += ["--q", *(repr(float(angle)) for angle in q)]
         if kinematics is not None:
@@ -149,7 +161,7 @@ def emulator_process(
 
 
 def _started(command: list[str], host: str, control_port: int) -> Emulator:
-    process = subprocess.Popen(
+    process = started(
         command,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import FARM, Call, command, option
@@ -16,7 +17,7 @@ from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.harness import statistics
 from weldcal.tools.studies.robot.jobs import jobs
-from weldcal.tools.studies.robot.stream import stream
+from weldcal.tools.studies.robot.stream import TRANSPORT, one_transport, stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING
@@ -72,6 +73,7 @@ def run_fault_benchmark(
     sequences: int = 20,
     seconds: float = 60.0,
     seed: int = 0,
+    transport: str = NATIVE,
     progress: Progress = no_progress,
 ) -> FaultReport:
     """The matrix, then the random sequences, each on a controller of its own; faults.csv and sequences.csv grow row by row."""
@@ -80,7 +82,7 @@ def run_fault_benchmark(
 
     cases = RUNNING + AT_START
     with emulator_process(host=address, seed=seed) as emulator, no_long_garbage_collections():
-        bench = Bench(emulator)
+        bench = Bench(emulator, transport=transport)
         for k, case in enumerate(cases):  # each must be able to start after the one before
             progress(case.name, share * k / len(cases))
             report.outcomes.append(run_case(bench, case, hasty=False))
@@ -88,7 +90,7 @@ def run_fault_benchmark(
     for k in range(sequences):
         progress(f"sequence {k + 1} of {sequences}", share + (1.0 - share) * k / sequences)
         with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
-            report.sequences.append(run_sequence(Bench(emulator), seed + k, seconds))
+            report.sequences.append(run_sequence(Bench(emulator, transport=transport), seed + k, seconds))
         write_atomic(out / "sequences.csv", _table(SEQUENCE_COLUMNS, report.sequences))
     write_json(out / "robot_faults.json", report.summary())
     return report
@@ -123,6 +125,7 @@ def faults(
     call: Call,
     sequences: Annotated[int, option("--sequences", "N", "Number of random fault sequences.", min=0)] = 20,
     seconds: Annotated[float, option("--seconds", "S", "Length of each.", min=1.0)] = 60.0,
+    transport: Annotated[str, TRANSPORT] = NATIVE,
 ) -> Printed:
     """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say why."""
     result = run_fault_benchmark(
@@ -131,6 +134,7 @@ def faults(
         sequences=sequences,
         seconds=seconds,
         seed=call.seed,
+        transport=one_transport(transport),
         progress=call.progress,
     )
     return Printed(result.summary(), rows={outcome.name: outcome.line for outcome in result.outcomes})

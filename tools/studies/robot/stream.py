@@ -15,9 +15,11 @@ from pydrake.systems.primitives import Adder, Sine, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
+from weldcal.systems.drivers.ur.wire.transport import NATIVE, UR_RTDE
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.wall_clock import WallClock
@@ -31,6 +33,7 @@ from weldcal.tools.worlds.robot.tap import STEP_JOINT, STEP_RAD_S, Tap
 RATE_HZ = 125.0
 READ_S = 0.002
 MISSED_S = 0.020  # a command that comes so much later than its time is named
+TRANSPORT = option("--transport", "NAME", "native or ur_rtde.")
 PERCENTILES = (50, 90, 99)
 MOST_STOPS = 20
 
@@ -138,6 +141,7 @@ def run_robot_benchmark(
     minutes: float = 10.0,
     seed: int = 0,
     lockstep: float = 0.0,
+    transport: str = NATIVE,
     progress: Progress = no_progress,
 ) -> StreamReport:
     """On an emulated controller of its own; robot.json and missed.csv are written into `out`.
@@ -148,7 +152,7 @@ def run_robot_benchmark(
     left, stops, tap = 60.0 * minutes, list[tuple[float, str]](), None
     with emulator_process(host=address, seed=seed, lockstep=lockstep) as emulator:
         while True:
-            prepared = PrepareRobot(UrRtde(host=emulator.host), load_arm())
+            prepared = PrepareRobot(UrRtde(host=emulator.host, transport=transport), load_arm())
             link = cast(UrLink, prepared.handle)
             if tap is None:
                 tap = Tap(link=link)
@@ -177,6 +181,13 @@ def _steps(seconds: float) -> PiecewisePolynomial:
     return PiecewisePolynomial.ZeroOrderHold(STEP_S * np.arange(n), samples)
 
 
+def one_transport(name: str) -> str:
+    """The option's value. Raises InputError for another."""
+    if name not in (NATIVE, UR_RTDE):
+        raise InputError(f"--transport must be {NATIVE} or {UR_RTDE}, not '{name}'.")
+    return name
+
+
 def _spread(values_s: NDArray[np.float64]) -> dict[str, float]:
     if not values_s.size:
         return {}
@@ -191,9 +202,17 @@ def _spread(values_s: NDArray[np.float64]) -> dict[str, float]:
     options=("address",),
 )
 def stream(
-    call: Call, minutes: Annotated[float, option("--minutes", "M", "Length of the stream.", min=0.05)] = 10.0
+    call: Call,
+    minutes: Annotated[float, option("--minutes", "M", "Length of the stream.", min=0.05)] = 10.0,
+    transport: Annotated[str, TRANSPORT] = NATIVE,
 ) -> Mapping[str, object]:
     """Stream commands at 125 Hz to an emulated controller: periods, latencies, and deadlines missed by 20 ms or more."""
-    folder, address = call.folder("benchmark", "robot"), call.given["address"]
-    found = run_robot_benchmark(folder, address=address, minutes=minutes, seed=call.seed, progress=call.progress)
+    found = run_robot_benchmark(
+        call.folder("benchmark", "robot"),
+        address=call.given["address"],
+        minutes=minutes,
+        seed=call.seed,
+        transport=one_transport(transport),
+        progress=call.progress,
+    )
     return found.summary()

@@ -21,6 +21,7 @@ from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.wire.dashboard import ask
+from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.pacing import real_time_priority
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import Emulator
@@ -113,8 +114,15 @@ class Stream(threading.Thread):
 class Bench:
     """One emulated controller and, between `start` and `end`, an arm that moves over a link to it."""
 
-    def __init__(self, emulator: Emulator, output: int | None = None, torch: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        emulator: Emulator,
+        output: int | None = None,
+        torch: Mapping[str, Any] | None = None,
+        transport: str = NATIVE,
+    ) -> None:
         """`torch`: what else of it is wired, as UrLink.start takes it."""
+        self.transport = transport
         self.emulator = emulator
         self.output, self._torch = output, torch or {}
         self.host = emulator.host
@@ -154,6 +162,7 @@ class Bench:
             payload_kg=config.payload_kg,
             payload_cog_m=(x, y, z),
             process_output=output,
+            transport=self.transport,
             **self._torch,
         )
         self._stream = Stream(self.link, self.arm, self.home)
@@ -163,7 +172,7 @@ class Bench:
     def start_elsewhere(self) -> list[int]:
         """As `start`, with link and commands in a process of their own, which can be killed; that process's children."""
         self.emulator.do("reset_checker")
-        command = [sys.executable, "-m", "weldcal.tools.worlds.robot.bench", self.host]
+        command = [sys.executable, "-m", "weldcal.tools.worlds.robot.bench", self.host, self.transport]
         self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self.cruise()
         self._workers = worker_of(self._child.pid)
@@ -262,11 +271,13 @@ class Bench:
 
 
 def main() -> None:
-    """Moves the arm at argv[1] until stdin closes or the process is killed; answers each line when it cruises, or why it does not."""
-    host = sys.argv[1]
+    """Moves the arm at argv[1] over the transport argv[2] until stdin closes or the process is killed; answers each line when it cruises, or why it does not."""
+    host, transport = sys.argv[1:]
     arm, config = load_arm(), UrRtde(host=host)
-    x, y, z = config.payload_cog_m
-    link = UrLink.start(host, arm, config.limits(arm), payload_kg=config.payload_kg, payload_cog_m=(x, y, z))
+    load = tuple(config.payload_cog_m)
+    link = UrLink.start(
+        host, arm, config.limits(arm), payload_kg=config.payload_kg, payload_cog_m=load, transport=transport
+    )
     stream = Stream(link, arm, np.array(HOME))
     stream.start()
     for _ in sys.stdin:

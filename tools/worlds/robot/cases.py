@@ -3,7 +3,7 @@
 import signal
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,7 @@ class Case:
     says: str = ""  # what a refusal's sentence must contain
     random: bool = True  # also in the random sequences
     short: bool = True  # also in the tests
+    over_ur_rtde: frozenset[Fault] = frozenset()  # what may be reported in addition with that transport
 
 
 def _fault(name: str, **values: object) -> Callable[[Bench], float]:
@@ -150,12 +151,29 @@ def _refused(name: str, throw: Callable[[Bench], float], says: str, *, short: bo
     return Case(name=f"start {name}", throw=throw, must=REFUSE, says=says, short=short)
 
 
+REAL_OUTPUTS = (
+    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "speed_scaling", "target_speed_fraction",
+    "output_double_register_36", "output_double_register_37", "output_double_register_38",
+)  # fmt: skip
+SHORT_NUMBERS = ("nan as actual_q", "inf as actual_TCP_pose", "nan as speed_scaling", "nan as timestamp")
+
+
+def _no_number(output: str, value: str, **settings: Any) -> Case:
+    """An output of real numbers that is not a finite number."""
+    name, throw = f"{value} as {output}", _fault("wrong_number", output=output, value=float(value))
+    named = name in SHORT_NUMBERS
+    return _stops(name, throw, Fault.STATE_NOT_FINITE, CLEAR, **({"random": named, "short": named} | settings))
+
+
 RUNNING: tuple[Case, ...] = (
     # the link
     Case(name="no state for 20 ms", throw=_fault("drop", seconds=0.02), must=GO, short=False),
     Case(name="state 30 ms late for 0.3 s", throw=_fault("delay", seconds=0.03, **{"for": 0.3}), must=GO, repair=CLEAR),
     Case(name="10 % of the states lost", throw=_fault("drop_p", p=0.1), must=GO, repair=CLEAR),
-    Case(name="states in torn pieces", throw=_fault("partial_writes", bytes=7), must=GO, repair=CLEAR),
+    # ur_rtde drops a state as soon as the next one's header has arrived, and so never has a whole one
+    Case(
+        name="states in torn pieces", throw=_fault("partial_writes", bytes=7), must=GO, repair=CLEAR, over_ur_rtde=LINK
+    ),
     Case(name="controller's frames jitter by 5 ms", throw=_fault("jitter", seconds=0.005), must=GO, repair=CLEAR),
     Case(name="controller's clock 100 ppm fast", throw=_fault("clock_skew", ppm=100), must=GO),
     Case(name="dashboard connection reset", throw=_fault("reset_tcp", kind="dashboard"), must=GO, short=False),
@@ -195,6 +213,9 @@ RUNNING: tuple[Case, ...] = (
         "controller's clock jumps 10 s ahead", _fault("timestamp_jump", seconds=10.0), Fault.CLOCK_JUMPED, short=False
     ),
     _stops("controller's clock jumps 10 s back", _fault("timestamp_jump", seconds=-10.0), Fault.CLOCK_JUMPED),
+    # each output of real numbers that the driver reads; those of a register are the number, the time and the passes of the guard
+    *(_no_number(output, value) for output in REAL_OUTPUTS for value in ("nan", "inf")),
+    replace(_no_number("speed_scaling", "nan", process=True, burns_s=0.06, short=True), name="nan, process on"),
     # the robot
     Case(name="reduced mode", throw=_fault("reduced"), must=GO, repair=(Action("normal"),)),
     Case(name="tool contact", throw=_fault("tool_contact", n=1), must=GO, short=False),
@@ -317,5 +338,14 @@ AT_START: tuple[Case, ...] = (
     _refused("without power", _fault("robot_mode", value=3), "no power", short=False),
     _refused("with another TCP", _fault("wrong_tcp"), "TCP"),
     _refused("with another payload", lambda b: b.emulator.do("set_payload", mass=0.0), "payload"),
+    *(
+        _refused(
+            f"with nan as {name}",
+            _fault("wrong_number", output=name),
+            name.partition("_cog")[0],
+            short=name == "tcp_offset",
+        )
+        for name in ("actual_q", "speed_scaling", "tcp_offset", "payload_cog")
+    ),
     _refused("with the speed slider at 50 %", _fault("speed_scaling", value=0.5), "slider"),
 )

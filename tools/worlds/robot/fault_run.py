@@ -10,8 +10,9 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
+from weldcal.systems.drivers.ur.wire.transport import UR_RTDE
 from weldcal.tools.worlds.robot.bench import OUTPUT, SPEED_M_S, Bench, StoppedUnasked
-from weldcal.tools.worlds.robot.cases import GO, REFUSE, REST_S, STOP, Case
+from weldcal.tools.worlds.robot.cases import GO, GO_OR_STOP, REFUSE, REST_S, STOP, Case
 
 GOING_S = 0.4
 TURN_S = 0.5  # in which an arm that goes on is at its speed again
@@ -62,6 +63,8 @@ def run_case(bench: Bench, case: Case, *, hasty: bool = False, attempts: int = S
     `hasty`: after a stop the worker is killed instead of asked to end, and it is watched for less long. `attempts`: how
     often a case may be tried where the load of this computer spoils it.
     """
+    if bench.transport == UR_RTDE and case.over_ur_rtde:
+        case = replace(case, must=GO_OR_STOP if case.must == GO else case.must, faults=case.faults | case.over_ur_rtde)
     for retries in range(attempts):
         overruns = bench.emulator.state()["overruns"]
         try:
@@ -198,7 +201,7 @@ def _at_start(bench: Bench, case: Case) -> Outcome:
     problems: list[str] = []
     sentence = ""
     try:
-        prepared = PrepareRobot(UrRtde(host=bench.host), load_arm())
+        prepared = PrepareRobot(UrRtde(host=bench.host, transport=bench.transport), load_arm())
         if prepared.handle is not None:
             prepared.handle.close()
         problems.append("it started")

@@ -6,7 +6,7 @@ A module of its own: its processes import it, and must be ready within seconds o
 import contextlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -33,6 +33,15 @@ class HostLateness:
             f"{late.on_time_percent:.3f} % of {sum(late.counts)} wake-ups of a program above all others under 4 ms, "
             f"{late.over(8.0)} over 8 ms, latest {late.worst_ms:.1f} ms"
         )
+
+    def caused(self, jobs: Sequence[Lateness]) -> int:
+        """How many velocities of these jobs were over 8 ms late while the program above all others was not woken up in time either."""
+        return sum(job.shared_with(self.lateness, 8.0) for job in jobs)
+
+    def judged(self, jobs: Sequence[Lateness]) -> str:
+        """How many velocities of these jobs were over 8 ms late, and for how many this computer itself was the cause."""
+        late, all_of = sum(job.over(8.0) for job in jobs), sum(sum(job.counts) for job in jobs)
+        return f"{late} of {all_of} velocities over 8 ms late, {self.caused(jobs)} of them by this computer itself"
 
     def summary(self) -> dict[str, object]:
         """The JSON object."""
@@ -62,17 +71,17 @@ def watched_host() -> Iterator[HostLateness]:
             with contextlib.suppress(OSError, EOFError):
                 pipe.send("end")
                 if pipe.poll(ANSWERS_WITHIN_S):
-                    counts, worst_ms = pipe.recv()
-                    late = found.lateness
-                    late.counts = [a + b for a, b in zip(late.counts, counts, strict=True)]
-                    late.worst_ms = max(late.worst_ms, worst_ms)
+                    one, late = pipe.recv(), found.lateness
+                    late.counts = [a + b for a, b in zip(late.counts, one.counts, strict=True)]
+                    late.worst_ms = max(late.worst_ms, one.worst_ms)
+                    late.delays += one.delays
             process.terminate()
             process.join()
 
 
 def probe(core: int, pipe: Connection) -> None:
     """Wake up every TICK_S on one core until something comes through the pipe. Says first whether it has precedence, and at the end
-    (counts, worst ms).
+    its lateness.
     """
     os.sched_setaffinity(0, {core})
     try:
@@ -85,5 +94,6 @@ def probe(core: int, pipe: Connection) -> None:
     while not pipe.poll(0.0):
         due = time.monotonic() + TICK_S
         time.sleep(TICK_S)
-        late.add(1e3 * max(time.monotonic() - due, 0.0))
-    pipe.send((late.counts, late.worst_ms))
+        now = time.monotonic()
+        late.add(1e3 * max(now - due, 0.0), now)
+    pipe.send(late)

@@ -3,6 +3,7 @@
 import math
 from bisect import bisect_right
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,6 +72,10 @@ class Stamps:
         return RigidTransform(R, (1.0 - share) * p0 + share * p1)
 
 
+Carrier = Callable[[Array, float], tuple[Array, Array, str | None]]
+"""Moves a tool by a velocity (6,) for a time s: its rotation (3, 3), its position (3,) m, and why it has stopped for good."""
+
+
 @dataclass(frozen=True, eq=False)
 class StudyRun:
     """One simulated weld.
@@ -125,6 +130,7 @@ def simulate(
     time_limit_s: float = 150.0,
     plan: SeamCurve | None = None,
     hidden_s: tuple[float, float] = (math.inf, math.inf),
+    carrier: Carrier | None = None,
 ) -> StudyRun:
     """One weld of a seam in a budget; everything random follows from the seed. The servo is the cell's own, unchanged.
 
@@ -133,7 +139,7 @@ def simulate(
 
     Args:
         gaps: (from, to) m of the groove that are missing; plan: in place of the budget's; hidden_s: from when to when
-            the tag is not seen.
+            the tag is not seen; carrier: what moves the tool from where it is; None: a robot that follows every velocity.
 
     Source: the kinematic model of the design note, section B.3, with a V-groove for the side wall.
     """
@@ -187,7 +193,12 @@ def simulate(
             reason = "The torch was lost: more than 60 mm off the seam."
             break
         V = V + blend * (command.V_BT - V)
-        R, p = _turned(R, V[:3] * dt, k), p + V[3:] * dt
+        if carrier is None:
+            R, p = _turned(R, V[:3] * dt, k), p + V[3:] * dt
+            continue
+        R, p, reason = carrier(V, dt)
+        if reason is not None:
+            break
     return StudyRun(np.array(rows), torch_line, plan.raised(SEAT_M), tuple(commands), state, reason or state.reason)
 
 

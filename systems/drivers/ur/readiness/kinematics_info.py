@@ -1,8 +1,8 @@
-"""Reads a robot's factory kinematics from its primary port and checks it against the controller's flange pose."""
+"""Reads a robot's factory kinematics and joint limits from its primary port, and checks the kinematics against the flange pose."""
 
 import re
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,10 +22,11 @@ PRIMARY_PORT = 30001
 KINEMATICS_TOLERANCE_M = 5e-5
 KINEMATICS_TOLERANCE_RAD = float(np.deg2rad(0.02))
 
-_ROBOT_STATE, _KINEMATICS_INFO = 16, 5
+_ROBOT_STATE, _KINEMATICS_INFO, _CONFIGURATION = 16, 5, 6
 _ROBOT_MODEL = re.compile(r"\bUR\d+", re.IGNORECASE)
 _HEADER, _PART = struct.Struct(">iB"), struct.Struct(">IB")
 _BODY = struct.Struct(">6I24dI")
+_LIMITS = struct.Struct(">24d")  # at the begin of ConfigurationData, as in UR's client library
 _LONGEST_PACKAGE = 1 << 20
 # Nominal kinematics has joint axes that are exactly parallel or square; a calibration has none.
 _EXACT = 1e-9
@@ -48,8 +49,26 @@ class KinematicsInfo:
     checksum: str
 
 
-def read_kinematics(host: str, timeout_s: float = 2.0, port: int = PRIMARY_PORT) -> KinematicsInfo:
-    """The kinematics that the controller at `host` computes with (package KinematicsInfo of its primary port).
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """What the controller reports for its joints, each (6,), rad, rad/s and rad/s^2.
+
+    It is not proven that these are the safety limits that are set on the pendant: those may be narrower.
+    """
+
+    lower: Array
+    upper: Array
+    speed: Array
+    acceleration: Array
+
+
+def read_kinematics(
+    host: str, timeout_s: float = 2.0, port: int = PRIMARY_PORT
+) -> tuple[KinematicsInfo, JointLimits | None]:
+    """Read the kinematics that the controller at `host` computes with, and its joint limits.
+
+    They are in the packages KinematicsInfo and ConfigurationData of the primary port. The limits are None where the controller reports
+    none, or numbers that are no limits.
 
     Raises:
         RobotUnreachable: nothing answers in time, or what answers is not the primary interface.
@@ -65,7 +84,7 @@ def read_kinematics(host: str, timeout_s: float = 2.0, port: int = PRIMARY_PORT)
             if kind == _ROBOT_STATE and (body := _part(package, _KINEMATICS_INFO, line)) is not None:
                 if len(body) < _BODY.size:
                     raise line.nonsense()
-                return _parse(body)
+                return _parse(body), _limits(_part(package, _CONFIGURATION, line))
 
 
 def _part(package: bytes, wanted: int, line: Line) -> bytes | None:
@@ -96,6 +115,36 @@ def _parse(body: bytes) -> KinematicsInfo:
     exact = max(np.abs(theta).max(), np.abs(square - np.round(square)).max(), abs(d[1]), abs(d[2]), abs(a[0])) < _EXACT
     checksum = "calib_" + "".join(f"{number:08x}" for number in numbers[:6])
     return KinematicsInfo(theta, a, d, alpha, calibrated=not exact, checksum=checksum)
+
+
+def _limits(body: bytes | None) -> JointLimits | None:
+    if body is None or len(body) < _LIMITS.size:
+        return None
+    numbers = np.array(_LIMITS.unpack_from(body)).reshape(2, 6, 2)
+    lower, upper, speed, acceleration = (numbers[i, :, j] for i in range(2) for j in range(2))
+    if not (
+        np.isfinite(numbers).all() and (lower < upper).all() and (speed > 0.0).all() and (acceleration > 0.0).all()
+    ):
+        return None
+    return JointLimits(lower, upper, speed, acceleration)
+
+
+def limited_arm(arm: ArmModel, limits: JointLimits | None) -> ArmModel:
+    """The arm within its own limits and those that the controller reports; the same where that reports none.
+
+    Raises:
+        InputError: the two leave a joint nothing.
+    """
+    if limits is None:
+        return arm
+    lower, upper = np.maximum(arm.position_lower, limits.lower), np.minimum(arm.position_upper, limits.upper)
+    if (none := np.flatnonzero(lower >= upper)).size:
+        raise InputError(
+            f"The controller reports limits of {arm.joint_names[none[0]]} that are outside the {arm.name}'s own: "
+            f"connect a {arm.name}, or correct the joint limits under Installation > Safety on the pendant."
+        )
+    speed = np.minimum(arm.velocity_limit, limits.speed)
+    return replace(arm, position_lower=lower, position_upper=upper, velocity_limit=speed)
 
 
 def model_finding(told: str, wanted: str) -> tuple[bool, str, str]:

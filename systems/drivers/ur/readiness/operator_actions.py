@@ -106,6 +106,14 @@ def safety(safety_mode: int) -> str:
     )
 
 
+def outputs(missing: list[str]) -> str:
+    """The operator action where a controller of a supported version does not report what each of them reports."""
+    return (
+        f"The controller does not report {', '.join(missing)}, which every supported PolyScope reports: restart the control box, and "
+        "connect this computer to it directly, not through a program that passes RTDE on."
+    )
+
+
 def payload(owner: str, text: str) -> str:
     """The operator action where the payload is not the expected one."""
     return (
@@ -132,7 +140,7 @@ def model(told: str, wanted: str) -> str:
 
 def limits(joint: str) -> str:
     """The operator action where a joint is too near its limit."""
-    return f"The {joint} joint is less than 5 degrees from its limit: turn it back with the Move tab of the pendant."
+    return f"The {joint} joint is less than 5 degrees from its limit, or beyond it: turn it back with the Move tab of the pendant."
 
 
 def program(state: str, name: str) -> str:

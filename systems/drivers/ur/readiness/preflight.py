@@ -21,6 +21,7 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KinematicsInfo,
     calibrated_arm,
     cross_check,
+    limited_arm,
     model_finding,
     read_kinematics,
 )
@@ -193,6 +194,7 @@ class _Look:
         self._kinematics: KinematicsInfo | None = None
         self._arm: ArmModel | None = None
         self._error: tuple[float, float] | None = None
+        self._whose_limits = "the controller reports none"
         self._dashboard = True
         self._upper = True
 
@@ -243,8 +245,8 @@ class _Look:
         self._check_speed()
         if self._done["power"].ok:
             self._check_standstill()
-            self._check_limits()
             self._check_kinematics()
+            self._check_limits()
         self._check_model()
         self._check_remote()
 
@@ -261,7 +263,7 @@ class _Look:
             claims = rtde.claim(register_names(self._offset, self._doubles))
             self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, GRAVITY_OUTPUT, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:
-            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.VERSION)
+            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.outputs(missing))
         return claims
 
     def _ok(self, name: str, found: str) -> None:
@@ -327,13 +329,13 @@ class _Look:
         self._state("standstill", speed <= REST_RAD_S, found, actions.STANDSTILL)
 
     def _check_limits(self) -> None:
-        q, arm = self._vector("actual_q"), self._nominal
-        room = np.minimum(q - arm.position_lower, arm.position_upper - q)
-        worst = int(np.argmin(room))
+        q, arm = self._vector("actual_q"), self._arm or self._nominal
+        margin = np.minimum(q - arm.position_lower, arm.position_upper - q)
+        worst = int(np.argmin(margin))
         joint = arm.joint_names[worst].removesuffix("_joint").replace("_", " ")
-        degrees = np.rad2deg(room[worst])
-        found = f"{degrees:.0f} deg of room ({joint})" if degrees >= 0.0 else f"{joint} {-degrees:.0f} deg beyond"
-        self._state("joint limits", bool(room[worst] >= LIMIT_MARGIN_RAD), found, actions.limits(joint))
+        degrees = np.rad2deg(margin[worst])
+        found = f"{joint} {abs(degrees):.0f} deg {'away' if degrees >= 0.0 else 'beyond'}; {self._whose_limits}"
+        self._state("joint limits", bool(margin[worst] >= LIMIT_MARGIN_RAD), found, actions.limits(joint))
 
     def _check_tcp(self) -> None:
         offset = self._vector("tcp_offset")
@@ -375,15 +377,17 @@ class _Look:
 
     def _check_kinematics(self) -> None:
         try:
-            self._kinematics = read_kinematics(self._host, self._timeout_s)
+            self._kinematics, limits = read_kinematics(self._host, self._timeout_s)
         except RobotRefused as problem:
             self._bad("kinematics", "not readable on port 30001", str(problem))
             return
         try:
-            self._arm = calibrated_arm(self._nominal, self._kinematics)
+            self._arm = limited_arm(calibrated_arm(self._nominal, self._kinematics), limits)
         except InputError as problem:
             self._bad("kinematics", f"not a {self._nominal.name}'s", str(problem))
             return
+        if limits is not None:
+            self._whose_limits = "the pendant's may be nearer"  # its safety limits: what is reported may not hold them
         found = "factory calibration" if self._kinematics.calibrated else "nominal, as URSim or an emulator has it"
         self._ok("kinematics", found)
         pose, offset = self._vector("actual_TCP_pose"), self._vector("tcp_offset")

@@ -5,11 +5,13 @@ Packages of protocol version 2 are big endian: uint16 size (header included), ui
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 from collections.abc import Sequence
 from types import TracebackType
 
+from weldcal.systems.drivers.ur.faults import Fault, RobotUnreachable, reported_as, sentence
 from weldcal.systems.drivers.ur.wire.line import Line
 
 RTDE_PORT = 30004
@@ -36,6 +38,14 @@ CODES = {
 Value = float | int | bool | tuple[float, ...] | tuple[int, ...]
 
 
+class NotFinite(RobotUnreachable):
+    """The controller reports an output as not a finite number."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(sentence(Fault.STATE_NOT_FINITE, reported_as(name)))
+        self.output = name
+
+
 class RtdeProbe:
     """One connection to a controller's RTDE port; a context manager that releases all claimed inputs at its end.
 
@@ -48,7 +58,9 @@ class RtdeProbe:
         try:
             (accepted,) = self._unpack(">?", self._request(_PROTOCOL, struct.pack(">H", PROTOCOL_VERSION)))
             if not accepted:
-                raise self._line.nonsense()
+                raise RobotUnreachable(
+                    f"The controller at {host} speaks version 1 of RTDE only: update PolyScope to 5.12 or newer."
+                )
             major, minor, bugfix, build = self._unpack(">4I", self._request(_VERSION, b""))
         except BaseException:
             self._line.close()
@@ -69,6 +81,9 @@ class RtdeProbe:
         """Read the next values of these outputs, all of one control step; names unknown to the controller are omitted.
 
         Vectors are tuples; poses are x, y, z (m) and a rotation vector (rad), joints rad and rad/s.
+
+        Raises:
+            NotFinite: a value is not a finite number.
         """
         types = self._set_outputs(names)
         wanted = [name for name, kind in zip(names, types, strict=True) if kind != NOT_FOUND]
@@ -92,6 +107,8 @@ class RtdeProbe:
         for name, kind in zip(wanted, types, strict=True):
             width = int(CODES[kind][0]) if kind.startswith("VECTOR") else 0
             values[name] = numbers[at : at + width] if width else numbers[at]
+            if not all(map(math.isfinite, numbers[at : at + (width or 1)])):
+                raise NotFinite(name)
             at += width or 1
         return values
 

@@ -6,13 +6,14 @@ One connection, no thread: the worker's loop reads what has arrived. Packages as
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import struct
 import time
 from collections.abc import Sequence
 
 from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.wire.rtde_client import CODES, IN_USE, NOT_FOUND, RtdeProbe
+from weldcal.systems.drivers.ur.wire.rtde_client import CODES, IN_USE, NOT_FOUND, NotFinite, RtdeProbe
 
 E_SERIES, FASTEST_HZ, CB3_HZ = 5, 500.0, 125.0
 DATA = ord("U")
@@ -33,6 +34,7 @@ class RtdeStream:
             self._recipe, kinds = self._probe.claim_recipe(inputs) if inputs else (0, [])
             if {IN_USE, NOT_FOUND} & set(kinds):
                 raise RobotRefused("Another client or a fieldbus writes the command registers.")
+            self._inputs = len(kinds)
             self._package = struct.Struct(">B" + "".join(CODES[kind] for kind in kinds))
             rate = FASTEST_HZ if self._probe.version[0] >= E_SERIES else CB3_HZ
             kinds = self._probe.subscribe(outputs, rate)
@@ -52,19 +54,30 @@ class RtdeStream:
         self._newest: tuple[float, ...] | None = None
         self._read = 0
         self.connected = True
+        self.not_finite = ""  # an output of the newest package that was dropped because it is not a finite number
 
     def poll(self) -> None:
-        """Read all packages that have arrived; the newest counts. A connection that has ended is told by `connected`."""
-        if starts := self._arrived():
-            self._newest = self._layout.unpack_from(self._inbox, starts[-1])
-        del self._inbox[: self._read]
+        """Read all packages that have arrived; the newest finite one counts. `connected` shows whether the connection has ended."""
+        self.packages()
 
     def packages(self) -> list[tuple[float, ...]]:
         """Every package since the last call, oldest first: the recipe's number, then the outputs' numbers in order. See poll."""
-        found = [self._layout.unpack_from(self._inbox, at) for at in self._arrived()]
+        found = [package for at in self._arrived() if (package := self._finite(at)) is not None]
         self._newest = found[-1] if found else self._newest
         del self._inbox[: self._read]
         return found
+
+    def _finite(self, at: int) -> tuple[float, ...] | None:
+        """The package that begins there in the inbox; None where one of its numbers is not finite."""
+        package = self._layout.unpack_from(self._inbox, at)
+        if all(map(math.isfinite, package)):
+            return package
+        self.not_finite = next(
+            name
+            for name, k in self._at.items()
+            if not all(map(math.isfinite, package[k] if isinstance(k, slice) else (package[k],)))
+        )
+        return None
 
     def _arrived(self) -> list[int]:
         """Where the outputs of whole packages begin in the inbox, of which `_read` bytes are then read."""
@@ -92,10 +105,12 @@ class RtdeStream:
         """Wait for the first package.
 
         Raises:
-            RobotUnreachable: none comes.
+            RobotUnreachable: none comes, or one that is not finite.
         """
         until = time.monotonic() + limit_s
         while self._newest is None:
+            if self.not_finite:
+                raise NotFinite(self.not_finite)
             if not self.connected or time.monotonic() > until:
                 raise RobotUnreachable("The controller accepts the recipe and sends no data.")
             self.wait(0.01)
@@ -119,8 +134,8 @@ class RtdeStream:
         return self._newest
 
     def send(self, *values: float) -> None:
-        """Write the inputs, in the order in which they were claimed."""
-        payload = self._package.pack(self._recipe, *values)
+        """Write the inputs, in the order in which they were claimed; those that are left out are zero."""
+        payload = self._package.pack(self._recipe, *values, *[0] * (self._inputs - len(values)))
         try:
             self._socket.settimeout(0.0)
             sent = self._socket.send(HEADER.pack(len(payload) + HEADER.size, DATA) + payload)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
 
 import pytest
@@ -13,6 +15,33 @@ def test_the_hosts_time_is_its_monotonic_clock() -> None:
     clock = HostTime()
     assert clock.now() == pytest.approx(time.monotonic(), abs=0.5)
     assert clock.at(12.5) == 12.5
+
+
+def test_several_threads_may_ask_one_clock() -> None:
+    """The acquisition's thread and the Diagram's do; the world stands still half of the time, which drops notes."""
+    began = time.monotonic()
+    clock = FollowedTime(lambda: round(20.0 * (time.monotonic() - began)) / 20.0)
+    until, faults = time.monotonic() + 2.0, list[Exception]()
+
+    def hammer() -> None:
+        try:
+            while time.monotonic() < until:
+                found = clock.at(time.monotonic() - 1e-4)
+                assert 0.0 <= found <= 2.1
+        except Exception as fault:
+            faults.append(fault)
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=hammer) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(before)
+    assert faults == []
 
 
 def test_a_world_that_stands_still_makes_nothing_late() -> None:

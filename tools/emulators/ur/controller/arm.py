@@ -85,14 +85,16 @@ class EmulatedArm:
                     qd = self._checked(qd)
             except MotionRefused as refused:
                 refusal = refused
+            except (ArithmeticError, ValueError) as error:  # numbers beyond what the arm's equations can hold
+                refusal = MotionRefused(f"the motion cannot be computed: {error}")
         elif self.motion is not None:
             speed = float(np.abs(before).max())
             self.motion.braked(float(np.abs(qd).max()) / speed if speed > 0.0 else 0.0)
         if self.compliance is not None:
             try:
                 qd = self._checked(self.compliance.velocity(self.q_target, self.X_FT, qd, self.touch(), live))
-            except MotionRefused as refused:
-                refusal, self.compliance = refused, None
+            except (MotionRefused, ArithmeticError, ValueError) as refused:
+                refusal, self.compliance = MotionRefused(str(refused), getattr(refused, "code", 153)), None
                 qd = slowed(self.qd_target, STOP_RAD_S2)
         self._integrate(qd)
         if refusal is not None:

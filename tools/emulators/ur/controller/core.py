@@ -19,6 +19,9 @@ from weldcal.tools.emulators.ur.versions import Version
 WORDS = ("stop program", "power on", "power off", "set robotmode run", "set unlock protective stop")
 
 
+MOST_SIDEKICKS = 20  # [M]
+
+
 class Controller(ControllerState):
     """Everything but the wire; the wire's faults live in the servers."""
 
@@ -80,8 +83,10 @@ class Controller(ControllerState):
             return False
         self.script_count += 1
         if program.kind == "sec":
-            self.sidekicks.append(program)
-            return True
+            if taken := len(self.sidekicks) < MOST_SIDEKICKS:
+                self.sidekicks.append(program)
+            self.note(f"secondary program {'started' if taken else 'ignored, too many run'}: {program.name}")
+            return taken
         self._drop_program()
         self.program, self.program_name = program, program.name
         self.runtime_state = RuntimeState.PLAYING
@@ -127,10 +132,9 @@ class Controller(ControllerState):
         self.inputs, self.outputs = Registers(), Registers()
         self.terminals.digital_outputs = 0
         self.terminals.analog_outputs = [0.0, 0.0]
-        for kept in (self.terminals.runstate, self.terminals.analog_runstate):
+        t = self.terminals
+        for kept in (t.runstate, t.analog_runstate, t.foreign, t.analog_foreign):
             kept.clear()
-        self.terminals.foreign.clear()
-        self.terminals.analog_foreign.clear()
         self.robot_mode, self.safety_mode = RobotMode.POWER_OFF, SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.timestamp = 0.0

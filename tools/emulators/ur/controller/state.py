@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
-from weldcal.tools.emulators.ur.controller.contact import ForceSensor, Surroundings
+from weldcal.tools.emulators.ur.controller.compliance import ForceSensor, Surroundings
 from weldcal.tools.emulators.ur.controller.events import ErrorCode, Event, SafetyChanged
 from weldcal.tools.emulators.ur.controller.modes import MOVING, POWERLESS, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
@@ -34,6 +34,7 @@ class ControllerState:
         self.surroundings, self.sensor = Surroundings(), ForceSensor()
         self.force_gain_scaling = 1.0
         self.gravity = [0.0, 0.0, 9.82]
+        self.random = np.random.default_rng(0)  # of the script's random(): the same row after every start
         self.tcp_offset = [0.0] * 6
         self.payload = Payload(1.4, [0.03, 0.0, 0.05], [0.0] * 6)  # [M] of the installation: the welding tool's
         self.operational_mode = "NONE"

@@ -5,24 +5,27 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
 from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of, rotation_matrix, rotation_vector
 from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS, Watchdog, register_index
 from weldcal.tools.emulators.ur.controller.state import ControllerState
-from weldcal.tools.emulators.ur.script.arithmetic import Pose
+from weldcal.tools.emulators.ur.script.arithmetic import Effort, Pose
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
+SLOW = 5000  # effort of inverse kinematics and of dynamics
 
-def six(values: Any, what: str) -> Array:
-    """Six finite numbers out of a script; raises ScriptError where they are not."""
-    if not isinstance(values, list) or len(values) != 6:
-        raise ScriptError(f"{what} needs six numbers, it got {values!r}.")
+
+def six(values: Any, what: str, count: int = 6) -> Array:
+    """Six finite numbers out of a script, or as many as `count`; raises ScriptError where they are not."""
+    if not isinstance(values, list) or len(values) != count:
+        raise ScriptError(f"{what} needs {count} numbers, it got {values!r}.")
     array = np.array(values, dtype=np.float64)
     if not np.isfinite(array).all():
         raise ScriptError(f"{what} got a number that is not finite.")
@@ -56,6 +59,8 @@ READS: dict[str, Callable[[ControllerState], Any]] = {
     "get_target_payload_cog": lambda c: list(c.payload.center),
     "get_target_payload_inertia": lambda c: list(c.payload.inertia),
     "get_controller_temp": lambda c: 30.0,
+    "get_gravity": lambda c: list(c.gravity),
+    "random": lambda c: float(c.random.random()),
     "get_tool_accelerometer_reading": lambda c: [0.0, 0.0, 9.81],
     "is_steady": lambda c: c.arm.at_rest,
 }
@@ -66,11 +71,15 @@ CALCULATIONS: dict[str, Callable[..., Any]] = {
     "pose_dist": lambda pose_from, pose_to: math.dist(pose_from[:3], pose_to[:3]),
     "point_dist": lambda p_from, p_to: math.dist(p_from[:3], p_to[:3]),
     "norm": lambda a: math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a)),
-    "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(l)],  # noqa: E741  (URScript's own name)
+    "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(min(l, 64))],  # noqa: E741  (URScript's own name)
     "d2r": lambda d: math.radians(d),
     "r2d": lambda r: math.degrees(r),
-    "pow": lambda base, exponent: float(base**exponent),
+    "pow": math.pow,
     "inv": lambda m: Pose(pose_of(inverse(matrix(m)))) if isinstance(m, Pose) else np.linalg.inv(m).tolist(),
+    "rpy2rotvec": lambda rpy_vector: rotation_vector(RollPitchYaw(rpy_vector).ToRotationMatrix().matrix()).tolist(),
+    "rotvec2rpy": lambda rotation_vector: (
+        RollPitchYaw(RotationMatrix(rotation_matrix(rotation_vector))).vector().tolist()
+    ),
     "floor": lambda f: math.floor(f),
     "ceil": lambda f: math.ceil(f),
     "log": lambda b, f: math.log(f, b),
@@ -143,16 +152,32 @@ class Answers:
 
     def _inverse(self, pose: Any, q_near: Any) -> Array | None:
         arm = self._controller.arm
+        Effort.spend(SLOW)
         X = arm.flange_goal(six(pose, "A pose").tolist())
         near = arm.q_target if q_near is None else six(q_near, "qnear")
         found = newton(arm.model, X, near)
-        if found is not None and float(np.abs(found - near).max()) < 1.0:
+        if found is not None and float(np.abs(found - near).max()) < 1.0 and _inside(arm.model, found):
             return found
         try:
-            R = RotationMatrix.ProjectToRotationMatrix(X[:3, :3])[0]
+            R = RotationMatrix.ProjectToRotationMatrix(X[:3, :3])
             return nearest_solution(arm.model, RigidTransform(R, X[:3, 3]), near)
         except InputError as error:
             raise ScriptError(str(error)) from error
+
+    def get_joint_temp(self, j: int) -> float:
+        register_index(j, 6)
+        return 30.0
+
+    def normalize(self, v: Any) -> list[float]:
+        if not isinstance(v, list) or not (length := math.hypot(*v)):
+            raise ScriptError(f"normalize needs numbers that are not all zero, it got {v!r}.")
+        return [value / length for value in v]
+
+    def wrench_trans(self, T_from_to: Any, w_from: Any) -> list[float]:
+        """[M] T_from_to is the pose of the new point of view in the old one."""
+        X, w = matrix(six(T_from_to, "wrench_trans")), six(w_from, "wrench_trans")
+        force, torque = w[:3] @ X[:3, :3], (w[3:] - np.cross(X[:3, 3], w[:3])) @ X[:3, :3]
+        return [*force.tolist(), *torque.tolist()]
 
     def pose_add(self, p_1: Any, p_2: Any) -> Pose:
         X, Y = matrix(p_1), matrix(p_2)
@@ -176,5 +201,8 @@ class Answers:
     def is_within_safety_limits(self, pose: Any) -> bool:
         if isinstance(pose, Pose):
             return self._inverse(pose, None) is not None
-        q, model = six(pose, "is_within_safety_limits"), self._controller.arm.model
-        return bool((q >= model.position_lower).all() and (q <= model.position_upper).all())
+        return _inside(self._controller.arm.model, six(pose, "is_within_safety_limits"))
+
+
+def _inside(model: ArmModel, q: Array) -> bool:
+    return bool((q >= model.position_lower).all() and (q <= model.position_upper).all())

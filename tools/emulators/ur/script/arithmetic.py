@@ -1,4 +1,7 @@
-"""URScript's operators on values: numbers, lists, matrices and structs, as the compiled program calls them."""
+"""URScript's operators on values: numbers, lists, matrices and structs, as the compiled program calls them.
+
+Values are bounded, since a program may not take the emulator's memory or time: see LARGEST, MOST_PARTS, DEEPEST and EFFORT.
+"""
 
 import math
 import operator
@@ -8,6 +11,11 @@ from typing import Any
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 NUMBERS = (int, float)  # the exact types: True is no number
+LARGEST = 1 << 63  # [M] of whole numbers
+MOST_PARTS = 100_000  # [M] elements of a value with all its lists, and characters of its texts
+DEEPEST = 8  # [M] lists in lists
+EFFORT = 400_000  # elements that the threads of a program may compute in one frame
+LOOP_EFFORT = 100  # so much is one turn of a loop or one call: 4000 of them fit in a frame
 
 
 class Pose(list[float]):
@@ -18,11 +26,70 @@ class Struct(dict[str, Any]):
     """struct(name=value, ...): its members are fixed when it is made."""
 
 
+class Effort:
+    """What the program that runs may still compute in this frame."""
+
+    left = EFFORT
+
+    @classmethod
+    def spend(cls, parts: int) -> None:
+        """Raises ScriptError where a frame is not enough."""
+        cls.left -= parts
+        if cls.left < 0:
+            raise ScriptError(
+                "Runtime is too much behind: a loop takes no time, or a calculation too much of it; add sync()."
+            )
+
+
 def copied(value: Any) -> Any:
     """A list or struct of its own, since assignment copies; anything else as it is."""
+    if type(value) in NUMBERS:
+        return value
     if value is None:
         raise ScriptError("A function that returns nothing is used as a value.")
-    return type(value)(value) if isinstance(value, list | Struct) else value
+    if not isinstance(value, list | Struct):
+        return value
+    Effort.spend(len(value))
+    if isinstance(value, Struct):
+        return Struct({name: copied(part) for name, part in value.items()})
+    return type(value)(copied(part) if isinstance(part, list | Struct) else part for part in value)
+
+
+def listed(*items: Any) -> list[Any]:
+    """[a, b, ...] with lists of its own."""
+    for item in items:
+        if type(item) not in NUMBERS:
+            return list(bounded([copied(item) for item in items]))
+    return list(items)
+
+
+def bounded(value: Any) -> Any:
+    """The value, where it is not too large and not nested too deeply."""
+    if isinstance(value, list | Struct | str) and (parts := _parts(value, 0)) > LOOP_EFFORT:
+        Effort.spend(parts)
+    return value
+
+
+def _parts(value: Any, depth: int) -> int:
+    if depth > DEEPEST:
+        raise ScriptError("Lists are nested too deeply.")
+    parts = len(value)
+    if not isinstance(value, str):
+        for part in value.values() if isinstance(value, Struct) else value:
+            if isinstance(part, list | Struct | str):
+                parts += _parts(part, depth + 1)
+                if parts > MOST_PARTS:
+                    break
+    if parts > MOST_PARTS:
+        raise ScriptError(f"A value has more than {MOST_PARTS} elements or characters.")
+    return parts
+
+
+def whole(value: Any) -> Any:
+    """The number, where it is no whole number with too many digits."""
+    if type(value) is int and not -LARGEST <= value < LARGEST:
+        raise ScriptError("A whole number has more than 64 bits.")
+    return value
 
 
 def item(values: Any, index: Any) -> Any:
@@ -40,10 +107,19 @@ def item(values: Any, index: Any) -> Any:
     return values[index]
 
 
-def place(values: Any, index: Any, value: Any) -> None:
-    """values[index] = value."""
-    item(values, index)
-    values[index] = value
+def place(root: Any, indices: tuple[Any, ...], value: Any) -> None:
+    """root[i][j] = value."""
+    values = _at(root, indices[:-1])
+    item(values, indices[-1])
+    values[indices[-1]] = value
+    if type(value) not in NUMBERS:
+        bounded(root)
+
+
+def _at(values: Any, indices: tuple[Any, ...]) -> Any:
+    for index in indices:
+        values = item(values, index)
+    return values
 
 
 def truth(value: Any) -> bool:
@@ -65,22 +141,23 @@ def number(value: Any) -> Any:
 def added(left: Any, right: Any) -> Any:
     """left + right."""
     if type(left) in NUMBERS and type(right) in NUMBERS:
-        return left + right
+        return whole(left + right)
     return _each(operator.add, left, right)
 
 
 def subtracted(left: Any, right: Any) -> Any:
     """left - right."""
     if type(left) in NUMBERS and type(right) in NUMBERS:
-        return left - right
+        return whole(left - right)
     return _each(operator.sub, left, right)
 
 
 def multiplied(left: Any, right: Any) -> Any:
     """left * right: element by element, or the matrix product where the left side is a matrix and the right a list."""
     if type(left) in NUMBERS and type(right) in NUMBERS:
-        return left * right
+        return whole(left * right)
     if _is_matrix(left) and isinstance(right, list):
+        Effort.spend(len(left) * len(left[0]) * (len(right[0]) if _is_matrix(right) else 1))
         columns = list(zip(*right, strict=True)) if _is_matrix(right) else [right]
         product = [[_inner(row, column) for column in columns] for row in left]
         return product if _is_matrix(right) else [row[0] for row in product]
@@ -102,12 +179,15 @@ def negated(value: Any) -> Any:
     return [negated(part) for part in value] if _is_plain(value) else -number(value)
 
 
-def method(target: Any, name: str, *arguments: Any) -> Any:
-    """target.name(...): what a list of variable length can do."""
+def method(root: Any, indices: tuple[Any, ...], name: str, *arguments: Any) -> Any:
+    """root[i][j].name(...): what a list of variable length can do."""
+    target = _at(root, indices)
     if not isinstance(target, list) or isinstance(target, Pose):
         raise ScriptError(f"Only a list has {name}().")
     if name == "append":
-        target.append(*arguments)
+        target.append(*map(copied, arguments))
+        if indices or type(target[-1]) not in NUMBERS or len(target) > MOST_PARTS:
+            bounded(root)
     elif name == "remove":
         del target[arguments[0]]
     elif name == "clear":
@@ -121,14 +201,16 @@ def method(target: Any, name: str, *arguments: Any) -> Any:
 
 def _each(apply: Callable[[Any, Any], Any], left: Any, right: Any) -> Any:
     if _is_plain(left):
+        Effort.spend(len(left))
         if not _is_plain(right):
             return [_each(apply, part, right) for part in left]
         if len(left) != len(right):
             raise ScriptError(f"Lists of {len(left)} and {len(right)} have no sum, difference, product or quotient.")
         return [_each(apply, a, b) for a, b in zip(left, right, strict=True)]
     if _is_plain(right):
+        Effort.spend(len(right))
         return [_each(apply, left, part) for part in right]
-    return apply(number(left), number(right))
+    return whole(apply(number(left), number(right)))
 
 
 def _is_plain(value: Any) -> bool:
@@ -142,7 +224,7 @@ def _is_matrix(value: Any) -> bool:
 def _inner(row: list[Any], column: Any) -> Any:
     if len(row) != len(column):
         raise ScriptError(f"A matrix with {len(row)} columns cannot multiply {len(column)} rows.")
-    return sum(number(a) * number(b) for a, b in zip(row, column, strict=True))
+    return whole(sum(number(a) * number(b) for a, b in zip(row, column, strict=True)))
 
 
 def _quotient(left: Any, right: Any) -> Any:

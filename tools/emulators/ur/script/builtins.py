@@ -6,6 +6,7 @@ physics for (friction, conveyors) is accepted and noted in the log.
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 from weldcal.tools.emulators.ur.controller.registers import register_index
@@ -13,18 +14,17 @@ from weldcal.tools.emulators.ur.controller.state import ControllerState
 from weldcal.tools.emulators.ur.script.answers import CALCULATIONS, READS, REGISTERS, Answers
 from weldcal.tools.emulators.ur.script.dynamics import Dynamics
 from weldcal.tools.emulators.ur.script.forces import Forces
-from weldcal.tools.emulators.ur.script.messages import Messages
 from weldcal.tools.emulators.ur.script.motions import Motions
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.sockets import Sockets
-from weldcal.tools.emulators.ur.script.terminals import TerminalFunctions
+from weldcal.tools.emulators.ur.script.terminals import DIGITAL, TerminalFunctions
 from weldcal.tools.emulators.ur.script.texts import TEXTS
 
 BLOCKING = frozenset(
     {
         *("movej", "movel", "movep", "movec", "optimovej", "optimovel", "speedj", "speedl", "servoj", "servoc"),
         *("stopj", "stopl", "direct_torque", "sync", "sleep", "popup"),
-        "socket_open",
+        *("socket_open", "socket_get_var"),
         *(f"socket_read_{what}" for what in ("line", "string", "ascii_float", "binary_integer", "byte_list")),
     }
 )
@@ -51,48 +51,29 @@ def script_functions(
     def known(name: str) -> bool:
         return controller.version.at_least(*SINCE.get(name, FIRST))
 
-    named: dict[str, Callable[..., Any]] = {name: _no_effect(controller, name) for name in NO_EFFECT}
+    named: dict[str, Callable[..., Any]] = {name: partial(_no_effect, controller, name) for name in NO_EFFECT}
     named |= {
         name: getattr(functions, name)
-        for kind in (Motions, Sockets, Messages, Forces, Dynamics, TerminalFunctions, Answers)
+        for kind in (Motions, Sockets, Forces, Dynamics, TerminalFunctions, Answers)
         for name in vars(kind)
         if not name.startswith("_") and known(name)
     }
-    named |= {name: _read(controller, name, read) for name, read in READS.items() if known(name)}
-    named |= {name: _register(controller, *bank) for name, bank in REGISTERS.items()}
-    named |= {name: _real(getattr(math, name)) for name in MATH} | CALCULATIONS | TEXTS
+    named |= {name: partial(read, controller) for name, read in READS.items() if known(name)}
+    named |= {f"set_{kind}_out": partial(functions._set, *group) for kind, group in DIGITAL.items()}
+    for way in ("in", "out"):
+        named |= {
+            f"get_{kind}_{way}": partial(functions._get, f"digital_{way}puts", *group)
+            for kind, group in DIGITAL.items()
+        }
+    named |= {name: partial(_register, controller, *bank) for name, bank in REGISTERS.items()}
+    named |= {name: getattr(math, name) for name in MATH} | CALCULATIONS | TEXTS
     return named, BLOCKING
 
 
-def _no_effect(controller: ControllerState, name: str) -> Callable[..., None]:
-    noted = False
-
-    def function(*arguments: Any, **keywords: Any) -> None:
-        nonlocal noted
-        if not noted:
-            noted = True
-            controller.note(f"no effect here: {name}")
-
-    return function
+def _no_effect(controller: ControllerState, name: str, *arguments: Any, **keywords: Any) -> None:
+    if not any(line.endswith(name) for line in controller.log):
+        controller.note(f"no effect here: {name}")
 
 
-def _read(controller: ControllerState, name: str, read: Callable[[ControllerState], Any]) -> Callable[[], Any]:
-    def function() -> Any:
-        return read(controller)
-
-    function.__qualname__ = name
-    return function
-
-
-def _register(controller: ControllerState, bank: str, kind: str, count: int) -> Callable[[int], Any]:
-    def read_register(index: int) -> Any:
-        return getattr(getattr(controller, bank), kind)[register_index(index, count)]
-
-    return read_register
-
-
-def _real(function: Callable[..., float]) -> Callable[..., float]:
-    def wrapped(*arguments: float) -> float:
-        return function(*arguments)
-
-    return wrapped
+def _register(controller: ControllerState, bank: str, kind: str, count: int, index: int) -> Any:
+    return getattr(getattr(controller, bank), kind)[register_index(index, count)]

@@ -16,7 +16,9 @@ SOURCE_NAME = "<urscript>"
 _OPERATORS = {"+": "added", "-": "subtracted", "*": "multiplied", "/": "divided", "%": "remainder"}
 _LOGICAL = ("not", "and", "or", "xor")
 _BOOLEAN = (*_LOGICAL, "==", "!=", "<", "<=", ">", ">=")
-_HELPERS = ("Pose", "copied", "item", "place", "truth", "negated", "number", "method")
+_HELPERS = ("Pose", "copied", "listed", "item", "place", "truth", "negated", "number", "method")
+_SHARED = syntax.Name | syntax.Index | syntax.Call | syntax.Method  # values that somebody else may hold
+_SPEND = f"spend({arithmetic.LOOP_EFFORT})"
 Slices = Generator[None, None, Any]
 
 
@@ -36,9 +38,8 @@ class Compiled:
 
 @dataclass(frozen=True)
 class Hooks:
-    """What compiled code calls back: one step of a loop, start, kill and join of a thread."""
+    """What compiled code calls back: start, kill and join of a thread."""
 
-    loop: Callable[[], None]
     run: Callable[[Slices, str], int]
     kill: Callable[[Any], None]
     alive: Callable[[Any], bool]
@@ -66,7 +67,13 @@ def bind(translation: Translation, builtins: Mapping[str, Callable[..., Any]], h
     """The program with the controller's functions, with variables of its own."""
     namespace: dict[str, Any] = {f"b_{name}": function for name, function in builtins.items()}
     namespace |= {name: getattr(arithmetic, name) for name in (*_OPERATORS.values(), *_HELPERS)}
-    namespace |= {"Halted": Halted, "loop": hooks.loop, "start": hooks.run, "kill": hooks.kill, "alive": hooks.alive}
+    namespace |= {
+        "Halted": Halted,
+        "spend": arithmetic.Effort.spend,
+        "start": hooks.run,
+        "kill": hooks.kill,
+        "alive": hooks.alive,
+    }
     exec(translation.code, namespace)
     return Compiled(translation.name, translation.kind, namespace["main"], translation.lines)
 
@@ -111,6 +118,7 @@ class _Emitter:
         self.emit(0, f"def f_{routine.name}({', '.join(parameters)}):")
         own = {name for name, _ in routine.parameters} | _declared(routine.body, "local")
         self._scope((self._globals & _assigned(routine.body)) - own)
+        self.emit(1, _SPEND)
         self._body(routine.body, 1)
 
     def _scope(self, names: Iterable[str]) -> None:
@@ -143,22 +151,24 @@ class _Emitter:
                     self._body(otherwise, depth + 1)
             case syntax.Loop(condition=condition, body=body):
                 self.emit(depth, f"while {self._truth(condition)}:")
-                self.emit(depth + 1, "loop()")
+                self.emit(depth + 1, _SPEND)
                 self._body(body, depth + 1)
             case syntax.Command():
                 self._command(statement, depth)
 
     def _assign(self, statement: syntax.Assign, depth: int) -> None:
         value = self.value(statement.value)
-        if isinstance(statement.value, syntax.Name | syntax.Index | syntax.Call):
+        if isinstance(statement.value, _SHARED):
             value = f"copied({value})"
+        if statement.name == "digital_out" and len(statement.indices) == 1:
+            # what older programs write; the name is the controller's
+            self.emit(depth, f"b_set_digital_out({self.value(statement.indices[0])}, {value})")
+            return
         if not statement.indices:
             self.emit(depth, f"v_{statement.name} = {value}")
             return
-        target = f"v_{statement.name}"
-        for index in statement.indices[:-1]:
-            target = f"item({target}, {self.value(index)})"
-        self.emit(depth, f"place({target}, {self.value(statement.indices[-1])}, {value})")
+        indices = "".join(f"{self.value(index)}, " for index in statement.indices)
+        self.emit(depth, f"place(v_{statement.name}, ({indices}), {value})")
 
     def _command(self, statement: syntax.Command, depth: int) -> None:
         value = self.value(statement.value) if statement.value is not None else ""
@@ -183,15 +193,21 @@ class _Emitter:
             case syntax.Name(name=name):
                 return f"v_{name}"
             case syntax.Items(items=items, pose=pose):
-                listed = "[" + ", ".join(self.value(item) for item in items) + "]"
+                listed = ", ".join(self.value(item) for item in items)
+                plain = all(isinstance(item, syntax.Literal) for item in items)
+                listed = f"[{listed}]" if plain else f"listed({listed})"
                 return f"Pose({listed})" if pose else listed
             case syntax.Index(target=target, index=index):
                 return f"item({self.value(target)}, {self.value(index)})"
             case syntax.Call():
                 return self._call(expression)
             case syntax.Method(target=target, name=name, arguments=arguments):
-                listed = ", ".join([self.value(target), repr(name), *map(self.value, arguments)])
-                return f"method({listed})"
+                indices: list[str] = []
+                while isinstance(target, syntax.Index):
+                    indices.insert(0, f"{self.value(target.index)}, ")
+                    target = target.target
+                listed = ", ".join([repr(name), *map(self.value, arguments)])
+                return f"method({self.value(target)}, ({''.join(indices)}), {listed})"
             case syntax.Operation(operator=operator, operands=operands):
                 if operator in _LOGICAL:
                     return self._logical(operator, [self._truth(operand) for operand in operands])
@@ -217,9 +233,9 @@ class _Emitter:
         return f"({left} {operator} {right})"
 
     def _call(self, call: syntax.Call) -> str:
-        arguments = [self.value(argument) for argument in call.arguments]
         if call.name in self._routines:
-            arguments += [f"v_{key}={self.value(value)}" for key, value in call.keywords]
+            arguments = [self._own(argument) for argument in call.arguments]
+            arguments += [f"v_{key}={self._own(value)}" for key, value in call.keywords]
             made = f"f_{call.name}({', '.join(arguments)})"
             if call.run:
                 if self._routines[call.name].kind != "thread":
@@ -228,9 +244,14 @@ class _Emitter:
             return f"(yield from {made})"
         if call.name not in self._builtins or call.run:
             raise ScriptError(f"compile_error_name_not_found:{call.name}:", call.line, call.column)
+        arguments = [self.value(argument) for argument in call.arguments]
         arguments += [f"{key}={self.value(value)}" for key, value in call.keywords]
         made = f"b_{call.name}({', '.join(arguments)})"
         return f"(yield from {made})" if call.name in self._blocking else made
+
+    def _own(self, expression: Expression) -> str:
+        value = self.value(expression)
+        return f"copied({value})" if isinstance(expression, _SHARED) else value
 
 
 def _walk(statements: tuple[Statement, ...]) -> Iterable[syntax.Assign]:

@@ -7,7 +7,8 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.poses import matrix
-from weldcal.tools.emulators.ur.script.answers import six
+from weldcal.tools.emulators.ur.script.answers import SLOW, six
+from weldcal.tools.emulators.ur.script.arithmetic import Effort
 from weldcal.tools.emulators.ur.script.terminals import TerminalFunctions
 
 STEP_RAD = 1e-6  # of the central differences
@@ -40,6 +41,7 @@ class Dynamics(TerminalFunctions):
         return list(self._controller.arm.qdd_target.tolist())
 
     def _joints(self, pos: Any) -> Array:
+        Effort.spend(SLOW)
         return self._controller.arm.q if pos is None else six(pos, "Joint positions")
 
     def _speeds(self, vel: Any) -> Array:

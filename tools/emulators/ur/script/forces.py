@@ -29,10 +29,7 @@ class Forces(Dynamics):
     ) -> None:
         self._controller.sensor.external = bool(enable)
 
-    def enable_external_ft_sensor(
-        self, enable: bool, sensor_mass: float = 0.0, sensor_measuring_offset: Any = None, sensor_cog: Any = None
-    ) -> None:
-        self.ft_rtde_input_enable(enable)
+    enable_external_ft_sensor = ft_rtde_input_enable
 
     def force_mode(self, task_frame: Any, selection_vector: Any, wrench: Any, type: int, limits: Any) -> None:
         if type not in (1, 2, 3):
@@ -60,14 +57,8 @@ class Forces(Dynamics):
         frame = BASE if feature is None or feature == "base" else six(feature, "freedrive_mode").tolist()
         self._comply(free_task(frame, six(list(freeAxes), "freedrive_mode")))
 
-    def end_freedrive_mode(self) -> None:
-        self._controller.arm.compliance = None
-
-    def teach_mode(self) -> None:
-        self.freedrive_mode()
-
-    def end_teach_mode(self) -> None:
-        self.end_freedrive_mode()
+    end_freedrive_mode = end_teach_mode = end_force_mode
+    teach_mode = freedrive_mode
 
     def get_freedrive_status(self) -> int:
         return 0

@@ -14,8 +14,10 @@ from weldcal.tools.emulators.ur.controller.motions import (
     Servo,
     Stop,
     ToolVelocity,
+    arc_path,
+    joint_path,
+    tool_path,
 )
-from weldcal.tools.emulators.ur.controller.paths import arc_path, joint_path, tool_path
 from weldcal.tools.emulators.ur.controller.poses import matrix
 from weldcal.tools.emulators.ur.script.answers import positive, six
 from weldcal.tools.emulators.ur.script.arithmetic import Pose
@@ -76,18 +78,18 @@ class Motions(Sockets):
         a, v = _share(a, "acceleration of optimovel"), _share(v, "speed of optimovel")
         yield from self.movel(goal, a * OPTIMOVE_M_S2, v * OPTIMOVE_M_S)
 
-    def speedj(self, qd: Any, a: float = 1.4, t: float = 0.0) -> Slices:
+    def speedj(self, qd: Any, a: float = 1.4, t: float = 0.0, t_min: float = 0.0) -> Slices:
         target, rate = six(qd, "speedj"), positive(a, "The acceleration of speedj")
-        yield from self._drive(JointVelocity(target, rate), t)
+        yield from self._drive(JointVelocity(target, rate), t or t_min)
 
-    def speedl(self, xd: Any, a: float = 1.2, t: float = 0.0, aRot: float | None = None) -> Slices:
+    def speedl(self, xd: Any, a: float = 1.2, t: float = 0.0, aRot: float | None = None, t_min: float = 0.0) -> Slices:
         target, rate = six(xd, "speedl"), positive(a, "The acceleration of speedl")
         angular = rate if aRot is None else positive(aRot, "aRot of speedl")
         arm = self._controller.arm
         before = arm.motion
         # successive calls go on from the commanded twist, whatever rounding the Jacobian adds
         start = before.twist if isinstance(before, ToolVelocity) else np.array(arm.tool_speed(target=True))
-        yield from self._drive(ToolVelocity(target, rate, angular, start), t)
+        yield from self._drive(ToolVelocity(target, rate, angular, start), t or t_min)
 
     def servoj(
         self,

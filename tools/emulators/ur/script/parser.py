@@ -1,9 +1,11 @@
 """Parses URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 from weldcal.tools.emulators.ur.script import syntax
+from weldcal.tools.emulators.ur.script.arithmetic import LARGEST
 from weldcal.tools.emulators.ur.script.lexer import Token, tokenize
 from weldcal.tools.emulators.ur.script.syntax import Expression, Routine, ScriptError, Statement
 
@@ -33,7 +35,7 @@ def parse_program(source: str) -> Routine:
 class _Parser:
     def __init__(self, tokens: list[Token]) -> None:
         self._tokens = tokens
-        self._position = 0
+        self._position = self._loops = 0
 
     @property
     def token(self) -> Token:
@@ -76,6 +78,8 @@ class _Parser:
         self.expect("(")
         parameters: list[tuple[str, Expression | None]] = []
         while not self.at(")"):
+            if self.token.text in (known for known, _ in parameters):
+                raise self.error(f"a second parameter {self.token.text!r}")
             parameter, default = self.word(), None
             if self.at("="):
                 self.take()
@@ -119,10 +123,14 @@ class _Parser:
             self.take()
             condition = self.expression()
             self.expect(":")
+            self._loops += 1
             body = self.statements("end")
+            self._loops -= 1
             self.expect("end")
             return syntax.Loop(line, condition, body)
         if self.at("break", "continue", "halt", "pass", "enter_critical", "exit_critical"):
+            if not self._loops and self.at("break", "continue"):
+                raise self.error(f"{self.token.text!r} outside of a loop")
             word = self.take().text
             if self.at("("):
                 self.take()
@@ -210,8 +218,9 @@ class _Parser:
     def primary(self) -> Expression:
         token = self.take()
         if token.kind == "number":
-            whole = token.text.isdigit()
-            return syntax.Literal(int(token.text) if whole else float(token.text))
+            if (number := float(token.text)) >= LARGEST and (token.text.isdigit() or number == math.inf):
+                raise ScriptError(f"Line {token.line}: {token.text[:20]}... is too large.", token.line, token.column)
+            return syntax.Literal(int(token.text) if token.text.isdigit() else number)
         if token.kind == "text":
             return syntax.Literal(token.text[1:-1])
         if token.text in ("True", "False"):
@@ -255,6 +264,8 @@ class _Parser:
             following = self._tokens[min(self._position + 1, len(self._tokens) - 1)]
             if self.token.kind == "word" and following.text == "=":
                 key = self.word()
+                if key in (known for known, _ in keywords):
+                    raise self.error(f"a second {key!r}")
                 self.take()
                 keywords.append((key, self.expression()))
             elif keywords:

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+from weldcal.tools.emulators.ur.script.arithmetic import EFFORT, Effort
 from weldcal.tools.emulators.ur.script.compiler import SOURCE_NAME, Halted, Hooks, Slices, Translation, bind, translate
 from weldcal.tools.emulators.ur.script.parser import parse_program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
-# How often a loop may turn within one 2 ms slice without giving it up; the real limit is time, this one repeats.
-LOOP_LIMIT = 4000
+MOST_THREADS = 50  # [M] at a time
+LONGEST_SCRIPT = 1_000_000  # [M] characters
 
 
 @dataclass
@@ -42,14 +43,19 @@ class Program:
         self.owner: Thread | None = None
         self.sockets: dict[str, Any] = {}
         self._threads: dict[int, Thread] = {}
-        self._loops = 0
         self._count = 0
         functions, blocking = builtins(self)
-        hooks = Hooks(self._loop, self._run, self._kill, self._alive)
+        hooks = Hooks(self._run, self._kill, self._alive)
+        Effort.left = EFFORT
         try:
+            if len(source) > LONGEST_SCRIPT:
+                raise ScriptError(f"The script has more than {LONGEST_SCRIPT} characters.")
             self._compiled = bind(_translated(source, frozenset(functions), frozenset(blocking)), functions, hooks)
-        except RecursionError:
-            raise ScriptError("The script is nested too deeply.") from None
+        except ScriptError:
+            raise
+        except Exception as error:  # whatever Python's own compiler refuses
+            deep = isinstance(error, RecursionError | MemoryError | IndentationError) or "nested" in str(error)
+            raise ScriptError("The script is nested too deeply." if deep else _plain(error)) from error
         self.name = self._compiled.name
         self.kind = self._compiled.kind
         self._main = self._run(self._compiled.main(), "main")
@@ -67,11 +73,12 @@ class Program:
         return self._script_line(frame.f_lineno) if frame is not None else 0
 
     def step(self) -> None:
-        """One slice of every thread, the main body first.
+        """One slice of every thread, the main body first; together they may spend the effort of one frame.
 
         Raises:
             ScriptError: the script made a mistake, with its line.
         """
+        Effort.left = EFFORT
         for thread in list(self._threads.values()):
             self._slice(thread)
             if self.finished:
@@ -104,7 +111,7 @@ class Program:
     def _slice(self, thread: Thread) -> None:
         if thread.number not in self._threads:
             return
-        self.current, self._loops = thread, 0
+        self.current = thread
         try:
             next(thread.slices)
         except StopIteration:
@@ -115,7 +122,7 @@ class Program:
             raise self._located(error) from error
         except RecursionError as error:
             raise self._located(ScriptError("The script calls itself too deeply."), error) from error
-        except (NameError, TypeError, ValueError, OverflowError) as error:
+        except Exception as error:  # a mistake of the script: it must not end the controller
             raise self._located(ScriptError(_plain(error)), error) from error
         finally:
             self.current = None
@@ -135,12 +142,9 @@ class Program:
             thread.slices.close()
         self.release(thread)
 
-    def _loop(self) -> None:
-        self._loops += 1
-        if self._loops > LOOP_LIMIT:
-            raise ScriptError("Runtime is too much behind: a loop takes no time; add sync() to it.")
-
     def _run(self, slices: Slices, name: str) -> int:
+        if len(self._threads) >= MOST_THREADS:
+            raise ScriptError(f"A program has no more than {MOST_THREADS} threads.")
         self._count += 1
         self._threads[self._count] = Thread(self._count, name, slices)
         return self._count
@@ -165,4 +169,4 @@ def _translated(source: str, builtins: frozenset[str], blocking: frozenset[str])
 def _plain(error: BaseException) -> str:
     if isinstance(error, NameError):
         return f"A variable is read before it is set: {str(getattr(error, 'name', '') or '').removeprefix('v_')}"
-    return f"Wrong arguments: {str(error).replace('b_', '').replace('v_', '')}"
+    return f"Wrong arguments: {str(error).replace('b_', '').replace('v_', '') or type(error).__name__}"

@@ -1,4 +1,4 @@
-"""URScript socket functions: the script is a client on loopback and waits frame by frame."""
+"""URScript functions that speak: to people and clients of the primary port, and as a client of sockets on loopback."""
 
 import math
 import re
@@ -8,15 +8,18 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from weldcal.tools.emulators.ur.controller.events import Popup, Text
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.script.arithmetic import EFFORT, Effort
 from weldcal.tools.emulators.ur.script.compiler import Slices
-from weldcal.tools.emulators.ur.script.messages import Messages
+from weldcal.tools.emulators.ur.script.forces import Forces
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 from weldcal.tools.emulators.ur.script.texts import text_of
 
 OPEN_LIMIT_S = 0.02
 OPEN_FRAMES = 4  # [M] how long a connection takes
 NAME = "socket_0"
+MOST_SOCKETS, MOST_UNREAD, MOST_NUMBERS = 20, 1 << 17, 1000  # [M]
 
 
 class ScriptSocket:
@@ -37,7 +40,7 @@ class ScriptSocket:
     def fill(self) -> None:
         """Takes in what has arrived."""
         with suppress(OSError):
-            while data := self._socket.recv(65536):
+            while len(self.inbox) < MOST_UNREAD and (data := self._socket.recv(65536)):
                 self.inbox += data
 
     def close(self) -> None:
@@ -45,8 +48,28 @@ class ScriptSocket:
         self._socket.close()
 
 
-class Sockets(Messages):
+class Sockets(Forces):
     """Sockets belong to their program and close with it; reads answer 0 values, then nan or -1, when time runs out."""
+
+    def textmsg(self, s1: Any, s2: Any = "") -> None:
+        text = text_of(s1) + text_of(s2)
+        self._controller.note(f"script: {text}")
+        self._controller.tell(Text(text))
+
+    def popup(
+        self, s: Any, title: str = "Popup", warning: bool = False, error: bool = False, blocking: bool = False
+    ) -> Slices:
+        """One that blocks waits until a person closes it: the dashboard's `close popup`."""
+        c = self._controller
+        c.note(f"popup: {title}: {text_of(s)}")
+        c.tell(Popup(text_of(s), text_of(title), warning, error, blocking))
+        c.popup_open = blocking
+        while blocking and c.popup_open:
+            yield
+
+    def protective_stop(self) -> None:
+        """The program stands still from its next frame on; one that has nothing left to do ends."""
+        self._controller.protective_stop("a protective stop was triggered", code=209)
 
     def socket_open(self, address: str, port: int, socket_name: str = NAME) -> Slices:
         # so that the other side sees the connections of a script in their order, as over a network
@@ -55,10 +78,12 @@ class Sockets(Messages):
         return self._open(address, port, socket_name)
 
     def _open(self, address: str, port: int, socket_name: str) -> bool:
-        if not str(address).startswith("127."):
+        if not re.fullmatch(r"127(\.\d{1,3}){3}", str(address)):
             self._controller.note(f"socket_open: {address} is not on loopback")
             return False
         self.socket_close(socket_name)
+        if len(self._program.sockets) >= MOST_SOCKETS:
+            raise ScriptError(f"A program has no more than {MOST_SOCKETS} sockets.")
         try:
             self._program.sockets[socket_name] = ScriptSocket(str(address), int(port))
         except OSError as error:
@@ -83,6 +108,15 @@ class Sockets(Messages):
     def socket_send_byte(self, value: int, socket_name: str = NAME) -> bool:
         return self._send(bytes([int(value) & 0xFF]), socket_name)
 
+    def socket_set_var(self, name: str, value: int, socket_name: str = NAME) -> bool:
+        return self._send(f"SET {text_of(name)} {int(value)}\n".encode(), socket_name)
+
+    def socket_get_var(self, name: str, socket_name: str = NAME) -> Slices:
+        self._send(f"GET {text_of(name)}\n".encode(), socket_name)
+        answer = yield from self.socket_read_line(socket_name)
+        found = re.fullmatch(r"(\S+) (-?\d{1,10})", answer)
+        return int(found[2]) if found and found[1] == name else 0
+
     def socket_read_line(self, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
         line = yield from self._read(socket_name, timeout, lambda inbox: inbox.find(b"\n") + 1)
         return line.decode("utf-8", "replace").rstrip("\r\n")
@@ -104,19 +138,21 @@ class Sockets(Messages):
         return text.partition(prefix)[2].removesuffix(end) if prefix else text.removesuffix(end)
 
     def socket_read_ascii_float(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
+        _count(number)
         text = yield from self._read(socket_name, timeout, lambda inbox: inbox.find(b")") + 1)
         found = [float(value) for value in re.findall(rb"[-+]?\d*\.?\d+(?:[eE][-+]?\d+)?", text)]
         return [len(found), *found] if len(found) == number else [0, *[math.nan] * int(number)]
 
     def socket_read_binary_integer(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
-        size = 4 * int(number)
-        data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
-        return [int(number), *struct.unpack(f">{int(number)}i", data)] if data else [0, *[-1] * int(number)]
+        return (yield from self._numbers(_count(number), "i", socket_name, timeout))
 
     def socket_read_byte_list(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
-        size = int(number)
-        data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
-        return [size, *data] if data else [0, *[-1] * size]
+        return (yield from self._numbers(_count(number), "B", socket_name, timeout))
+
+    def _numbers(self, number: int, code: str, name: str, timeout: float) -> Slices:
+        size = struct.calcsize(f">{number}{code}")
+        data = yield from self._read(name, timeout, lambda inbox: size * (len(inbox) >= size))
+        return [number, *struct.unpack(f">{number}{code}", data)] if data else [0, *[-1] * number]
 
     def _send(self, data: bytes, name: str) -> bool:
         opened = self._program.sockets.get(name)
@@ -134,8 +170,17 @@ class Sockets(Messages):
             if length > 0:
                 data = bytes(opened.inbox[:length])
                 del opened.inbox[:length]
+                if 2 * Effort.left < EFFORT:
+                    yield  # a client that sends faster than its program reads costs the program frames, and does not end it
                 return data
             if timeout > 0.0 and frames * STEP_S >= timeout:
                 return b""
             frames += 1
             yield
+
+
+def _count(number: Any) -> int:
+    """How many numbers a read asks for."""
+    if not 0 <= number <= MOST_NUMBERS:
+        raise ScriptError(f"A read has 0 to {MOST_NUMBERS} numbers, not {number!r}.")
+    return int(number)

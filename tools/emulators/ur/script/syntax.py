@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 from weldcal.models.errors import WeldcalError
 
+LONGEST = 1000  # characters of a message
+
 
 class ScriptError(WeldcalError):
     """A URScript program that the controller refuses to start, or that stops while it runs.
@@ -14,7 +16,7 @@ class ScriptError(WeldcalError):
     """
 
     def __init__(self, message: str, line: int = 0, column: int = 0) -> None:
-        super().__init__(message)
+        super().__init__(message if len(message) < LONGEST else f"{message[:LONGEST]} ...")
         self.line, self.column = line, column
 
 

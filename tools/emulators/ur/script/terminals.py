@@ -4,39 +4,16 @@ from typing import Any
 
 from weldcal.models.robots import get_robot
 from weldcal.tools.emulators.ur.controller.registers import register_index
-from weldcal.tools.emulators.ur.script.answers import Answers
+from weldcal.tools.emulators.ur.script.answers import Answers, six
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
-STANDARD, CONFIGURABLE, TOOL = 0, 8, 16  # first bit of each group of digital terminals
+DIGITAL = {"standard_digital": (0, 8), "digital": (0, 8), "configurable_digital": (8, 8), "tool_digital": (16, 2)}
+"""First bit and number of the terminals of each group, as they are named in set_..._out, get_..._out and get_..._in."""
 TOOL_VOLTAGES = (0, 12, 24)
 
 
 class TerminalFunctions(Answers):
     """Outputs keep their level when the program ends, unless they follow its state."""
-
-    def set_standard_digital_out(self, n: int, b: bool) -> None:
-        self._set(STANDARD, register_index(n, 8), b)
-
-    def set_digital_out(self, n: int, b: bool) -> None:
-        self.set_standard_digital_out(n, b)
-
-    def get_standard_digital_out(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_outputs, STANDARD, register_index(n, 8))
-
-    def get_digital_out(self, n: int) -> bool:
-        return self.get_standard_digital_out(n)
-
-    def set_configurable_digital_out(self, n: int, b: bool) -> None:
-        self._set(CONFIGURABLE, register_index(n, 8), b)
-
-    def get_configurable_digital_out(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_outputs, CONFIGURABLE, register_index(n, 8))
-
-    def set_tool_digital_out(self, n: int, b: bool) -> None:
-        self._set(TOOL, register_index(n, 2), b)
-
-    def get_tool_digital_out(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_outputs, TOOL, register_index(n, 2))
 
     def set_runstate_standard_digital_output_to_value(self, outputId: int, state: int) -> None:
         self._controller.terminals.runstate[register_index(outputId, 8)] = register_index(state, 8)
@@ -44,23 +21,10 @@ class TerminalFunctions(Answers):
     def set_runstate_standard_analog_output_to_value(self, outputId: int, state: int) -> None:
         self._controller.terminals.analog_runstate[register_index(outputId, 2)] = register_index(state, 8)
 
-    def get_standard_digital_in(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_inputs, STANDARD, register_index(n, 8))
-
-    def get_digital_in(self, n: int) -> bool:
-        return self.get_standard_digital_in(n)
-
-    def get_configurable_digital_in(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_inputs, CONFIGURABLE, register_index(n, 8))
-
-    def get_tool_digital_in(self, n: int) -> bool:
-        return self._get(self._controller.terminals.digital_inputs, TOOL, register_index(n, 2))
-
     def set_standard_analog_out(self, n: int, f: float) -> None:
         self._controller.terminals.set_analog(register_index(n, 2), float(f))
 
-    def set_analog_out(self, n: int, f: float) -> None:
-        self.set_standard_analog_out(n, f)
+    set_analog_out = set_standard_analog_out
 
     def get_standard_analog_out(self, n: int) -> float:
         return self._controller.terminals.analog_outputs[register_index(n, 2)]
@@ -81,36 +45,28 @@ class TerminalFunctions(Answers):
 
     def set_payload(self, m: float, cog: Any = None) -> None:
         model = self._controller.arm.model.name
-        if (
-            not 0.0 <= float(m) <= (most := get_robot(model).payload_kg)
-        ):  # [M] what a controller answers is not documented
+        most = get_robot(model).payload_kg
+        if not 0.0 <= float(m) <= most:  # [M] what a controller answers is not documented
             raise ScriptError(f"The payload of a {model} is 0 to {most:g} kg, not {m!r}.")
         self._controller.payload.mass = float(m)
         if cog is not None:
             self.set_payload_cog(cog)
 
-    def set_payload_mass(self, m: float) -> None:
-        self.set_payload(m)
+    set_payload_mass = set_payload
 
     def set_payload_cog(self, CoG: Any) -> None:
-        self._controller.payload.center = _numbers(CoG, 3, "The centre of gravity")
+        self._controller.payload.center = six(CoG, "The centre of gravity", 3).tolist()
 
     def set_target_payload(self, m: float, cog: Any, inertia: Any = None, transition_time: float = 0.0) -> None:
         self.set_payload(m, cog)
         if inertia is not None:
-            self._controller.payload.inertia = _numbers(inertia, 6, "The inertia")
+            self._controller.payload.inertia = six(inertia, "The inertia", 6).tolist()
 
     def set_gravity(self, d: Any) -> None:
-        self._controller.gravity = _numbers(d, 3, "Gravity")
+        self._controller.gravity = six(d, "Gravity", 3).tolist()
 
-    def _set(self, first: int, n: int, b: bool) -> None:
-        self._controller.terminals.set_digital(first, 1 << n, (1 if b else 0) << n)
+    def _set(self, first: int, count: int, n: int, b: bool) -> None:
+        self._controller.terminals.set_digital(first, 1 << register_index(n, count), (1 if b else 0) << n)
 
-    def _get(self, bits: int, first: int, n: int) -> bool:
-        return bool(bits >> (first + n) & 1)
-
-
-def _numbers(values: Any, count: int, what: str) -> list[float]:
-    if not isinstance(values, list) or len(values) != count:
-        raise ScriptError(f"{what} needs {count} numbers, it got {values!r}.")
-    return [float(value) for value in values]
+    def _get(self, bank: str, first: int, count: int, n: int) -> bool:
+        return bool(getattr(self._controller.terminals, bank) >> (first + register_index(n, count)) & 1)

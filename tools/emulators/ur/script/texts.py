@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from weldcal.tools.emulators.ur.script.arithmetic import Pose, Struct
+from weldcal.tools.emulators.ur.script.arithmetic import MOST_PARTS, Effort, Pose, Struct, bounded, copied, whole
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -13,6 +13,8 @@ def text_of(value: Any) -> str:
     """What to_str, str_cat and textmsg make of a value: six significant digits, True, [1, 2], p[...]."""
     if isinstance(value, str):
         return value
+    if isinstance(value, list | Struct):
+        Effort.spend(10 * len(value))
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, list):
@@ -24,7 +26,7 @@ def text_of(value: Any) -> str:
 
 def str_cat(op1: Any, op2: Any) -> str:
     """Both operands as text, one after the other."""
-    return text_of(op1) + text_of(op2)
+    return str(bounded(text_of(op1) + text_of(op2)))
 
 
 def str_len(str: str) -> int:
@@ -60,7 +62,7 @@ def to_num(str: str) -> int | float:
     if match is None:
         raise ScriptError(f"to_num: {str!r} does not start with a number.")
     found = match.group().strip()
-    return int(found) if re.fullmatch(r"[-+]?\d+", found) else float(found)
+    return int(whole(int(found))) if re.fullmatch(r"[-+]?\d+", found) else float(found)
 
 
 def length(v: Any) -> int:
@@ -86,18 +88,23 @@ def transpose(m: Any) -> Any:
 
 def make_list(length: int, initial_value: Any = 0, capacity: int = 0) -> list[Any]:
     """A list of `length` equal elements."""
-    return [initial_value] * int(length)
+    if length > MOST_PARTS:
+        raise ScriptError(f"A list has no more than {MOST_PARTS} elements.")
+    parts = [initial_value] * int(length)
+    bounded(parts)
+    return list(copied(parts))
 
 
 def binary_list_to_integer(l: Any) -> int:  # noqa: E741  (URScript's own name)
     """The number whose bits are in a list, the lowest first."""
-    value = sum(1 << i for i, bit in enumerate(l) if bit)
+    value = sum(1 << i for i, bit in enumerate(l[:32]) if bit)
     return value - (1 << 32) if len(l) == 32 and l[31] else value
 
 
 def struct(**members: Any) -> Struct:
     """A struct with these members."""
-    return Struct(members)
+    made: Struct = bounded(copied(Struct(members)))
+    return made
 
 
 TEXTS = {

@@ -9,17 +9,18 @@ import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.checker import Checker
-from weldcal.tools.emulators.ur.controller.contact import ForceSensor, Surroundings
+from weldcal.tools.emulators.ur.controller.compliance import ForceSensor, Surroundings
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.lockstep import Lockstep
 from weldcal.tools.emulators.ur.wire.dashboard import IDLE_PROGRAM
-from weldcal.tools.emulators.ur.wire.external_control import CLIENT_PORT, ExternalControl
 from weldcal.tools.emulators.ur.wire.net import Connection, LinkFaults, Network, Server
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
+from weldcal.tools.emulators.ur.wire.script_ports import CLIENT_PORT, ExternalControl
 
 Request = Mapping[str, Any]
+LARGEST = 1e9  # of the numbers that a request may hold
 
 
 class World:
@@ -83,14 +84,15 @@ class ControlServer(Server):
             "set_analog_out": self._foreign_analog,
             "limiter": lambda r, now: setattr(c.terminals, "limiter", _number(r, "value")),
             "timestamp_jump": lambda r, now: setattr(c, "timestamp", max(0.0, c.timestamp + _number(r, "seconds"))),
-            "clock_skew": lambda r, now: setattr(c, "clock_rate", 1.0 + _number(r, "ppm") * 1e-6),
-            "jitter": lambda r, now: setattr(self._world, "jitter_s", _number(r, "seconds")),
+            "clock_skew": lambda r, now: setattr(c, "clock_rate", max(0.0, 1.0 + _number(r, "ppm") * 1e-6)),
+            "jitter": lambda r, now: setattr(self._world, "jitter_s", min(10.0, _number(r, "seconds"))),
             "reboot": self._reboot,
             "refuse_upload": lambda r, now: setattr(c, "refuse_upload", bool(r.get("on", True))),
             "slow_start": lambda r, now: setattr(c, "start_delay_s", _number(r, "seconds")),
             "tracking_lag": lambda r, now: setattr(c.arm, "lag_s", _number(r, "seconds")),
-            "wrong_tcp": lambda r, now: c.set_tcp(_six(r, "pose", [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])),
-            "set_q": lambda r, now: c.arm.displace(np.array(_six(r, "q"))),
+            "wrong_tcp": lambda r, now: c.set_tcp(_several(r, "pose", 6, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])),
+            "set_q": lambda r, now: c.arm.displace(np.array(_several(r, "q", 6))),
+            "wrong_number": self._wrong_number,
             "tool_contact": lambda r, now: setattr(c, "tool_contact_steps", int(_number(r, "n", 1))),
         }
         self._faults |= more_faults or {}
@@ -105,8 +107,8 @@ class ControlServer(Server):
             "unlock": lambda r, now: _required(c.unlock_protective_stop(), "the protective stop is younger than 5 s"),
             "power_on": lambda r, now: c.release_brakes(),
             "external_control": self._external_control,
-            "set_tcp": lambda r, now: c.set_tcp(_six(r, "pose")),
-            "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
+            "set_tcp": lambda r, now: c.set_tcp(_several(r, "pose", 6)),
+            "set_q": lambda r, now: c.arm.place(np.array(_several(r, "q", 6))),
             "set_payload": self._payload,
             "set_digital_in": self._digital_input,
             "set_gravity": lambda r, now: setattr(c, "gravity", _several(r, "gravity", 3)),
@@ -121,6 +123,21 @@ class ControlServer(Server):
             "reset_checker": lambda r, now: checker.reset(),
             "quit": lambda r, now: setattr(self._world, "quit", True),
         }
+        self._checks: dict[str, Callable[[Request], dict[str, Any]]] = {
+            "at_rest_after": lambda r: checker.at_rest_after(
+                _number(r, "fault_time"), _number(r, "within", 0.3), _number(r, "speed", 1e-3)
+            ),
+            "output_after": lambda r: checker.output_after(_number(r, "fault_time"), int(_number(r, "output"))),
+            "output_on_after": lambda r: checker.output_on_after(_number(r, "fault_time"), int(_number(r, "output"))),
+            "summary": lambda r: checker.summary(),
+        }
+        self._questions: dict[str, Callable[[Request], dict[str, Any]]] = {
+            "state": lambda r: c.state() | {"overruns": world.overruns, "lockstep": lockstep.state()},
+            "time": lambda r: {"timestamp": c.timestamp},
+            "log": lambda r: {"log": list(c.log)},
+            "program": lambda r: {"source": c.program.source if c.program else None},
+            "connections": lambda r: {"connections": [link.kind for link in network.of_kind("all")]},
+        }
 
     def arrived(self, connection: Connection, data: bytes, now: float) -> None:
         for line in connection.lines(data):
@@ -134,47 +151,21 @@ class ControlServer(Server):
             if not isinstance(request, dict):
                 raise InputError("Send one JSON object a line.")
             return {"ok": True, "time": now, **self._act(request, now)}
-        except (InputError, ValueError, TypeError, KeyError) as error:
-            return {"ok": False, "time": now, "error": str(error)}
+        except Exception as error:  # nonsense must not end the controller
+            return {"ok": False, "time": now, "error": str(error) or type(error).__name__}
 
     def _act(self, request: Request, now: float) -> dict[str, Any]:
-        if "fault" in request:
-            name = str(request["fault"])
-            if name not in self._faults:
-                raise InputError(f"There is no fault {name!r}; choose one of: {', '.join(sorted(self._faults))}.")
-            self._faults[name](request, now)
-            if request.get("latch", True):
-                self._checker.fault(name, now)
-            return {}
-        if "do" in request:
-            name = str(request["do"])
-            if name not in self._actions:
-                raise InputError(f"There is no action {name!r}; choose one of: {', '.join(sorted(self._actions))}.")
-            self._actions[name](request, now)
-            return {}
-        if request.get("check") == "at_rest_after":
-            return self._checker.at_rest_after(
-                _number(request, "fault_time"), _number(request, "within", 0.3), _number(request, "speed", 1e-3)
-            )
-        if request.get("check") == "output_after":
-            return self._checker.output_after(_number(request, "fault_time"), int(_number(request, "output")))
-        if request.get("check") == "output_on_after":
-            return self._checker.output_on_after(_number(request, "fault_time"), int(_number(request, "output")))
-        if request.get("check") == "summary":
-            return self._checker.summary()
-        if request.get("ask") == "state":
-            return self._controller.state() | {
-                "overruns": self._world.overruns,
-                "lockstep": self._lockstep.state(),
-            }
-        if request.get("ask") == "time":
-            return {"timestamp": self._controller.timestamp}
-        if request.get("ask") == "log":
-            return {"log": list(self._controller.log)}
-        if request.get("ask") == "program":
-            return {"source": self._controller.program.source if self._controller.program else None}
-        if request.get("ask") == "connections":
-            return {"connections": [c.kind for c in self._network.of_kind("all")]}
+        for kind, known in (("fault", self._faults), ("do", self._actions)):
+            if kind in request:
+                if (name := str(request[kind])) not in known:
+                    raise InputError(f"There is no {kind} {name!r}; choose one of: {', '.join(sorted(known))}.")
+                known[name](request, now)
+                if kind == "fault" and request.get("latch", True):
+                    self._checker.fault(name, now)
+                return {}
+        for kind, questions in (("check", self._checks), ("ask", self._questions)):
+            if request.get(kind) in questions:
+                return questions[request[kind]](request)
         raise InputError(
             "Send fault, do, check (at_rest_after, output_after, output_on_after, summary) or ask (state, log, program, connections)."
         )
@@ -220,6 +211,7 @@ class ControlServer(Server):
 
     def _clear_links(self, request: Request, now: float) -> None:
         self._world.jitter_s = 0.0
+        self._rtde.wrong.clear()
         for connection in self._links({"kind": "all"} | dict(request)):
             connection.faults = LinkFaults()
 
@@ -229,6 +221,8 @@ class ControlServer(Server):
         self._clear_links({}, now)
         self._rtde.release_elsewhere()
         c.stop_program()
+        while c.sidekicks:
+            c.sidekicks.pop().close()
         c.set_safety_mode(SafetyMode.NORMAL)
         c.robot_mode, c.remote, c.refuse_upload = RobotMode.RUNNING, True, False
         c.start_delay_s, c.clock_rate, c.tool_contact_steps = 0.0, 1.0, 0
@@ -274,26 +268,27 @@ class ControlServer(Server):
         """As the installation has it."""
         payload = self._controller.payload
         payload.mass = _number(request, "mass")
-        payload.center = [float(value) for value in request.get("cog", (0.0, 0.0, 0.0))]
+        payload.center = _several(request, "cog", 3, [0.0, 0.0, 0.0])
 
     def _foreign_output(self, request: Request, now: float) -> None:
         frames = max(1, round(_number(request, "seconds", 0.0) / STEP_S))
         until = self._controller.frame + frames
-        self._controller.terminals.foreign[int(_number(request, "n"))] = (bool(request.get("on", True)), until)
+        self._controller.terminals.foreign[_count(request, "n", 18)] = (bool(request.get("on", True)), until)
 
     def _digital_input(self, request: Request, now: float) -> None:
         """The level of a standard input, by whoever is wired there."""
-        n, terminals = int(_number(request, "n")), self._controller.terminals
-        if not 0 <= n < 8:
-            raise InputError("Give a number from 0 to 7 as 'n'.")
+        n, terminals = _count(request, "n", 8), self._controller.terminals
         terminals.digital_inputs = terminals.digital_inputs & ~(1 << n) | int(bool(request.get("on", True))) << n
 
     def _foreign_analog(self, request: Request, now: float) -> None:
         until = self._controller.frame + max(1, round(_number(request, "seconds", 0.0) / STEP_S))
-        n = int(_number(request, "n"))
-        if n not in (0, 1):
-            raise InputError("Give 0 or 1 as 'n'.")
-        self._controller.terminals.analog_foreign[n] = (_number(request, "share"), until)
+        self._controller.terminals.analog_foreign[_count(request, "n", 2)] = (_number(request, "share"), until)
+
+    def _wrong_number(self, request: Request, now: float) -> None:
+        name = str(request.get("output"))
+        if name not in self._rtde.real_outputs():
+            raise InputError(f"There is no output of real numbers {name!r}.")
+        self._rtde.wrong[name] = float(request.get("value", math.nan))  # not finite: that is the fault
 
     def _reboot(self, request: Request, now: float) -> None:
         self._network.unplug(self)
@@ -302,21 +297,30 @@ class ControlServer(Server):
 
 
 def _number(request: Request, key: str, default: float | None = None) -> float:
-    value = request.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"Give a number as {key!r}.")
+    if key not in request and default is not None:
+        return default
+    return _finite(request.get(key), f"a number as {key!r}")
+
+
+def _finite(value: Any, what: str) -> float:
+    if type(value) not in (int, float) or not abs(value) <= LARGEST:
+        raise InputError(f"Give {what}.")
     return float(value)
 
 
-def _six(request: Request, key: str, default: list[float] | None = None) -> list[float]:
-    return _several(request, key, 6, default)
+def _count(request: Request, key: str, count: int) -> int:
+    """A whole number from 0 to count - 1."""
+    if request.get(key) not in range(count):
+        raise InputError(f"Give a number from 0 to {count - 1} as {key!r}.")
+    return int(request[key])
 
 
 def _several(request: Request, key: str, count: int, default: list[float] | None = None) -> list[float]:
     value = request.get(key, default)
-    if not isinstance(value, list) or len(value) != count or not all(type(v) in (int, float) for v in value):
-        raise InputError(f"Give {'six' if count == 6 else 'three'} numbers as {key!r}.")
-    return [float(v) for v in value]
+    what = f"{'six' if count == 6 else 'three'} numbers as {key!r}"
+    if not isinstance(value, list) or len(value) != count:
+        raise InputError(f"Give {what}.")
+    return [_finite(v, what) for v in value]
 
 
 def _required(done: bool, problem: str) -> None:

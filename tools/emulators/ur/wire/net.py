@@ -10,9 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.tools.connections import CONNECTIONS
+
 # A client that does not read is dropped after this long, as the controller does.
 UNREAD_LIMIT_S = 10.0
 MAX_QUEUED = 1 << 20
+MOST_CONNECTIONS = 200  # select() cannot watch more than about 1000
 DIAL_LIMIT_S = 0.02
 TORN_S = 0.001
 
@@ -48,7 +51,7 @@ class Connection:
         self.sock = sock
         self.faults = LinkFaults()
         self.inbox = bytearray()
-        self.closed = False
+        self.closed = self.heard = False
         self.patient = False  # never dropped for not reading
         self._rng = rng
         self._waiting: deque[tuple[float, bytes]] = deque()
@@ -127,16 +130,18 @@ class Connection:
         except OSError:
             self.closed = True
             return b""
+        self.heard = self.heard or bool(data)
         if not data:
             self.closed = True
         return b"" if self.faults.deaf(now) else data
 
     def lines(self, data: bytes) -> Iterator[bytes]:
         """The lines that are complete with these bytes, without their ends; the rest waits in the inbox."""
-        self.inbox += data
-        while b"\n" in self.inbox:
-            line, _, self.inbox[:] = bytes(self.inbox).partition(b"\n")
-            yield line
+        *lines, rest = (self.inbox + data).split(b"\n")
+        self.inbox[:] = rest
+        if len(rest) > MAX_QUEUED:
+            self.close(reset=True)
+        yield from map(bytes, lines)
 
     def readable(self, now: float) -> bool:
         """Whether the loop should look at this socket."""
@@ -226,6 +231,8 @@ class Network:
                 self._accept(sock, now)
                 continue
             connection = by_socket[sock]
+            if connection not in self.connections:  # ended for one that has come
+                continue
             data = connection.receive(now)
             if connection.closed:
                 # at once: what this client has claimed is free for one that has just come
@@ -240,9 +247,19 @@ class Network:
             sock, _ = listener.accept()
         except OSError:
             return
+        if len(self.connections) >= CONNECTIONS:
+            # one more ends the oldest that has never asked for anything, as a client of RTDE or of the dashboard does
+            silent = next((c for c in self.connections if not c.heard), None)
+            if silent is None:
+                sock.close()
+                return
+            self._forget(silent)
         self._adopt(sock, server, now)
 
     def _adopt(self, sock: socket.socket, server: Server, now: float) -> None:
+        if len(self.connections) >= MOST_CONNECTIONS:
+            sock.close()
+            return
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection = Connection(server.kind, sock, self._rng)

@@ -1,7 +1,7 @@
 """RTDE server on port 30004: recipes, claims, and packages at an integer share of 500 Hz (protocols 1 and 2)."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,6 +31,7 @@ class OutputRecipe:
     every: int
     packer: struct.Struct
     getters: tuple[tuple[Getter, bool], ...]
+    at: dict[str, int]  # index of each real output's first number in a package
 
 
 @dataclass
@@ -67,6 +68,11 @@ class RtdeServer(Server):
         self._outputs = {name: f for name, f in outputs().items() if version.at_least(*f.since)}
         self._inputs = inputs()
         self._claims: dict[str, Connection | None] = {}
+        self.wrong: dict[str, float] = {}  # injected: the first number that is reported of each of these outputs
+
+    def real_outputs(self) -> list[str]:
+        """Names of the outputs of real numbers."""
+        return [name for name, f in self._outputs.items() if CODES[f.type].endswith("d")]
 
     def claim_elsewhere(self, names: list[str]) -> None:
         """Another user of the controller (EtherNet/IP, PROFINET) takes these inputs; unknown names are ignored."""
@@ -137,14 +143,21 @@ class RtdeServer(Server):
         found = [f for f in known if f is not None]
         good = bool(names) and len(found) == len(names)
         good &= 0.0 < frequency <= FREQUENCY_HZ
-        session.output = self._output_recipe(frequency, found, session.protocol) if good else None
+        session.output = self._output_recipe(frequency, names, found, session.protocol) if good else None
         number = bytes([1 if session.output is not None else 0])
         return types if session.protocol < 2 else number + types
 
-    def _output_recipe(self, frequency: float, fields: list[Output], protocol: int) -> OutputRecipe:
+    def _output_recipe(
+        self, frequency: float, names: Sequence[str], fields: Sequence[Output], protocol: int
+    ) -> OutputRecipe:
         code = ">HB" + ("B" if protocol >= 2 else "") + "".join(CODES[f.type] for f in fields)
         getters = tuple((f.get, f.type.startswith("VECTOR")) for f in fields)
-        return OutputRecipe(1, max(1, round(FREQUENCY_HZ / frequency)), struct.Struct(code), getters)
+        at, start = {}, 3 if protocol >= 2 else 2
+        for name, f in zip(names, fields, strict=True):
+            if CODES[f.type].endswith("d"):
+                at[name] = start
+            start += int(CODES[f.type][:-1] or 1)
+        return OutputRecipe(1, max(1, round(FREQUENCY_HZ / frequency)), struct.Struct(code), getters, at)
 
     def _set_inputs(self, connection: Connection, session: Session, payload: bytes) -> bytes:
         names = _names(payload)
@@ -209,6 +222,8 @@ class RtdeServer(Server):
                     values += get(self._controller)
                 else:
                     values.append(get(self._controller))
+            for name in self.wrong.keys() & recipe.at.keys():
+                values[recipe.at[name]] = self.wrong[name]
             connection.send(recipe.packer.pack(*values), now, droppable=True)
 
     def _reply(self, connection: Connection, kind: int, payload: bytes, now: float) -> None:

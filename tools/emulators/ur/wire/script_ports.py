@@ -7,11 +7,19 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.dh import dh_parameters
-from weldcal.tools.emulators.ur.controller.events import Event, SafetyChanged
+from weldcal.tools.emulators.ur.controller.events import (
+    ErrorCode,
+    Event,
+    Popup,
+    SafetyChanged,
+    ScriptStopped,
+    Started,
+    Text,
+)
 from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.script.lexer import split_programs
+from weldcal.tools.emulators.ur.script.program import LONGEST_SCRIPT
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
-from weldcal.tools.emulators.ur.wire.primary_messages import message_body
 
 STATE_PERIOD_FRAMES = 50  # 10 Hz
 STATE, MESSAGE = 16, 20
@@ -19,6 +27,11 @@ CALIBRATED, NOMINAL = 2, 0
 VERSION = 3
 SOURCE_CONTROLLER = -2
 REAL_TIME_BYTES = 1220
+CLIENT_PORT = 50002
+SILENCE_S = 0.1
+GIVE_UP_S = 5.0
+TEXT, POPUP, SAFETY_MODE, ERROR_CODE, KEY, RUNTIME_EXCEPTION = 0, 2, 5, 6, 7, 10
+LONGEST_TITLE = 255
 
 
 class ScriptServer(Server):
@@ -39,6 +52,9 @@ class ScriptServer(Server):
         connection.inbox += data
         programs, rest = split_programs(connection.inbox.decode("utf-8", "replace"))
         connection.inbox[:] = rest.encode()
+        if len(rest) > LONGEST_SCRIPT:
+            programs.append(connection.inbox.decode("utf-8", "replace"))
+            connection.inbox.clear()
         for program in programs:
             self._on_script(now)
             self._controller.submit(program)
@@ -152,6 +168,49 @@ class PrimaryServer(ScriptServer):
         )
 
 
+class ExternalControl(Server):
+    """External Control node of a program on the pendant: fetches its URScript from a client on play, one at a time.
+
+    This is the only way in on PolyScope X before 10.10, where ur_rtde neither opens the script port nor uploads. As the
+    URCap does, it connects to the client's script sender, asks `request_program`, and takes what comes until 0.1 s of silence.
+    """
+
+    kind = "external_control"
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self._connection: Connection | None = None
+        self._last = 0.0
+
+    def opened(self, connection: Connection, now: float) -> None:
+        if self._connection is not None:
+            self._connection.close(reset=False)
+        self._connection, self._last = connection, now
+        connection.send(b"request_program\n", now)
+
+    def arrived(self, connection: Connection, data: bytes, now: float) -> None:
+        connection.inbox += data
+        self._last = now
+
+    def gone(self, connection: Connection) -> None:
+        if connection is self._connection:
+            self._finish(connection)
+
+    def frame(self, now: float) -> None:
+        connection = self._connection
+        if connection is not None and now - self._last > (SILENCE_S if connection.inbox else GIVE_UP_S):
+            self._finish(connection)
+            connection.close(reset=False)
+
+    def _finish(self, connection: Connection) -> None:
+        self._connection = None
+        text = connection.inbox.decode("ascii", "replace")
+        if not text.strip():
+            self._controller.note("external control: the client sent no script")
+            return
+        self._controller.start(f"def external_control():\n{text}\nend\n")
+
+
 def kinematics_info(model: ArmModel) -> bytes:
     """The body of KinematicsInfo: six checksums, theta, a, d, alpha of the chain in use, and whether it is calibrated."""
     dh = dh_parameters(model)
@@ -169,3 +228,28 @@ def _configuration(model: ArmModel) -> bytes:
     defaults = [1.05, 1.4, 0.25, 1.2, 0.35]
     body = struct.pack(">29d", *limits, *speeds, *defaults)
     return body + struct.pack(">24d4i", *dh.a, *dh.d, *dh.alpha, *dh.theta, 1, 2, robot_type, 0)
+
+
+def message_body(event: Event) -> tuple[int, bytes]:
+    """What the guide of the client interface lays down for this event."""
+    match event:
+        case Text(text=text):
+            return TEXT, text.encode()
+        case Popup():
+            flags = struct.pack(">IB3?", 0, 0, event.warning, event.error, event.blocking)
+            return POPUP, flags + _titled(event.title) + event.text.encode()
+        case ScriptStopped():
+            return RUNTIME_EXCEPTION, struct.pack(">ii", event.line, event.column) + event.text.encode()
+        case ErrorCode():
+            numbers = struct.pack(">3i2I", event.code, event.argument, event.level, 0, 0)
+            return ERROR_CODE, numbers + event.text.encode()
+        case SafetyChanged(mode=mode):
+            return SAFETY_MODE, struct.pack(">2iB2I", 0, 0, mode, 0, 0)
+        case _:
+            title = "PROGRAM_XXX_STARTED" if isinstance(event, Started) else "PROGRAM_XXX_STOPPED"
+            return KEY, struct.pack(">2i", 0, 0) + _titled(title) + event.text.encode()
+
+
+def _titled(title: str) -> bytes:
+    text = title.encode()[:LONGEST_TITLE]
+    return bytes([len(text)]) + text

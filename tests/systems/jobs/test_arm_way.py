@@ -1,0 +1,126 @@
+"""A seam that the arm cannot follow is refused before anything moves; what the refusal advises, followed literally, is accepted."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, plain_station, scenario
+from tests.systems.placements import Placement, draw, follow, offered, placed
+from weldcal.models.errors import InputError
+from weldcal.systems.jobs.weld.arm_way import find_way
+from weldcal.systems.jobs.weld.job import seam_planning
+from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_drawn_seam
+from weldcal.systems.jobs.weld.settings import servo_config
+from weldcal.systems.messages import PlannedSeam
+from weldcal.systems.scenario.checks import check_scenario
+from weldcal.tools.worlds.weld.budgets import PERFECT
+from weldcal.tools.worlds.weld.plant import groove_config, simulate
+from weldcal.tools.worlds.weld.seams import get_seam
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.settings import ServoConfig, ToolGeometry
+from weldcal.welding.servo.state import Phase
+from weldcal.welding.servo.tool_axes import tool_path
+
+
+@cache
+def planning(*changes: str) -> SeamPlanning:
+    found = scenario(SMALL_IDEAL_SCANNER, EXACT_PLATE, *changes)
+    station = plain_station()
+    return seam_planning(found, station, servo_config(found, station))
+
+
+def drawn(x: float, yaw_deg: float, *changes: str, move: RigidTransform | None = None, z: float = 0.02) -> PlannedSeam:
+    X = RigidTransform(RollPitchYaw(0.0, 0.0, np.radians(yaw_deg)), [x, 0.0, z])
+    return plan_drawn_seam(replace(planning(*changes), X_BP_guess=(move or RigidTransform()) @ X), 1)
+
+
+def numbers(text: str) -> list[float]:
+    return [float(n) for n in re.findall(r"[-+]\d+", text)]
+
+
+def test_a_seam_beyond_the_arms_reach_is_refused_and_the_advised_move_works() -> None:
+    """Without surroundings, where nothing was checked between the seam's ends."""
+    assert drawn(0.65, 90.0).reason is None
+    refused = drawn(1.2, 0.0)
+    assert refused.seam is None
+    assert "The arm cannot reach the seam above its end, with the elbow at its end: " in str(refused.reason)
+    advised = numbers(str(refused.reason).partition("move the part by")[2])
+    assert len(advised) == 3
+    assert drawn(1.2, 0.0, move=RigidTransform(1e-3 * np.array(advised))).reason is None
+    assert (
+        drawn(1.2, 0.0, move=RigidTransform(0.5e-3 * np.array(advised))).reason is not None
+    )  # no smaller one of the list
+
+
+def test_the_advised_lean_works_and_the_servo_leans() -> None:
+    refused = drawn(1.3, 90.0)
+    assert refused.seam is None
+    advised = re.search(r"set (welding\.lean_deg: (\d+)),", str(refused.reason))
+    assert advised is not None
+    planned = drawn(1.3, 90.0, f"welding: {{lean_deg: {advised[2]}}}")
+    assert planned.reason is None
+    assert abs(np.degrees(planned.lean_rad)) == pytest.approx(float(advised[2]))
+    assert drawn(0.65, 90.0, f"welding: {{lean_deg: {advised[2]}}}").lean_rad == 0.0  # upright where it can be
+
+
+def test_the_advised_branch_works() -> None:
+    refused = drawn(0.65, 90.0, z=0.6)
+    assert "set welding.posture: any," in str(refused.reason)
+    assert drawn(0.65, 90.0, "welding: {posture: any}", z=0.6).reason is None
+
+
+@pytest.mark.parametrize(("key", "names"), [("lean_deg: 11", "lean_deg"), ("posture: other", "posture")])
+def test_a_setting_that_is_none_is_refused(key: str, names: str) -> None:
+    with pytest.raises(InputError, match=f"welding.{names} must be"):
+        check_scenario(scenario(f"welding: {{{key}}}"))
+
+
+@pytest.mark.parametrize(("name", "lean_deg"), [("s_r60", 8.0)])
+def test_the_planned_path_is_the_servos(name: str, lean_deg: float) -> None:
+    """The servo itself, in a world without errors, holds the tool within 1 mm and 0.5 deg of the planned path."""
+    seam = get_seam(name)
+    config = ServoConfig(tool=ToolGeometry(torch_height_m=-0.0015), weld_speed_m_s=0.016)
+    config = replace(config, torch=replace(config.torch, work_angle_rad=np.radians(lean_deg)))
+    run = simulate(seam, PERFECT, config, 0)
+    assert run.phase == Phase.DONE
+    path = tool_path(SeamCurve.from_points(seam.points, seam.up), groove_config(config))
+    s = run.column("s_torch_m")
+    rows = np.flatnonzero(run.column("torch_on") > 0.5)[50::40]
+    index = np.arange(len(path.s_torch))
+    place = np.interp(s[rows], path.s_torch, index)
+    p = np.array([X.translation() for X in path.X_BT])
+    for row, at in zip(rows, place, strict=True):
+        between = [float(np.interp(at, index, p[:, k])) for k in range(3)]
+        assert np.linalg.norm(between - run.points("robot")[row]) < 1e-3
+        axes = path.X_BT[round(at)].rotation().matrix()
+        assert np.degrees(np.arccos(axes[:, 0] @ run.points("ahead")[row])) < 0.5
+        assert np.degrees(np.arccos(axes[:, 1] @ run.points("left")[row])) < 0.5
+    took = run.column("time_s")[rows[-1]] - run.column("time_s")[rows[0]]
+    assert np.diff(np.interp(place[[0, -1]], index, path.time)) == pytest.approx(took, rel=0.03)
+
+
+def test_an_accepted_placement_is_followed_and_a_refused_one_is_not() -> None:
+    """Of random placements: the drive by servo, guard and slew limiter ends as the check has said."""
+    accepted, refused = placed(401), placed(12)
+    assert (accepted["state"], accepted["end"]) == ("accepted", "done")
+    assert (refused["state"], refused["end"]) == ("refused", "guard")
+    assert re.search(r"at \d+ mm: .* the \w+( \w+)? turns without effect", refused["reason"])
+
+
+def test_an_offered_turn_of_a_refused_placement_is_followed() -> None:
+    """The advice is applied to the true part, and the arm is driven along it."""
+    text = offered(12)
+    turn = numbers(text.partition("turn the part by")[2])[0]
+    old = draw(12)
+    centre = old.plan.frame(0.5 * old.plan.length).position
+    R = RotationMatrix(RollPitchYaw(0.0, 0.0, np.radians(turn)))
+    X = RigidTransform(R, centre - R.multiply(centre))
+    seam = replace(old.seam, points=X.multiply(old.seam.points.T).T, up=R.multiply(old.seam.up))
+    new = Placement(seam, old.plan.transformed(X), old.welder)
+    assert follow(new, find_way(new.welder, new.plan, None).q_start, 12)["end"] == "done"
