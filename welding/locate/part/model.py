@@ -20,6 +20,8 @@ SAMPLES = 30_000
 EDGE_STEP_M = 0.003
 SHARP_COS = math.cos(math.radians(35.0))
 MOST_DIRECTIONS = 14
+BENEATH_M = 2e-5  # start of a ray into the part: a float32 rounds by 1e-6 m at 10 m, so the ray misses its own face
+LEAST_SHEET_M = 1e-4  # a shorter ray ends at the face of another body that overlaps by a drawing's tolerance
 SMOOTHED, SMOOTHED_M, SMOOTHED_COS = 32, 0.010, (math.cos(math.radians(40.0)), math.cos(math.radians(20.0)))
 
 
@@ -93,10 +95,10 @@ class PartModel:
 
     @cached_property
     def thickness_m(self) -> float:
-        """Thickness under the thinnest fifth of the surface."""
+        """Thickness under the thinnest fifth of the surface; a ray ends at the next face, also where two bodies touch."""
         p, n = self.points[::20], self.normals[::20]
-        through = self.ranges(p - 2e-5 * n, -n)[0]
-        through = through[np.isfinite(through) & (through > 1e-4)]
+        through = BENEATH_M + self.ranges(p - BENEATH_M * n, -n)[0]
+        through = through[np.isfinite(through) & (through > LEAST_SHEET_M)]
         return float(np.percentile(through, 20)) if len(through) else 0.1
 
     @cached_property
