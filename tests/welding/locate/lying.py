@@ -1,6 +1,7 @@
-"""Scenes of parts as they lie in a welding cell, by a ray caster of its own: boxes and tubes by formulas, no mesh is cast.
+"""Scenes of parts as they lie in a welding cell, by a ray caster of its own: formulas of boxes and tubes, no mesh.
 
-``python -m tests.welding.locate.lying`` registers the 60 judged scenes and prints how many poses are right, wrong or refused.
+``python -m tests.welding.locate.lying`` registers the 60 judged scenes. It prints how many poses are right, wrong or
+refused.
 """
 
 from __future__ import annotations
@@ -182,8 +183,9 @@ def looking(eye: Array, target: Array, turn: float = 0.0) -> Array:
 
 
 def scan(solids: Sequence[Solid], X_BC: Array, rng: np.random.Generator, shiny: Sequence[int] = ()) -> Array:
-    """A scan (H,W,3) m in the base, NaN where nothing was measured: noise, shadows of the projector, lost and flying points.
+    """Simulate a scan (H,W,3) m in the base, NaN where nothing was measured.
 
+    It has noise, shadows of the projector, lost points and flying points.
     The solids whose numbers are in `shiny` return only where they mirror little.
     """
     u, v = np.meshgrid(
@@ -225,7 +227,7 @@ def scan(solids: Sequence[Solid], X_BC: Array, rng: np.random.Generator, shiny: 
 
 
 def sheet_with_web(rng: np.random.Generator, thickness: float | None = None) -> list[Solid]:
-    """A base sheet of 0.8 to 3 mm with a web that stands off its middle, and a gusset."""
+    """A base sheet of 0.8 to 3 mm with a web off its middle, and a gusset."""
     t = rng.uniform(0.0008, 0.003) if thickness is None else thickness
     a, b = rng.uniform(0.20, 0.30), rng.uniform(0.12, 0.18)
     w, h = rng.uniform(0.0015, 0.005), rng.uniform(0.03, 0.07)
@@ -287,7 +289,7 @@ def tube_on_plate(rng: np.random.Generator) -> list[Solid]:
 
 
 def nearly_symmetric(rng: np.random.Generator) -> list[Solid]:
-    """A plate with a web along its middle: only a small lug tells it from itself turned by 180 degrees."""
+    """A plate with a web along its middle: only a small lug differs after a turn by 180 degrees."""
     t, a, b = rng.uniform(0.002, 0.006), rng.uniform(0.2, 0.26), rng.uniform(0.1, 0.14)
     w, h = rng.uniform(0.004, 0.006), rng.uniform(0.035, 0.05)
     c = rng.uniform(0.014, 0.022)
@@ -367,7 +369,7 @@ def beside(rng: np.random.Generator, at: Array, count: int, reach: float = 0.3) 
 
 
 def toggle_clamps(rng: np.random.Generator, base: Solid, count: int) -> list[Solid]:
-    """Clamps at the rims of a base sheet: a foot beside it, an arm over it and a pad that presses on it, in the sheet's frame."""
+    """Clamps at the rims of a base sheet: a foot beside it, an arm over it and a pad that presses on it."""
     assert isinstance(base, Box)
     hx, hy, hz = base.half
     found: list[Solid] = []
@@ -464,11 +466,11 @@ def long_beam(seed: int, rng: np.random.Generator) -> Lying:
             at,
             math.atan2(X[1, 0], X[0, 0]) + rng.uniform(-0.1, 0.1),
         )
-        said = pose(rng.normal(0.0, 5e-5, 3), rng.normal(0.0, 5e-5, 3)) @ true
+        stated = pose(rng.normal(0.0, 5e-5, 3), rng.normal(0.0, 5e-5, 3)) @ true
         cloud = scan([*put(part, X), *others, TABLE, FLOOR], true, rng)
-        E = said @ np.linalg.inv(true)
+        E = stated @ np.linalg.inv(true)
         scans.append(cloud @ E[:3, :3].T + E[:3, 3])
-        poses.append(said)
+        poses.append(stated)
     return Lying(kind="beam in three scans", seed=seed, part=part, X_BP=X, scans=scans, X_BC=poses)
 
 
@@ -647,7 +649,8 @@ def main() -> None:
                 f"{s.kind:20s} {seed:5d} {v.verdict:8s} {v.off_mm:7.2f} mm {v.seconds:5.1f} s  {v.sentence}", flush=True
             )
     print(
-        f"{len(found)} scenes: right {found.count('right')}, wrong {found.count('wrong')}, refused {found.count('refused')}"
+        f"{len(found)} scenes: right {found.count('right')}, wrong {found.count('wrong')}, "
+        f"refused {found.count('refused')}"
     )
     sys.exit(int(found.count("wrong") > 0))
 

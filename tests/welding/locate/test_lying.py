@@ -1,4 +1,4 @@
-"""Parts as they lie: thin sheets, clamps, a positioner, several scans, two equal parts; scenes by a ray caster of their own."""
+"""Parts as they lie: thin sheets, clamps, a positioner, several scans, two equal parts, by another ray caster."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_of_two_equal_parts_the_one_nearer_to_the_guess_is_taken() -> None:
 
 
 def test_two_solids_of_a_beam_are_one_part() -> None:
-    """A part of several bodies has inner faces where they touch: its thickness is that of the thinnest, not of a face's sliver."""
+    """The thickness of a part of two bodies that touch is that of the thinnest body."""
     from weldcal.welding.locate.part.model import PartModel
 
     solids = [solid_box((-0.1, 0.1), (-0.05, 0.05), (0, 0.0012)), solid_box((-0.05, 0.05), (0, 0.004), (0.0012, 0.04))]

@@ -22,8 +22,9 @@ NOT_MEASURED_COS = 0.22
 VISIBLE_SAMPLES = 2500
 BEYOND_M = 0.004
 SAME_FACE_COS = 0.95
-NEAR_M = 0.02  # of a surface that a wrongly fused scan shows beside its place
-THIN = 0.6  # of a sheet's thickness: what lies lower is no longer its face
+NEAR_M = 0.02  # error of fusion that is looked for: a ray that ends farther from the part meets another thing
+THIN = 0.6  # of a sheet's thickness: a lower point is nearer to the table, one thickness below, than to the face
+LEAST_NEAR, LEAST_MET = 100, 0.5  # rays of a scan that judge its fusion, and the share that meets a part in its place
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,7 +58,7 @@ class Agreement:
 
 
 def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_m: float = 0.01) -> Floats:
-    """The scan's rays (N,6) that may meet the part at X_BP or near it: the point measured, and the scanner's position."""
+    """Select the rays (N,6) that may meet the part near X_BP: the point measured, and the scanner's position."""
     middle = X_BP.multiply(model.center) - scan.eyes
     far = np.linalg.norm(middle, axis=1)
     sine = np.minimum(1.0, (model.radius + reach_m) / far)
@@ -118,7 +119,7 @@ def agreement(
 
 
 def views_off(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float) -> list[int]:
-    """Indices of the scans that show the part's surface near X_BP, but not at it: they were fused with a wrong pose."""
+    """List the scans that show the part's surface near X_BP, but not at it: their pose is wrong."""
     rays = rays_near(scan, model, X_BP)
     off = []
     for k, eye in enumerate(scan.eyes):
@@ -127,7 +128,7 @@ def views_off(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolera
         far = np.linalg.norm(mine - origin, axis=1)
         hit, _ = model.ranges(origin, (mine - origin) / far[:, None])
         near = np.abs(far - hit)[np.abs(far - hit) < NEAR_M]
-        if len(near) > 100 and np.mean(near < 2.0 * tolerance_m) < 0.5:
+        if len(near) > LEAST_NEAR and np.mean(near < 2.0 * tolerance_m) < LEAST_MET:
             off.append(k)
     return off
 

@@ -26,17 +26,17 @@ HIDDEN_COS = math.cos(math.radians(77.0))  # a face seen at a larger angle is no
 INSET, INSET_SIGMA = 0.35, 0.2  # of the outermost points of a face, in point distances
 RIM_SIGMA = 0.40  # of one of them, in point distances
 RIM_GATE, STILL_M = 4.5, 2e-5  # in point distances; a step smaller than this is the last with one gate
-LEAST_OWN, BEHIND_M, BEHIND = (
-    0.15,
-    0.002,
-    0.55,
-)  # share of the rims with something behind them; how far, or of a sheet's thickness
+LEAST_OWN = 0.15  # share of the rims with something behind them, below which nothing lies behind the part
+BEHIND_M = 0.002  # a face ends where the scan shows something so far behind it: over ten times the noise of a scan
+BEHIND = (
+    0.55  # the same for a thinner sheet, in its thickness: nearer to its table, one thickness below, than to itself
+)
 SHARED_M = 0.08
 RIM_FLOOR = 0.15  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
 PATCHES = 14.0  # size of a patch whose points share their error, in point distances
 SIGMA_FLOOR_M, CREEP_M, SLOW_M = 2e-5, 2e-5, 3e-5
-CLUSTERS = 100_000  # more than one scan has
+CLUSTERS = 100_000  # numbers reserved for the clusters of each scan: more than its points on rims
 MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
 
 
@@ -115,12 +115,12 @@ _Rows = TypeVar("_Rows", SharpEdges, Equations)
 
 
 def contours(model: PartModel, X_BP: RigidTransform, scan: PreparedScan) -> list[SharpEdges]:
-    """The contour from each of the scanner's positions."""
+    """Compute the contour from each of the scanner's positions."""
     return [contour(model, eye) for eye in into(X_BP, scan.eyes)]
 
 
 def joined(parts: list[_Rows]) -> _Rows:
-    """Edges, or equations, of several scans as one; their chains, or clusters, stay apart."""
+    """Join the edges, or the equations, of several scans; chains, or clusters, of two scans keep different numbers."""
     if len(parts) == 1:
         return parts[0]
     rows = {f.name: np.concatenate([getattr(one, f.name) for one in parts]) for f in fields(parts[0])}

@@ -86,7 +86,7 @@ class PartModel:
         return np.asarray(normals)
 
     def ranges(self, eye: Floats, directions: Floats) -> tuple[Floats, Floats]:
-        """Distances (N,) m from eyes (3,) or (N,3) along unit directions (N,3), inf where the part is missed, and the normals there."""
+        """Cast rays from eyes (3,) or (N,3) along directions (N,3): distances (N,), inf for a miss, normals (N,3)."""
         rays = np.hstack([np.broadcast_to(eye, directions.shape), directions]).astype(np.float32)
         hit = self._scene.cast_rays(self._tensor(rays))
         index = hit["primitive_ids"].numpy().astype(np.int64)
@@ -95,7 +95,7 @@ class PartModel:
 
     @cached_property
     def thickness_m(self) -> float:
-        """Thickness under the thinnest fifth of the surface; a ray ends at the next face, also where two bodies touch."""
+        """Thickness under the thinnest fifth of the surface. A ray ends where two bodies touch."""
         p, n = self.points[::20], self.normals[::20]
         through = BENEATH_M + self.ranges(p - BENEATH_M * n, -n)[0]
         through = through[np.isfinite(through) & (through > LEAST_SHEET_M)]

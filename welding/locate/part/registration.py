@@ -1,4 +1,4 @@
-"""Registers any part to one scan: rough poses, fine fits, comparison by the scanner's rays, and the decision."""
+"""Registers any part to scans: rough poses, fine fits, comparison by the scanner's rays, and the decision."""
 
 from __future__ import annotations
 
@@ -24,18 +24,20 @@ from weldcal.welding.locate.part.rivals import (
     turned_poses,
 )
 from weldcal.welding.locate.part.scan import PreparedScan, finite_points, prepare
-from weldcal.welding.locate.part.search import LARGE_M, rough_places
+from weldcal.welding.locate.part.search import LARGE_GATES, LARGE_M, rough_places
 
 Floats = npt.NDArray[np.float64]
 
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
-COARSE_TOLERANCE_M, TOLERANCE_M, SHEET_TOLERANCE_M, SHEET = 0.004, 0.0010, 0.0004, 0.5
+COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
+SHEET = 0.5  # the same of a sheet, in its thickness: nearer to the sheet than to its table
+SHEET_TOLERANCE_M = 0.0004  # at least: four times a scan's noise of 0.1 mm
 FINE_PLACES, FINE_RIVALS = 10, 5
 NEAR_HINT_DEG = 40.0
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
-COMPARABLE = 0.5  # of the best score, of a rival that may be better in the rays where they differ
-CLEAR = 0.25  # of the best pose's rays: a rival with less is worse by few rays already
-LARGER = 0.9  # size of a part that one scan does not show, in what the scan shows
+COMPARABLE = 0.5  # of the best score: a rival with less meets the table only
+CLEAR = 0.25  # of the best pose's rays: a rival with less has one ray in five where the two differ
+LARGER = 0.9  # size of a part that one scan does not show, in the scan's extent: its margin is a tenth
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
 
 
@@ -61,13 +63,22 @@ def register_part(
 ) -> PartRegistration:
     """Register a part to a scan (N,3) or (H,W,3), or to a list of scans of one scene, m in base, NaN where unmeasured.
 
-    mesh: the part in its frame P, m. X_BP_guess: search only near it (config.reach_m, reach_rad). eye_B (3,): the scanner's
-    position, of a list (V,3).     X_BP_hint: decides between poses that look the same, and is not used else. matters_P (N,3), the seam: a direction that is free
-    but leaves these points, as a set, where they are is no reason to refuse.
+    Args:
+        points_B: the scan or the scans.
+        mesh: the part in its frame P, m.
+        X_BP_guess: search only near it (config.reach_m, reach_rad).
+        eye_B: the scanner's position (3,), or (V,3) for a list of V scans, m in base.
+        X_BP_hint: decides between poses that look the same; has no other use.
+        matters_P: points (N,3) of the seam. A free direction that leaves them, as a set, where they are is not refused.
+        config: limits of the search and of the decision.
+
+    Returns:
+        The pose with its covariance and the scan's agreement.
 
     Raises:
-        PartNotFound: too few points of it are seen, or it does not fit. AmbiguousPart: it has free directions, which the
-        text names, or looks the same elsewhere. InputError: the scan has another shape.
+        PartNotFound: too few points of the part are seen, or it does not fit.
+        AmbiguousPart: the part has free directions, which the text names, or looks the same elsewhere.
+        InputError: a scan has another shape, or several scans have no position for each.
     """
     config = config or PartConfig()
     scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
@@ -129,8 +140,9 @@ def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Ri
     """Poses from the search, fitted to the coarse points, best first."""
     scored: list[tuple[float, RigidTransform]] = []
     for place in rough_places(scan, model, config):
-        # A flat part may slide along itself in the coarse fit, and a fixture may pull it: the pose before it is a start too.
-        gates = (0.053 * model.radius, 0.04 * model.radius, *COARSE_GATES) if model.radius > LARGE_M else COARSE_GATES
+        # A flat part may slide along itself in the coarse fit, or a fixture may pull it: the pose before is a start.
+        wide = tuple(g * model.radius for g in LARGE_GATES) if model.radius > LARGE_M else ()
+        gates = (*wide, *COARSE_GATES)
         for X in (place.X_BP, coarse_fit(scan, model, place.X_BP, gates)):
             if X is not None and not any(same_pose(X, Y, model) for _, Y in scored):
                 rays = rays_near(scan, model, X)[::5]
@@ -182,7 +194,7 @@ def _fine(
 
 
 def _tolerance(model: PartModel) -> float:
-    """How far a ray may end from the part that it meets, m: less than a sheet's thickness, for beneath it lies the table."""
+    """Compute how far a ray that meets the part may end from it, m; less than a sheet's thickness."""
     return min(TOLERANCE_M, max(SHEET_TOLERANCE_M, SHEET * model.thickness_m))
 
 
@@ -230,8 +242,8 @@ def _check_fused(best: _Judged, scan: PreparedScan, model: PartModel) -> None:
     if off and len(off) < len(scan.views):
         numbers = ", ".join(str(k + 1) for k in off)
         raise PartNotFound(
-            f"Of the {len(scan.views)} scans number {numbers} shows the part elsewhere than the others: the arm, the scanner or the part "
-            "moved, or X_BC is wrong. Scan again."
+            f"Of {len(scan.views)} scans, number {numbers} shows the part elsewhere than the others. The arm, the "
+            "scanner or the part moved, or X_BC is wrong: scan again, or correct the calibration."
         )
 
 
@@ -241,7 +253,10 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
     shown, size = scan.extent_m, 2.0 * model.radius
     advice = "clear the view, or scan it from elsewhere"
     if size > LARGER * shown:
-        advice = f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: give a list of several scans along it"
+        advice = (
+            f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
+            "give a list of several scans along it"
+        )
     if a.n_met < config.min_points:
         raise PartNotFound(
             f"The scan shows only {a.n_met} points of the part, and {config.min_points} are needed: {advice}."
@@ -318,7 +333,8 @@ def _decided(
             )
         a, b = (_in_mm(x.X_BP.multiply(model.center)) for x in (best, harmful[0]))
         raise AmbiguousPart(
-            f"Two places in the scan look equally like the part: near {a} and {b}; cover or remove one, or give a guess of where the part is."
+            f"Two places in the scan look equally like the part: near {a} and {b}; "
+            "cover or remove one, or give a guess of where the part is."
         )
     return best, runner_up, ""
 

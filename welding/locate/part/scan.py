@@ -20,8 +20,10 @@ Floats = npt.NDArray[np.float64]
 FINE_POINTS, COARSE_CELL_M = 160_000, 0.004
 FLAT_COS, FLAT_SHARE = 0.985, 0.6
 PLANE_BAND_M, PLANE_TRIALS, MOST_PLANES = 0.0025, 150, 6
-LEVEL_M = (0.0004, 0.0025)  # least and greatest height over a plane that is no longer its own
-LEAST_LEVEL, LEVEL_COS = 300, math.cos(math.radians(1.0))  # points of such a plane, and its turn by them
+LEVEL_M = (0.0004, PLANE_BAND_M)  # height over a plane that is no longer its own: at least half of a sheet of 0.8 mm
+NARROWED_M = (1.5e-3, 1.2e-3, 1e-3, 0.8e-3, 0.6e-3, 0.5e-3, 0.4e-3, 0.4e-3, 0.4e-3)  # bands over a plane's lowest tenth
+LEAST_LEVEL = 300  # points in such a band: the level is then known to 0.1 mm / sqrt(300) = 6 um
+LEVEL_COS = math.cos(math.radians(1.0))  # turn of a plane 0.3 m across by which its ends leave the band of +-2.5 mm
 EYE_ABOVE_M = 1.0  # assumed where the scanner's position is not given
 
 
@@ -29,8 +31,8 @@ EYE_ABOVE_M = 1.0  # assumed where the scanner's position is not given
 class Plane:
     """Points x with normal . x = level, the normal towards the scanner.
 
-    extent_m: how far the scan shows the plane across; filled: share of the square over this diagonal that its points fill;
-    own_m: height over it within which a point is its own.
+    extent_m: how far the scan shows the plane across; filled: area of its points over that of the square with this
+    diagonal; own_m: height over it within which a point is its own.
     """
 
     normal: Floats
@@ -58,8 +60,8 @@ class View:
 class PreparedScan:
     """Points (N,3) m in base with normals towards the scanner, a coarse copy, and the planes in them.
 
-    view (N,): index in `views` of each point's scan; planes: the largest, largest first; pitch_m: distance between neighbouring
-    points as measured.
+    view (N,): index in `views` of each point's scan; planes: the largest, largest first; pitch_m: distance between
+    neighbouring points as measured.
     """
 
     points: Floats
@@ -94,7 +96,11 @@ class PreparedScan:
 
 
 def finite_points(points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]]) -> list[Floats]:
-    """The measured points (N,3) of each scan, (N,3) or (H,W,3), of a list or alone; raises InputError for another shape."""
+    """Select the measured points (N,3) of each scan, (N,3) or (H,W,3), of a list or alone.
+
+    Raises:
+        InputError: a scan has another shape.
+    """
     found = []
     for one in points_B if isinstance(points_B, list | tuple) else [points_B]:
         points = np.asarray(one, dtype=np.float64)
@@ -106,7 +112,9 @@ def finite_points(points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.f
 
 
 def prepare(scans: list[Floats], eye_B: npt.ArrayLike | None, least: int, seed: int) -> PreparedScan:
-    """Thin scans (N,3) of one scene, estimate normals and planes. Without `eye_B` the scanner is assumed above the largest plane.
+    """Thin scans (N,3) of one scene, and estimate normals and planes.
+
+    Without `eye_B` the scanner is assumed above the largest plane.
 
     Raises:
         PartNotFound: fewer than `least` points. InputError: several scans without a position for each.
@@ -153,13 +161,13 @@ def prepare(scans: list[Floats], eye_B: npt.ArrayLike | None, least: int, seed: 
 
 
 def _own_level(plane: Plane, points: Floats) -> Plane:
-    """The plane fitted to its lowest points only: a thin sheet that lies on a table is no part of the table."""
+    """Fit the plane to its lowest points only: a thin sheet that lies on a table is no part of the table."""
     height = points @ plane.normal - plane.level
     band = points[np.abs(height) < PLANE_BAND_M]
     normal, level = plane.normal, plane.level
-    for above in (1.5, 1.2, 1.0, 0.8, 0.6, 0.5, 0.4, 0.4, 0.4):
+    for above in NARROWED_M:
         height = band @ normal - level
-        low = band[height < np.percentile(height, 10) + 1e-3 * above]
+        low = band[height < np.percentile(height, 10) + above]
         if len(low) < LEAST_LEVEL:
             return plane
         middle = low.mean(axis=0)

@@ -25,10 +25,17 @@ MOST_CELLS = 150  # along a side of the scene's map
 SAME_HEIGHT_M = 0.007
 RING_CELLS, RING_SHARE = 3, 0.5
 PEAKS, MOST_PLACES, MOST_UPS = 3, 24, 4
-LEAST_FILLED = 0.4  # of a ground, by its points: a plane that cuts across several things is none
-GROUND_SHARE, LARGE_M = 0.85, 0.4  # of the scan's extent, for a part of a larger radius
-WIDE_CELLS = 3.0  # in the usual cell
+LEAST_FILLED = (
+    0.4  # Plane.filled of a ground: 1 for a square, 0.79 for a disc; less where a plane cuts across several things
+)
+LARGE_M = 0.4  # radius of a part that fills the field of one scan, 0.8 m across
+GROUND_SHARE = (
+    0.85  # extent of a large part's ground, in the scan's: no table is GROUND_EXTENT times as large in the scan
+)
+WIDE_CELLS = 3.0  # in config.cell_m: 12 mm, in which a web and the plate beside it share a cell
 RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, and of a turn at its ends
+# Gates of a large part, in its radius: half a turn and half a cell's diagonal, (0.5 * 1.8 + 0.71) / 40; the first is wider.
+LARGE_GATES = (0.053, 0.04)
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
 _BOX = {n: np.ones((n, n), np.uint8) for n in (1, 3, 2 * RING_CELLS + 1)}
 
