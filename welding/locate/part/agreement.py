@@ -52,9 +52,8 @@ class Agreement:
     @property
     def score_of_rest(self) -> float:
         """The score by the rays that nothing keeps from the part."""
-        return max(0.0, self.met / max(1e-9, 1.0 - self.hidden) - 2.0 * self.passed - self.goes_on) * math.sqrt(
-            self.seen
-        )
+        met = self.met / max(1e-9, 1.0 - self.hidden)
+        return max(0.0, met - 2.0 * self.passed - self.goes_on) * math.sqrt(self.seen)
 
 
 def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_m: float = 0.01) -> Floats:
@@ -121,16 +120,12 @@ def agreement(
 def views_off(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float) -> list[int]:
     """List the scans that show the part's surface near X_BP, but not at it: their pose is wrong."""
     rays = rays_near(scan, model, X_BP)
-    off = []
-    for k, eye in enumerate(scan.eyes):
-        mine = into(X_BP, rays[(rays[:, 3:] == eye).all(axis=1), :3])
-        origin = into(X_BP, eye[None])[0]
-        far = np.linalg.norm(mine - origin, axis=1)
-        hit, _ = model.ranges(origin, (mine - origin) / far[:, None])
-        near = np.abs(far - hit)[np.abs(far - hit) < NEAR_M]
-        if len(near) > LEAST_NEAR and np.mean(near < 2.0 * tolerance_m) < LEAST_MET:
-            off.append(k)
-    return off
+    origin = into(X_BP, rays[:, 3:])
+    d = into(X_BP, rays[:, :3]) - origin
+    far = np.linalg.norm(d, axis=1)
+    gap = np.abs(far - model.ranges(origin, d / far[:, None])[0])
+    near = [gap[(rays[:, 3:] == eye).all(axis=1) & (gap < NEAR_M)] for eye in scan.eyes]
+    return [k for k, g in enumerate(near) if len(g) > LEAST_NEAR and np.mean(g < 2.0 * tolerance_m) < LEAST_MET]
 
 
 def _goes_on(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float) -> float:

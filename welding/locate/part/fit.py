@@ -20,6 +20,7 @@ from weldcal.welding.locate.part.model import PartModel, SharpEdges
 from weldcal.welding.locate.part.scan import PreparedScan, View
 
 Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 SAME_SIDE_COS = math.cos(math.radians(38.0))
 HIDDEN_COS = math.cos(math.radians(77.0))  # a face seen at a larger angle is not measured
@@ -69,7 +70,7 @@ def into(X_BP: RigidTransform, p_B: Floats) -> Floats:
     return np.asarray((p_B - X_BP.translation()) @ X_BP.rotation().matrix())
 
 
-def _within(p: Floats, middle: Floats, reach: float) -> npt.NDArray[np.bool_]:
+def _within(p: Floats, middle: Floats, reach: float) -> Mask:
     """Which points (N,3) lie nearer than `reach` to a point (3,)."""
     d = p - middle
     return np.asarray(np.vecdot(d, d) < reach**2)
@@ -130,20 +131,14 @@ def joined(parts: list[_Rows]) -> _Rows:
 
 
 def rim_rows(
-    p: Floats,
-    edges: SharpEdges,
-    gate: float,
-    band: float,
-    view: View,
-    pitch: float,
-    behind: float,
-    X_BP: RigidTransform,
+    p: Floats, edges: SharpEdges, gate: float, band: float, view: View, behind: float, X_BP: RigidTransform
 ) -> Equations | None:
     """Equations of the outermost points of the faces among p (N,3) in P against the edges that end them.
 
     A face may also end where something hides it, or where nothing was measured. So just beyond its outermost point the scan has to
     show something behind it; where no edge does, for nothing lies in the scanner's range behind the part, all edges are used.
     """
+    pitch = view.pitch_m
     if len(edges.point) < 4 or not len(p):
         return None
     away, k = (
@@ -164,7 +159,7 @@ def rim_rows(
     if len(good) < 4:
         return None
     beyond = edges.point[good] + (last[good] + 1.5 * pitch)[:, None] * edges.outward[good]
-    own = _ends_itself(beyond, edges.normal[good], view, pitch, behind, X_BP)
+    own = _ends_itself(beyond, edges.normal[good], view, behind, X_BP)
     if np.count_nonzero(own) > max(4, LEAST_OWN * len(good)):
         good = good[own]
     m, at = edges.outward[good], edges.point[good]
@@ -172,17 +167,15 @@ def rim_rows(
     return Equations(-np.hstack([np.cross(at, m), m]), r, np.ones(len(r)), _shared(edges, good))
 
 
-def _ends_itself(
-    beyond: Floats, normal: Floats, view: View, pitch: float, behind: float, X_BP: RigidTransform
-) -> npt.NDArray[np.bool_]:
+def _ends_itself(beyond: Floats, normal: Floats, view: View, behind: float, X_BP: RigidTransform) -> Mask:
     """Whether around points (N,3) of P, just beyond the rims of faces with normals (N,3), the scan shows something behind the
     faces and nothing before them."""
-    tree = view.rays
     R = X_BP.rotation().matrix()
     at = beyond @ R.T + X_BP.translation()
     d = at - view.eye
     away = np.linalg.norm(d, axis=1)
-    _, k = tree.query(d / away[:, None], k=9, distance_upper_bound=2.5 * pitch / float(np.median(away)))
+    reach = 2.5 * view.pitch_m / float(np.median(away))
+    _, k = view.rays.query(d / away[:, None], k=9, distance_upper_bound=reach)
     found = np.asarray(k) < len(view.measured)
     height = np.einsum("ijk,ik->ij", view.measured[np.where(found, k, 0)] - at[:, None], normal @ R.T)
     return np.asarray((found & (height < -behind)).any(axis=1) & ~(found & (height > BEHIND_M)).any(axis=1))
@@ -194,7 +187,7 @@ def _shared(edges: SharpEdges, index: npt.NDArray[np.int64]) -> npt.NDArray[np.i
     return np.asarray(np.unique(key, axis=0, return_inverse=True)[1]).ravel()
 
 
-def _beside(p: Floats, edges: SharpEdges, reach: float) -> npt.NDArray[np.bool_]:
+def _beside(p: Floats, edges: SharpEdges, reach: float) -> Mask:
     """Which points (N,3) in P lie near an edge."""
     if not len(edges.point):
         return np.zeros(len(p), dtype=bool)
@@ -282,7 +275,7 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
             # A narrower gate would only let through the rims that agree with the pose already.
             band = max(4.0 * sigma, 0.0004)
             found = [
-                rim_rows(into(X, p), e, rim_gate, band, v, pitch, behind, X)
+                rim_rows(into(X, p), e, rim_gate, band, v, behind, X)
                 for p, e, v in zip(beside, edges, scan.views, strict=True)
             ]
             some_rims = [one for one in found if one is not None]

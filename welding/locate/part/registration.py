@@ -249,13 +249,12 @@ def _check_fused(best: _Judged, scan: PreparedScan, model: PartModel) -> None:
 
 def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: PartConfig) -> None:
     """Raise PartNotFound where the best pose does not agree with the scan."""
-    a = best.agreement
-    shown, size = scan.extent_m, 2.0 * model.radius
+    a, shown, size = best.agreement, scan.extent_m, 2.0 * model.radius
     advice = "clear the view, or scan it from elsewhere"
     if size > LARGER * shown:
         advice = (
             f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
-            "give a list of several scans along it"
+            "scan it from farther away, or give register_part a list of several scans along it"
         )
     if a.n_met < config.min_points:
         raise PartNotFound(

@@ -44,10 +44,11 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One scan: the scanner's position (3,) in base and all measured points (M,3), m."""
+    """One scan: the scanner's position (3,) in base, all measured points (M,3) and their distance, m."""
 
     eye: Floats
     measured: Floats
+    pitch_m: float
 
     @cached_property
     def rays(self) -> cKDTree:
@@ -156,7 +157,7 @@ def prepare(scans: list[Floats], eye_B: npt.ArrayLike | None, least: int, seed: 
     coarse_normals = coarse_normals * np.where(np.sum(coarse_normals * near, axis=1) < 0.0, -1.0, 1.0)[:, None]
     return PreparedScan(
         points=points, normals=normals, view=view, coarse=coarse, coarse_normals=coarse_normals, planes=planes,
-        views=tuple(View(e, p) for e, p in zip(eyes, scans, strict=True)), pitch_m=pitch,
+        views=tuple(View(e, p, pitch) for e, p in zip(eyes, scans, strict=True)), pitch_m=pitch,
     )  # fmt: skip
 
 

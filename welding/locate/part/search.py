@@ -34,7 +34,7 @@ GROUND_SHARE = (
 )
 WIDE_CELLS = 3.0  # in config.cell_m: 12 mm, in which a web and the plate beside it share a cell
 RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, and of a turn at its ends
-# Gates of a large part, in its radius: half a turn and half a cell's diagonal, (0.5 * 1.8 + 0.71) / 40; the first is wider.
+# Gates of a large part, in its radius: the second is half a turn and half a cell's diagonal, (0.5 * 1.8 + 0.71) / 40.
 LARGE_GATES = (0.053, 0.04)
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
 _BOX = {n: np.ones((n, n), np.uint8) for n in (1, 3, 2 * RING_CELLS + 1)}
