@@ -73,6 +73,8 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
         return worded("recording", _both(_recorded(folder / RECORDING, progress), of_weld))
     if (folder / CSV_NAME).is_file():
         return worded("weld log", Diagnosis(of_weld, 0, float("nan")))
+    if of_weld:  # held before anything was seen
+        return worded("result", Diagnosis(of_weld, 0, float("nan")))
     if (folder / CALIBRATION).is_file():
         raise InputError(
             f"'{folder}' was written before results kept what was seen of the flange. Calibrate again, or give the dataset's folder."

@@ -26,13 +26,8 @@ from weldcal.systems.runner import Progress, Run, no_progress
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
-from weldcal.tools.cli.options import (
-    Call,
-    Outcome,
-    ScenarioOption,
-    command,
-)
-from weldcal.tools.commands.run import RECORDED, JobRun, run_job, run_options
+from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
+from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
@@ -44,13 +39,14 @@ from weldcal.welding.servo.state import Phase
 
 SCANS: Final = "scans"
 SUMMARY: Final = "summary.json"
+PRESET: Final = "straight_groove"
 PHASE_NAMES = [str(phase) for phase in Phase]
 
 
 @command("weld", options=RECORDED, short_help="Weld a seam in a scenario, without calibrating.")
-def weld(call: Call, scenario: ScenarioOption = "straight_groove") -> Outcome:
+def weld(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = PRESET) -> Outcome:
     """Weld a seam in a scenario, with the scanner's pose taken from the scenario."""
-    found = run_weld(run_options(call, "weld", scenario), call.progress)
+    found = run_weld(run_options(call, "weld", named_once(name, scenario, PRESET)), call.progress)
     return Outcome(found.summary(), first=found.first)
 
 

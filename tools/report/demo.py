@@ -164,9 +164,11 @@ class DemoResult:
     def _next(self) -> Next:
         folder, robot = self.folder, self.robot != "simulated"
         if self.state == "held":
+            if self.weld is None and not self.n_scans:
+                return after_hold(self.run.ended_by_operator)
             return after_hold(
                 self.run.ended_by_operator,
-                "Settle the reason; nothing goes on by itself. The doctor looks at scans and weld.",
+                "Look for the cause in scans and weld, remove it, then run the job again.",
                 f"weldcal doctor {folder}",
             )
         if self.weld is not None and robot:

@@ -108,7 +108,7 @@ class VerifyReport:
             return Next("See what has changed, then calibrate again.", f"weldcal doctor {self.dataset}")
         if v.verdict == NONE or sum(not p.used_before for p in self.poses) < ENOUGH_UNSEEN:
             return Next("Take four or more new scans across the work space, and verify with them.")
-        return Next("Settle what could be wrong, then verify again.", f"weldcal doctor {self.dataset}")
+        return Next("Remove what could be wrong, then verify again.", f"weldcal doctor {self.dataset}")
 
     @property
     def position_error_mm(self) -> dict[str, float]:

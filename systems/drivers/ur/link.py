@@ -140,7 +140,8 @@ class UrLink:
                 if found.fault:
                     fault = Fault(found.fault)
                     link._end()
-                    raise RobotRefused(sentence(fault, found.detail))
+                    kind = StartFailed if fault == Fault.START_FAILED else RobotRefused
+                    raise kind(sentence(fault, found.detail))
             if link._process.poll() is not None:
                 break
             time.sleep(0.01)

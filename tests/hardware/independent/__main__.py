@@ -200,6 +200,7 @@ class Controller:
     def _listen(self, until: float) -> None:
         """Handle what arrives until this time, at least once."""
         while True:
+            self._forget()
             left = max(until - time.monotonic(), 0.0)
             ready, _, _ = select.select([*self._servers, *self._clients], [], [], left)
             for one in ready:

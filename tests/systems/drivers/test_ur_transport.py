@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -74,6 +75,30 @@ def test_each_state_that_is_read_is_in_the_type_table_of_ur_rtde() -> None:
     from weldcal.systems.drivers.ur.wire.ur_rtde_client import GETTERS
 
     assert set(GETTERS) == {*ALWAYS, "actual_TCP_pose", OUTPUTS, INPUTS}
+
+
+@NEEDS_UR_RTDE
+def test_the_guard_gets_no_command_before_the_control_connection_has_seen_it_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # ur_rtde reads states and gives commands on two connections: here the second one hears of the program later
+    from weldcal.systems.drivers.ur.wire.ur_rtde_client import UrRtdeTransport
+
+    heard = iter((False, False, True))
+    asked: list[bool] = []
+
+    class Control:
+        def setCustomScriptFile(self, name: str) -> None: ...
+
+        def isProgramRunning(self) -> bool:
+            asked.append(next(heard))
+            return asked[-1]
+
+    made = object.__new__(UrRtdeTransport)
+    monkeypatch.setattr(made, "_control", Control(), raising=False)
+    monkeypatch.setattr(made, "wait", lambda seconds: None)
+    assert made.upload("def guard():\nend\n", lambda: True, time.monotonic() + 5.0)
+    assert asked == [False, False, True]
 
 
 @NEEDS_UR_RTDE

@@ -111,7 +111,7 @@ def test_the_error_of_a_mapped_point_is_that_of_drawn_poses() -> None:
 
 def test_a_run_that_the_operator_ended_has_no_fault_to_look_for() -> None:
     assert after_hold(True).text.startswith("The operator ended this run.")
-    assert after_hold(False).text.startswith("Settle the reason")
+    assert after_hold(False).text.startswith("Remove the cause")
 
 
 @pytest.mark.parametrize("width", [60, 100])

@@ -13,7 +13,9 @@ import typer
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
+from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET
 from weldcal.systems.drivers.ur.rtde import UrRtde, chosen_transport
+from weldcal.systems.drivers.ur.wire.transport import UR_RTDE
 from weldcal.systems.host_timing import measure_host
 from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
@@ -63,7 +65,10 @@ def with_transport(report: Preflight, config: UrRtde) -> Preflight:
     """The report of a controller that is ready, with a further row: how the driver will reach it, and why so."""
     if not report.ok:
         return report
-    _, why = chosen_transport(config, report.version or (), report.upper_registers)
+    transport, why = chosen_transport(config, report.version or (), report.upper_registers)
+    if transport == UR_RTDE:
+        base = UPPER_OFFSET if report.upper_registers else 0
+        why += f" It claims the integer input registers {base} to {base + 7} and the double ones {base} to {base + 17}."
     return replace(report, checks=(*report.checks, Check("transport", True, why.removeprefix("Transport "))))
 
 

@@ -140,7 +140,8 @@ class UrRtdeTransport:
             self._control.setCustomScriptFile(file.name)
             while time.monotonic() < until:
                 self.wait(transport.LOOK_S)
-                if started():
+                # its control interface has a connection of its own, and gives no command before it has seen the program run
+                if started() and self._control.isProgramRunning():
                     return True
         return False
 
