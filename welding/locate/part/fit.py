@@ -37,6 +37,7 @@ RIM_FLOOR = 0.15  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
 PATCHES = 14.0  # size of a patch whose points share their error, in point distances
 SIGMA_FLOOR_M, CREEP_M, SLOW_M = 2e-5, 2e-5, 3e-5
+FINE_GATE_M, FINE_GATE = 0.008, 1.0 / 40.0  # first gate, at least, and in the part's radius: a cell of the search
 CLUSTERS = 100_000  # numbers reserved for the clusters of each scan: more than its points on rims
 MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
 
@@ -249,9 +250,9 @@ def coarse_fit(
     return X
 
 
-def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: float = 0.008) -> Fit | None:
-    """The pose by surface and rims from one good to `gate`, with its covariance; None where too few points are near."""
-    pitch = scan.pitch_m
+def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> Fit | None:
+    """Fit surface and rims from a pose good to the gate, with its covariance; None where too few points are near."""
+    pitch, gate = scan.pitch_m, max(FINE_GATE_M, FINE_GATE * model.radius)
     middle, around = X.multiply(model.center), model.radius + 0.02
     near = _within(scan.points, middle, around)
     points, normals = scan.points[near], scan.normals[near]

@@ -164,7 +164,8 @@ def _places_for(
                 score = float(value) - float(len(difference) - np.count_nonzero(same)) / n
                 middle = corner + (np.array([column, row]) + reach + 0.5) * cell
                 R = R_BU @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_UP
-                lift = float(np.mean(difference[same])) if same.any() else lift
+                level = np.abs(difference - lift) < SAME_HEIGHT_M  # a web in the next cell does not count for the lift
+                lift = float(np.mean(difference[level])) if level.any() else lift
                 origin = R_BU @ np.array([middle[0], middle[1], lift]) - R @ model.center
                 places.append(Place(score, RigidTransform(RotationMatrix(_orthogonal(R)), origin)))
     places.sort(key=lambda place: -place.score)
