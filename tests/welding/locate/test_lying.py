@@ -52,10 +52,9 @@ def test_a_part_is_found_as_it_lies(kind: str, seed: int) -> None:
     assert found.verdict == "right", found
 
 
-@pytest.mark.parametrize(
-    "seed", [7001, 7005]
-)  # turned by 180 deg before; not found before, for its web shifted its height
+@pytest.mark.parametrize("seed", [7005, 7017])
 def test_a_beam_of_three_scans_is_found(seed: int) -> None:
+    """Its web shifts the search's height (7005); it meets 97 % of the rays turned by 180 deg too (7017)."""
     s = of("long_beam", seed)
     found = judge(s)
     assert found.verdict == "right", found

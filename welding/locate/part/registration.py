@@ -33,6 +33,11 @@ COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
 SHEET = 0.5  # the same of a sheet, in its thickness: nearer to the sheet than to its table
 SHEET_TOLERANCE_M = 0.0004  # at least: four times a scan's noise of 0.1 mm
 FINE_PLACES, FINE_RIVALS = 10, 5
+LARGE_PLACES = 40  # of a large part: turned, or moved by the distance of two stiffeners, it meets nearly all rays too
+CLEAN, PASSED = (
+    0.98,
+    0.005,
+)  # shares that meet, and that pass through, a pose that ends the search: it leaves flying points
 NEAR_HINT_DEG = 40.0
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
 COMPARABLE = 0.5  # of the best score: a rival with less meets the table only
@@ -101,7 +106,7 @@ def register_prepared(
     _check_size(scan, model)
     hint = X_BP_guess if X_BP_hint is None else X_BP_hint
     starts = _near_starts(scan, model, X_BP_guess) if X_BP_guess is not None else _starts(scan, model, config)
-    fits = _fine(scan, model, starts, FINE_PLACES)
+    fits = _fine(scan, model, starts, LARGE_PLACES if model.radius > LARGE_M else FINE_PLACES)
     if not fits:
         raise PartNotFound(
             "The scan shows nothing that fits the part: move it into view, or check the file and its unit."
@@ -179,10 +184,12 @@ def _screened(
 def _fine(
     scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 5
 ) -> list[_Judged]:
-    """Fine fits of the best starts, different ones only, best first; after more than `enough` a good one ends the search."""
+    """Fit the best starts finely, different ones only, best first; after `enough` a good and clean one ends the search."""
     judged: list[_Judged] = []
     for X in starts[:most]:
-        if enough is not None and len(judged) > enough and max(j.agreement.score for j in judged) > 0.8:
+        known = [j.agreement for j in judged]
+        clean = any(a.score > 0.8 and a.met > CLEAN and a.passed < PASSED for a in known)
+        if enough is not None and len(judged) > enough and clean:
             break
         fit = fine_fit(scan, model, X)
         if fit is None or any(same_pose(fit.X_BP, j.X_BP, model) for j in judged):
