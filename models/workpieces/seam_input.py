@@ -58,7 +58,11 @@ def seam_of(shape: PartShape, source: SeamSource, joint: str) -> DrawnSeam:
         drawn = draw_seam(shape.mesh, line, joint, normals, closed)
     else:
         line, closed = chained(shape, source.edges)
-        drawn = draw_seam(shape.mesh, line, joint, None, closed)
+        ups = [shape.edge(id).up_P for id in source.edges if len(shape.edge(id).points_P) == 2]
+        normals = (
+            np.broadcast_to(ups[0], line.shape) if len(ups) == len(source.edges) == 1 and ups[0] is not None else None
+        )
+        drawn = draw_seam(shape.mesh, line, joint, normals, closed)
     if source.direction == "reverse":
         drawn = drawn.reversed()
     if source.start_m + source.end_m > 0.0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,15 +13,21 @@ import numpy.typing as npt
 from weldcal.models.errors import InputError
 from weldcal.models.files import file_size, read_bytes
 from weldcal.models.mesh import TriMesh, merge
-from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartShape
+from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
+
+if TYPE_CHECKING:
+    from weldcal.models.workpieces.brep import Face
 
 Floats = npt.NDArray[np.float64]
 
 LARGEST_STEP = 512 * 1024**2
 CHORD_MM, FACET_RAD = 0.02, 0.05  # largest distance and angle between the mesh and the surface
-EDGE_SPACING_MM = 0.5
+LEAST_EDGE_MM = 1e-6
 SMOOTH_RAD = math.radians(2.0)
 _MERGED_M = 1e-7
+_EXTERNAL = re.compile(
+    rb"DOCUMENT_FILE\s*\(\s*'([^']*\.st(?:e?p))'", re.IGNORECASE
+)  # ISO 10303-44: parts in files of their own
 _STRINGS, _HELD, _NAMED = re.compile(rb"'(?:[^']|'')*'"), re.compile(rb"#(\d+)\s*="), re.compile(rb"#(\d+)")
 _UNIT_NAMES = {"MILLIMETRE": "mm", "MILLIMETER": "mm", "METRE": "m", "METER": "m", "INCH": "inch"}
 
@@ -33,12 +39,37 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
         InputError: no OpenCascade, not a STEP file, no solid in it, or another unit than `units`.
     """
     file_size(path, LARGEST_STEP)
-    _check_text(path)
+    for file in (path, *referenced(path)):
+        _check_text(file)
     shape, unit = _transferred(path)
     if units is not None and unit is not None and unit != units:
         raise InputError(f"'{path.name}' is in {unit}, not in {units}: give units {unit}.")
     mesh, bodies = _mesh(shape, path)
-    return PartShape(path.name, mesh, _edges(shape), UNITS_M[unit or units or "mm"], bodies)
+    edges, joints = _with_joints(_edges(shape), shape)
+    return PartShape(path.name, mesh, edges, UNITS_M[unit or units or "mm"], bodies, joints)
+
+
+def referenced(path: Path) -> list[Path]:
+    """The STEP files beside a part's file from which it takes bodies, by its own and their external references.
+
+    Raises:
+        InputError: one of them is not there.
+    """
+    found, asked = list[Path](), [path]
+    while asked:
+        one = asked.pop()
+        if one.suffix.lower() not in (".step", ".stp"):
+            continue
+        for name in _EXTERNAL.findall(read_bytes(one, LARGEST_STEP)):
+            other = path.parent / Path(name.decode(errors="replace").replace("\\", "/")).name
+            if not other.is_file():
+                raise InputError(
+                    f"'{one.name}' takes a body from '{other.name}': put that file beside it, or export the assembly as one file."
+                )
+            if other not in (path, *found):
+                found.append(other)
+                asked.append(other)
+    return found
 
 
 def _check_text(path: Path) -> None:
@@ -84,8 +115,10 @@ def _transferred(path: Path) -> tuple[Any, str | None]:
         reader.FileUnits(lengths, angles, solids)
         names = {lengths.Value(k + 1).ToCString().upper() for k in range(lengths.Length())}
         reader.SetSystemLengthUnit(1.0)
-        reader.TransferRoots()
-        shape = reader.OneShape()
+        shape = _assembled(path) if referenced(path) else None
+        if shape is None:
+            reader.TransferRoots()
+            shape = reader.OneShape()
     except InputError:
         raise
     except Exception as error:  # OpenCascade raises several types
@@ -96,6 +129,20 @@ def _transferred(path: Path) -> tuple[Any, str | None]:
     if len(known) > 1:
         raise InputError(f"'{path.name}' mixes the units {', '.join(sorted(known))}: export it in one unit.")
     return shape, next(iter(known), None)
+
+
+def _assembled(path: Path) -> Any:
+    """The shape of an assembly whose bodies are in other files, in millimetres."""
+    from OCP.STEPCAFControl import STEPCAFControl_Reader
+    from OCP.TCollection import TCollection_ExtendedString
+    from OCP.TDocStd import TDocStd_Document
+    from OCP.XCAFDoc import XCAFDoc_DocumentTool
+
+    document = TDocStd_Document(TCollection_ExtendedString("assembly"))
+    reader = STEPCAFControl_Reader()
+    reader.ReadFile(str(path))
+    reader.Transfer(document)
+    return XCAFDoc_DocumentTool.ShapeTool_s(document.Main()).GetOneShape()
 
 
 def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:
@@ -139,75 +186,39 @@ def _mesh(shape: Any, path: Path) -> tuple[TriMesh, int]:
 
 def _edges(shape: Any) -> tuple[PartEdge, ...]:
     """Every edge of the shape, numbered in the file's order; edges within one smooth face are left out."""
-    from OCP.BRep import BRep_Tool
-    from OCP.collections import (
-        IndexedDataMap_TopoDS_Shape_List_TopoDS_Shape_TopTools_ShapeMapHasher as EdgeFaces,
-    )
+    from OCP.BRepAdaptor import BRepAdaptor_Curve
+    from OCP.GeomAbs import GeomAbs_CurveType
     from OCP.TopAbs import TopAbs_ShapeEnum
-    from OCP.TopExp import TopExp
     from OCP.TopoDS import TopoDS
 
-    faces_of = EdgeFaces()
-    TopExp.MapShapesAndAncestors_s(shape, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_FACE, faces_of)
+    from weldcal.models.workpieces.brep import Face, faces_at, length_of, parts_of, sampled
+
+    faces = [Face(TopoDS.Face(face)) for face in parts_of(shape, TopAbs_ShapeEnum.TopAbs_FACE)]
     found: list[PartEdge] = []
-    for k in range(faces_of.Extent()):
-        edge = TopoDS.Edge(faces_of.FindKey(k + 1))
-        faces = [TopoDS.Face(face) for face in faces_of.FindFromIndex(k + 1)]
-        unique = [f for i, f in enumerate(faces) if not any(f.IsSame(g) for g in faces[:i])]
-        if BRep_Tool.Degenerated_s(edge) or (len(unique) == 1 and len(faces) > 1):
+    for edge, met in faces_at(shape, faces):
+        curve = BRepAdaptor_Curve(edge)
+        points = sampled(curve, curve.FirstParameter(), curve.LastParameter())
+        if not length_of(points) > LEAST_EDGE_MM:
             continue
-        points, radius = _sampled(edge)
-        if len(points) < 2:
-            continue
-        kind, angle = ("boundary", math.nan) if len(unique) < 2 else _met(edge, unique[0], unique[1])
+        kind, angle = ("boundary", math.nan) if len(met) < 2 else _met(curve, edge, met[0], met[1])
+        circular = curve.GetType() == GeomAbs_CurveType.GeomAbs_Circle
+        radius = 1e-3 * float(curve.Circle().Radius()) if circular else None
         found.append(PartEdge(len(found) + 1, kind, 1e-3 * points, angle, radius))
     return tuple(found)
 
 
-def _sampled(edge: Any) -> tuple[Floats, float | None]:
-    """Points (N,3) mm evenly along an edge, and the radius m of a circle or arc."""
-    from OCP.BRepAdaptor import BRepAdaptor_Curve
-    from OCP.GCPnts import GCPnts_AbscissaPoint, GCPnts_UniformAbscissa
-    from OCP.GeomAbs import GeomAbs_CurveType
-
-    curve = BRepAdaptor_Curve(edge)
-    length = GCPnts_AbscissaPoint.Length_s(curve)
-    if not math.isfinite(length) or length < 1e-6:
-        return np.empty((0, 3)), None
-    straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
-    count = 2 if straight else max(9, math.ceil(length / EDGE_SPACING_MM) + 1)
-    spread = GCPnts_UniformAbscissa(curve, count)
-    at = [spread.Parameter(k + 1) for k in range(spread.NbPoints())] if spread.IsDone() else []
-    if len(at) < 2:
-        at = list(np.linspace(curve.FirstParameter(), curve.LastParameter(), count))
-    points = np.array([(p.X(), p.Y(), p.Z()) for p in (curve.Value(u) for u in at)])
-    circular = curve.GetType() == GeomAbs_CurveType.GeomAbs_Circle
-    return points, 1e-3 * float(curve.Circle().Radius()) if circular else None
-
-
-def _met(edge: Any, first: Any, second: Any) -> tuple[str, float]:
+def _met(curve: Any, edge: Any, first: Face, second: Face) -> tuple[str, float]:
     """Kind of an edge between two faces, and the angle between these, rad."""
-    from OCP.BRep import BRep_Tool
-    from OCP.BRepAdaptor import BRepAdaptor_Curve
-    from OCP.gp import gp_Pnt, gp_Vec
     from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum
-    from OCP.TopExp import TopExp_Explorer
-    from OCP.TopoDS import TopoDS
 
-    low, high = BRep_Tool.Range_s(edge)
-    middle = 0.5 * (low + high)
-    point, along = gp_Pnt(), gp_Vec()
-    BRepAdaptor_Curve(edge).D1(middle, point, along)
-    tangent = np.array([along.X(), along.Y(), along.Z()])
+    from weldcal.models.workpieces.brep import middle_of, parts_of
+
+    point, tangent, _ = middle_of(curve, curve.FirstParameter(), curve.LastParameter())
     # The orientation of the edge as it stands in the first face: the face lies to its left.
-    explorer = TopExp_Explorer(first, TopAbs_ShapeEnum.TopAbs_EDGE)
-    while explorer.More():
-        if explorer.Current().IsSame(edge):
-            if TopoDS.Edge(explorer.Current()).Orientation() == TopAbs_Orientation.TopAbs_REVERSED:
-                tangent = -tangent
-            break
-        explorer.Next()
-    n_1, n_2 = _normal(edge, first, middle), _normal(edge, second, middle)
+    own = next(e for e in parts_of(first.face, TopAbs_ShapeEnum.TopAbs_EDGE) if e.IsSame(edge))
+    if own.Orientation() == TopAbs_Orientation.TopAbs_REVERSED:
+        tangent = -tangent
+    n_1, n_2 = first.normal(point), second.normal(point)
     turn = math.acos(float(np.clip(n_1 @ n_2, -1.0, 1.0)))
     if turn < SMOOTH_RAD:
         return "smooth", math.pi
@@ -215,19 +226,52 @@ def _met(edge: Any, first: Any, second: Any) -> tuple[str, float]:
     return ("concave" if n_2 @ inward > 0.0 else "convex"), math.pi - turn
 
 
-def _normal(edge: Any, face: Any, at: float) -> Floats:
-    """Outward unit normal (3,) of a face at the parameter of one of its edges."""
-    from OCP.BRep import BRep_Tool
-    from OCP.BRepAdaptor import BRepAdaptor_Surface
-    from OCP.gp import gp_Pnt, gp_Vec
-    from OCP.TopAbs import TopAbs_Orientation
+def _with_joints(edges: tuple[PartEdge, ...], shape: Any) -> tuple[tuple[PartEdge, ...], tuple[PartJoint, ...]]:
+    """The edges of a part with those of its joints that are no edge of a body added at the end, and its joints."""
+    from weldcal.models.workpieces.brep import length_of
+    from weldcal.models.workpieces.joints import closes, joints_of
 
-    u_v = BRep_Tool.CurveOnSurface_s(edge, face, 0.0, 0.0).Value(at)
-    point, by_u, by_v = gp_Pnt(), gp_Vec(), gp_Vec()
-    BRepAdaptor_Surface(face).D1(u_v.X(), u_v.Y(), point, by_u, by_v)
-    n = np.cross([by_u.X(), by_u.Y(), by_u.Z()], [by_v.X(), by_v.Y(), by_v.Z()])
-    n = n / max(float(np.linalg.norm(n)), 1e-300)
-    return np.asarray(-n if face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else n)
+    known, joints = list(edges), []
+    for chain in joints_of(shape):
+        ids = []
+        for piece in chain:
+            kind = "concave" if piece.angle < math.pi - 0.01 else "flush"
+            lies = (k for k, edge in enumerate(known) if edge.up_P is None and _is(edge, 1e-3 * piece.line))
+            at = next(lies, len(known))
+            radius = known[at].radius_m if at < len(known) else None
+            line = known[at].points_P if at < len(known) else 1e-3 * piece.line
+            known[at : at + 1] = [PartEdge(at + 1, kind, line, piece.angle, radius, piece.up)]
+            ids.append(at + 1)
+        longest = max(chain, key=lambda piece: length_of(piece.line))
+        joints.append(
+            PartJoint(
+                type=longest.type,
+                edges=tuple(ids),
+                length_m=1e-3 * sum(length_of(piece.line) for piece in chain),
+                angle_rad=longest.angle,
+                gap_m=1e-3 * max(piece.gap for piece in chain),
+                walls_m=(1e-3 * longest.walls[0], 1e-3 * longest.walls[1]),
+                up_P=longest.up,
+                side=longest.side,
+                closed=closes(chain),
+            )
+        )
+    return tuple(known), tuple(joints)
+
+
+def _is(edge: PartEdge, line: Floats) -> bool:
+    """Whether an edge is this line (N,3) m."""
+    from weldcal.models.workpieces.brep import length_of
+
+    p, q = edge.points_P, line
+    if abs(edge.length_m - length_of(q)) > 2e-5:
+        return False
+    ends = min(np.abs(p[[0, -1]] - q[[0, -1]]).max(), np.abs(p[[0, -1]] - q[[-1, 0]]).max())
+    middle = 0.5 * (q[0] + q[-1]) if len(q) == 2 else q[len(q) // 2]
+    a, d = p[:-1], np.diff(p, axis=0)
+    share = np.clip(np.vecdot(middle - a, d) / np.vecdot(d, d), 0.0, 1.0)
+    off = float(np.linalg.norm(a + share[:, None] * d - middle, axis=1).min())
+    return bool((ends < 2e-5 or (edge.closed and np.linalg.norm(q[0] - q[-1]) < 1e-5)) and off < 5e-5)
 
 
 def _first_line(error: Exception) -> str:

@@ -12,6 +12,7 @@ from pydrake.common.yaml import yaml_dump_typed
 
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import is_scanner_file
+from weldcal.models.workpieces.step import referenced
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 
@@ -27,6 +28,7 @@ def packed(scenario: Scenario) -> dict[str, bytes]:
         while name in files:
             name = f"{Path(name).stem}_{path.suffix}"
         files[name] = path.read_bytes()
+        files |= {other.name: other.read_bytes() for other in referenced(path)}
         setattr(config, field, name)
     return {SCENARIO: yaml_dump_typed(copy).encode(), **files}
 

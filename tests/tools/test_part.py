@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
+import re
+from itertools import combinations
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
+from mpl_toolkits.mplot3d import proj3d
 from typer.testing import CliRunner
 
+from weldcal.models.tools.loading import WELDING, load_tool, tool_file
+from weldcal.models.workpieces.reading import read_shape
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.parts.step_parts import PARTS
+from weldcal.tools.commands.cell.part import edges_picture, ranked
+from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, write_step
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +63,81 @@ def test_a_mistake_is_a_sentence(step: Path, arguments: list[str], says: str, tm
     assert result.exit_code == 1
     assert says in result.output
     assert not (tmp_path / "out").exists()
+
+
+def write_pipe(path: Path, radius: float) -> None:
+    """A pipe of 80 mm on a plate."""
+    pipe = less(cylinder((0, 0, 0), radius, 80), cylinder((0, 0, -1), radius - 30, 90))
+    write_step(assembly(box((-150, -150, -10), (300, 300, 10)), pipe), path)
+
+
+def test_each_seam_says_whether_the_tool_fits_it(tmp_path: Path) -> None:
+    write_pipe(tmp_path / "pipe.step", 80)
+    result = CliRunner().invoke(app, ["part", str(tmp_path / "pipe.step"), "--json", "--out", str(tmp_path / "out")])
+    outside, inside = json.loads(result.stdout.splitlines()[-1])["seams"]
+    assert [outside["type"], outside["weldable"]] == ["pipe on plate", True]
+    assert outside["length_mm"] == pytest.approx(2.0 * math.pi * 80.0, abs=0.05)
+    assert [outside["least_radius_mm"], inside["least_radius_mm"]] == pytest.approx([80.0, 50.0])
+    assert outside["closed"]
+    assert not inside["weldable"]
+    assert re.search(r"tool does not fit: .* \(-\d+\.\d mm\)", inside["reason"])
+    text = CliRunner().invoke(app, ["part", str(tmp_path / "pipe.step"), "--out", str(tmp_path / "text")]).stdout
+    assert re.search(r"pipe on plate +502\.7 +90\.0 .*  yes", text)
+    assert "Seams</h2>" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_least_pipe_that_a_tool_can_weld_is_named(tmp_path: Path) -> None:
+    tool = load_tool(WELDING).tool
+    reasons = []
+    for radius in (70, 75):
+        write_pipe(tmp_path / f"{radius}.step", radius)
+        shape = read_shape(tmp_path / f"{radius}.step")
+        outside = max(shape.joints, key=lambda joint: joint.length_m)
+        reasons.append(next(seam.reason for seam in ranked(shape, tool) if seam.joint is outside))
+    assert reasons[1] == ""
+    least = re.search(r"least pipe for this tool is (\d+) mm across", reasons[0])
+    assert least is not None
+    assert 140 <= int(least[1]) <= 150
+
+
+def test_a_lap_of_thin_sheets_needs_the_small_ball(tmp_path: Path) -> None:
+    write_step(assembly(box((0, 0, -3), (220, 120, 3)), box((10, 40, 0), (200, 70, 1.5))), tmp_path / "lap.step")
+    joints = read_shape(tmp_path / "lap.step")
+    (large,), (small,) = (ranked(joints, load_tool(tool_file(Path(name))).tool) for name in ("welding", "tip_1p5"))
+    assert "A tip of radius 2.5 mm is too large" in large.reason
+    assert small.reason == ""
+    cell = tmp_path / "cell"
+    made = ["new", str(cell), "--part", str(tmp_path / "lap.step"), "--tool-file", "tip_1p5"]
+    result = CliRunner().invoke(app, made)
+    assert result.exit_code == 0, result.output
+    assert "radius_mm: 1.0" in (cell / "tool.yaml").read_text()
+
+
+def test_the_numbers_in_the_picture_do_not_overlap(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    ribs = [box((0, y, 0), (200, 3, 40)) for y in range(5, 200, 12)]
+    write_step(assembly(box((0, 0, -5), (200, 200, 5)), *ribs), tmp_path / "ribs.step")
+    figures: list[Figure] = []
+    kept = Figure.savefig
+
+    def save(self: Figure, *args: object, **kwargs: object) -> None:
+        figures.append(self)
+        kept(self, *args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Figure, "savefig", save)
+    edges_picture(read_shape(tmp_path / "ribs.step"))
+    (figure,) = figures
+    for axes in figure.axes:
+        boxes = []
+        for text in axes.texts:
+            x, y, _ = proj3d.proj_transform(*text.get_position_3d(), axes.get_proj())
+            px, py = axes.transData.transform((x, y))
+            size = text.get_window_extent()
+            boxes.append(Bbox.from_bounds(px - size.width / 2, py - size.height / 2, size.width, size.height))
+        assert len(boxes) > 12
+        assert not [1 for a, b in combinations(boxes, 2) if a.overlaps(b)]
+
+
+def test_a_very_small_part_is_asked_whether_it_is_in_inches(tmp_path: Path) -> None:
+    write_step(box((0, 0, 0), (10, 5, 3)), tmp_path / "small.step")
+    text = CliRunner().invoke(app, ["part", str(tmp_path / "small.step"), "--out", str(tmp_path / "out")]).stdout
+    assert "10.0 x 5.0 x 3.0 mm: its unit may be inch" in text

@@ -283,7 +283,9 @@ class FirstScreen:
         }
 
 
-def after_hold(ended: bool, advice: str = "Remove the cause that is named above, then run the job again.", command: str = "") -> Next:
+def after_hold(
+    ended: bool, advice: str = "Remove the cause that is named above, then run the job again.", command: str = ""
+) -> Next:
     """What to do after a run that was held; `ended`: the operator ended it, so there is no fault to look for."""
     return Next("The operator ended this run. Run it again for a result.") if ended else Next(advice, command)
 

@@ -26,7 +26,11 @@ STEP_M = 0.02
 
 
 class NoRoom(WeldcalError):
-    """The tool's body would touch the part while the tip is in the joint."""
+    """The tool's body would touch the part while the tip is in the joint; `short_m`: by how much its clearance is too small."""
+
+    def __init__(self, sentence: str, short_m: float) -> None:
+        super().__init__(sentence)
+        self.short_m = short_m
 
 
 def check_room(
@@ -63,7 +67,8 @@ def check_room(
             if near < CLEARANCE_M:
                 raise NoRoom(
                     f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body would come within "
-                    f"{1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer finger or weld the joint from elsewhere."
+                    f"{1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer finger or weld the joint from elsewhere.",
+                    CLEARANCE_M - near,
                 )
 
 
@@ -90,7 +95,8 @@ def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: fl
             change = f"welding.seam_length_mm {off} smaller" if by_length else f"{name}_mm of the seam {off} larger"
             raise NoRoom(
                 f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs {1e3 * needed:.0f} mm there: "
-                f"set {change}, or weld it from elsewhere."
+                f"set {change}, or weld it from elsewhere.",
+                needed - free,
             )
 
 

@@ -66,6 +66,7 @@ class Welder:
         table_z_m: height of the table over the base, m, for a move to another branch.
         lean_rad: largest lean across the chord that the job may use by itself.
         any_posture: whether the job may weld on another branch than that of home.
+        advises: whether to look for the change that makes an infeasible seam feasible; this takes seconds.
     """
 
     arm: ArmModel
@@ -78,6 +79,7 @@ class Welder:
     table_z_m: float = 0.0
     lean_rad: float = 0.0
     any_posture: bool = False
+    advises: bool = True
 
 
 def leaning(config: ServoConfig, lean_rad: float) -> ServoConfig:
@@ -101,6 +103,8 @@ def find_way(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None) -> Ar
         except InfeasiblePath as problem:
             first = first or problem
     assert first is not None
+    if not welder.advises:
+        raise first
     raise first.advised(_offer(welder, seam, X_BP, may)) from first
 
 

@@ -32,7 +32,7 @@ CONCAVE = {
     "curved_web": (4, (200.0 + 190.0) * math.radians(50.0) + 20.0),
     "butt": (0, 0.0),
     "two_solids": (2, 360.0),
-    "bevelled_plates": (0, 0.0),
+    "bevelled_plates": (1, 180.0),
 }
 # The walls' normals, left and right of the travel, in the middle of the seam.
 s30, c30 = math.sin(math.radians(30.0)), math.cos(math.radians(30.0))

@@ -14,7 +14,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, chained, read_polyline, seam_of
-from weldcal.tools.worlds.parts.step_parts import PARTS, write_step
+from weldcal.models.workpieces.step import referenced
+from weldcal.tools.commands.cell.new import OwnPart, write_cell
+from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, write_step
 
 if TYPE_CHECKING:
     from tests.models.workpieces.conftest import Shelf
@@ -229,3 +231,38 @@ def test_a_seam_says_either_its_line_or_its_edges() -> None:
         SeamSource(edges=(1,), direction="left")
     with pytest.raises(InputError, match="0 or more"):
         SeamSource(edges=(1,), start_m=-0.001)
+
+
+def write_in_files(shape: object, path: Path) -> None:
+    """Write an assembly as CAD systems do where each body has a file: the assembly names them as external documents."""
+    from OCP.STEPCAFControl import STEPCAFControl_Writer
+    from OCP.STEPControl import STEPControl_StepModelType
+    from OCP.TCollection import TCollection_ExtendedString
+    from OCP.TDocStd import TDocStd_Document
+    from OCP.XCAFDoc import XCAFDoc_DocumentTool
+
+    document = TDocStd_Document(TCollection_ExtendedString("parts"))
+    XCAFDoc_DocumentTool.ShapeTool_s(document.Main()).AddShape(shape, True)
+    writer = STEPCAFControl_Writer()
+    writer.Transfer(document, STEPControl_StepModelType.STEPControl_AsIs, "body_")
+    writer.Write(str(path))
+
+
+def test_an_assembly_takes_its_bodies_from_the_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = assembly(box((0, 0, -8), (100, 80, 8)), box((10, 37, 0), (80, 6, 40)))
+    whole, top = tmp_path / "whole.step", tmp_path / "parts" / "top.step"
+    top.parent.mkdir()
+    write_step(shape, whole)
+    monkeypatch.chdir(top.parent)  # the writer puts the bodies there
+    write_in_files(shape, top)
+    names = sorted(file.name for file in referenced(top))
+    assert len(names) == 2
+    found, known = read_shape(top), read_shape(whole)
+    assert (found.bodies, len(found.joints)) == (2, len(known.joints))
+    assert found.mesh.bounds == pytest.approx(known.mesh.bounds, abs=1e-9)
+    assert found.joints[0].length_m == pytest.approx(known.joints[0].length_m, abs=1e-9)
+    cell, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(top))
+    assert (reason, sorted(file.name for file in referenced(cell.parent / "top.step"))) == ("", names)
+    (top.parent / names[1]).unlink()
+    with pytest.raises(InputError, match=f"takes a body from '{names[1]}': put that file beside it"):
+        read_shape(top)

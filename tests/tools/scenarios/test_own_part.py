@@ -22,6 +22,7 @@ from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.new import OwnPart, edge_numbers, write_cell
+from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])  # an L, mm
 
@@ -90,7 +91,7 @@ def test_edges_and_joint_can_be_chosen(angle: Path, tmp_path: Path) -> None:
 
 
 def test_a_part_that_cannot_begin_a_cell_is_refused_in_a_sentence(angle: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"angle.obj has no edge 99: see weldcal part"):
+    with pytest.raises(InputError, match=r"'angle.obj' has no edge 99: its edges are 1 to 18"):
         write_cell(tmp_path / "a", "s_groove", OwnPart(angle, (99,)))
     box = tmp_path / "box.obj"
     box.write_text(extrude(ANGLE[[0, 1, 2]], 0.0, 20.0).to_obj())
@@ -117,3 +118,29 @@ def test_a_part_that_no_place_lets_the_arm_weld_is_no_cell(tmp_path: Path) -> No
     assert "It runs as it is" not in text
     assert "the arm cannot weld the seam of its part yet" in text
     assert load_scenario(str(folder / "unfinished.yaml")).workpiece is not None
+
+
+def test_the_next_seam_is_taken_where_the_longest_cannot_be_welded(tmp_path: Path) -> None:
+    """A long slot that no tool enters, and a shorter T beside it."""
+    plate = box((0, 0, -10), (250, 160, 10))
+    slot = [box((0, y, 0), (250, 6, 60)) for y in (20, 36)]
+    write_step(assembly(plate, *slot, box((40, 110, 0), (170, 6, 40))), tmp_path / "slot.step")
+    found = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "slot.step"))
+    scenario = load_scenario(str(found[0]))
+    assert found[1] == ""
+    assert scenario.workpiece is not None
+    assert planned(scenario).reason is None
+    y = part_of(scenario.workpiece).seam.points_P[:, 1]
+    assert not ((y > 0.0255) & (y < 0.0365)).any()
+
+
+def test_new_takes_the_unit_of_a_mesh(angle: Path, tmp_path: Path) -> None:
+    path = tmp_path / "metres.obj"
+    path.write_text(extrude(1e-3 * ANGLE, 0.0, 0.15).to_obj())
+    with pytest.raises(InputError, match="Its unit may be m"):
+        write_cell(tmp_path / "a", "s_groove", OwnPart(path))
+    cell, _ = write_cell(tmp_path / "b", "s_groove", OwnPart(path, (1,), units="m"))
+    part = load_scenario(str(cell)).workpiece
+    assert part is not None
+    assert part.units == "m"
+    assert part_of(part).seam.length_m == pytest.approx(0.15, abs=1e-4)

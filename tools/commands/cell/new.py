@@ -17,11 +17,13 @@ from pydrake.math import RotationMatrix
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.result_files import write_atomic
-from weldcal.models.tools.loading import WELDING
+from weldcal.models.tool import WeldingTool
+from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.shape import PartEdge, PartShape
+from weldcal.models.workpieces.step import referenced
 from weldcal.systems.drivers.config import DEVICES, NoDevice
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
@@ -32,6 +34,7 @@ from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, S
 from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
+from weldcal.tools.commands.cell.part import least_pipe, ranked, unit_hint
 from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
@@ -77,6 +80,8 @@ HEAD = """# yaml-language-server: $schema={schema}
 """
 TOOL = "tool.yaml"
 NARROW_RAD = np.deg2rad(75.0)  # a V is narrower than this, a fillet wider
+FLUSH_RAD = np.deg2rad(179.0)  # a joint as open as this needs a gap for the tip to feel
+MOST_TRIED = 4  # seams for which a place is looked for
 OPEN_ABOVE = 0.3  # z of the joint's bisector
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
@@ -100,12 +105,16 @@ def new(
         Path | None, option("--part", "FILE", "A part of your own: STEP, STL, OBJ or PLY. It is copied there.")
     ] = None,
     edges: Annotated[
-        str, option("--edges", "N,N...", "Edges of the seam, from weldcal part; default: the longest.")
+        str, option("--edges", "N,N...", "Edges of the seam, from weldcal part; default: the best that can be welded.")
     ] = "",
     joint: Annotated[
         str | None, option("--joint", "NAME", "v_groove, butt, fillet or lap; default: by the angle.")
     ] = None,
+    units: Annotated[str | None, option("--units", "UNIT", "Of the part's file: mm, m or inch.")] = None,
     tool: Annotated[bool, switch("--tool", "Also write tool.yaml, a copy of the welding tool to change.")] = False,
+    tool_of: Annotated[
+        Path | None, option("--tool-file", "FILE", "Weld with this tool; tip_1p5 is weldcal's for laps from 1.5 mm.")
+    ] = None,
     dataset: Annotated[
         bool, switch("--dataset", "Write an example of a calibration dataset, scanned in simulation, instead.")
     ] = False,
@@ -122,8 +131,8 @@ def new(
         following = f"weldcal calibrate {written}"
     else:
         numbers = tuple(edge_numbers(edges))
-        own = None if part is None else OwnPart(part, numbers, joint)
-        written, reason = write_cell(folder, base, own, WELDING if tool else None)
+        own = None if part is None else OwnPart(part, numbers, joint, units)
+        written, reason = write_cell(folder, base, own, tool_file(tool_of or WELDING) if tool or tool_of else None)
         following = f"weldcal demo --scenario {written}"
         if reason:
             assert part is not None
@@ -171,11 +180,12 @@ def write_example(folder: Path, seed: int, progress: Progress = no_progress, for
 
 @dataclass(frozen=True)
 class OwnPart:
-    """A part's file, the numbers of the seam's edges (none: the longest concave one), and the joint (None: by its angle)."""
+    """A part's file, the numbers of the seam's edges (none: the best that can be welded), the joint (None: by its angle), its unit."""
 
     file: Path
     edges: tuple[int, ...] = ()
     joint: str | None = None
+    units: str | None = None
 
 
 def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path | None = None) -> tuple[Path, str]:
@@ -195,16 +205,27 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     folder.mkdir(parents=True, exist_ok=True)
     if part is not None:
         scenario.description = f"A cell that welds {part.file.name}."
-        add_part(scenario, folder, part.file, list(part.edges), part.joint)
+        fits = load_tool(WELDING if tool is None else tool).tool
+        candidates = add_part(scenario, folder, part, fits)
     if tool is not None:
         add_tool(scenario, folder, tool)
     write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
     unfinished = folder / UNFINISHED
     if part is not None:
         assert scenario.workpiece is not None
-        _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
-        scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)))
+        standing, nearest = scenario.workpiece.pose_guess, ""
+        for seam, joint in candidates:  # the reason is that of the first one
+            scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
+            _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
+            scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)), not nearest)
+            nearest = nearest or reason
+            if not reason:
+                break
         if reason:
+            several = f"None of {len(candidates)} seams can be welded; the nearest one: " if len(candidates) > 1 else ""
+            reason = _with_advice(read_shape(part.file, part.units), candidates[0][0], fits, several + nearest)
+            seam, joint = candidates[0]
+            scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
             words = "\n# ".join(textwrap.wrap(reason, WIDTH - 2))
             _write(unfinished, scenario, CANNOT_WELD.format(reason=words, path=unfinished))
             return unfinished, reason
@@ -256,32 +277,44 @@ def _line(key: Key, value: Any, indent: str, written: bool = False) -> str:
     return "".join(f"{indent}# {words}\n" for words in above) + text + "\n"
 
 
-def add_part(scenario: Scenario, folder: Path, part: Path, edges: list[int], joint: str | None) -> None:
+def add_part(scenario: Scenario, folder: Path, part: OwnPart, tool: WeldingTool) -> list[tuple[SeamConfig, str]]:
     """Copy a part's file into the cell's folder, and make it the scenario's workpiece, standing on the table.
 
-    Without `edges` the longest concave one that opens upwards is the seam; without `joint` its angle says which joint it is.
+    Returns:
+        The seams to try, each with its joint, the best one first: without edges those that open upwards, by their length.
 
     Raises:
-        InputError: the part cannot be read, has no such edge, or no concave one.
+        InputError: the part cannot be read, has no such edge, or no joint.
     """
-    shape = read_shape(part)
-    chosen = _chosen(shape, part, edges)
-    name = joint or _joint(chosen[0])
+    shape = read_shape(part.file, part.units)
+    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else _candidates(shape, part.file, tool)
+    found = [(SeamConfig(edges=[edge.id for edge in edges]), part.joint or _joint(edges[0])) for edges in chosen]
     scenario.workpiece = WorkpieceConfig(
-        file=part.name,
-        seams=[SeamConfig(edges=[edge.id for edge in chosen])],
-        joint=name,
+        file=part.file.name,
+        units=part.units,
+        seams=[found[0][0]],
+        joint=found[0][1],
         pose_guess=_standing(shape.mesh, TURNS_DEG[0], 0.5 * shape.mesh.bounds.sum(axis=0), scenario),
         located_by="scan",
         placement_error=ErrorConfig(OFF_MM, OFF_DEG),
     )
-    shutil.copyfile(part, folder / part.name)
+    for file in (part.file, *referenced(part.file)):
+        shutil.copyfile(file, folder / file.name)
+    return found
 
 
-def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
+def _with_advice(shape: PartShape, seam: SeamConfig, tool: WeldingTool, reason: str) -> str:
+    """Why no seam of a part can be welded, with what its size and a round seam say of that."""
+    ring = next((joint for joint in shape.joints if list(joint.edges) == seam.edges), None)
+    least = "" if ring is None or "tool does not fit" not in reason else least_pipe(shape, ring, tool)
+    return f"{unit_hint(shape)} {reason}{least}".strip()
+
+
+def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig, str]:
     """The first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
 
-    Where there is none: the scenario's own pose, and the reason of the try in which the most seams could be welded.
+    Where there is none: the scenario's own pose, and the reason of the try in which the most seams could be welded; `advises`:
+    with what would help.
     """
     assert scenario.workpiece is not None
     own = scenario.workpiece.pose_guess
@@ -289,7 +322,7 @@ def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
         station = make_station(scenario, 0)
     except WeldcalError as error:
         return own, str(error)
-    nearest = (-1, "")
+    nearest, nearest_pose = (-1, ""), own
     try:
         part = station.cad
         if not isinstance(part, Part) or station.tool is None:
@@ -306,17 +339,23 @@ def weldable_place(scenario: Scenario) -> tuple[PoseConfig, str]:
                 if not reason:
                     return guess, ""
                 if welded > nearest[0]:
-                    nearest = welded, reason
+                    nearest, nearest_pose = (welded, reason), guess
+        if advises:
+            nearest = _first_refusal(scenario, station, seams, nearest_pose, advises=True)
     finally:
         station.close()
     return own, nearest[1]
 
 
-def _first_refusal(scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig) -> tuple[int, str]:
+def _first_refusal(
+    scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig, advises: bool = False
+) -> tuple[int, str]:
     """The number of seams before the first that the arm cannot weld with the part in a pose, and why; all, and "" for none."""
     for number, part in enumerate(seams):
         config = servo_config(scenario, station, number)
-        planning = dc.replace(seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose())
+        planning = dc.replace(
+            seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=advises
+        )
         reason = plan_drawn_seam(planning, 0).reason
         if reason is not None:
             return number, reason
@@ -332,22 +371,37 @@ def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], sce
 
 
 def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
-    """Copy a tool's file into the cell's folder as tool.yaml, and make it the scenario's tool."""
-    shutil.copyfile(tool, folder / TOOL)
-    scenario.tool = ToolFile(TOOL)
+    """Make a file the scenario's tool: one of weldcal's is copied into the cell's folder as tool.yaml, another stays where it is."""
+    ours = tool.parent == WELDING.parent
+    if ours:
+        shutil.copyfile(tool, folder / TOOL)
+    scenario.tool = ToolFile(TOOL if ours else str(tool.resolve()))
 
 
-def _chosen(shape: PartShape, part: Path, edges: list[int]) -> list[PartEdge]:
-    by_id = {edge.id: edge for edge in shape.edges}
-    if unknown := [str(number) for number in edges if number not in by_id]:
-        raise InputError(f"{part.name} has no edge {', '.join(unknown)}: see weldcal part {part}.")
-    if edges:
-        return [by_id[number] for number in edges]
-    concave = [edge for edge in shape.edges if edge.kind == "concave"]
-    if not concave:
+def _candidates(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdge]]:
+    """The seams to try, at most MOST_TRIED, each by its edges, a seam with corners edge by edge.
+
+    Those that the tool fits come first, then those that it nearly fits; of these first what opens upwards.
+    """
+    found, order = [], []
+    for seam in ranked(shape, tool):
+        chain = [shape.edge(id) for id in seam.joint.edges]
+        if seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
+            bent = all(len(edge.points_P) > 2 for edge in chain)
+            for edges in [chain] if bent else [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]:
+                found.append(edges)
+                above = edges[0].up_P is not None and edges[0].up_P[2] > OPEN_ABOVE
+                order.append((bool(seam.reason), round(seam.short_m, 3), not above))
+    if shape.joints:
+        found = [found[k] for k in sorted(range(len(found)), key=lambda k: order[k])]
+    else:
+        concave = sorted((edge for edge in shape.edges if edge.kind == "concave"), key=lambda edge: -edge.length_m)
+        found = [[edge] for edge in concave]
+        if first := next((chain for chain in found if _open_above(shape, chain[0])), None):
+            found.insert(0, found.pop(found.index(first)))
+    if not found:
         raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
-    concave.sort(key=lambda edge: -edge.length_m)
-    return [next((edge for edge in concave if _open_above(shape, edge)), concave[0])]
+    return found[:MOST_TRIED]
 
 
 def _open_above(shape: PartShape, edge: PartEdge) -> bool:
@@ -360,4 +414,6 @@ def _open_above(shape: PartShape, edge: PartEdge) -> bool:
 
 
 def _joint(edge: PartEdge) -> str:
+    if edge.kind == "flush":
+        return "butt"
     return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"

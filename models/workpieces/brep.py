@@ -1,0 +1,208 @@
+"""Faces and solids as OpenCascade has them: normals, nearest points and what is inside; lengths in mm."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from OCP.Bnd import Bnd_Box
+from OCP.BRep import BRep_Tool
+from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
+from OCP.BRepBndLib import BRepBndLib
+from OCP.BRepClass3d import BRepClass3d_SolidClassifier
+from OCP.collections import IndexedDataMap_TopoDS_Shape_List_TopoDS_Shape_TopTools_ShapeMapHasher as EdgeFaces
+from OCP.GeomAbs import GeomAbs_CurveType, GeomAbs_SurfaceType
+from OCP.GeomLProp import GeomLProp_SLProps
+from OCP.gp import gp_Dir, gp_Lin, gp_Pnt, gp_Vec
+from OCP.IntCurvesFace import IntCurvesFace_ShapeIntersector
+from OCP.IntTools import IntTools_FClass2d
+from OCP.ShapeAnalysis import ShapeAnalysis_Surface
+from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_State
+from OCP.TopExp import TopExp, TopExp_Explorer
+from OCP.TopoDS import TopoDS
+
+Floats = npt.NDArray[np.float64]
+EXACT_MM = 1e-4  # between curves of OpenCascade
+BRIDGED_MM = 1.0  # clearance beside a tab, along a straight line
+IN_MM = 0.4  # a point is taken inside a body or a face this far from its edge
+CHORDS, NEWTON = 64, 6  # of a bent edge; steps from the nearest chord to the nearest point
+RAYS = np.array([(0.5257, 0.3411, 0.7793), (-0.2113, 0.8271, -0.5208)])  # along no direction that parts are drawn in
+
+
+class Face:
+    """A face with its surface, box and normal."""
+
+    def __init__(self, face: Any) -> None:
+        self.face = face
+        self.surface = BRep_Tool.Surface_s(face)
+        self.low, self.high = _box(face)
+        self.sign = -1.0 if face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else 1.0
+        self.by_point = ShapeAnalysis_Surface(self.surface)
+        adaptor = BRepAdaptor_Surface(face)
+        self.round = adaptor.GetType() == GeomAbs_SurfaceType.GeomAbs_Cylinder
+        self.flat = adaptor.GetType() == GeomAbs_SurfaceType.GeomAbs_Plane
+        self.axis: Any = adaptor.Cylinder().Axis() if self.round else None
+
+    @cached_property
+    def ends(self) -> list[tuple[Any, tuple[Floats, Floats, Floats]]]:
+        """The edges at which a flush face could go on: see `_end_of`."""
+        edges = [TopoDS.Edge(edge) for edge in parts_of(self.face, TopAbs_ShapeEnum.TopAbs_EDGE)]
+        return [(edge, end) for edge in edges if (end := _end_of(self, edge)) is not None]
+
+    def normal(self, p: Floats) -> Floats:
+        """Out of the material (3,), of the surface or its continuation at a point."""
+        at = self.by_point.ValueOfUV(gp_Pnt(*p), EXACT_MM)
+        n = GeomLProp_SLProps(self.surface, at.X(), at.Y(), 1, 1e-9).Normal()
+        return self.sign * np.array([n.X(), n.Y(), n.Z()])
+
+    @cached_property
+    def _inside(self) -> Any:
+        return IntTools_FClass2d(self.face, EXACT_MM)
+
+    @cached_property
+    def _border(self) -> tuple[list[Any], Floats, Floats, Floats, npt.NDArray[np.int64]]:
+        """The curves of the edges; chords of them by their starts, (N,3) vectors, (N,2) parameters and curves."""
+        edges = [TopoDS.Edge(edge) for edge in parts_of(self.face, TopAbs_ShapeEnum.TopAbs_EDGE)]
+        curves = [BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge)]
+        starts, chords, parameters, of = [], [], [], []
+        for k, curve in enumerate(curves):
+            straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
+            at = np.linspace(curve.FirstParameter(), curve.LastParameter(), 2 if straight else CHORDS + 1)
+            points = np.array([array_of(curve.Value(t)) for t in at])
+            starts.append(points[:-1])
+            chords.append(np.diff(points, axis=0))
+            parameters.append(np.stack([at[:-1], at[1:]], axis=1))
+            of.append(np.full(len(at) - 1, k))
+        return curves, np.vstack(starts), np.vstack(chords), np.vstack(parameters), np.concatenate(of)
+
+    def foot(self, p: Floats) -> Floats:
+        """The point of the face that is nearest to a point; of a bent face one at which the distance is least in its vicinity."""
+        at = self.by_point.ValueOfUV(gp_Pnt(*p), EXACT_MM)
+        if self._inside.Perform(at) in (TopAbs_State.TopAbs_IN, TopAbs_State.TopAbs_ON):
+            return array_of(self.surface.Value(at.X(), at.Y()))
+        curves, starts, chords, parameters, of = self._border
+        share = np.clip(np.vecdot(p - starts, chords) / np.vecdot(chords, chords), 0.0, 1.0)
+        nearest = int(np.argmin(np.linalg.norm(starts + share[:, None] * chords - p, axis=1)))
+        curve, (low, high) = curves[of[nearest]], parameters[nearest]
+        t = low + share[nearest] * (high - low)
+        if curve.GetType() == GeomAbs_CurveType.GeomAbs_Line:
+            return np.asarray(starts[nearest] + share[nearest] * chords[nearest])
+        point, along, bend = gp_Pnt(), gp_Vec(), gp_Vec()
+        for _ in range(NEWTON):
+            curve.D2(t, point, along, bend)
+            away, d = array_of(point) - p, array_of(along)
+            steep = max(float(d @ d + away @ array_of(bend)), 0.1 * float(d @ d))
+            t = float(np.clip(t - away @ d / steep, curve.FirstParameter(), curve.LastParameter()))
+        return array_of(curve.Value(t))
+
+
+class Body:
+    """A solid with its faces and with what answers whether a point is inside."""
+
+    def __init__(self, solid: Any) -> None:
+        self.solid = solid
+        self.faces = [Face(TopoDS.Face(face)) for face in parts_of(solid, TopAbs_ShapeEnum.TopAbs_FACE)]
+        self.low, self.high = _box(solid)
+        self._classifier = BRepClass3d_SolidClassifier(solid)
+        self._rays = IntCurvesFace_ShapeIntersector()
+        self._rays.Load(solid, 1e-6)
+
+    def holds(self, p: Floats) -> bool:
+        """Whether a point is inside."""
+        if (p < self.low).any() or (p > self.high).any():
+            return False
+        hits = [self._hits(p, along) for along in RAYS]
+        odd = [len(one) % 2 == 1 for one in hits]
+        if odd[0] == odd[1]:  # else one ray crosses an edge, which may count twice or not at all
+            return odd[0]
+        self._classifier.Perform(gp_Pnt(*p), 1e-6)
+        return bool(self._classifier.State() == TopAbs_State.TopAbs_IN)
+
+    def _hits(self, p: Floats, along: Floats) -> list[float]:
+        """Where a ray from a point crosses the skin, mm from the point."""
+        self._rays.Perform(gp_Lin(gp_Pnt(*p), gp_Dir(*along)), 0.0, 1e5)
+        return [self._rays.WParameter(k + 1) for k in range(self._rays.NbPnt())]
+
+    def through(self, p: Floats, along: Floats) -> float:
+        """How far a ray from a point stays in the material before it leaves."""
+        return float(min((hit for hit in self._hits(p, along) if hit > 1e-3), default=0.0))
+
+
+def parts_of(shape: Any, kind: Any) -> list[Any]:
+    """The parts of a shape of one kind, in the file's order."""
+    explorer, found = TopExp_Explorer(shape, kind), []
+    while explorer.More():
+        found.append(explorer.Current())
+        explorer.Next()
+    return found
+
+
+def faces_at(shape: Any, faces: list[Face]) -> list[tuple[Any, list[Face]]]:
+    """The edges of a shape in the file's order, each with those of its faces that meet there; none within one face."""
+    faces_of, found = EdgeFaces(), []
+    TopExp.MapShapesAndAncestors_s(shape, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_FACE, faces_of)
+    for k in range(faces_of.Extent()):
+        edge, met = TopoDS.Edge(faces_of.FindKey(k + 1)), list(faces_of.FindFromIndex(k + 1))
+        own = [face for face in faces if any(face.face.IsSame(one) for one in met)]
+        if not BRep_Tool.Degenerated_s(edge) and (len(own) > 1 or len(met) == 1):
+            found.append((edge, own))
+    return found
+
+
+def middle_of(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, float]:
+    """The middle of a stretch of a curve, its direction there, and how far from it a wall may end, along it.
+
+    A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
+    """
+    point, along = gp_Pnt(), gp_Vec()
+    curve.D1(0.5 * (begin + end), point, along)
+    length = (end - begin) * along.Magnitude()
+    return array_of(point), unit(array_of(along)), 0.5 * length if length <= BRIDGED_MM else 0.0
+
+
+def sampled(curve: Any, begin: float, end: float) -> Floats:
+    """Points (N,3) on a stretch of a curve, 0.5 mm apart on a bent one."""
+    steps = np.linspace(begin, end, 33)
+    points = np.array([array_of(curve.Value(u)) for u in steps])
+    length = length_of(points)
+    if abs(length - float(np.linalg.norm(points[-1] - points[0]))) < EXACT_MM:
+        return points[[0, -1]]
+    return np.array([array_of(curve.Value(u)) for u in np.linspace(begin, end, max(9, math.ceil(2.0 * length) + 1))])
+
+
+def _box(shape: Any) -> tuple[Floats, Floats]:
+    box = Bnd_Box()
+    BRepBndLib.AddOptimal_s(shape, box, False, False)
+    return array_of(box.CornerMin()), array_of(box.CornerMax())
+
+
+def length_of(line: Floats) -> float:
+    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+
+
+def array_of(p: Any) -> Floats:
+    return np.array([p.X(), p.Y(), p.Z()])
+
+
+def unit(v: Floats) -> Floats:
+    return np.asarray(v / np.linalg.norm(v))
+
+
+def _end_of(face: Face, edge: Any) -> tuple[Floats, Floats, Floats] | None:
+    """Middle of a straight or round edge, the face's normal there, and the way out of the face in its plane."""
+    curve = BRepAdaptor_Curve(edge)
+    straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line
+    if BRep_Tool.Degenerated_s(edge) or not (
+        straight if face.flat else curve.GetType() == GeomAbs_CurveType.GeomAbs_Circle
+    ):
+        return None
+    point, along = gp_Pnt(), gp_Vec()
+    curve.D1(0.5 * (curve.FirstParameter() + curve.LastParameter()), point, along)
+    p, t = array_of(point), unit(array_of(along))
+    n = face.normal(p)
+    m = np.cross(t, n)
+    inner = face.foot(p + IN_MM * m)
+    return p, n, m if np.linalg.norm(inner - p - IN_MM * m) > 0.5 * IN_MM else -m
