@@ -29,8 +29,8 @@ BESIDE_SEAM_M = 0.25  # more than the tool's body reaches from its tip
 OTHER_M = (
     0.0025  # from the part's surface: above a scan's noise and the registration's error, below the height of a tack
 )
-SAMPLES_BESIDE = 400_000  # about 1 mm apart on a part of 0.4 m2: their distance is small beside OTHER_M
-LEAST_AREA_M2 = 1.5e-5  # of a thing that is seen: less is a few flying points at an edge
+SAMPLES_BESIDE = 400_000  # of a part's 0.2 m2 about 0.7 mm apart, which is small beside OTHER_M
+LEAST_AREA_M2 = 8e-6  # of a thing that is seen: less is a few flying points at an edge
 STEP_BESIDE_M, LIFTED_M = 0.005, 0.1  # between the places along the seam, and above its ends
 WIRE_M = 0.001  # radius of the wire with its play
 
@@ -107,15 +107,19 @@ def check_beside(
     wire = np.array([-tool.chord_m, 0.0, tool.torch_height_m])
     upward = np.array([0.0, 0.0, NEAR_TIP_M])
     spans += [(np.zeros(3), upward, tool.tip_radius_m), (wire, wire + upward, WIRE_M)]
+    widest = max(radius for _, _, radius in spans) + CLEARANCE_M
+    low = np.min([end for a, b, _ in spans for end in (a, b)], axis=0) - widest
+    high = np.max([end for a, b, _ in spans for end in (a, b)], axis=0) + widest
     last = min(seam.drawn_m, seam.length + tool.chord_m)
     places = [(float(s), 0.0) for s in np.linspace(0.0, last, max(2, math.ceil(last / STEP_BESIDE_M) + 1))]
     places += [(s, float(lift)) for s in (0.0, last) for lift in np.arange(STEP_BESIDE_M, LIFTED_M, STEP_BESIDE_M)]
     for s, lift in places:
         tip, R = _held(seam, s, tool.chord_m, lean_rad)
         points_T = (other - tip.position) @ R - [0.0, 0.0, lift]
+        within = np.flatnonzero(((points_T > low) & (points_T < high)).all(axis=1))
         for a, b, radius in spans:
-            met = _distances(points_T, a, b) < radius + CLEARANCE_M
-            if np.count_nonzero(met) >= least:
+            met = within[_distances(points_T[within], a, b) < radius + CLEARANCE_M]
+            if len(met) >= least:
                 x, y, z = 1e3 * np.median(other[met], axis=0)
                 raise NoRoom(
                     f"The scan shows something that is not in the drawing, near ({x:.0f}, {y:.0f}, {z:.0f}) mm in the base. The tool would "
