@@ -138,7 +138,10 @@ class Body:
 
     def _hits(self, p: Floats, along: Floats) -> list[float]:
         """Where a ray from a point crosses the skin, mm from the point."""
-        self._rays.Perform(gp_Lin(gp_Pnt(*p), gp_Dir(*along)), 0.0, 1e5)
+        try:
+            self._rays.Perform(gp_Lin(gp_Pnt(*p), gp_Dir(*along)), 0.0, 1e5)
+        except Exception:  # OpenCascade cannot compute a few rays beside a sphere
+            return []
         return [self._rays.WParameter(k + 1) for k in range(self._rays.NbPnt())]
 
     def through(self, p: Floats, along: Floats) -> tuple[float, float]:
