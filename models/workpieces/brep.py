@@ -10,11 +10,13 @@ import numpy as np
 import numpy.typing as npt
 from OCP.Bnd import Bnd_Box
 from OCP.BRep import BRep_Tool
-from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
+from OCP.BRepAdaptor import BRepAdaptor_Curve
 from OCP.BRepBndLib import BRepBndLib
 from OCP.BRepClass3d import BRepClass3d_SolidClassifier
 from OCP.collections import IndexedDataMap_TopoDS_Shape_List_TopoDS_Shape_TopTools_ShapeMapHasher as EdgeFaces
 from OCP.GeomAbs import GeomAbs_CurveType, GeomAbs_SurfaceType
+from OCP.GeomAdaptor import GeomAdaptor_Surface
+from OCP.GeomConvert import GeomConvert_SurfToAnaSurf
 from OCP.GeomLProp import GeomLProp_SLProps
 from OCP.gp import gp_Dir, gp_Lin, gp_Pnt, gp_Vec
 from OCP.IntCurvesFace import IntCurvesFace_ShapeIntersector
@@ -37,14 +39,27 @@ class Face:
 
     def __init__(self, face: Any) -> None:
         self.face = face
-        self.surface = BRep_Tool.Surface_s(face)
+        drawn = BRep_Tool.Surface_s(face)
+        own = GeomAdaptor_Surface(drawn)
+        spline = own.GetType() == GeomAbs_SurfaceType.GeomAbs_BSplineSurface
+        # Some programs write planes and cylinders as splines: those cross each other slowly and in many pieces.
+        exact = GeomConvert_SurfToAnaSurf(drawn).ConvertToAnalytical(EXACT_MM) if spline else None
+        self.surface = drawn if exact is None else exact
         self.low, self.high = _box(face)
         self.sign = -1.0 if face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else 1.0
         self.by_point = ShapeAnalysis_Surface(self.surface)
-        adaptor = BRepAdaptor_Surface(face)
+        self._by_border = self.by_point if exact is None else ShapeAnalysis_Surface(drawn)
+        adaptor = GeomAdaptor_Surface(self.surface)
         self.round = adaptor.GetType() == GeomAbs_SurfaceType.GeomAbs_Cylinder
         self.flat = adaptor.GetType() == GeomAbs_SurfaceType.GeomAbs_Plane
         self.axis: Any = adaptor.Cylinder().Axis() if self.round else None
+        if exact is not None:
+            uv = [
+                0.5 * (own.FirstUParameter() + own.LastUParameter()),
+                0.5 * (own.FirstVParameter() + own.LastVParameter()),
+            ]
+            n = GeomLProp_SLProps(drawn, *uv, 1, 1e-9).Normal()
+            self.sign *= np.sign(self.sign * self.normal(array_of(drawn.Value(*uv))) @ array_of(n))
 
     @cached_property
     def ends(self) -> list[tuple[Any, tuple[Floats, Floats, Floats]]]:
@@ -80,9 +95,9 @@ class Face:
 
     def foot(self, p: Floats) -> Floats:
         """The point of the face that is nearest to a point; of a bent face one at which the distance is least in its vicinity."""
-        at = self.by_point.ValueOfUV(gp_Pnt(*p), EXACT_MM)
+        at = self._by_border.ValueOfUV(gp_Pnt(*p), EXACT_MM)
         if self._inside.Perform(at) in (TopAbs_State.TopAbs_IN, TopAbs_State.TopAbs_ON):
-            return array_of(self.surface.Value(at.X(), at.Y()))
+            return array_of(self._by_border.Value(at.X(), at.Y()))
         curves, starts, chords, parameters, of = self._border
         share = np.clip(np.vecdot(p - starts, chords) / np.vecdot(chords, chords), 0.0, 1.0)
         nearest = int(np.argmin(np.linalg.norm(starts + share[:, None] * chords - p, axis=1)))
@@ -123,12 +138,16 @@ class Body:
 
     def _hits(self, p: Floats, along: Floats) -> list[float]:
         """Where a ray from a point crosses the skin, mm from the point."""
-        self._rays.Perform(gp_Lin(gp_Pnt(*p), gp_Dir(*along)), 0.0, 1e5)
+        try:
+            self._rays.Perform(gp_Lin(gp_Pnt(*p), gp_Dir(*along)), 0.0, 1e5)
+        except Exception:  # OpenCascade cannot compute a few rays beside a sphere
+            return []
         return [self._rays.WParameter(k + 1) for k in range(self._rays.NbPnt())]
 
-    def through(self, p: Floats, along: Floats) -> float:
-        """How far a ray from a point stays in the material before it leaves."""
-        return float(min((hit for hit in self._hits(p, along) if hit > 1e-3), default=0.0))
+    def through(self, p: Floats, along: Floats) -> tuple[float, float]:
+        """How far from a point in the material a ray leaves it the first time, at a hole for one, and the last time."""
+        hits = [hit for hit in self._hits(p, along) if hit > 1e-3] or [0.0]
+        return min(hits), max(hits)
 
 
 def parts_of(shape: Any, kind: Any) -> list[Any]:

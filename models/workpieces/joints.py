@@ -180,7 +180,10 @@ def _breaks(
         for face in () if (body.low > high).any() or (body.high < low).any() else body.faces:
             if face in own or (face.low > high).any() or (face.high < low).any():
                 continue
-            crossed = GeomAPI_IntCS(curve, face.surface)
+            try:
+                crossed = GeomAPI_IntCS(curve, face.surface)
+            except Exception:  # of several types: no crossing can be computed
+                continue
             found += [crossed.Parameters(k + 1)[2] for k in range(crossed.NbPoints())] if crossed.IsDone() else []
     for face in own:
         for vertex in parts_of(face.face, TopAbs_ShapeEnum.TopAbs_VERTEX):
@@ -232,11 +235,14 @@ def _cut(
     thick, wall, goes_on = [], [], []
     for k in (0, 1):
         skin = x + (begins[k] + IN_MM) * ways[k] - 0.1 * normals[k]
-        wall.append(begins[k] + IN_MM + two[k].through(skin, ways[k]))
-        thick.append(two[k].through(x + (begins[k] + IN_MM) * ways[k], -ways[1 - k]))
-        beyond = x - (thick[k] + 2.0 * IN_MM) * ways[1 - k]
+        wall.append(begins[k] + IN_MM + two[k].through(skin, ways[k])[0])
         other, n = two[1 - k], normals[1 - k]
-        goes_on.append(other.holds(beyond - IN_MM * n) and not other.holds(beyond + IN_MM * n))
+        exits = two[k].through(
+            x + (begins[k] + IN_MM) * ways[k], -ways[1 - k]
+        )  # a bolt's hole may go through both bodies
+        behind = [x - (far + 2.0 * IN_MM) * ways[1 - k] for far in exits]
+        goes_on.append(any(other.holds(p - IN_MM * n) and not other.holds(p + IN_MM * n) for p in behind))
+        thick.append(exits[0])
     if any(goes_on):
         k = goes_on.index(True)
         kind, side = ("lap" if wall[k] < thick[k] else "T"), ""
@@ -290,8 +296,8 @@ def _flush(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Itera
             if any(body.holds(x + IN_MM * n) for body in bodies):
                 continue
             starts = [x - (0.5 * gap + IN_MM) * m, x + (0.5 * gap + IN_MM) * m]
-            depth = [two[k].through(starts[k], -n) for k in (0, 1)]
-            wide = [two[k].through(starts[k] - 0.1 * n, s * m) for k, s in ((0, -1.0), (1, 1.0))]
+            depth = [two[k].through(starts[k], -n)[0] for k in (0, 1)]
+            wide = [two[k].through(starts[k] - 0.1 * n, s * m)[0] for k, s in ((0, -1.0), (1, 1.0))]
             if length_of(line) < min(depth) or not _facing(two, x, n, m, gap, min(depth)):
                 continue
             narrow = [wide[k] < 0.9 * depth[k] for k in (0, 1)]

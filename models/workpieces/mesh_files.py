@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, file_size
@@ -125,14 +127,45 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
     Raises:
         InputError: the file is missing, empty, malformed, too large or has holes.
     """
-    mesh = read_surface(path, unit_m)
+    mesh, bodies = _bodies(read_surface(path, unit_m))
     if not mesh.watertight():
         raise InputError(
             f"'{path.name}' is not a closed surface (a hole, or triangles that face different ways): close it to a solid."
         )
     if mesh.volume < 0.0:
         mesh = mesh.flipped()
-    return PartShape(path.name, mesh, mesh_edges(mesh), unit_m)
+    return PartShape(path.name, mesh, mesh_edges(mesh), unit_m, bodies)
+
+
+def _bodies(mesh: TriMesh) -> tuple[TriMesh, int]:
+    """The mesh with corners of its own for each body, and their number: bodies that touch in an edge or a face share none.
+
+    Where more than two triangles meet in an edge, two of them bound the same material.
+    """
+    t, n = mesh.triangles, len(mesh.vertices)
+    edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
+    apex, owner = np.concatenate([t[:, 2], t[:, 0], t[:, 1]]), np.tile(np.arange(len(t)), 3)
+    key = edges.min(axis=1) * n + edges.max(axis=1)
+    order = np.argsort(key, kind="stable")
+    pairs = []
+    for met in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+        ahead = edges[met, 0] < edges[met, 1]
+        if len(met) == 2 or 2 * ahead.sum() != len(met):
+            pairs.append(met[:2])
+            continue
+        foot, tip = mesh.vertices[np.sort(edges[met[0]])]
+        along = (tip - foot) / np.linalg.norm(tip - foot)
+        out = mesh.vertices[apex[met]] - foot
+        across = out[0] - (out[0] @ along) * along
+        angle = np.arctan2(out @ np.cross(along, across), out @ across)
+        for k in np.flatnonzero(ahead):
+            behind = (angle[k] - angle[~ahead] - 1e-4) % (2.0 * math.pi)  # through the material
+            pairs.append(np.array([met[k], met[~ahead][np.argmin(behind)]]))
+    joined = owner[np.array([pair for pair in pairs if len(pair) == 2]).reshape(-1, 2)]
+    links = coo_matrix((np.ones(len(joined)), (joined[:, 0], joined[:, 1])), shape=(len(t), len(t)))
+    count, body = connected_components(links, directed=False)
+    own, triangles = np.unique(body[:, None] * n + t, return_inverse=True)
+    return TriMesh(mesh.vertices[own % n], triangles.reshape(-1, 3)), count
 
 
 def read_surface(path: Path, unit_m: float) -> TriMesh:

@@ -86,6 +86,12 @@ def test_each_seam_says_whether_the_tool_fits_it(tmp_path: Path) -> None:
     assert "Seams</h2>" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_a_part_without_seams_says_so(tmp_path: Path) -> None:
+    write_step(box((0, 0, 0), (100, 60, 10)), tmp_path / "plate.step")
+    text = CliRunner().invoke(app, ["part", str(tmp_path / "plate.step"), "--out", str(tmp_path / "out")]).stdout
+    assert "No seams are listed: no two bodies meet" in text
+
+
 def test_the_least_pipe_that_a_tool_can_weld_is_named(tmp_path: Path) -> None:
     tool = load_tool(WELDING).tool
     reasons = []

@@ -25,7 +25,7 @@ BESIDE_M = 1e-7 * np.array([3.7, 6.1, 7.1])  # keeps rays off the edges between 
 ASIDE_RAD = np.radians(np.arange(0.0, 181.0, 15.0))
 SAMPLES = 20_000
 STEP_M = 0.02
-BESIDE_SEAM_M = 0.25  # more than the tool's body reaches from its tip
+SPHERES = 40  # that stand for one capsule of the tool where points far from it are left out
 OTHER_M = (
     0.0025  # from the part's surface: above a scan's noise and the registration's error, below the height of a tack
 )
@@ -92,35 +92,33 @@ def check_beside(
     Raises:
         NoRoom: with the place.
     """
-    along = seam.position(np.linspace(0.0, seam.drawn_m, max(2, math.ceil(seam.drawn_m / STEP_M))))
-    away = np.asarray(cKDTree(along).query(points_B, distance_upper_bound=BESIDE_SEAM_M)[0])
-    near = points_B[away < BESIDE_SEAM_M]
-    if not len(near):
+    spans = [span for capsule in tool.capsules() if (span := _above_tip(capsule, tool.X_FT)) is not None]
+    wire, upward = np.array([-tool.chord_m, 0.0, tool.torch_height_m]), np.array([0.0, 0.0, NEAR_TIP_M])
+    spans += [(np.zeros(3), upward, tool.tip_radius_m), (wire, wire + upward, WIRE_M)]
+    last = min(seam.drawn_m, seam.length + tool.chord_m)
+    steps = np.linspace(0.0, last, max(2, math.ceil(last / STEP_BESIDE_M) + 1))
+    lifts = np.arange(STEP_BESIDE_M, LIFTED_M, STEP_BESIDE_M)
+    places = [(float(s), 0.0) for s in steps] + [(s, float(lift)) for s in (0.0, last) for lift in lifts]
+    held = [(s, lift, *_held(seam, s, tool.chord_m, lean_rad)) for s, lift in places]
+    share = np.linspace(0.0, 1.0, SPHERES)[:, None]
+    body = np.vstack([a + share * (b - a) for a, b, _ in spans])
+    swept = cKDTree(np.vstack([tip.position + (body + lift * upward / NEAR_TIP_M) @ R.T for _, lift, tip, R in held]))
+    reach = max(radius for _, _, radius in spans) + STEP_BESIDE_M
+    near = points_B[np.asarray(swept.query(points_B, distance_upper_bound=reach)[0]) < reach]
+    if len(near) < 2:
         return
     surface = cKDTree(mesh.transformed(X_BP).sample(SAMPLES_BESIDE, np.random.default_rng(0))[0])
     pitch = float(np.median(np.asarray(cKDTree(near).query(near, k=2)[0])[:, 1]))
     other = near[np.asarray(surface.query(near)[0]) > OTHER_M]
     least = max(4, math.ceil(LEAST_AREA_M2 / max(pitch, 1e-5) ** 2))
-    if len(other) < least:
-        return
-    spans = [span for capsule in tool.capsules() if (span := _above_tip(capsule, tool.X_FT)) is not None]
-    wire = np.array([-tool.chord_m, 0.0, tool.torch_height_m])
-    upward = np.array([0.0, 0.0, NEAR_TIP_M])
-    spans += [(np.zeros(3), upward, tool.tip_radius_m), (wire, wire + upward, WIRE_M)]
-    widest = max(radius for _, _, radius in spans) + CLEARANCE_M
-    low = np.min([end for a, b, _ in spans for end in (a, b)], axis=0) - widest
-    high = np.max([end for a, b, _ in spans for end in (a, b)], axis=0) + widest
-    last = min(seam.drawn_m, seam.length + tool.chord_m)
-    places = [(float(s), 0.0) for s in np.linspace(0.0, last, max(2, math.ceil(last / STEP_BESIDE_M) + 1))]
-    places += [(s, float(lift)) for s in (0.0, last) for lift in np.arange(STEP_BESIDE_M, LIFTED_M, STEP_BESIDE_M)]
-    for s, lift in places:
-        tip, R = _held(seam, s, tool.chord_m, lean_rad)
+    before: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)] * len(spans)
+    for s, lift, tip, R in held:
         points_T = (other - tip.position) @ R - [0.0, 0.0, lift]
-        within = np.flatnonzero(((points_T > low) & (points_T < high)).all(axis=1))
-        for a, b, radius in spans:
-            met = within[_distances(points_T[within], a, b) < radius + CLEARANCE_M]
-            if len(met) >= least:
-                x, y, z = 1e3 * np.median(other[met], axis=0)
+        for k, (a, b, radius) in enumerate(spans):
+            met = np.flatnonzero(_distances(points_T, a, b) < radius + CLEARANCE_M)
+            both, before[k] = np.union1d(met, before[k]), met  # a tack is longer than a step and shorter than two
+            if len(met) and len(both) >= least:
+                x, y, z = 1e3 * np.median(other[both], axis=0)
                 raise NoRoom(
                     f"The scan shows something that is not in the drawing, near ({x:.0f}, {y:.0f}, {z:.0f}) mm in the base. The tool would "
                     f"touch it at {1e3 * s:.0f} mm of the seam: remove it, or cut the seam with start_mm or end_mm, and scan again.",

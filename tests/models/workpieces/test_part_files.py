@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.models.mesh import TriMesh, extrude
+from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, chained, read_polyline, seam_of
 from weldcal.models.workpieces.step import referenced
@@ -57,6 +57,31 @@ def test_a_mesh_lists_its_sharp_edges_and_gives_its_seam(tmp_path: Path) -> None
         assert np.abs(np.abs(seam.points_P[:, 0]) - 0.005).max() < 1e-5
         assert np.abs(seam.points_P[:, 1]).max() < 1e-5
     assert read_shape(stl, "inch").mesh.bounds[1, 2] == pytest.approx(200.0 * 0.0254)
+
+
+def brick(low: tuple[float, float, float], high: tuple[float, float, float]) -> TriMesh:
+    corners = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+    return extrude(corners, low[2], high[2])
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        ((0.0, 0.0, 10.0), (100.0, 60.0, 30.0)),  # a whole face
+        ((0.0, 60.0, 10.0), (100.0, 90.0, 30.0)),  # one edge
+        ((0.0, 60.0, 0.0), (100.0, 90.0, 10.0)),  # side by side
+    ],
+)
+def test_the_bodies_of_a_mesh_may_touch_in_faces_and_edges(other: tuple, tmp_path: Path) -> None:
+    first, second = brick((0, 0, 0), (100, 60, 10)), brick(*other)
+    write_stl(tmp_path / "two.stl", merge(first, second))
+    shape = read_shape(tmp_path / "two.stl")
+    assert shape.bodies == 2
+    assert shape.mesh.volume == pytest.approx(1e-9 * (first.volume + second.volume), rel=1e-6)
+    assert [edge.kind for edge in shape.edges] == ["convex"] * 24
+    assert sum(edge.length_m for edge in shape.edges) == pytest.approx(
+        4e-3 * sum(np.ptp(mesh.vertices, axis=0).sum() for mesh in (first, second))
+    )
 
 
 def test_a_circle_on_a_mesh_has_its_radius(shelf: Shelf, tmp_path: Path) -> None:

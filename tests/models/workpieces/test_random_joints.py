@@ -10,7 +10,7 @@ import pytest
 from tests.models.workpieces.random_joints import KINDS, mistakes
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
-from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
+from weldcal.tools.worlds.parts.step_parts import as_splines, assembly, box, cylinder, less, write_step
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -51,3 +51,25 @@ def test_either_side_of_an_open_corner_is_its_own_edge(tmp_path: Path) -> None:
     for joint in shape.joints:
         seam = seam_of(shape, SeamSource(edges=joint.edges), "fillet")
         assert seam.up_P[5] == pytest.approx(joint.up_P, abs=1e-6)
+
+
+def test_planes_and_cylinders_that_are_written_as_splines_have_the_same_seams(tmp_path: Path) -> None:
+    plate = less(box((-60, -60, -10), (120, 120, 10)), cylinder((0, 30, -20), 5.1, 40))
+    solids = plate, cylinder((0, -20, 0), 20, 50), cylinder((0, 30, -30), 5, 60), box((20, -50, 0), (8, 100, 40))
+    for name, shape in (("exact", assembly(*solids)), ("splines", as_splines(assembly(*solids)))):
+        write_step(shape, tmp_path / f"{name}.step")
+    exact, splines = (read_shape(tmp_path / f"{name}.step") for name in ("exact", "splines"))
+    assert sorted(joint.type for joint in splines.joints) == sorted(joint.type for joint in exact.joints)
+    for one, other in zip(splines.joints, exact.joints, strict=True):
+        assert (one.type, one.closed) == (other.type, other.closed)
+        assert one.length_m == pytest.approx(other.length_m, abs=1e-5)
+        assert one.up_P == pytest.approx(other.up_P, abs=1e-4)
+    assert any(joint.length_m == pytest.approx(2.0 * np.pi * 0.020, abs=1e-5) for joint in splines.joints)
+
+
+def test_a_hole_through_both_bodies_does_not_change_the_type(tmp_path: Path) -> None:
+    hole = cylinder((50, 30, -20), 6, 60)
+    plate, foot = less(box((0, 0, -10), (200, 100, 10)), hole), less(box((20, 10, 0), (60, 40, 20)), hole)
+    write_step(assembly(plate, foot), tmp_path / "foot.step")
+    joint = next(joint for joint in read_shape(tmp_path / "foot.step").joints if len(joint.edges) == 4)
+    assert (joint.type, joint.closed) == ("T", True)

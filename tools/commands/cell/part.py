@@ -20,8 +20,13 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.tool import WeldingTool
+<<<<<<< HEAD
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.reading import read_shape
+=======
+from weldcal.models.tools.loading import WELDING, load_tool
+from weldcal.models.workpieces.reading import STEP_SUFFIXES, read_shape
+>>>>>>> h-public
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
@@ -38,6 +43,10 @@ DPI = 110
 SMALL_M = 0.012  # a part this small may be drawn in inches
 PIPES_M, PIPE_STEP_M = (0.005, 0.5), 5e-4  # radii among which the least one for a tool is searched
 SHOWN = ("length_mm", "angle_deg", "gap_mm", "throat_mm")
+NO_SEAMS = {
+    True: "no two bodies meet within 3 mm in a concave joint, and no body has a concave edge.",
+    False: "the file is a mesh. Choose a concave edge, or the edge of a body where it meets another.",
+}
 VIEWS = ((32.0, -60.0), (32.0, 120.0))  # elevation, azimuth
 
 
@@ -228,6 +237,8 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         ids = ", ".join(map(str, seam.joint.edges))
         numbers = "  ".join(f"{row[key]:9.1f}" for key in ("length_mm", "angle_deg", "throat_mm"))
         typer.echo(f"{row['type']:16}  {numbers}  {ids:16}  {'no: ' + seam.reason if seam.reason else 'yes'}")
+    if not seams:
+        typer.echo(f"No seams are listed: {NO_SEAMS[bool(shape.name.lower().endswith(STEP_SUFFIXES))]}")
     if hint := unit_hint(shape):
         typer.echo(hint)
     typer.echo(
