@@ -155,6 +155,12 @@ class LoadedTool:
     torch_axis: Array
 
 
+def tool_file(name: Path) -> Path:
+    """The file of a tool that is given by its path, or by the name of one that weldcal has, such as tip_1p5."""
+    own = WELDING.parent / f"{name}.yaml"
+    return own if not name.is_file() and own.is_file() else name
+
+
 def load_tool(path: Path) -> LoadedTool:
     """The tool of a file; files that it names are relative to it.
 

@@ -14,7 +14,7 @@ from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import proj3d
 from typer.testing import CliRunner
 
-from weldcal.models.tools.loading import WELDING, load_tool
+from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.part import edges_picture, ranked
@@ -104,6 +104,19 @@ def test_the_least_pipe_that_a_tool_can_weld_is_named(tmp_path: Path) -> None:
     least = re.search(r"least pipe for this tool is (\d+) mm across", reasons[0])
     assert least is not None
     assert 140 <= int(least[1]) <= 150
+
+
+def test_a_lap_of_thin_sheets_needs_the_small_ball(tmp_path: Path) -> None:
+    write_step(assembly(box((0, 0, -3), (220, 120, 3)), box((10, 40, 0), (200, 70, 1.5))), tmp_path / "lap.step")
+    joints = read_shape(tmp_path / "lap.step")
+    (large,), (small,) = (ranked(joints, load_tool(tool_file(Path(name))).tool) for name in ("welding", "tip_1p5"))
+    assert "A tip of radius 2.5 mm is too large" in large.reason
+    assert small.reason == ""
+    cell = tmp_path / "cell"
+    made = ["new", str(cell), "--part", str(tmp_path / "lap.step"), "--tool-file", "tip_1p5"]
+    result = CliRunner().invoke(app, made)
+    assert result.exit_code == 0, result.output
+    assert "radius_mm: 1.0" in (cell / "tool.yaml").read_text()
 
 
 def test_the_numbers_in_the_picture_do_not_overlap(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

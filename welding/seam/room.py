@@ -6,10 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
+from scipy.spatial import cKDTree
 
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh
+from weldcal.models.tool import WeldingTool
 from weldcal.welding.numerics import Array, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 
@@ -23,6 +25,14 @@ BESIDE_M = 1e-7 * np.array([3.7, 6.1, 7.1])  # keeps rays off the edges between 
 ASIDE_RAD = np.radians(np.arange(0.0, 181.0, 15.0))
 SAMPLES = 20_000
 STEP_M = 0.02
+SPHERES = 40  # that stand for one capsule of the tool where points far from it are left out
+OTHER_M = (
+    0.0025  # from the part's surface: above a scan's noise and the registration's error, below the height of a tack
+)
+SAMPLES_BESIDE = 400_000  # of a part's 0.2 m2 about 0.7 mm apart, which is small beside OTHER_M
+LEAST_AREA_M2 = 8e-6  # of a thing that is seen: less is a few flying points at an edge
+STEP_BESIDE_M, LIFTED_M = 0.005, 0.1  # between the places along the seam, and above its ends
+WIRE_M = 0.001  # radius of the wire with its play
 
 
 class NoRoom(WeldcalError):
@@ -55,12 +65,7 @@ def check_room(
     spans = [span for capsule in capsules if (span := _above_tip(capsule, X_FT)) is not None]
     last = min(seam.drawn_m, seam.length + chord_m)
     for s in np.linspace(0.0, last, max(2, math.ceil(last / STEP_M) + 1)):
-        tip, torch = seam.frame(float(s)), seam.frame(float(s) - chord_m)
-        up = unit(tip.up + torch.up, tip.up)
-        x = tip.position - torch.position
-        x = unit(x - (x @ up) * up, tip.tangent)
-        y = math.cos(lean_rad) * np.cross(up, x) + math.sin(lean_rad) * up
-        R = np.column_stack([x, y, np.cross(x, y)])
+        tip, R = _held(seam, float(s), chord_m, lean_rad)
         points_T = (points_B - tip.position) @ R
         for a, b, radius in spans:
             near = float(_distances(points_T, a, b).min()) - radius
@@ -69,6 +74,55 @@ def check_room(
                     f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body would come within "
                     f"{1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer finger or weld the joint from elsewhere.",
                     CLEARANCE_M - near,
+                )
+
+
+def check_beside(
+    points_B: NDArray[np.float64],
+    mesh: TriMesh,
+    X_BP: RigidTransform,
+    seam: SeamCurve,
+    tool: WeldingTool,
+    lean_rad: float = 0.0,
+) -> None:
+    """Check that nothing that a scan (N,3) shows and the drawing does not, as a clamp or a tack, is in the way of the tool.
+
+    Tip, finger, torch and the tool's body along the seam, and lifted off at both of its ends.
+
+    Raises:
+        NoRoom: with the place.
+    """
+    spans = [span for capsule in tool.capsules() if (span := _above_tip(capsule, tool.X_FT)) is not None]
+    wire, upward = np.array([-tool.chord_m, 0.0, tool.torch_height_m]), np.array([0.0, 0.0, NEAR_TIP_M])
+    spans += [(np.zeros(3), upward, tool.tip_radius_m), (wire, wire + upward, WIRE_M)]
+    last = min(seam.drawn_m, seam.length + tool.chord_m)
+    steps = np.linspace(0.0, last, max(2, math.ceil(last / STEP_BESIDE_M) + 1))
+    lifts = np.arange(STEP_BESIDE_M, LIFTED_M, STEP_BESIDE_M)
+    places = [(float(s), 0.0) for s in steps] + [(s, float(lift)) for s in (0.0, last) for lift in lifts]
+    held = [(s, lift, *_held(seam, s, tool.chord_m, lean_rad)) for s, lift in places]
+    share = np.linspace(0.0, 1.0, SPHERES)[:, None]
+    body = np.vstack([a + share * (b - a) for a, b, _ in spans])
+    swept = cKDTree(np.vstack([tip.position + (body + lift * upward / NEAR_TIP_M) @ R.T for _, lift, tip, R in held]))
+    reach = max(radius for _, _, radius in spans) + STEP_BESIDE_M
+    near = points_B[np.asarray(swept.query(points_B, distance_upper_bound=reach)[0]) < reach]
+    if len(near) < 2:
+        return
+    surface = cKDTree(mesh.transformed(X_BP).sample(SAMPLES_BESIDE, np.random.default_rng(0))[0])
+    pitch = float(np.median(np.asarray(cKDTree(near).query(near, k=2)[0])[:, 1]))
+    other = near[np.asarray(surface.query(near)[0]) > OTHER_M]
+    least = max(4, math.ceil(LEAST_AREA_M2 / max(pitch, 1e-5) ** 2))
+    before: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)] * len(spans)
+    for s, lift, tip, R in held:
+        points_T = (other - tip.position) @ R - [0.0, 0.0, lift]
+        for k, (a, b, radius) in enumerate(spans):
+            met = np.flatnonzero(_distances(points_T, a, b) < radius + CLEARANCE_M)
+            both, before[k] = np.union1d(met, before[k]), met  # a tack is longer than a step and shorter than two
+            if len(met) and len(both) >= least:
+                x, y, z = 1e3 * np.median(other[both], axis=0)
+                raise NoRoom(
+                    f"The scan shows something that is not in the drawing, near ({x:.0f}, {y:.0f}, {z:.0f}) mm in the base. The tool would "
+                    f"touch it at {1e3 * s:.0f} mm of the seam: remove it, or cut the seam with start_mm or end_mm, and scan again.",
+                    CLEARANCE_M,
                 )
 
 
@@ -151,6 +205,16 @@ def _crossings(triangles: NDArray[np.float64], origin: Array, direction: Array) 
     hit = np.isfinite(safe) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
     cosine = det[hit] / np.linalg.norm(np.cross(ab[hit], ac[hit]), axis=1)
     return np.asarray((np.sum(ac * q, axis=1) / safe)[hit]), np.asarray(cosine)
+
+
+def _held(seam: SeamCurve, s: float, chord_m: float, lean_rad: float) -> tuple[SeamFrame, Array]:
+    """The seam's frame at an arc length, and R_BT as the servo holds the tool there."""
+    tip, torch = seam.frame(s), seam.frame(s - chord_m)
+    up = unit(tip.up + torch.up, tip.up)
+    x = tip.position - torch.position
+    x = unit(x - (x @ up) * up, tip.tangent)
+    y = math.cos(lean_rad) * np.cross(up, x) + math.sin(lean_rad) * up
+    return tip, np.column_stack([x, y, np.cross(x, y)])
 
 
 def _above_tip(capsule: Capsule, X_FT: RigidTransform) -> tuple[Array, Array, float] | None:

@@ -16,7 +16,7 @@ from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces.part import WeldPart, numbered
+from weldcal.models.workpieces.part import Part, WeldPart, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
@@ -26,7 +26,7 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam,
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.room import check_ends, check_room
+from weldcal.welding.seam.room import check_beside, check_ends, check_room
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
@@ -188,8 +188,11 @@ def plan_seam(
             points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
         )
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
+        plan = _planned(planning, scan.sequence, seam, found.X_BP)
+        if isinstance(planning.workpiece, Part) and found.X_BP is not None:
+            check_beside(points_B, planning.workpiece.mesh, found.X_BP, seam, planning.tool, plan.lean_rad)
         return dc.replace(
-            _planned(planning, scan.sequence, seam, found.X_BP),
+            plan,
             rms_m=found.rms_m,
             confidence=found.confidence,
             points_B=points_B,

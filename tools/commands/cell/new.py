@@ -17,7 +17,8 @@ from pydrake.math import RotationMatrix
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.result_files import write_atomic
-from weldcal.models.tools.loading import WELDING, load_tool
+from weldcal.models.tool import WeldingTool
+from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
@@ -111,6 +112,9 @@ def new(
     ] = None,
     units: Annotated[str | None, option("--units", "UNIT", "Of the part's file: mm, m or inch.")] = None,
     tool: Annotated[bool, switch("--tool", "Also write tool.yaml, a copy of the welding tool to change.")] = False,
+    tool_of: Annotated[
+        Path | None, option("--tool-file", "FILE", "Weld with this tool; tip_1p5 is weldcal's for laps from 1.5 mm.")
+    ] = None,
     dataset: Annotated[
         bool, switch("--dataset", "Write an example of a calibration dataset, scanned in simulation, instead.")
     ] = False,
@@ -128,7 +132,7 @@ def new(
     else:
         numbers = tuple(edge_numbers(edges))
         own = None if part is None else OwnPart(part, numbers, joint, units)
-        written, reason = write_cell(folder, base, own, WELDING if tool else None)
+        written, reason = write_cell(folder, base, own, tool_file(tool_of or WELDING) if tool or tool_of else None)
         following = f"weldcal demo --scenario {written}"
         if reason:
             assert part is not None
@@ -201,7 +205,8 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     folder.mkdir(parents=True, exist_ok=True)
     if part is not None:
         scenario.description = f"A cell that welds {part.file.name}."
-        candidates = add_part(scenario, folder, part)
+        fits = load_tool(WELDING if tool is None else tool).tool
+        candidates = add_part(scenario, folder, part, fits)
     if tool is not None:
         add_tool(scenario, folder, tool)
     write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
@@ -218,7 +223,7 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
                 break
         if reason:
             several = f"None of {len(candidates)} seams can be welded; the nearest one: " if len(candidates) > 1 else ""
-            reason = _with_advice(read_shape(part.file, part.units), candidates[0][0], several + nearest)
+            reason = _with_advice(read_shape(part.file, part.units), candidates[0][0], fits, several + nearest)
             seam, joint = candidates[0]
             scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
             words = "\n# ".join(textwrap.wrap(reason, WIDTH - 2))
@@ -272,7 +277,7 @@ def _line(key: Key, value: Any, indent: str, written: bool = False) -> str:
     return "".join(f"{indent}# {words}\n" for words in above) + text + "\n"
 
 
-def add_part(scenario: Scenario, folder: Path, part: OwnPart) -> list[tuple[SeamConfig, str]]:
+def add_part(scenario: Scenario, folder: Path, part: OwnPart, tool: WeldingTool) -> list[tuple[SeamConfig, str]]:
     """Copy a part's file into the cell's folder, and make it the scenario's workpiece, standing on the table.
 
     Returns:
@@ -282,7 +287,7 @@ def add_part(scenario: Scenario, folder: Path, part: OwnPart) -> list[tuple[Seam
         InputError: the part cannot be read, has no such edge, or no joint.
     """
     shape = read_shape(part.file, part.units)
-    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else _candidates(shape, part.file)
+    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else _candidates(shape, part.file, tool)
     found = [(SeamConfig(edges=[edge.id for edge in edges]), part.joint or _joint(edges[0])) for edges in chosen]
     scenario.workpiece = WorkpieceConfig(
         file=part.file.name,
@@ -298,12 +303,10 @@ def add_part(scenario: Scenario, folder: Path, part: OwnPart) -> list[tuple[Seam
     return found
 
 
-def _with_advice(shape: PartShape, seam: SeamConfig, reason: str) -> str:
+def _with_advice(shape: PartShape, seam: SeamConfig, tool: WeldingTool, reason: str) -> str:
     """Why no seam of a part can be welded, with what its size and a round seam say of that."""
     ring = next((joint for joint in shape.joints if list(joint.edges) == seam.edges), None)
-    least = (
-        "" if ring is None or "tool does not fit" not in reason else least_pipe(shape, ring, load_tool(WELDING).tool)
-    )
+    least = "" if ring is None or "tool does not fit" not in reason else least_pipe(shape, ring, tool)
     return f"{unit_hint(shape)} {reason}{least}".strip()
 
 
@@ -368,18 +371,20 @@ def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], sce
 
 
 def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
-    """Copy a tool's file into the cell's folder as tool.yaml, and make it the scenario's tool."""
-    shutil.copyfile(tool, folder / TOOL)
-    scenario.tool = ToolFile(TOOL)
+    """Make a file the scenario's tool: one of weldcal's is copied into the cell's folder as tool.yaml, another stays where it is."""
+    ours = tool.parent == WELDING.parent
+    if ours:
+        shutil.copyfile(tool, folder / TOOL)
+    scenario.tool = ToolFile(TOOL if ours else str(tool.resolve()))
 
 
-def _candidates(shape: PartShape, part: Path) -> list[list[PartEdge]]:
+def _candidates(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdge]]:
     """The seams to try, at most MOST_TRIED, each by its edges, a seam with corners edge by edge.
 
-    Those that the shipped tool fits come first, then those that it nearly fits; of these first what opens upwards.
+    Those that the tool fits come first, then those that it nearly fits; of these first what opens upwards.
     """
     found, order = [], []
-    for seam in ranked(shape, load_tool(WELDING).tool):
+    for seam in ranked(shape, tool):
         chain = [shape.edge(id) for id in seam.joint.edges]
         if seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
             bent = all(len(edge.points_P) > 2 for edge in chain)

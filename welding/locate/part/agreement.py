@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 from scipy.spatial import cKDTree
 
-from weldcal.welding.locate.part.fit import contour, into
+from weldcal.welding.locate.part.fit import contours, into, joined
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.scan import PreparedScan
 
@@ -22,6 +22,9 @@ NOT_MEASURED_COS = 0.22
 VISIBLE_SAMPLES = 2500
 BEYOND_M = 0.004
 SAME_FACE_COS = 0.95
+NEAR_M = 0.02  # error of fusion that is looked for: a ray that ends farther from the part meets another thing
+THIN = 0.6  # of a sheet's thickness: a lower point is nearer to the table, one thickness below, than to the face
+LEAST_NEAR, LEAST_MET = 100, 0.5  # rays of a scan that judge its fusion, and the share that meets a part in its place
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,26 +52,33 @@ class Agreement:
     @property
     def score_of_rest(self) -> float:
         """The score by the rays that nothing keeps from the part."""
-        return max(0.0, self.met / max(1e-9, 1.0 - self.hidden) - 2.0 * self.passed - self.goes_on) * math.sqrt(
-            self.seen
-        )
+        met = self.met / max(1e-9, 1.0 - self.hidden)
+        return max(0.0, met - 2.0 * self.passed - self.goes_on) * math.sqrt(self.seen)
 
 
 def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_m: float = 0.01) -> Floats:
-    """The scan's points (N,3) whose rays may meet the part at X_BP or near it."""
-    middle = X_BP.multiply(model.center) - scan.eye
-    far = float(np.linalg.norm(middle))
-    sine = min(1.0, (model.radius + reach_m) / far)
-    near = scan.points[scan.sight @ (middle / far) > math.sqrt(1.0 - sine**2)]
+    """Select the rays (N,6) that may meet the part near X_BP: the point measured, and the scanner's position."""
+    middle = X_BP.multiply(model.center) - scan.eyes
+    far = np.linalg.norm(middle, axis=1)
+    sine = np.minimum(1.0, (model.radius + reach_m) / far)
+    towards = (middle / far[:, None])[scan.view]
+    near = np.flatnonzero(np.vecdot(scan.sight, towards) > np.sqrt(1.0 - sine**2)[scan.view])
+    eye = into(X_BP, scan.eyes)[scan.view[near]]
+    d = into(X_BP, scan.points[near]) - eye
+    low, high = model.mesh.bounds
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (low - reach_m - eye) / d, (high + reach_m - eye) / d
+    near = near[np.minimum(a, b).max(axis=1) <= np.maximum(a, b).min(axis=1)]
     stride = max(1.0, len(near) / MOST_RAYS)
-    return np.asarray(near[(np.arange(int(len(near) / stride)) * stride).astype(int)])
+    near = near[(np.arange(int(len(near) / stride)) * stride).astype(int)]
+    return np.hstack([scan.points[near], scan.eyes[scan.view[near]]])
 
 
 def agreement(
-    points: Floats, scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float
+    rays: Floats, scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float
 ) -> Agreement:
-    """Compare the rays of these points (N,3) with the part at X_BP."""
-    eye = into(X_BP, scan.eye[None])[0]
+    """Compare these rays (N,6) with the part at X_BP."""
+    points, eye = rays[:, :3], into(X_BP, rays[:, 3:])
     d = into(X_BP, points) - eye
     far = np.linalg.norm(d, axis=1)
     hit, normal = model.ranges(eye, d / far[:, None])
@@ -84,12 +94,13 @@ def agreement(
     verdict = met.astype(np.int8) - passed.astype(np.int8)
     # Which of the visible surface the scan shows: rays back to samples of the part.
     s, n = model.points[::12][:VISIBLE_SAMPLES], model.normals[::12][:VISIBLE_SAMPLES]
-    v = s - eye
-    away = np.linalg.norm(v, axis=1)
-    visible = -np.sum(v * n, axis=1) / away > 0.3
-    s, v, away = s[visible], v[visible] / away[visible, None], away[visible]
-    first, _ = model.ranges(eye, v)
-    s = s[np.abs(first - away) < 0.001]
+    visible = np.zeros(len(s), dtype=bool)
+    for one in into(X_BP, scan.eyes):
+        v = s - one
+        away = np.linalg.norm(v, axis=1)
+        first, _ = model.ranges(one, v / away[:, None])
+        visible |= (-np.sum(v * n, axis=1) / away > 0.3) & (np.abs(first - away) < 0.001)
+    s = s[visible]
     seen = 0.0
     if len(s) and met.any():
         spacing = 2.0 * scan.pitch_m * max(1.0, (len(scan.points) / max(1, len(points))) ** 0.5)
@@ -101,20 +112,32 @@ def agreement(
         hidden=float(hidden.sum() / total),
         seen=seen,
         n_met=int(met.sum()),
-        goes_on=_goes_on(scan, model, X_BP, eye, tolerance_m),
+        goes_on=_goes_on(scan, model, X_BP, tolerance_m),
         verdict=verdict,
     )
 
 
-def _goes_on(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, eye: Floats, tolerance_m: float) -> float:
+def views_off(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float) -> list[int]:
+    """List the scans that show the part's surface near X_BP, but not at it: their pose is wrong."""
+    rays = rays_near(scan, model, X_BP)
+    origin = into(X_BP, rays[:, 3:])
+    d = into(X_BP, rays[:, :3]) - origin
+    far = np.linalg.norm(d, axis=1)
+    gap = np.abs(far - model.ranges(origin, d / far[:, None])[0])
+    near = [gap[(rays[:, 3:] == eye).all(axis=1) & (gap < NEAR_M)] for eye in scan.eyes]
+    return [k for k, g in enumerate(near) if len(g) > LEAST_NEAR and np.mean(g < 2.0 * tolerance_m) < LEAST_MET]
+
+
+def _goes_on(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float) -> float:
     """Share of the edges that end a face with scan points on it, beyond which the scan has points in the same face."""
-    edges = contour(model, eye)
+    edges = joined(contours(model, X_BP, scan))
+    band = min(0.8 * tolerance_m, THIN * model.thickness_m)
     if len(edges.point) < 8:
         return 0.0
     away = max(BEYOND_M, 2.5 * scan.pitch_m, 1.5 * tolerance_m)
     reach = max(0.0015, 1.5 * scan.pitch_m)
     there = [
-        _on_face(scan, X_BP, edges.point + side * away * edges.outward, edges.normal, reach, 0.8 * tolerance_m)
+        _on_face(scan, X_BP, edges.point + side * away * edges.outward, edges.normal, reach, band)
         for side in (-1.0, 1.0)
     ]
     # Across a gap of the part's own the same face begins again.

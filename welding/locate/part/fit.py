@@ -7,7 +7,8 @@ the scanner, the outermost points of the face lie a share of a point distance in
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,21 +17,28 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from weldcal.welding.locate.part.model import PartModel, SharpEdges
-from weldcal.welding.locate.part.scan import PreparedScan
+from weldcal.welding.locate.part.scan import PreparedScan, View
 
 Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 SAME_SIDE_COS = math.cos(math.radians(38.0))
 HIDDEN_COS = math.cos(math.radians(77.0))  # a face seen at a larger angle is not measured
 INSET, INSET_SIGMA = 0.35, 0.2  # of the outermost points of a face, in point distances
 RIM_SIGMA = 0.40  # of one of them, in point distances
 RIM_GATE, STILL_M = 4.5, 2e-5  # in point distances; a step smaller than this is the last with one gate
-LEAST_OWN, BEHIND_M = 0.15, 0.002  # share of the rims with something behind them; how far behind
+LEAST_OWN = 0.15  # share of the rims with something behind them, below which nothing lies behind the part
+BEHIND_M = 0.002  # a face ends where the scan shows something so far behind it: over ten times the noise of a scan
+BEHIND = (
+    0.55  # the same for a thinner sheet, in its thickness: nearer to its table, one thickness below, than to itself
+)
 SHARED_M = 0.08
 RIM_FLOOR = 0.15  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
 PATCHES = 14.0  # size of a patch whose points share their error, in point distances
 SIGMA_FLOOR_M, CREEP_M, SLOW_M = 2e-5, 2e-5, 3e-5
+FINE_GATE_M, FINE_GATE = 0.008, 1.0 / 40.0  # first gate, at least, and in the part's radius: a cell of the search
+CLUSTERS = 100_000  # numbers reserved for the clusters of each scan: more than its points on rims
 MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
 
 
@@ -46,13 +54,11 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A pose with its covariance (6,6), of the motion in P; rms_m of the surface; n_points on it; n_rims points on edges."""
+    """A pose with its covariance (6,6), of the motion in P; rms_m of the surface."""
 
     X_BP: RigidTransform
     covariance: Floats
     rms_m: float
-    n_points: int
-    n_rims: int
 
 
 def moved(X: RigidTransform, xi: Floats) -> RigidTransform:
@@ -65,7 +71,7 @@ def into(X_BP: RigidTransform, p_B: Floats) -> Floats:
     return np.asarray((p_B - X_BP.translation()) @ X_BP.rotation().matrix())
 
 
-def _within(p: Floats, middle: Floats, reach: float) -> npt.NDArray[np.bool_]:
+def _within(p: Floats, middle: Floats, reach: float) -> Mask:
     """Which points (N,3) lie nearer than `reach` to a point (3,)."""
     d = p - middle
     return np.asarray(np.vecdot(d, d) < reach**2)
@@ -107,15 +113,33 @@ def contour(model: PartModel, eye: Floats) -> SharpEdges:
     )
 
 
+_Rows = TypeVar("_Rows", SharpEdges, Equations)
+
+
+def contours(model: PartModel, X_BP: RigidTransform, scan: PreparedScan) -> list[SharpEdges]:
+    """Compute the contour from each of the scanner's positions."""
+    return [contour(model, eye) for eye in into(X_BP, scan.eyes)]
+
+
+def joined(parts: list[_Rows]) -> _Rows:
+    """Join the edges, or the equations, of several scans; chains, or clusters, of two scans keep different numbers."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = {f.name: np.concatenate([getattr(one, f.name) for one in parts]) for f in fields(parts[0])}
+    last = fields(parts[0])[-1].name
+    rows[last] += CLUSTERS * np.repeat(np.arange(len(parts)), [len(getattr(one, last)) for one in parts])
+    return type(parts[0])(**rows)
+
+
 def rim_rows(
-    p: Floats, edges: SharpEdges, gate: float, band: float, scan: PreparedScan, X_BP: RigidTransform
+    p: Floats, edges: SharpEdges, gate: float, band: float, view: View, behind: float, X_BP: RigidTransform
 ) -> Equations | None:
     """Equations of the outermost points of the faces among p (N,3) in P against the edges that end them.
 
     A face may also end where something hides it, or where nothing was measured. So just beyond its outermost point the scan has to
     show something behind it; where no edge does, for nothing lies in the scanner's range behind the part, all edges are used.
     """
-    pitch = scan.pitch_m
+    pitch = view.pitch_m
     if len(edges.point) < 4 or not len(p):
         return None
     away, k = (
@@ -136,7 +160,7 @@ def rim_rows(
     if len(good) < 4:
         return None
     beyond = edges.point[good] + (last[good] + 1.5 * pitch)[:, None] * edges.outward[good]
-    own = _ends_itself(beyond, edges.normal[good], scan, X_BP)
+    own = _ends_itself(beyond, edges.normal[good], view, behind, X_BP)
     if np.count_nonzero(own) > max(4, LEAST_OWN * len(good)):
         good = good[own]
     m, at = edges.outward[good], edges.point[good]
@@ -144,18 +168,18 @@ def rim_rows(
     return Equations(-np.hstack([np.cross(at, m), m]), r, np.ones(len(r)), _shared(edges, good))
 
 
-def _ends_itself(beyond: Floats, normal: Floats, scan: PreparedScan, X_BP: RigidTransform) -> npt.NDArray[np.bool_]:
+def _ends_itself(beyond: Floats, normal: Floats, view: View, behind: float, X_BP: RigidTransform) -> Mask:
     """Whether around points (N,3) of P, just beyond the rims of faces with normals (N,3), the scan shows something behind the
     faces and nothing before them."""
-    tree = scan.rays
     R = X_BP.rotation().matrix()
     at = beyond @ R.T + X_BP.translation()
-    d = at - scan.eye
+    d = at - view.eye
     away = np.linalg.norm(d, axis=1)
-    _, k = tree.query(d / away[:, None], k=9, distance_upper_bound=2.5 * scan.pitch_m / float(np.median(away)))
-    found = np.asarray(k) < len(scan.measured)
-    height = np.einsum("ijk,ik->ij", scan.measured[np.where(found, k, 0)] - at[:, None], normal @ R.T)
-    return np.asarray((found & (height < -BEHIND_M)).any(axis=1) & ~(found & (height > BEHIND_M)).any(axis=1))
+    reach = 2.5 * view.pitch_m / float(np.median(away))
+    _, k = view.rays.query(d / away[:, None], k=9, distance_upper_bound=reach)
+    found = np.asarray(k) < len(view.measured)
+    height = np.einsum("ijk,ik->ij", view.measured[np.where(found, k, 0)] - at[:, None], normal @ R.T)
+    return np.asarray((found & (height < -behind)).any(axis=1) & ~(found & (height > BEHIND_M)).any(axis=1))
 
 
 def _shared(edges: SharpEdges, index: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -164,7 +188,7 @@ def _shared(edges: SharpEdges, index: npt.NDArray[np.int64]) -> npt.NDArray[np.i
     return np.asarray(np.unique(key, axis=0, return_inverse=True)[1]).ravel()
 
 
-def _beside(p: Floats, edges: SharpEdges, reach: float) -> npt.NDArray[np.bool_]:
+def _beside(p: Floats, edges: SharpEdges, reach: float) -> Mask:
     """Which points (N,3) in P lie near an edge."""
     if not len(edges.point):
         return np.zeros(len(p), dtype=bool)
@@ -226,21 +250,22 @@ def coarse_fit(
     return X
 
 
-def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: float = 0.008) -> Fit | None:
-    """The pose by surface and rims from one good to `gate`, with its covariance; None where too few points are near."""
-    pitch = scan.pitch_m
+def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> Fit | None:
+    """Fit surface and rims from a pose good to the gate, with its covariance; None where too few points are near."""
+    pitch, gate = scan.pitch_m, max(FINE_GATE_M, FINE_GATE * model.radius)
     middle, around = X.multiply(model.center), model.radius + 0.02
     near = _within(scan.points, middle, around)
     points, normals = scan.points[near], scan.normals[near]
     stride = max(1.0, len(points) / MOST_POINTS)
     few = (np.arange(int(len(points) / stride)) * stride).astype(int)
-    every = scan.measured[_within(scan.measured, middle, around)]
+    every = [v.measured[_within(v.measured, middle, around)] for v in scan.views]
+    behind = min(BEHIND_M, BEHIND * model.thickness_m)
     sigma = 0.5e-3
     surface, rims = None, None
     for g, steps in ((gate, 3), (0.5 * gate, 3), (0.004, 3), (0.002, 6)):
-        edges = contour(model, into(X, scan.eye[None])[0])
+        edges = contours(model, X, scan)
         rim_gate = max(g, RIM_GATE * pitch)
-        beside = _beside(into(X, every), edges, 2.0 * rim_gate)
+        beside = [p[_beside(into(X, p), e, 2.0 * rim_gate)] for p, e in zip(every, edges, strict=True)]
         some = few if g <= 0.002 else few[:: max(1, len(few) // EARLY_POINTS)]
         for _ in range(steps):
             near_m = max(g, 3.5 * pitch) if g > 0.002 else max(0.001, 8.0 * sigma)
@@ -249,7 +274,13 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
                 return None
             sigma = max(SIGMA_FLOOR_M, 1.4826 * float(np.median(np.abs(surface.residual))))
             # A narrower gate would only let through the rims that agree with the pose already.
-            rims = rim_rows(into(X, every[beside]), edges, rim_gate, max(4.0 * sigma, 0.0004), scan, X)
+            band = max(4.0 * sigma, 0.0004)
+            found = [
+                rim_rows(into(X, p), e, rim_gate, band, v, behind, X)
+                for p, e, v in zip(beside, edges, scan.views, strict=True)
+            ]
+            some_rims = [one for one in found if one is not None]
+            rims = joined(some_rims) if some_rims else None
             reach = rim_gate if g > 0.002 else 0.0
             xi = step(surface, rims, max(4.0 * sigma, 0.0004), sigma, pitch, reach)
             if xi is None:
@@ -262,8 +293,6 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
         X,
         covariance(surface, rims, sigma, pitch),
         float(np.sqrt(np.mean(np.square(surface.residual[np.abs(surface.residual) < max(4.0 * sigma, 0.0004)])))),
-        len(surface.residual),
-        0 if rims is None else len(rims.residual),
     )
 
 

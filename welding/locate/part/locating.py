@@ -1,7 +1,8 @@
-"""Finds a part with a drawn seam in one scan, and measures its joint along the seam."""
+"""Finds a part with a drawn seam in scans, and measures its joint along the seam."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def locate_part(
-    points_B: npt.NDArray[np.floating],
+    points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]],
     mesh: TriMesh,
     seam: DrawnSeam,
     X_BP_guess: RigidTransform | None = None,
@@ -36,11 +37,11 @@ def locate_part(
         PartNotFound, AmbiguousPart, InputError: as register_part.
     """
     config = config or PartConfig()
-    finite = finite_points(points_B)
-    scan = prepare(finite, eye_B, config.min_points, config.seed)
+    scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
     model = PartModel(mesh, config.seed)
     found = register_prepared(scan, model, X_BP_guess, X_BP_hint=X_BP_hint, matters_P=seam.points_P, config=config)
-    points, normals = _about_seam(into(found.X_BP, finite), into(found.X_BP, scan.eye[None])[0], seam)
+    near = [_about_seam(into(found.X_BP, v.measured), into(found.X_BP, v.eye[None])[0], seam) for v in scan.views]
+    points, normals = (np.concatenate(part) for part in zip(*near, strict=True))
     return found, measure_joint(points, normals, scan.pitch_m, model, seam)
 
 
@@ -52,7 +53,7 @@ def _about_seam(points: Floats, eye: Floats, seam: DrawnSeam) -> tuple[Floats, F
     low, high = seam.points_P.min(axis=0) - reach, seam.points_P.max(axis=0) + reach
     points = points[((points > low) & (points < high)).all(axis=1)]
     if len(points) < 20:
-        return points, points
+        return points[:0], points[:0]
     cloud: Any = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
     normals = np.asarray(cloud.normals)

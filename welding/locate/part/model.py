@@ -20,6 +20,8 @@ SAMPLES = 30_000
 EDGE_STEP_M = 0.003
 SHARP_COS = math.cos(math.radians(35.0))
 MOST_DIRECTIONS = 14
+BENEATH_M = 2e-5  # start of a ray into the part: a float32 rounds by 1e-6 m at 10 m, so the ray misses its own face
+LEAST_SHEET_M = 1e-4  # a shorter ray ends at the face of another body that overlaps by a drawing's tolerance
 SMOOTHED, SMOOTHED_M, SMOOTHED_COS = 32, 0.010, (math.cos(math.radians(40.0)), math.cos(math.radians(20.0)))
 
 
@@ -84,12 +86,20 @@ class PartModel:
         return np.asarray(normals)
 
     def ranges(self, eye: Floats, directions: Floats) -> tuple[Floats, Floats]:
-        """Distances (N,) m from the eye (3,) along unit directions (N,3), inf where the part is missed, and the normals there."""
+        """Cast rays from eyes (3,) or (N,3) along directions (N,3): distances (N,), inf for a miss, normals (N,3)."""
         rays = np.hstack([np.broadcast_to(eye, directions.shape), directions]).astype(np.float32)
         hit = self._scene.cast_rays(self._tensor(rays))
         index = hit["primitive_ids"].numpy().astype(np.int64)
         index[index >= len(self.mesh.triangles)] = 0
         return hit["t_hit"].numpy().astype(np.float64), self.mesh.normals[index]
+
+    @cached_property
+    def thickness_m(self) -> float:
+        """Thickness under the thinnest fifth of the surface. A ray ends where two bodies touch."""
+        p, n = self.points[::20], self.normals[::20]
+        through = BENEATH_M + self.ranges(p - BENEATH_M * n, -n)[0]
+        through = through[np.isfinite(through) & (through > LEAST_SHEET_M)]
+        return float(np.percentile(through, 20)) if len(through) else 0.1
 
     @cached_property
     def directions(self) -> list[Floats]:
@@ -118,8 +128,7 @@ class PartModel:
     def edges(self) -> SharpEdges:
         """The convex sharp edges."""
         t, n = self.mesh.triangles, self.mesh.normals
-        v, key = np.unique(np.round(self.mesh.vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
-        del v
+        _, key = np.unique(np.round(self.mesh.vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
         key = key.ravel()
         pair = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
         face = np.tile(np.arange(len(t)), 3)

