@@ -14,6 +14,7 @@ from weldcal.calibration.refinement.local_field import LEAST as LEAST_OF_FIELD
 from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
+from weldcal.models.workpieces.reading import LARGEST_SIZE_M
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.jobs.discovery import job_of, jobs
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
@@ -280,7 +281,9 @@ def check_scenario(scenario: Scenario) -> None:
     workpiece, farthest = scenario.workpiece, get_robot(scenario.arm).reach_m + BEYOND_REACH_M
     if workpiece is not None:
         check_workpiece(workpiece)
-    if workpiece is not None and math.hypot(*workpiece.pose_guess.xyz_m) > farthest:
+    # The frame of a part from a file may lie as far from it as the largest part is long.
+    beyond = farthest if workpiece is None or workpiece.file is None else farthest + LARGEST_SIZE_M
+    if workpiece is not None and math.hypot(*workpiece.pose_guess.xyz_m) > beyond:
         raise InputError(
             f"workpiece.pose_guess.xyz_m is {math.hypot(*workpiece.pose_guess.xyz_m):.3g} m from the robot; a {scenario.arm} with "
             f"its torch does not reach beyond {farthest:.3g} m."

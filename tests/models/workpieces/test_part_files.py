@@ -291,3 +291,10 @@ def test_an_assembly_takes_its_bodies_from_the_files_beside_it(tmp_path: Path, m
     (top.parent / names[1]).unlink()
     with pytest.raises(InputError, match=f"takes a body from '{names[1]}': put that file beside it"):
         read_shape(top)
+
+
+def test_the_frame_of_a_part_may_lie_out_of_the_arms_reach(tmp_path: Path) -> None:
+    plate, web = box((3000, 1000, -10), (240, 120, 10)), box((3000, 1055, 0), (240, 10, 60))
+    write_step(assembly(plate, web), tmp_path / "t.step")
+    path, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "t.step"))
+    assert (path.name, reason) == ("cell.yaml", "")

@@ -117,13 +117,6 @@ def less(first: Any, *others: Any) -> Any:
     return first
 
 
-def as_splines(shape: Any) -> Any:
-    """The shape with all its surfaces and curves as splines, as some programs write planes and cylinders."""
-    from OCP.BRepBuilderAPI import BRepBuilderAPI_NurbsConvert
-
-    return BRepBuilderAPI_NurbsConvert(shape).Shape()
-
-
 def assembly(*solids: Any) -> Any:
     """Several solids side by side, as a CAD assembly is exported."""
     from OCP.BRep import BRep_Builder
