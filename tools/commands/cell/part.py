@@ -20,13 +20,8 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.tool import WeldingTool
-<<<<<<< HEAD
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
-from weldcal.models.workpieces.reading import read_shape
-=======
-from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.models.workpieces.reading import STEP_SUFFIXES, read_shape
->>>>>>> h-public
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
