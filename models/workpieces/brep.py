@@ -59,7 +59,7 @@ class Face:
                 0.5 * (own.FirstVParameter() + own.LastVParameter()),
             ]
             n = GeomLProp_SLProps(drawn, *uv, 1, 1e-9).Normal()
-            self.sign *= np.sign(self.sign * self.normal(array_of(drawn.Value(*uv))) @ array_of(n))
+            self.sign *= float(np.sign(self.sign * self.normal(array_of(drawn.Value(*uv))) @ array_of(n)))
 
     @cached_property
     def ends(self) -> list[tuple[Any, tuple[Floats, Floats, Floats]]]:
