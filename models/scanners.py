@@ -13,9 +13,11 @@ repeatability of about 1 mm at 1 m.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +25,11 @@ import numpy.typing as npt
 from weldcal.models.depth_noise import Depth, DepthNoise, measured_points, noisy_depth
 from weldcal.models.documents import did_you_mean, read_document, read_part
 from weldcal.models.errors import InputError
+
+if TYPE_CHECKING:
+    from pydrake.math import RigidTransform
+
+    from weldcal.models.mesh import TriMesh
 
 LARGEST_PX = 8192
 
@@ -372,3 +379,23 @@ def depth_to_points(depth: npt.NDArray[np.floating], fx: float, fy: float, cx: f
     points[..., 1] = z * ((np.arange(height) - cy) / fy)[:, None]
     points[..., 2] = z
     return points
+
+
+def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset, seed: int) -> Floats:
+    """What the scanner at X_BC sees of meshes given in base, its noise included: (H,W,3) m in base."""
+    from weldcal.models.mesh import o3d
+
+    tensor: Any = o3d.core.Tensor
+    scene = o3d.t.geometry.RaycastingScene()
+    for mesh in meshes:
+        scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
+    flat = np.ones((scanner.height, scanner.width), dtype=np.float32)
+    rays_C = depth_to_points(flat, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
+    R, eye = X_BC.rotation().matrix(), X_BC.translation()
+    rays = np.concatenate([np.broadcast_to(eye, rays_C.shape), rays_C @ R.T], axis=2).astype(np.float32)
+    # The rays have unit depth, so what the caster calls distance is depth.
+    depth = scene.cast_rays(tensor(rays))["t_hit"].numpy()
+    depth[~np.isfinite(depth)] = 0.0
+    measured = apply_noise(depth, scanner, np.random.default_rng(seed))
+    points_C = depth_to_points(measured, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
+    return np.asarray(points_C @ R.T + eye)

@@ -32,6 +32,7 @@ OTHER_M = (
 SAMPLES_BESIDE = 400_000  # of a part's 0.2 m2 about 0.7 mm apart, which is small beside OTHER_M
 LEAST_AREA_M2 = 8e-6  # of a thing that is seen: less is a few flying points at an edge
 STEP_BESIDE_M, LIFTED_M = 0.005, 0.1  # between the places along the seam, and above its ends
+LEVEL_M = 0.0005  # the ball touches its walls, and a table level with one of them, by as much
 WIRE_M = 0.001  # radius of the wire with its play
 
 
@@ -84,17 +85,19 @@ def check_beside(
     seam: SeamCurve,
     tool: WeldingTool,
     lean_rad: float = 0.0,
+    table_z_m: float = -math.inf,
 ) -> None:
     """Check that nothing that a scan (N,3) shows and the drawing does not, as a clamp or a tack, is in the way of the tool.
 
-    Tip, finger, torch and the tool's body along the seam, and lifted off at both of its ends.
+    Tip, finger, torch and the tool's body along the seam, and lifted off at both of its ends; below `table_z_m` it is the table.
 
     Raises:
         NoRoom: with the place.
     """
-    spans = [span for capsule in tool.capsules() if (span := _above_tip(capsule, tool.X_FT)) is not None]
+    above = [span for capsule in tool.capsules() if (span := _above_tip(capsule, tool.X_FT)) is not None]
+    spans = [(a, b, radius + CLEARANCE_M) for a, b, radius in above]
     wire, upward = np.array([-tool.chord_m, 0.0, tool.torch_height_m]), np.array([0.0, 0.0, NEAR_TIP_M])
-    spans += [(np.zeros(3), upward, tool.tip_radius_m), (wire, wire + upward, WIRE_M)]
+    spans += [(np.zeros(3), upward, tool.tip_radius_m - LEVEL_M), (wire, wire + upward, WIRE_M)]
     last = min(seam.drawn_m, seam.length + tool.chord_m)
     steps = np.linspace(0.0, last, max(2, math.ceil(last / STEP_BESIDE_M) + 1))
     lifts = np.arange(STEP_BESIDE_M, LIFTED_M, STEP_BESIDE_M)
@@ -115,15 +118,16 @@ def check_beside(
     for s, lift, tip, R in held:
         points_T = (other - tip.position) @ R - [0.0, 0.0, lift]
         for k, (a, b, radius) in enumerate(spans):
-            met = np.flatnonzero(_distances(points_T, a, b) < radius + CLEARANCE_M)
+            met = np.flatnonzero(_distances(points_T, a, b) < radius)
             both, before[k] = np.union1d(met, before[k]), met  # a tack is longer than a step and shorter than two
             if len(met) and len(both) >= least:
-                x, y, z = 1e3 * np.median(other[both], axis=0)
-                raise NoRoom(
-                    f"The scan shows something that is not in the drawing, near ({x:.0f}, {y:.0f}, {z:.0f}) mm in the base. The tool would "
-                    f"touch it at {1e3 * s:.0f} mm of the seam: remove it, or cut the seam with start_mm or end_mm, and scan again.",
-                    CLEARANCE_M,
-                )
+                x, y, z = np.median(other[both], axis=0)
+                there = f"near ({1e3 * x:.0f}, {1e3 * y:.0f}, {1e3 * z:.0f}) mm in the base, at {1e3 * s:.0f} mm of the seam"
+                if z < table_z_m + OTHER_M:
+                    what, change = f"The tool would touch the table {there}", "raise the part"
+                else:
+                    what, change = f"The tool would touch something that is not in the drawing {there}", "remove it"
+                raise NoRoom(f"{what}: {change}, or cut the seam with start_mm or end_mm, and scan again.", CLEARANCE_M)
 
 
 def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:

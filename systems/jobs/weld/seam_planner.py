@@ -190,7 +190,9 @@ def plan_seam(
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
         plan = _planned(planning, scan.sequence, seam, found.X_BP)
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
-            check_beside(points_B, planning.workpiece.mesh, found.X_BP, seam, planning.tool, plan.lean_rad)
+            check_beside(
+                points_B, planning.workpiece.mesh, found.X_BP, seam, planning.tool, plan.lean_rad, planning.table_z_m
+            )
         return dc.replace(
             plan,
             rms_m=found.rms_m,

@@ -11,6 +11,6 @@ from tests.welding.seam.obstacles import CLEAR_M, scene
 def test_what_the_tool_would_touch_is_refused_and_nothing_else(seed: int) -> None:
     found = scene(seed)
     if found.away_m < 0.0:
-        assert "The scan shows something that is not in the drawing" in found.refusal, found
+        assert "The tool would touch something that is not in the drawing" in found.refusal, found
     if found.away_m > CLEAR_M:
         assert found.refusal == "", found

@@ -12,11 +12,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from pydrake.math import RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.models.mesh import TriMesh
+from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.result_files import write_atomic
+from weldcal.models.scanners import cast
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
@@ -25,9 +27,11 @@ from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.models.workpieces.step import referenced
 from weldcal.systems.drivers.config import DEVICES, NoDevice
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
+from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam, plan_seam
 from weldcal.systems.jobs.weld.settings import servo_config
+from weldcal.systems.messages import Scan
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, SeamConfig, ToolFile, WorkpieceConfig
@@ -84,6 +88,7 @@ FLUSH_RAD = np.deg2rad(179.0)  # a joint as open as this needs a gap for the tip
 MOST_TRIED = 4  # seams for which a place is looked for
 OPEN_ABOVE = 0.3  # z of the joint's bisector
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
+TABLE_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
 PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
 
@@ -313,6 +318,7 @@ def _with_advice(shape: PartShape, seam: SeamConfig, tool: WeldingTool, reason: 
 def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig, str]:
     """The first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
 
+    There it must also be found in a scan: else the reason is why not.
     Where there is none: the scenario's own pose, and the reason of the try in which the most seams could be welded; `advises`:
     with what would help.
     """
@@ -337,7 +343,7 @@ def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig
                 guess = _standing(part.mesh, turn, middle, scenario)
                 welded, reason = _first_refusal(scenario, station, seams, guess)
                 if not reason:
-                    return guess, ""
+                    return guess, _unseen(scenario, station, seams[0], guess)
                 if welded > nearest[0]:
                     nearest, nearest_pose = (welded, reason), guess
         if advises:
@@ -360,6 +366,34 @@ def _first_refusal(
         if reason is not None:
             return number, reason
     return len(seams), ""
+
+
+def _unseen(scenario: Scenario, station: Station, part: WeldPart, guess: PoseConfig) -> str:
+    """Why the job does not find a part in a scan of it, turned and displaced as the scenario says; "" where it does."""
+    scanner, placed = scenario.scanner, scenario.workpiece
+    if (
+        not isinstance(scanner, RenderedScanner)
+        or scanner.mounted_on != "base"
+        or placed is None
+        or placed.located_by != "scan"
+    ):
+        return ""
+    X_BC = PoseConfig(list(scanner.xyz_m), list(scanner.rpy_deg)).pose()
+    off = RotationMatrix.MakeZRotation(np.deg2rad(placed.placement_error.rotation_deg))
+    middle = guess.pose() @ (0.5 * part.mesh.bounds.sum(axis=0))
+    shift = 1e-3 * placed.placement_error.translation_mm * np.array([0.8, 0.6, 0.0])
+    X_BP = RigidTransform(off, middle + shift - off @ middle) @ guess.pose()
+    low, high = PLACE_M - np.array(TABLE_M), PLACE_M + np.array(TABLE_M)
+    z = scenario.calibration.table_z_m
+    table = extrude(np.array([low, (high[0], low[1]), high, (low[0], high[1])]), z - 0.02, z)
+    cloud_B = cast([part.mesh.transformed(X_BP), table], X_BC, scanner.scanner(), 0)
+    X_CB = X_BC.inverse()
+    points_C = (cloud_B @ X_CB.rotation().matrix().T + X_CB.translation()).astype(np.float32)
+    config = servo_config(scenario, station, 0)
+    planning = dc.replace(
+        seam_planning(scenario, station, config), workpiece=part, X_BP_guess=guess.pose(), advises=False
+    )
+    return plan_seam(planning, Scan(sequence=1, points_C=points_C), X_BC, ScannerCorrection()).reason or ""
 
 
 def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], scenario: Scenario) -> PoseConfig:

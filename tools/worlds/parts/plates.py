@@ -3,14 +3,13 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.spatial import cKDTree
 
 from weldcal.models.mesh import TriMesh, extrude
-from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
+from weldcal.models.scanners import ScannerPreset, cast, get_scanner
 from weldcal.models.workpieces.part import bend
 from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 from weldcal.welding.locate.planes import Floats, into
@@ -46,26 +45,6 @@ def looking_at(eye: Floats, target: Floats) -> RigidTransform:
     x = np.cross(z, [0.0, 1.0, 0.0])
     x /= np.linalg.norm(x)
     return RigidTransform(RotationMatrix(np.column_stack([x, np.cross(z, x), z])), eye)
-
-
-def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset, seed: int) -> Floats:
-    """What the scanner at X_BC sees of meshes given in base, its noise included: (H,W,3) m in base."""
-    import open3d
-
-    tensor: Any = open3d.core.Tensor
-    scene = open3d.t.geometry.RaycastingScene()
-    for mesh in meshes:
-        scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
-    flat = np.ones((scanner.height, scanner.width), dtype=np.float32)
-    rays_C = depth_to_points(flat, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
-    R, eye = X_BC.rotation().matrix(), X_BC.translation()
-    rays = np.concatenate([np.broadcast_to(eye, rays_C.shape), rays_C @ R.T], axis=2).astype(np.float32)
-    # The rays have unit depth, so what the caster calls distance is depth.
-    depth = scene.cast_rays(tensor(rays))["t_hit"].numpy()
-    depth[~np.isfinite(depth)] = 0.0
-    measured = apply_noise(depth, scanner, np.random.default_rng(seed))
-    points_C = depth_to_points(measured, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
-    return np.asarray(points_C @ R.T + eye)
 
 
 def random_pose(rng: np.random.Generator, part: Workpiece, tilt_rad: float, spread_m: float = 0.06) -> RigidTransform:
