@@ -32,7 +32,6 @@ OTHER_M = (
 SAMPLES_BESIDE = 400_000  # of a part's 0.2 m2 about 0.7 mm apart, which is small beside OTHER_M
 LEAST_AREA_M2 = 8e-6  # of a thing that is seen: less is a few flying points at an edge
 STEP_BESIDE_M, LIFTED_M = 0.005, 0.1  # between the places along the seam, and above its ends
-LEVEL_M = 0.0005  # the ball touches its walls, and a table level with one of them, by as much
 WIRE_M = 0.001  # radius of the wire with its play
 
 
@@ -97,7 +96,7 @@ def check_beside(
     above = [span for capsule in tool.capsules() if (span := _above_tip(capsule, tool.X_FT)) is not None]
     spans = [(a, b, radius + CLEARANCE_M) for a, b, radius in above]
     wire, upward = np.array([-tool.chord_m, 0.0, tool.torch_height_m]), np.array([0.0, 0.0, NEAR_TIP_M])
-    spans += [(np.zeros(3), upward, tool.tip_radius_m - LEVEL_M), (wire, wire + upward, WIRE_M)]
+    spans += [(np.zeros(3), upward, tool.tip_radius_m + CLEARANCE_M), (wire, wire + upward, WIRE_M + CLEARANCE_M)]
     last = min(seam.drawn_m, seam.length + tool.chord_m)
     steps = np.linspace(0.0, last, max(2, math.ceil(last / STEP_BESIDE_M) + 1))
     lifts = np.arange(STEP_BESIDE_M, LIFTED_M, STEP_BESIDE_M)
@@ -113,12 +112,14 @@ def check_beside(
     surface = cKDTree(mesh.transformed(X_BP).sample(SAMPLES_BESIDE, np.random.default_rng(0))[0])
     pitch = float(np.median(np.asarray(cKDTree(near).query(near, k=2)[0])[:, 1]))
     other = near[np.asarray(surface.query(near)[0]) > OTHER_M]
+    flat = other[:, 2] < table_z_m + OTHER_M
     least = max(4, math.ceil(LEAST_AREA_M2 / max(pitch, 1e-5) ** 2))
     before: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)] * len(spans)
     for s, lift, tip, R in held:
         points_T = (other - tip.position) @ R - [0.0, 0.0, lift]
         for k, (a, b, radius) in enumerate(spans):
-            met = np.flatnonzero(_distances(points_T, a, b) < radius)
+            # tip and wire may be as near to a table that lies level with a wall as they are to this wall
+            met = np.flatnonzero((_distances(points_T, a, b) < radius) & ~(flat if k >= len(above) else False))
             both, before[k] = np.union1d(met, before[k]), met  # a tack is longer than a step and shorter than two
             if len(met) and len(both) >= least:
                 x, y, z = np.median(other[both], axis=0)
