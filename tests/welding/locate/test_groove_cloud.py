@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
-from weldcal.models.scanners import get_scanner
+from weldcal.models.scanners import cast, get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.tools.worlds.parts.plates import Scene, box, cast, looking_at, scan_part, sideways, table
+from weldcal.tools.worlds.parts.plates import Scene, box, looking_at, scan_part, sideways, table
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.groove.seam import (
     GrooveNotFound,

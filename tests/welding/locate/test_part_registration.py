@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
-from weldcal.models.scanners import get_scanner
-from weldcal.tools.worlds.parts.plates import box, cast, looking_at, table
+from weldcal.models.scanners import cast, get_scanner
+from weldcal.tools.worlds.parts.plates import box, looking_at, table
 from weldcal.tools.worlds.parts.scenes import PartScene, block, scan_scene
 from weldcal.welding.locate.part.fit import fine_fit
 from weldcal.welding.locate.part.model import PartModel

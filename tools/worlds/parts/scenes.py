@@ -16,11 +16,11 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh, merge, revolve
-from weldcal.models.scanners import ScannerPreset
+from weldcal.models.scanners import ScannerPreset, cast
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.seams import DrawnSeam
-from weldcal.tools.worlds.parts.plates import box, cast, looking_at, table
+from weldcal.tools.worlds.parts.plates import box, looking_at, table
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.locate.part.result import AmbiguousPart, PartNotFound
 
