@@ -118,8 +118,11 @@ def check_beside(
     for s, lift, tip, R in held:
         points_T = (other - tip.position) @ R - [0.0, 0.0, lift]
         for k, (a, b, radius) in enumerate(spans):
-            # tip and wire may be as near to a table that lies level with a wall as they are to this wall
-            met = np.flatnonzero((_distances(points_T, a, b) < radius) & ~(flat if k >= len(above) else False))
+            met = np.flatnonzero(_distances(points_T, a, b) < radius)
+            if k >= len(
+                above
+            ):  # tip and wire may be as near to a table that lies level with a wall as they are to this wall
+                met = met[~flat[met]]
             both, before[k] = np.union1d(met, before[k]), met  # a tack is longer than a step and shorter than two
             if len(met) and len(both) >= least:
                 x, y, z = np.median(other[both], axis=0)
