@@ -26,9 +26,8 @@ ASIDE_RAD = np.radians(np.arange(0.0, 181.0, 15.0))
 SAMPLES = 20_000
 STEP_M = 0.02
 SPHERES = 40  # that stand for one capsule of the tool where points far from it are left out
-OTHER_M = (
-    0.0025  # from the part's surface: above a scan's noise and the registration's error, below the height of a tack
-)
+# From the part's surface: above a scan's noise and the registration's error, below the height of a tack, 3 mm and more.
+OTHER_M = 0.0025
 SAMPLES_BESIDE = 400_000  # of a part's 0.2 m2 about 0.7 mm apart, which is small beside OTHER_M
 LEAST_AREA_M2 = 8e-6  # of a thing that is seen: less is a few flying points at an edge
 STEP_BESIDE_M, LIFTED_M = 0.005, 0.1  # between the places along the seam, and above its ends

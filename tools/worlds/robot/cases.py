@@ -18,7 +18,6 @@ REST_S = 0.3
 LINK = frozenset({Fault.LINK_STALE, Fault.LINK_CLOSED, Fault.CONTROLLER_DEAF})
 DEAF = LINK | {Fault.GUARD_LATCHED}
 ALL = frozenset(Fault) - {Fault.NONE}
-CRASHED = frozenset({Fault.WORKER_DIED})  # ur_rtde itself may crash after a lost connection; the guard stops the arm
 
 
 @dataclass(frozen=True)
@@ -197,9 +196,9 @@ RUNNING: tuple[Case, ...] = (
         rest_s=1.0,
         short=False,
     ),
-    _stops("RTDE connection reset", _fault("reset_tcp"), LINK, over_ur_rtde=CRASHED),
-    _stops("RTDE connection closed", _fault("close_tcp"), LINK, short=False, over_ur_rtde=CRASHED),
-    _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK, over_ur_rtde=CRASHED),
+    _stops("RTDE connection reset", _fault("reset_tcp"), LINK),
+    _stops("RTDE connection closed", _fault("close_tcp"), LINK, short=False),
+    _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
     _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
     # the guard slows the arm, and the next number gives it its speed back
     Case(name="numbers 15 ms late", throw=_fault("mute_input", seconds=0.015), must=GO, may_rest=True),
