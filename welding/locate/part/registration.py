@@ -259,7 +259,8 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
     if size > LARGER * shown:
         advice = (
             f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
-            "scan it from farther away, or give register_part a list of several scans along it"
+            "scan it from several poses along it with a scanner on the flange (planning.scan_poses_deg; weldcal new --part "
+            "FILE --from carried_scanner proposes them), or from farther away"
         )
     if a.n_met < config.min_points:
         raise PartNotFound(

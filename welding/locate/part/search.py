@@ -37,6 +37,8 @@ RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, a
 # Gates of a large part, in its radius: the second is half a turn and half a cell's diagonal, (0.5 * 1.8 + 0.71) / 40.
 LARGE_GATES = (0.053, 0.04)
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
+# A large part does not reach farther through its ground, in its radius; else a beam on end fits wherever a beam lies.
+UNDER, LEVEL_GROUND_COS = 0.25, math.cos(math.radians(7.0))
 _BOX = {n: np.ones((n, n), np.uint8) for n in (1, 3, 2 * RING_CELLS + 1)}
 
 
@@ -125,8 +127,11 @@ def _places_for(
     scene_body, scene_seen = fft.rfft2(mask, s=full), fft.rfft2(body_seen.astype(np.float32), s=full)
     places: list[Place] = []
     points, normals = model.points - model.center, model.normals
+    level_ground = ground is not None and float(ground.normal @ up) > LEVEL_GROUND_COS and model.radius > LARGE_M
+    under = ground.level - UNDER * model.radius if ground is not None and level_ground else -math.inf
     for direction in model.directions:
         R_UP = frame_with_z(direction).T  # turns `direction` into z
+        lowest_z = float((points @ R_UP[2]).min())
         p = (points @ R_UP.T)[normals @ R_UP.T[:, 2] > 0.05]
         p = p[np.argsort(p[:, 2])]
         for turn in np.arange(0.0, 2.0 * math.pi, step):
@@ -157,6 +162,8 @@ def _places_for(
                 if len(difference) < 0.2 * n:
                     continue
                 lift = float(np.median(difference))
+                if lift + lowest_z < under:
+                    continue
                 below, above_it = (
                     (at[row + rows, column + columns] - heights)[shown] - lift for at in (lowest, highest)
                 )
