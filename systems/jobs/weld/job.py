@@ -30,7 +30,7 @@ from weldcal.systems.jobs.weld.settings import (
     work_point,
 )
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
-from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.singularity_guard import SingularityGuard
@@ -278,7 +278,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         if wiring.meshcat is not None:
             drawn = {**shown, "job_state": state}
             if scenario.carried_scanner() is not None:
-                del drawn["scan"]  # the viewer's scanner is at rest
+                drawn["scan"] = wiring.constant("no_scan", Scan())  # the viewer's scanner is at rest
             add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, work_point(scenario), drawn)
         logged = dict(welding.logged)
         if logged:

@@ -31,6 +31,7 @@ from weldcal.welding.seam.room import check_beside, check_ends, check_room
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
+Views = tuple[ScanView, ...]
 
 
 def plan_root_anyhow(
@@ -171,21 +172,14 @@ class SeamPlanner(BackgroundSystem):
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
         planning = dc.replace(planning, workpiece=numbered(planning.workpiece, job.seam))
-        views = newest.views if job.view else ()
+        views = (*(newest.views if job.view else ()), ScanView(scan, X_BC))
         if job.view + 1 < job.views and X_BC is not None:
-            return self.background.ask(_kept, PlannedSeam(sequence=scan.sequence, views=(*views, ScanView(scan, X_BC))))
-        return self.plan(planning, scan, X_BC, correction, views)
+            return self.background.ask(_kept, PlannedSeam(sequence=scan.sequence, views=views))
+        return self.plan(planning, views, correction)
 
-    def plan(
-        self,
-        planning: SeamPlanning,
-        scan: Scan,
-        X_BC: RigidTransform | None,
-        correction: ScannerCorrection,
-        views: tuple[ScanView, ...],
-    ) -> Answer[PlannedSeam]:
-        """Start the plan from this scan and the views before it."""
-        return self.background.ask(plan_seam, planning, scan, X_BC, correction, views)
+    def plan(self, planning: SeamPlanning, views: Views, correction: ScannerCorrection) -> Answer[PlannedSeam]:
+        """Start the plan from these views."""
+        return self.background.ask(plan_seam, planning, views[-1].scan, views[-1].X_BC, correction, views[:-1])
 
 
 def _kept(plan: PlannedSeam) -> PlannedSeam:
@@ -204,12 +198,11 @@ def plan_seam(
     scan: Scan,
     X_BC: RigidTransform | None,
     correction: ScannerCorrection,
-    views: tuple[ScanView, ...] = (),
+    views: Views = (),
 ) -> PlannedSeam:
     """Plan the seam from a scan of the part and the views before it; a plan that fails holds the reason, nothing is raised."""
-    all_views = (*views, ScanView(scan, X_BC))
-    known = [(view.scan, view.X_BC) for view in all_views if view.X_BC is not None]
-    if len(known) < len(all_views):
+    known = [(view.scan, view.X_BC) for view in (*views, ScanView(scan, X_BC)) if view.X_BC is not None]
+    if len(known) <= len(views):
         return PlannedSeam(
             sequence=scan.sequence,
             reason="The seam cannot be computed in the base: the scanner is not calibrated, or the arm's pose at the scan is not known.",
@@ -304,16 +297,9 @@ class DrawnSeamPlanner(SeamPlanner):
         - planned_seam
     """
 
-    def plan(
-        self,
-        planning: SeamPlanning,
-        scan: Scan,
-        X_BC: RigidTransform | None,
-        correction: ScannerCorrection,
-        views: tuple[ScanView, ...],
-    ) -> Answer[PlannedSeam]:
+    def plan(self, planning: SeamPlanning, views: Views, correction: ScannerCorrection) -> Answer[PlannedSeam]:
         """Start the plan; of the scan only its number is used."""
-        return self.background.ask(plan_drawn_seam, planning, scan.sequence)
+        return self.background.ask(plan_drawn_seam, planning, views[-1].scan.sequence)
 
 
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
