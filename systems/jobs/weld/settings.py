@@ -186,11 +186,10 @@ def check_scan_poses(scenario: Scenario) -> None:
 def clear_scan_move(scenario: Scenario, station: Station, q_a: Array, q_b: Array) -> bool:
     """Whether a straight move (6,) rad between home and scan poses is clear of all that is known, the part at its guess included."""
     bodies, spec, cad = station_bodies(station), scenario.workpiece, station.cad
-    part = Surroundings()
-    if spec is not None and cad is not None:
-        part = Surroundings((Obstacle("part", cad.mesh.transformed(spec.pose_guess.pose()), SCAN_CLEAR_M),))
-    clear = clear_move(scenario, station, bodies, q_a, q_b)
-    return clear and not part.touched_on_path(station.arm, bodies, q_a, q_b)
+    if not clear_move(scenario, station, bodies, q_a, q_b) or spec is None or cad is None:
+        return False
+    part = Obstacle("part", cad.mesh.transformed(spec.pose_guess.pose()), SCAN_CLEAR_M)
+    return not Surroundings((part,)).touched_on_path(station.arm, bodies, q_a, q_b)
 
 
 def check_scan_moves(scenario: Scenario, station: Station) -> None:

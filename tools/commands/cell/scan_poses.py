@@ -16,7 +16,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.scanners import ScannerPreset, cast
-from weldcal.models.workpieces.part import numbered, seam_count
+from weldcal.models.workpieces.part import WeldPart, numbered, seam_count
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam, plan_seam
@@ -30,6 +30,7 @@ MARGIN_M = 0.025  # least overlap of two scans, and what the outer ones show bey
 TILTS_DEG = (25.0, 12.0, 0.0, -12.0, -25.0)  # of the view about the part's length, towards the seam's side first
 DISTANCES = 8  # from the scanner's best distance to its largest, for a part that is wide
 TABLE_M = 0.5  # beyond the part, of the scan that is tried
+OFF_M, OFF_RAD = (0.005, 0.0036, 0.0), math.radians(1.5)  # of the part in it from its guess
 CARRIED = "carried_scanner"
 
 
@@ -66,20 +67,34 @@ def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
 
 def _too_long(scenario: Scenario, station: Station) -> str:
     """Why one scan of a scanner beside the arm does not show a part that the arm could weld; "" where size is not the cause."""
-    scanner, cad, spec = scenario.scanner, station.cad, scenario.workpiece
-    if not isinstance(scanner, RenderedScanner) or cad is None or spec is None:
+    cad, X_BP = _part(scenario, station)
+    drawn = plan_drawn_seam(seam_planning(scenario, station, servo_config(scenario, station)), 0)
+    if drawn.reason or not isinstance(scenario.scanner, RenderedScanner) or scenario.scanner.mounted_on != "base":
         return ""
-    if plan_drawn_seam(seam_planning(scenario, station, servo_config(scenario, station)), 0).reason is not None:
-        return ""
-    X_BP = spec.pose_guess.pose()
-    away = float(np.linalg.norm(X_BP @ (0.5 * cad.mesh.bounds.sum(axis=0)) - np.array(scanner.xyz_m)))
-    shown, size = max(scanner.scanner().footprint_m(away)), _lying(cad.mesh.transformed(X_BP), station.arm.up)[1][0]
-    if size <= shown:
-        return ""
+    away = float(np.linalg.norm(X_BP @ (0.5 * cad.mesh.bounds.sum(axis=0)) - np.array(scenario.scanner.xyz_m)))
+    shown = max(scenario.scanner.scanner().footprint_m(away))
+    size = _lying(cad.mesh.transformed(X_BP), station.arm.up)[1][0]
     return (
-        f"The part is {size:.2g} m long, and the scanner beside the arm shows {shown:.2g} m of it. Let the arm carry the scanner along "
-        f"the part: add --from {CARRIED}."
+        ""
+        if size <= shown
+        else (
+            f"The part is {size:.2g} m long, and the scanner beside the arm shows {shown:.2g} m of it. Let the arm carry the scanner along "
+            f"the part: add --from {CARRIED}."
+        )
     )
+
+
+def _part(scenario: Scenario, station: Station) -> tuple[WeldPart, RigidTransform]:
+    assert station.cad is not None
+    assert scenario.workpiece is not None
+    return station.cad, scenario.workpiece.pose_guess.pose()
+
+
+def _scanner(scenario: Scenario) -> tuple[ScannerPreset, RigidTransform]:
+    config, X_FC = scenario.scanner_config(), scenario.carried_scanner()
+    assert config is not None
+    assert X_FC is not None
+    return config.scanner(), X_FC.pose()
 
 
 def _lying(mesh_B: TriMesh, up: Array) -> tuple[Array, Array, Array]:
@@ -99,13 +114,10 @@ def scan_poses(scenario: Scenario, station: Station) -> list[Array]:
     Raises:
         InputError: there are none, with the reason of the poses that came nearest.
     """
-    assert station.cad is not None
-    assert scenario.workpiece is not None
-    X_BP, config = scenario.workpiece.pose_guess.pose(), scenario.scanner_config()
-    assert config is not None
-    axes, size, middle = _lying(station.cad.mesh.transformed(X_BP), station.arm.up)
-    side = 1.0 if float((X_BP.rotation() @ station.cad.up_P.mean(axis=0)) @ axes[:, 1]) >= 0.0 else -1.0
-    places, distance = _spread(config.scanner(), size)
+    cad, X_BP = _part(scenario, station)
+    axes, size, middle = _lying(cad.mesh.transformed(X_BP), station.arm.up)
+    side = 1.0 if float((X_BP.rotation() @ cad.up_P.mean(axis=0)) @ axes[:, 1]) >= 0.0 else -1.0
+    places, distance = _spread(_scanner(scenario)[0], size)
     reason = f"the arm reaches no {len(places)} scan poses at {distance:.2g} m above the part without touching anything"
     for X_BC in _views(axes, middle, side, places, distance):
         poses = _reached(scenario, station, X_BC)
@@ -148,11 +160,10 @@ def _views(axes: Array, middle: Array, side: float, places: Array, distance: flo
 
 def _reached(scenario: Scenario, station: Station, views: list[RigidTransform]) -> list[Array]:
     """Joints (6,) rad of each view, with clear moves between them and home; empty where one is not reached."""
-    arm, home, carried = station.arm, np.deg2rad(scenario.home_deg), scenario.carried_scanner()
-    assert carried is not None
+    arm, home, X_CF = station.arm, np.deg2rad(scenario.home_deg), _scanner(scenario)[1].inverse()
     stops: list[Array] = [home]
     for X_BC in views:
-        q = inverse_kinematics(arm, X_BC @ carried.pose().inverse())
+        q = inverse_kinematics(arm, X_BC @ X_CF)
         q = q + 2.0 * np.pi * np.round((stops[-1] - q) / (2.0 * np.pi))
         q = q[((q > arm.position_lower) & (q < arm.position_upper)).all(axis=1)]
         near = sorted(q, key=lambda one: float(np.abs(one - stops[-1]).max()))
@@ -164,25 +175,19 @@ def _reached(scenario: Scenario, station: Station, views: list[RigidTransform]) 
 
 
 def _refused(scenario: Scenario, station: Station, poses: list[Array]) -> str:
-    """Why the job does not find the part in scans from these poses, displaced as the scenario says; "" where it does."""
-    spec, config, carried, cad = scenario.workpiece, scenario.scanner_config(), scenario.carried_scanner(), station.cad
-    assert spec is not None
-    assert config is not None
-    assert carried is not None
-    assert cad is not None
-    guess = spec.pose_guess.pose()
-    off = RotationMatrix.MakeZRotation(np.deg2rad(spec.placement_error.rotation_deg))
+    """Why the job does not find the part in scans from these poses, displaced by OFF; "" where it does."""
+    (cad, guess), (scanner, X_FC) = _part(scenario, station), _scanner(scenario)
+    off = RotationMatrix.MakeZRotation(OFF_RAD)
     middle = guess @ (0.5 * cad.mesh.bounds.sum(axis=0))
-    shift = 1e-3 * spec.placement_error.translation_mm * np.array([0.8, 0.6, 0.0])
-    X_BP = RigidTransform(off, middle + shift - off @ middle) @ guess
+    X_BP = RigidTransform(off, middle + np.array(OFF_M) - off @ middle) @ guess
     z = scenario.table_height_m()
     part_B = cad.mesh.transformed(X_BP)
     (x, y), (x_to, y_to) = part_B.bounds[:, :2] + np.array([[-TABLE_M], [TABLE_M]])
     scene = [part_B, extrude(np.array([[x, y], [x_to, y], [x_to, y_to], [x, y_to]]), z - 0.02, z)]
     views = []
     for k, q in enumerate(poses):
-        X_BC = forward_kinematics(station.arm, q) @ carried.pose()
-        cloud, X_CB = cast(scene, X_BC, config.scanner(), k), X_BC.inverse()
+        X_BC = forward_kinematics(station.arm, q) @ X_FC
+        cloud, X_CB = cast(scene, X_BC, scanner, k), X_BC.inverse()
         points_C = (cloud @ X_CB.rotation().matrix().T + X_CB.translation()).astype(np.float32)
         views.append(ScanView(Scan(sequence=k + 1, points_C=points_C), X_BC))
     for number in range(seam_count(cad)):
