@@ -256,7 +256,11 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
     """Raise PartNotFound where the best pose does not agree with the scan."""
     a, shown, size = best.agreement, scan.extent_m, 2.0 * model.radius
     advice = "clear the view, or scan it from elsewhere"
-    if size > LARGER * shown:
+    if len(scan.views) > 1:
+        advice = (
+            "correct X_BC of the scans (X_FC of a scanner on the flange), clear the view, or scan it from elsewhere"
+        )
+    elif size > LARGER * shown:
         advice = (
             f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
             "scan it from several poses along it with a scanner on the flange (planning.scan_poses_deg; weldcal new --part "
