@@ -68,20 +68,15 @@ def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
 def _too_long(scenario: Scenario, station: Station) -> str:
     """Why one scan of a scanner beside the arm does not show a part that the arm could weld; "" where size is not the cause."""
     cad, X_BP = _part(scenario, station)
-    drawn = plan_drawn_seam(seam_planning(scenario, station, servo_config(scenario, station)), 0)
-    if drawn.reason or not isinstance(scenario.scanner, RenderedScanner) or scenario.scanner.mounted_on != "base":
+    scanner, planning = scenario.scanner, seam_planning(scenario, station, servo_config(scenario, station))
+    refused = plan_drawn_seam(dc.replace(planning, advises=False), 0).reason is not None
+    if refused or not isinstance(scanner, RenderedScanner) or scanner.mounted_on != "base":
         return ""
-    away = float(np.linalg.norm(X_BP @ (0.5 * cad.mesh.bounds.sum(axis=0)) - np.array(scenario.scanner.xyz_m)))
-    shown = max(scenario.scanner.scanner().footprint_m(away))
+    away = float(np.linalg.norm(X_BP @ (0.5 * cad.mesh.bounds.sum(axis=0)) - np.array(scanner.xyz_m)))
+    shown = max(scanner.scanner().footprint_m(away))
     size = _lying(cad.mesh.transformed(X_BP), station.arm.up)[1][0]
-    return (
-        ""
-        if size <= shown
-        else (
-            f"The part is {size:.2g} m long, and the scanner beside the arm shows {shown:.2g} m of it. Let the arm carry the scanner along "
-            f"the part: add --from {CARRIED}."
-        )
-    )
+    words = f"The part is {size:.2g} m long, and the scanner beside the arm shows {shown:.2g} m of it"
+    return "" if size <= shown else f"{words}. Let the arm carry the scanner along the part: add --from {CARRIED}."
 
 
 def _part(scenario: Scenario, station: Station) -> tuple[WeldPart, RigidTransform]:
