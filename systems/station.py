@@ -325,8 +325,8 @@ def _tool(scenario: Scenario, cad: WeldPart | None) -> WeldingTool | None:
     measured = camera.tag_size_m() if isinstance(camera, FingerCameraConfig) else None
     clear, carried = tool.keep_clear, scenario.carried_scanner()
     if carried is not None:  # its housing moves with the tool
-        ends = [carried.pose() @ np.array([x, 0.0, -0.045]) for x in (-0.09, 0.09)]
-        clear = (*tool.capsules(), Capsule(LAST_LINK, *ends, 0.05))
+        start, end = (carried.pose() @ np.array([x, 0.0, -0.045]) for x in (-0.09, 0.09))
+        clear = (*tool.capsules(), Capsule(LAST_LINK, start, end, 0.05))
     return dc.replace(
         tool,
         keep_clear=clear,

@@ -189,7 +189,7 @@ def _kept(plan: PlannedSeam) -> PlannedSeam:
 def _points_in_base(planning: SeamPlanning, scan: Scan, X_BC: RigidTransform, correction: ScannerCorrection) -> Array:
     points_C = scan.points_C.reshape(-1, 3).astype(float)
     points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
-    points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
+    points_B: Array = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
     return points_B if planning.local_field is None else points_B - planning.field_at(points_B)
 
 
