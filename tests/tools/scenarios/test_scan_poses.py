@@ -17,13 +17,12 @@ from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import plan_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam, Scan, ScanView
-from weldcal.systems.runner import no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
-from weldcal.tools.commands.run import run_job
-from weldcal.tools.commands.weld import measure
+from weldcal.tools.commands.replay import replay_recording
+from weldcal.tools.commands.weld import run_scenario
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 
@@ -63,18 +62,22 @@ def test_a_long_part_gets_scan_poses_that_overlap_and_pass_its_ends(cell: Path) 
 
 
 @pytest.mark.parametrize("start", [0.0, 730.0])
-def test_a_long_part_is_welded_from_all_scans(cell: Path, start: float) -> None:
+def test_a_long_part_is_welded_from_all_scans_and_replayed(cell: Path, start: float, tmp_path: Path) -> None:
     seams = load_scenario(str(cell)).workpiece
     assert seams is not None
     scenario = load_scenario(str(cell), SHORT.format(edges=seams.seams[0].edges, start=start))
-    options = RunOptions(scenario=str(cell), out=Path("never"), recording=False)
-    finished = run_job(scenario, options, no_progress, "")
-    outcome = measure(finished.run, options).summary()
+    replayed = start > 0.0
+    result = run_scenario(
+        scenario, RunOptions(scenario=str(cell), out=tmp_path / "run", recording=False, record=replayed)
+    )
+    outcome = result.summary()
     assert outcome["state"] == "done", outcome
     assert outcome["welded_mm"] > 39.0
     assert outcome["torch_max_mm"] < 0.3
-    phases = [name for name, _, _ in finished.run.phases]
+    phases = [name for name, _, _ in result.run.phases]
     assert phases.count("move_to_scan") == phases.count("scan_workpiece") == 3
+    if replayed:
+        assert replay_recording(tmp_path / "run/recording.mcap").first is None
 
 
 def planned(cell: Path, number: int, off_B: list[float]) -> PlannedSeam:
