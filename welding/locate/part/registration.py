@@ -263,8 +263,8 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
     elif size > LARGER * shown:
         advice = (
             f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
-            "scan it from several poses along it with a scanner on the flange (planning.scan_poses_deg; weldcal new --part "
-            "FILE --from carried_scanner proposes them), or from farther away"
+            "scan it from several poses with a scanner on the flange (weldcal new FOLDER --part FILE --from carried_scanner "
+            "writes them to planning.scan_poses_deg)"
         )
     if a.n_met < config.min_points:
         raise PartNotFound(
