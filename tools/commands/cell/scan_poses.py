@@ -52,7 +52,10 @@ def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
     carried = loaded.carried_scanner() is not None and loaded.workpiece.located_by == "scan"
     if carried == bool(reason):
         return reason
-    station = make_station(loaded, 0)
+    try:
+        station = make_station(loaded, 0)
+    except WeldcalError as error:
+        return reason or str(error)
     try:
         if not carried:
             return _too_long(loaded, station) or reason
