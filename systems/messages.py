@@ -121,6 +121,8 @@ class JobCommand(Message):
     reason: str | None = None
     speed_share: float = 1.0  # of the mover's speed, 0 to 1
     seam: int = 0  # number of the seam that is planned and welded, from 0
+    view: int = 0  # number of the newest scan of the workpiece, from 0
+    views: int = 1  # number of scans that one plan is made from
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -209,11 +211,20 @@ class CalibrationStatus(Message):
         return ScannerCorrection() if found is None else found
 
 
+@dataclass(frozen=True, eq=False)
+class ScanView(Message):
+    """A scan of the workpiece and the scanner's pose X_BC when it was taken; None: it is not known."""
+
+    scan: Scan
+    X_BC: RigidTransform | None
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlannedSeam(Message):
-    """The SeamPlanner's result for the workpiece scan."""
+    """The SeamPlanner's result for the workpiece scan, or for several; before the last one it holds the `views` so far."""
 
     sequence: int = 0
+    views: tuple[ScanView, ...] = ()
     seam: SeamCurve | None = None
     X_BP: RigidTransform | None = None
     rms_m: float = np.nan

@@ -12,8 +12,9 @@ from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
-from weldcal.models.tool import WeldingTool
+from weldcal.models.tool import LAST_LINK, WeldingTool
 from weldcal.models.workpieces.part import WeldPart, bend
 from weldcal.models.workpieces.plate import make_workpiece, seeded_groove_error
 from weldcal.models.workpieces.seat import Press
@@ -322,8 +323,13 @@ def _tool(scenario: Scenario, cad: WeldPart | None) -> WeldingTool | None:
     given = [None if mm is None else 1e-3 * mm for mm in (welding.axial_deflection_mm, welding.deflection_mm)]
     press = Press(tool.press_axial_m, tool.press_lateral_m) if cad is None else cad.press(tool, given[0], given[1])
     measured = camera.tag_size_m() if isinstance(camera, FingerCameraConfig) else None
+    clear, carried = tool.keep_clear, scenario.carried_scanner()
+    if carried is not None:  # its housing moves with the tool
+        start, end = (carried.pose() @ np.array([x, 0.0, -0.045]) for x in (-0.09, 0.09))
+        clear = (*tool.capsules(), Capsule(LAST_LINK, start, end, 0.05))
     return dc.replace(
         tool,
+        keep_clear=clear,
         press_axial_m=press.axial_m,
         press_lateral_m=press.lateral_m,
         tag_size_m=measured or tool.tag_size_m,

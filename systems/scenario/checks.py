@@ -290,5 +290,5 @@ def check_scenario(scenario: Scenario) -> None:
         )
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
-    if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:
+    if scenario.job.weld and not scenario.job.calibrate and (scenario.job.X_BC or scenario.carried_scanner()) is None:
         raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")

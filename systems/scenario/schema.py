@@ -144,6 +144,8 @@ class PlanningConfig:
 
     method: str = "cad"  # cad: the CAD is registered to the scan; cloud: the groove is found in the scan without CAD
     search: str = "guess"  # search for the CAD: guess, near workpiece.pose_guess; anywhere, in the whole scan
+    # joints from which a scanner on the flange scans the part, six angles each; one plan is made from all scans; empty: from home
+    scan_poses_deg: list[list[float]] = dc.field(default_factory=list)
     start_m: list[float] | None = None  # a cloud's seam starts at the end nearest to this; null: nearest to the robot
 
     def planning_method(self) -> PlanningMethod:
@@ -175,6 +177,7 @@ class JobConfig:
     calibrate: bool = True
     weld: bool = True
     X_BC: PoseConfig | None = None  # a known calibration, where `calibrate` is off
+    X_FC: PoseConfig | None = None  # the same of a scanner on the flange: its pose in the flange's frame
     speed_factor: float = 1.0  # speed of the arm's moves, 0.05 to 1; the weld speed does not change
     maximum_time_s: float = 240.0  # at speed_factor 1
 
@@ -255,6 +258,11 @@ class Scenario:
     def flange_name(self) -> str:
         """Designation of the arm's flange: the scenario's, or that of the arm's maker."""
         return self.flange or get_robot(self.arm).flange
+
+    def carried_scanner(self) -> PoseConfig | None:
+        """The known pose X_FC of a scanner on the flange that welds; None for a scanner elsewhere."""
+        scanner = self.scanner_config()
+        return self.job.X_FC if scanner is not None and scanner.mounted_on == "flange" else None
 
     def scanner_config(self) -> ScannerConfig | None:
         """The scanner's configuration; None where there is no scanner."""

@@ -220,7 +220,7 @@ surroundings:
   unit: m
   pose: {xyz_m: [1.2, 0.1, 0.5], rpy_deg: [1.0, 2.0, 3.0]}
   margin_m: 0.05
-planning: {method: cloud, search: anywhere, start_m: [0.6, -0.1, 0.0]}
+planning: {method: cloud, search: anywhere, scan_poses_deg: [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]], start_m: [0.6, -0.1, 0.0]}
 welding:
   speed_mm_s: 6.0
   deflection_mm: 1.5
@@ -235,6 +235,7 @@ job:
   calibrate: false
   weld: false
   X_BC: {xyz_m: [0.61, 0.11, 1.01], rpy_deg: [171.0, 3.0, -84.0]}
+  X_FC: {xyz_m: [0.01, 0.02, 0.03], rpy_deg: [1.0, 2.0, 3.0]}
   speed_factor: 0.5
   maximum_time_s: 100.0
 visualization:

@@ -81,7 +81,11 @@ def known_camera(name: str) -> Scenario:
     scenario.job.calibrate, scenario.job.weld = False, True
     if isinstance(scenario.scanner, RenderedScanner):
         scenario.scanner.mounting_translation_mm = scenario.scanner.mounting_rotation_deg = 0.0
-        scenario.job.X_BC = PoseConfig(list(scenario.scanner.xyz_m), list(scenario.scanner.rpy_deg))
+        pose = PoseConfig(list(scenario.scanner.xyz_m), list(scenario.scanner.rpy_deg))
+        if scenario.scanner.mounted_on == "flange":
+            scenario.job.X_FC = pose
+        else:
+            scenario.job.X_BC = pose
     check_scenario(scenario)
     return scenario
 

@@ -1,18 +1,27 @@
-"""Plans the groove's root from one scan: by the drawing registered to the scan, or from the cloud alone."""
+"""Plans the groove's root from scans: by the drawing registered to them, or from the cloud alone."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
+from weldcal.models.mesh import TriMesh
 from weldcal.models.workpieces.part import Part, WeldPart
 from weldcal.models.workpieces.plate import Workpiece
+from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
-from weldcal.welding.locate.part.locating import locate_part
+from weldcal.welding.locate.part.fit import into
+from weldcal.welding.locate.part.joint import MOST_M, REACH_M, MeasuredJoint, measure_joint
+from weldcal.welding.locate.part.model import PartModel
+from weldcal.welding.locate.part.registration import register_prepared
+from weldcal.welding.locate.part.result import PartConfig, PartRegistration
+from weldcal.welding.locate.part.scan import finite_points, prepare
 from weldcal.welding.locate.planes import Floats
 from weldcal.welding.locate.registration import register_workpiece
 
@@ -61,8 +70,47 @@ class RootPlan:
     summary: str
 
 
+def locate_part(
+    points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]],
+    mesh: TriMesh,
+    seam: DrawnSeam,
+    X_BP_guess: RigidTransform | None = None,
+    eye_B: npt.ArrayLike | None = None,
+    *,
+    X_BP_hint: RigidTransform | None = None,
+    config: PartConfig | None = None,
+) -> tuple[PartRegistration, MeasuredJoint]:
+    """The pose of a part, and its joint in the part's frame as the scan shows it; see register_part and measure_joint.
+
+    Raises:
+        PartNotFound, AmbiguousPart, InputError: as register_part.
+    """
+    config = config or PartConfig()
+    scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
+    model = PartModel(mesh, config.seed)
+    found = register_prepared(scan, model, X_BP_guess, X_BP_hint=X_BP_hint, matters_P=seam.points_P, config=config)
+    near = [_about_seam(into(found.X_BP, v.measured), into(found.X_BP, v.eye[None])[0], seam) for v in scan.views]
+    points, normals = (np.concatenate(part) for part in zip(*near, strict=True))
+    return found, measure_joint(points, normals, scan.pitch_m, model, seam)
+
+
+def _about_seam(points: Floats, eye: Floats, seam: DrawnSeam) -> tuple[Floats, Floats]:
+    """All of the scan's points (N,3) in the box about the seam, with normals (N,3) towards the eye (3,)."""
+    from weldcal.models.mesh import o3d
+
+    reach = REACH_M + 2.0 * MOST_M
+    low, high = seam.points_P.min(axis=0) - reach, seam.points_P.max(axis=0) + reach
+    points = points[((points > low) & (points < high)).all(axis=1)]
+    if len(points) < 20:
+        return points[:0], points[:0]
+    cloud: Any = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
+    normals = np.asarray(cloud.normals)
+    return points, normals * np.where(np.sum(normals * (eye - points), axis=1) < 0.0, -1.0, 1.0)[:, None]
+
+
 def plan_part_root(
-    points_B: npt.NDArray[np.floating],
+    points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]],
     part: Part,
     X_BP_guess: RigidTransform,
     method: PlanningMethod,
@@ -89,7 +137,7 @@ def plan_part_root(
 
 
 def plan_root(
-    points_B: npt.NDArray[np.floating],
+    points_B: npt.NDArray[np.floating] | Sequence[npt.NDArray[np.floating]],
     workpiece: WeldPart,
     X_BP_guess: RigidTransform,
     method: PlanningMethod | None = None,
@@ -97,6 +145,7 @@ def plan_root(
 ) -> RootPlan:
     """Plan the root of the groove from a scan (N,3) or (H,W,3), metres in base; eye_B (3,): the scanner's position.
 
+    Of a part from a file also from a list of V scans; eye_B is then (V,3).
     The cloud method takes nothing from `workpiece`; of several grooves it chooses the one nearest to the guess.
 
     Raises:
@@ -107,6 +156,8 @@ def plan_root(
         return plan_part_root(points_B, workpiece, X_BP_guess, method, eye_B)
     if not isinstance(workpiece, Workpiece):
         raise InputError(f"'{workpiece.name}' cannot be located in a scan: use located_by: drawing.")
+    if not isinstance(points_B, np.ndarray):
+        raise InputError("Several scans are for a part from a file: scan a plate from one pose.")
     if method.method == "cloud":
         groove = extract_groove(points_B, hint_A=X_BP_guess.translation(), start_A=method.start_B)
         return RootPlan(

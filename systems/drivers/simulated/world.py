@@ -42,6 +42,7 @@ from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, To
 from weldcal.systems.drivers.simulated.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 
+TABLE_M = (1.5, 1.2)  # length and width of the table, at least
 SCANNER_RENDERER = "scanner"
 JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of a UR10e's joint servos
 JOINT_DAMPING = (4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2)  # N m s / rad
@@ -138,7 +139,11 @@ def build_world(
     if foot is not None:
         ring = mesh_shape(flange_mesh(foot.standard, foot.standard.bore_depth_m), "foot.obj")
         show(plant, plant.GetBodyByName("base", instance), foot.X_BR, ring, "base_circle", STEEL)
-    show(plant, world_body, table @ RigidTransform([0.0, 0.0, -0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
+    length, width = TABLE_M
+    if workpiece is not None and X_BP is not None:  # a long part lies on a long table
+        reach = np.abs(workpiece.mesh.transformed(table.inverse() @ X_BP).bounds[:, :2]).max(axis=0)
+        length, width = (max(least, 2.0 * float(r) + 0.2) for least, r in zip(TABLE_M, reach, strict=True))
+    show(plant, world_body, table @ RigidTransform([0.0, 0.0, -0.02]), Box(length, width, 0.04), "table", TABLE)
     if surroundings is not None:
         add_surroundings(plant, surroundings)
     if workpiece is not None and X_BP is not None:

@@ -63,7 +63,7 @@ def check_mounting(
             f"In {configuration} the scanner is mounted_on {' or '.join(CARRIED[configuration])}, not '{mounted_on}'."
         )
     if job is None:
-        if configuration != "eye_on_base":
+        if configuration != "eye_on_base" and not (configuration == "eye_in_hand" and weld):
             raise InputError(f"{configuration} needs a mounting part in the scenario: write mounting: {{}}.")
         if second_robot:
             raise InputError("A second robot belongs to co_manipulation: write robot_2: !NoDevice {}.")

@@ -20,6 +20,8 @@ from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.jobs.weld.sequencer import JobSequencer
 from weldcal.systems.jobs.weld.settings import (
     calibrator_config,
+    check_scan_moves,
+    check_scan_poses,
     feature_on_flange,
     feature_standard,
     job_plan,
@@ -28,7 +30,7 @@ from weldcal.systems.jobs.weld.settings import (
     work_point,
 )
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
-from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.singularity_guard import SingularityGuard
@@ -99,7 +101,7 @@ def add_watch(
     """
     scenario, station, c = wiring.scenario, wiring.station, wiring.scenario.calibration
     scanner, job = scenario.scanner, scenario.job
-    if not isinstance(scanner, StreamingScanner):
+    if not isinstance(scanner, StreamingScanner) or scanner.mounted_on != "base":
         return None
     delay_s = scanner.stream().delay_s
     stated = None if job.calibrate or job.X_BC is None else job.X_BC.pose()
@@ -124,7 +126,9 @@ SHARES = {
     "move_to_verify": 0.28,
     "scan_verify": 0.30,
     "park": 0.31,
+    "move_to_scan": 0.32,
     "scan_workpiece": 0.33,
+    "leave_scan": 0.335,
     "approach_above": 0.34,
     "approach": 0.36,
     "weld": 0.38,
@@ -217,10 +221,12 @@ class Weld(Job[tuple[PlannedPose, ...]]):
     """The default job: that of a scenario without another job's part."""
 
     def check(self, scenario: Scenario) -> None:
-        """See Job; check_scenario contains this job's checks."""
+        """See Job; check_scenario contains this job's other checks."""
+        check_scan_poses(scenario)
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
         """See Job: every calibration and verification pose."""
+        check_scan_moves(scenario, station)
         return plan_poses(scenario, station, seed) if scenario.job.calibrate else ()
 
     def add(self, wiring: Wiring, spine: Spine, plan: tuple[PlannedPose, ...]) -> WeldJob:
@@ -271,6 +277,8 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         shown = {**results, "scan": wiring.out("scanner.scan"), "servo_report": welding.report}
         if wiring.meshcat is not None:
             drawn = {**shown, "job_state": state}
+            if scenario.carried_scanner() is not None:
+                drawn["scan"] = wiring.constant("no_scan", Scan())  # the viewer's scanner is at rest
             add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, work_point(scenario), drawn)
         logged = dict(welding.logged)
         if logged:
@@ -341,15 +349,17 @@ def _add_welding(
     out, command, job = wiring.out, sequencer.GetOutputPort("job"), scenario.job
     position = spine.arm.position
     kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
+    carried = scenario.carried_scanner()
     planner = wiring.add(
         "seam_planner",
         kind(
             seam_planning(scenario, station, config),
             None if job.calibrate or job.X_BC is None else job.X_BC.pose(),
             station.background,
+            X_FC_known=None if carried is None else carried.pose(),
         ),
     )
-    wiring.connect(planner, scan=out("scanner.scan"), job=command, calibration_status=status)
+    wiring.connect(planner, scan=out("scanner.scan"), job=command, calibration_status=status, history=spine.arm.history)
     finger = wiring.add(
         "deformation_estimator",
         ArucoDeformationEstimator(station.arm, tool, scenario.finger_camera.camera(), station.background),

@@ -22,7 +22,8 @@ from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
-from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
@@ -30,10 +31,11 @@ from weldcal.welding.seam.room import check_beside, check_ends, check_room
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
+Views = tuple[ScanView, ...]
 
 
 def plan_root_anyhow(
-    points_B: npt.NDArray[np.floating],
+    points_B: npt.NDArray[np.floating] | list[Array],
     workpiece: WeldPart,
     X_BP_guess: RigidTransform,
     method: PlanningMethod,
@@ -56,7 +58,8 @@ def plan_root_anyhow(
         x, y, z = X_UB @ np.array(method.start_B)
         method = dc.replace(method, start_B=(x, y, z))
     R_UB = X_UB.rotation().matrix()
-    found = plan(points_B @ R_UB.T, workpiece, X_UB @ X_BP_guess, method, R_UB @ eye_B)
+    turned = [p @ R_UB.T for p in points_B] if isinstance(points_B, list) else points_B @ R_UB.T
+    found = plan(turned, workpiece, X_UB @ X_BP_guess, method, eye_B @ R_UB.T)
     R = R_BU.matrix()
     X_BP = None if found.X_BP is None else X_UB.inverse() @ found.X_BP
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
@@ -125,10 +128,13 @@ class SeamPlanner(BackgroundSystem):
         - scan
         - job
         - calibration_status
+        - history
         output_ports:
         - planned_seam
 
-    Without calibration in the job, `X_BC_known` is used, with the scan as it is. The plan is made beside the control loop.
+    Without calibration in the job, `X_BC_known` is used, with the scan as it is. For a scanner on the flange `X_FC_known` is used, and
+    `history` (else it may stay open) gives the flange's pose at the scan. Where the job takes several scans, one plan is made from all
+    of them after the last. The plan is made beside the control loop.
     """
 
     def __init__(
@@ -137,12 +143,14 @@ class SeamPlanner(BackgroundSystem):
         X_BC_known: RigidTransform | None = None,
         background: Background | None = None,
         period_s: float = 0.02,
+        X_FC_known: RigidTransform | None = None,
     ) -> None:
         super().__init__("planned_seam", PlannedSeam(), background, period_s)
-        self._planning, self._X_BC_known = planning, X_BC_known
+        self._planning, self._X_BC_known, self._X_FC_known = planning, X_BC_known, X_FC_known
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
+        self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
 
     def ask(self, context: Context, newest: PlannedSeam) -> Answer[PlannedSeam] | None:
         """Ask for the plan from a new scan of the workpiece."""
@@ -151,7 +159,10 @@ class SeamPlanner(BackgroundSystem):
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
             return None
         X_BC, correction, planning = self._X_BC_known, ScannerCorrection(), self._planning
-        if X_BC is None:
+        if self._X_FC_known is not None:
+            X_BF = self._history.Eval(context).pose_at(planning.arm, scan.capture_time)
+            X_BC = None if X_BF is None else X_BF @ self._X_FC_known
+        elif X_BC is None:
             status: CalibrationStatus = self._status.Eval(context)
             X_BC, correction = status.X_BC, status.correction
             planning = dc.replace(
@@ -161,31 +172,51 @@ class SeamPlanner(BackgroundSystem):
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
         planning = dc.replace(planning, workpiece=numbered(planning.workpiece, job.seam))
-        return self.plan(planning, scan, X_BC, correction)
+        views = (*(newest.views if job.view else ()), ScanView(scan, X_BC))
+        if job.view + 1 < job.views and X_BC is not None:
+            return self.background.ask(_kept, PlannedSeam(sequence=scan.sequence, views=views))
+        return self.plan(planning, views, correction)
 
-    def plan(
-        self, planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection
-    ) -> Answer[PlannedSeam]:
-        """Start the plan from this scan."""
-        return self.background.ask(plan_seam, planning, scan, X_BC, correction)
+    def plan(self, planning: SeamPlanning, views: Views, correction: ScannerCorrection) -> Answer[PlannedSeam]:
+        """Start the plan from these views."""
+        return self.background.ask(plan_seam, planning, views[-1].scan, views[-1].X_BC, correction, views[:-1])
+
+
+def _kept(plan: PlannedSeam) -> PlannedSeam:
+    return plan
+
+
+def _points_in_base(planning: SeamPlanning, scan: Scan, X_BC: RigidTransform, correction: ScannerCorrection) -> Array:
+    points_C = scan.points_C.reshape(-1, 3).astype(float)
+    points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
+    points_B: Array = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
+    return points_B if planning.local_field is None else points_B - planning.field_at(points_B)
 
 
 def plan_seam(
-    planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection
+    planning: SeamPlanning,
+    scan: Scan,
+    X_BC: RigidTransform | None,
+    correction: ScannerCorrection,
+    views: Views = (),
 ) -> PlannedSeam:
-    """Plan the seam from a scan of the part; where that fails the plan holds the reason, and no exception is raised."""
-    if X_BC is None:
+    """Plan the seam from a scan of the part and the views before it; a plan that fails holds the reason, nothing is raised."""
+    known = [(view.scan, view.X_BC) for view in (*views, ScanView(scan, X_BC)) if view.X_BC is not None]
+    if len(known) <= len(views):
         return PlannedSeam(
-            sequence=scan.sequence, reason="The seam cannot be computed in the base: the scanner is not calibrated."
+            sequence=scan.sequence,
+            reason="The seam cannot be computed in the base: the scanner is not calibrated, or the arm's pose at the scan is not known.",
         )
-    points_C = scan.points_C.reshape(-1, 3).astype(float)
-    points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
-    points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
-    if planning.local_field is not None:
-        points_B = points_B - planning.field_at(points_B)
+    scans = [_points_in_base(planning, one, X, correction) for one, X in known]
+    eyes, points_B = np.array([X.translation() for _, X in known]), np.concatenate(scans)
     try:
         found = plan_root_anyhow(
-            points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
+            scans if views else points_B,
+            planning.workpiece,
+            planning.X_BP_guess,
+            planning.method,
+            eyes if views else eyes[0],
+            planning.arm.up,
         )
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
         plan = _planned(planning, scan.sequence, seam, found.X_BP)
@@ -261,15 +292,14 @@ class DrawnSeamPlanner(SeamPlanner):
         - scan
         - job
         - calibration_status
+        - history
         output_ports:
         - planned_seam
     """
 
-    def plan(
-        self, planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection
-    ) -> Answer[PlannedSeam]:
+    def plan(self, planning: SeamPlanning, views: Views, correction: ScannerCorrection) -> Answer[PlannedSeam]:
         """Start the plan; of the scan only its number is used."""
-        return self.background.ask(plan_drawn_seam, planning, scan.sequence)
+        return self.background.ask(plan_drawn_seam, planning, views[-1].scan.sequence)
 
 
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:

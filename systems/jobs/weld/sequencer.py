@@ -36,6 +36,7 @@ class JobPlan:
     move_timeout_s: float = 20.0
     maximum_time_s: float = 240.0
     seams: int = 1
+    scan_poses: tuple[Array, ...] = ()  # (6,) rad, from which the workpiece is scanned; empty: from home
 
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,6 +49,7 @@ class JobState(ProcedureState):
         streaming: the finger camera streams.
         process_on: the process is enabled.
         seam: number of the seam that is planned and welded, from 0.
+        view: number of the newest scan of the workpiece, from 0.
         log: start time, s, and name of every phase.
         warnings: sentences that hold nothing.
     """
@@ -57,6 +59,7 @@ class JobState(ProcedureState):
     streaming: bool = False
     process_on: bool = False
     seam: int = 0
+    view: int = 0
     log: tuple[tuple[float, str], ...] = ((0.0, "start"),)
     warnings: tuple[str, ...] = ()
 
@@ -132,6 +135,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
     inputs = JobInputs
     moves = (
         *("move_home", "move_to_verification_cloud", "move_to_pose", "move_to_verify", "park"),
+        *("move_to_scan", "leave_scan"),
         *("approach_above", "approach", "retract", "home"),
     )
     driven = ("weld",)
@@ -147,7 +151,10 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             maximum_time_s=plan.maximum_time_s,
             timeouts={
                 **dict.fromkeys(("scan_verification_cloud", "scan_pose", "scan_verify"), no_scan),
-                "scan_workpiece": (plan.scan_timeout_s, late.format("No workpiece scan", plan.scan_timeout_s)),
+                "scan_workpiece": (
+                    plan.scan_timeout_s * max(1, len(plan.scan_poses)),  # the plan from all of them is made in it
+                    late.format("No workpiece scan", plan.scan_timeout_s),
+                ),
             },
             dwell_s=plan.dwell_s,
             period_s=period_s,
@@ -186,6 +193,8 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             streaming=s.streaming and not s.held,
             process_on=s.process_on and not s.held,
             seam=s.seam,
+            view=s.view,
+            views=max(1, len(self._plan.scan_poses)),
         )
 
     def flag(self, name: str, s: JobState) -> bool:
@@ -248,15 +257,28 @@ class JobSequencer(Procedure[JobState, JobInputs]):
     def _parked(self, s: JobState, now: JobInputs) -> JobState:
         if not self._plan.weld:
             return self.enter(s, now, "done")
+        return self._scan(s, now) if not self._plan.scan_poses else self._to_view(s, now, 0)
+
+    def _to_view(self, s: JobState, now: JobInputs, view: int) -> JobState:
+        return self.go(s, now, "move_to_scan", self._plan.scan_poses[view], view=view)
+
+    def _scan(self, s: JobState, now: JobInputs) -> JobState:
         return self.request(s, now, "scan_workpiece", purpose="workpiece", label="workpiece")
 
     def _planned(self, s: JobState, now: JobInputs) -> JobState:
         planned = now.planned_seam
         if planned.sequence < s.trigger:
             return s
+        if planned.views and s.view + 1 < len(self._plan.scan_poses):
+            return self._to_view(s, now, s.view + 1)
         if planned.seam is None or planned.q_above is None or planned.q_start is None:
             return self.held(s, now, planned.reason or "No seam could be planned.")
-        return self.go(s, now, "approach_above", planned.q_above)
+        if self._plan.scan_poses:
+            return self._homeward(s, now, "leave_scan")  # from where the way to the seam is planned
+        return self._approach(s, now)
+
+    def _approach(self, s: JobState, now: JobInputs) -> JobState:
+        return self.go(s, now, "approach_above", now.planned_seam.q_above)
 
     def _above(self, s: JobState, now: JobInputs) -> JobState:
         return self.go(s, now, "approach", now.planned_seam.q_start)
@@ -292,7 +314,9 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         "move_to_verify": _arrive_and_scan("verify", "scan_verify"),
         "scan_verify": _verified,
         "park": _parked,
+        "move_to_scan": _scan,
         "scan_workpiece": _planned,
+        "leave_scan": _approach,
         "approach_above": _above,
         "approach": _approached,
         "weld": _welding,

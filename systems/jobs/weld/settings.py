@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -9,17 +10,20 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.calibrate import PLAIN
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
+from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.calibration.refinement.kinematics_fit import KINDS
 from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import chain_of
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.workpieces.part import numbered
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
-from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
+from weldcal.systems.motion.clear_moves import clear_move, clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
+from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.welding.servo.settings import (
@@ -35,6 +39,7 @@ _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
+SCAN_CLEAR_M = 0.02  # from a part that is not found yet
 TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
 
 
@@ -150,6 +155,63 @@ def _telling_of_the_arm(
     return planned(config, wanted)
 
 
+def check_scan_poses(scenario: Scenario) -> None:
+    """Check the scan poses of the workpiece, and that the pose of a scanner on the flange is known.
+
+    Raises:
+        InputError: one sentence that says what to change.
+    """
+    job, poses, scanner = scenario.job, scenario.planning.scan_poses_deg, scenario.scanner_config()
+    on_flange = scanner is not None and scanner.mounted_on == "flange"
+    if poses and not on_flange:
+        raise InputError(
+            "planning.scan_poses_deg is for a scanner on the flange (scanner.mounted_on: flange). A scanner beside the arm has one view: "
+            "remove the list, or let the arm carry the scanner."
+        )
+    if on_flange and job.weld and (job.calibrate or job.X_FC is None):
+        raise InputError(
+            "A weld with the scanner on the flange needs its pose there: calibrate with the scenario eye_in_hand first, then write "
+            "job.calibrate: false and job.X_FC."
+        )
+    if len(poses) > 1 and (scenario.workpiece is None or scenario.workpiece.file is None):
+        raise InputError(
+            "planning.scan_poses_deg: several poses are for a part from a file; write one pose for a plate."
+        )
+    for k, pose in enumerate(poses):
+        if len(pose) != 6:
+            raise InputError(f"planning.scan_poses_deg[{k}] must hold 6 angles, not {len(pose)}.")
+        check_home(pose, scenario.arm, f"planning.scan_poses_deg[{k}]")
+
+
+def clear_scan_move(scenario: Scenario, station: Station, q_a: Array, q_b: Array) -> bool:
+    """Whether a straight move (6,) rad between home and scan poses is clear of all that is known, the part at its guess included."""
+    bodies, spec, cad = station_bodies(station), scenario.workpiece, station.cad
+    if not clear_move(scenario, station, bodies, q_a, q_b) or spec is None or cad is None:
+        return False
+    part = Obstacle("part", cad.mesh.transformed(spec.pose_guess.pose()), SCAN_CLEAR_M)
+    return not Surroundings((part,)).touched_on_path(station.arm, bodies, q_a, q_b)
+
+
+def check_scan_moves(scenario: Scenario, station: Station) -> None:
+    """Check the moves from home to each scan pose and back.
+
+    Raises:
+        InputError: a move is not clear.
+    """
+    home, poses = np.deg2rad(scenario.home_deg), [np.deg2rad(pose) for pose in scenario.planning.scan_poses_deg]
+    stops = [home, *poses, home] if poses else []
+    for k, (a, b) in enumerate(pairwise(stops)):
+        if not clear_scan_move(scenario, station, a, b):
+            where = (
+                f"to planning.scan_poses_deg[{k}]"
+                if k < len(poses)
+                else "home from the last of planning.scan_poses_deg"
+            )
+            raise InputError(
+                f"On the way {where} the arm would touch the table, the part, the surroundings or itself: choose another pose."
+            )
+
+
 def work_point(scenario: Scenario) -> np.ndarray:
     """p_BWork (3,) m: the point at which the calibration's error is evaluated."""
     if scenario.workpiece is not None:
@@ -175,6 +237,7 @@ def job_plan(scenario: Scenario) -> JobPlan:
         move_timeout_s=MOVE_TIMEOUT_S * slower,
         maximum_time_s=job.maximum_time_s * slower * seams,
         seams=seams,
+        scan_poses=tuple(np.deg2rad(pose) for pose in scenario.planning.scan_poses_deg),
     )
 
 

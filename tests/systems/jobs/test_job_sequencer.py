@@ -18,7 +18,15 @@ from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
 from weldcal.systems.jobs.weld.job import SHARES
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobInputs, JobPlan, JobSequencer, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
-from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
+from weldcal.systems.messages import (
+    CalibrationStatus,
+    JobCommand,
+    PlannedSeam,
+    Scan,
+    ScanView,
+    UrStatus,
+    VerificationResult,
+)
 from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -135,8 +143,32 @@ def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     assert world.arrive() == "done"
     assert (world.command.mode, world.command.finished, world.command.held) == ("hold", True, False)
     passed = [phase for _, phase in world.state.log]
-    assert {*PHASES, "done"} == {*passed, "move_home"}, "it stood at home already"
+    assert {*PHASES, "done"} == {*passed, "move_home", "move_to_scan", "leave_scan"}, "it stood at home already"
     assert [t for t, _ in world.state.log] == sorted(t for t, _ in world.state.log)
+
+
+def test_a_part_is_scanned_from_each_pose_then_planned_once() -> None:
+    poses = tuple(np.full(6, 0.1 * k) for k in (1, 2, 3))
+    world = World(dc.replace(PLAN, calibrate=False, scan_poses=poses), JobState(phase="park", goal_id=5))
+    assert world.arrive() == "move_to_scan"
+    for k, pose in enumerate(poses):
+        assert world.command.q_goal is pose
+        assert world.arrive() == "scan_workpiece"
+        assert (world.command.view, world.command.views, world.command.scan_sequence) == (k, 3, k + 1)
+        view = ScanView(Scan(sequence=k + 1), RigidTransform())
+        if k < 2:
+            assert world.look(0.3, planned_seam=PlannedSeam(sequence=k + 1, views=(view,) * (k + 1))) == "move_to_scan"
+        else:
+            assert world.look(0.3, planned_seam=PLANNED) == "leave_scan"
+    assert world.command.q_goal is Q_HOME  # from where the way to the seam is planned
+    assert world.arrive() == "approach_above"
+
+
+def test_a_scan_without_the_arms_pose_holds_the_job_at_once() -> None:
+    plan = dc.replace(PLAN, calibrate=False, scan_poses=(np.zeros(6), np.ones(6)))
+    world = World(plan, JobState(phase="scan_workpiece", goal_id=5, trigger=1))
+    assert world.look(0.3, planned_seam=PlannedSeam(sequence=1, reason="The arm's pose is not known.")) == "held"
+    assert world.command.reason == "The arm's pose is not known."
 
 
 def test_every_seam_is_scanned_planned_and_welded_in_turn() -> None:

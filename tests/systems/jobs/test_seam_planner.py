@@ -11,12 +11,15 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
 from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.workpieces.plate import make_workpiece
+from weldcal.systems.background import Answer
 from weldcal.systems.jobs.weld.arm_way import SeamOutOfReach, arm_waypoints
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanner, SeamPlanning, plan_drawn_seam, tip_seam
 from weldcal.systems.jobs.weld.settings import servo_config
-from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
@@ -188,6 +191,49 @@ def test_the_cloud_is_shown_in_the_base(plan: PlannedSeam) -> None:
     assert plan.points_B is not None
     on_top = np.abs(plan.points_B[:, 2] - 0.02) < 0.5e-3
     assert on_top.sum() > 1000
+
+
+class Keeping(SeamPlanner):
+    """A planner that keeps the views it would plan from."""
+
+    views: tuple[ScanView, ...] = ()
+
+    def plan(
+        self, planning: SeamPlanning, views: tuple[ScanView, ...], correction: ScannerCorrection
+    ) -> Answer[PlannedSeam]:
+        self.views = views
+        return super().plan(planning, (ScanView(Scan(sequence=views[-1].scan.sequence), None),), correction)
+
+
+def test_each_scan_has_the_pose_at_which_it_was_taken(config: ServoConfig) -> None:
+    X_FC = RigidTransform(RollPitchYaw(0.0, 0.1, np.pi / 2), [-0.16, 0.01, 0.02])
+    joints = [Q_HOME, Q_HOME + np.array([0.3, -0.1, 0.05, 0.0, 0.1, 0.2])]
+    history = PoseHistory(np.array([0.0, 1.0, 1.1, 2.0]), np.array([joints[0], joints[0], joints[1], joints[1]]))
+    planning = SeamPlanning(
+        arm=the_arm(),
+        tool=TOOL,
+        workpiece=STRAIGHT,
+        X_BP_guess=X_BP,
+        config=config,
+        q_near=Q_HOME,
+        clearance_m=CLEARANCE_M,
+        seam_length_m=0.1,
+    )
+    system = Keeping(planning, X_FC_known=X_FC)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for name, value in {"calibration_status": CalibrationStatus(), "history": history}.items():
+        system.GetInputPort(name).FixValue(context, AbstractValue.Make(value))
+    for view, time in enumerate((0.5, 1.5)):
+        job = replace(JOB, scan_sequence=view + 1, view=view, views=2)
+        for name, message in {"scan": Scan(view + 1, time), "job": job}.items():
+            system.GetInputPort(name).FixValue(context, AbstractValue.Make(message))
+        simulator.AdvanceTo(0.1 * (view + 1))
+        answer: PlannedSeam = system.GetOutputPort("planned_seam").Eval(context)
+        assert len(answer.views) == (1 if view == 0 else 0)
+    for found, q in zip(system.views, joints, strict=True):
+        assert found.X_BC is not None
+        assert found.X_BC.GetAsMatrix4() == pytest.approx((forward_kinematics(the_arm(), q) @ X_FC).GetAsMatrix4())
 
 
 def test_without_a_calibration_there_is_no_plan_but_a_reason(workpiece_scan: Scan, config: ServoConfig) -> None:

@@ -39,6 +39,7 @@ from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
 from weldcal.tools.commands.cell.part import least_pipe, ranked, unit_hint
+from weldcal.tools.commands.cell.scan_poses import add_scan_poses
 from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
@@ -223,6 +224,7 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
             scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
             _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
             scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)), not nearest)
+            reason = add_scan_poses(scenario, unfinished, reason)
             nearest = nearest or reason
             if not reason:
                 break

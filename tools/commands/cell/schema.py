@@ -133,7 +133,8 @@ def kind_in_words(kind: Any) -> str:
         kinds = [k for k in get_args(kind) if k is not NoneType]
         return " or ".join(dict.fromkeys(kind_in_words(k) for k in kinds))
     if get_origin(kind) is list:
-        return f"list of {kind_in_words(get_args(kind)[0])}s"
+        inner = kind_in_words(get_args(kind)[0])
+        return f"list of {inner.replace('list', 'lists', 1) if inner.startswith('list') else inner + 's'}"
     return _WORDS.get(kind, "keys below" if dc.is_dataclass(kind) else getattr(kind, "__name__", str(kind)))
 
 

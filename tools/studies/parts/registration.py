@@ -23,11 +23,11 @@ from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.worlds.parts.scenes import REFUSALS, PartScene, Subject, scan_scene, scanned_mesh, subject
 from weldcal.tools.worlds.parts.step_parts import PARTS
-from weldcal.welding.locate.part.locating import locate_part
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_part
 from weldcal.welding.locate.part.result import AmbiguousPart, PartNotFound, PartRegistration
 from weldcal.welding.locate.part.rivals import same_set, turned_poses
+from weldcal.welding.locate.planning import locate_part
 
 Floats = NDArray[np.float64]
 

@@ -330,10 +330,15 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
     advice, check = "clear the view, or scan it from elsewhere", "check which part this is and the file's unit"
     if a.hidden > MUCH_HIDDEN:
         advice = check = f"something hides {100 * a.hidden:.0f} % of it: clear the view, or scan it from elsewhere"
-    if size > LARGER * shown:
+    if len(scan.views) > 1:
+        advice = (
+            "correct X_BC of the scans (X_FC of a scanner on the flange), clear the view, or scan it from elsewhere"
+        )
+    elif size > LARGER * shown:
         advice = (
             f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
-            "scan it from farther away, or give register_part a list of several scans along it"
+            "scan it from several poses with a scanner on the flange (weldcal new FOLDER --part FILE --from carried_scanner "
+            "writes them to planning.scan_poses_deg)"
         )
         check = advice
     if a.n_met < config.min_points:

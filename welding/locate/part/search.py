@@ -40,6 +40,8 @@ RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, a
 LARGE_GATES = (0.053, 0.04)
 SUNK_M, LEAST_GROUND = 0.008, 30  # depth of a part's middle in its ground, and the coarse points that show this ground
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
+# A large part does not reach farther through its ground, in its radius; else a beam on end fits wherever a beam lies.
+UNDER, LEVEL_GROUND_COS = 0.25, math.cos(math.radians(7.0))
 _BOX = {n: np.ones((n, n), np.uint8) for n in (1, 3, 2 * RING_CELLS + 1)}
 
 
@@ -150,9 +152,12 @@ def _places_for(
     everything = _scene(top, known_ground, around, full, False)
     places: list[Place] = []
     points, normals = model.points - model.center, model.normals
+    level_ground = ground is not None and float(ground.normal @ up) > LEVEL_GROUND_COS and model.radius > LARGE_M
+    under = ground.level - UNDER * model.radius if ground is not None and level_ground else -math.inf
     for direction in model.directions:
         R_UP = frame_with_z(direction).T  # turns `direction` into z
         p = points @ R_UP.T
+        lowest_z = float(p[:, 2].min())
         scenes = [everything]
         if ground is not None and ground.normal is up:
             # What is higher than the part, if it lies on the ground, hides it: there the scan says nothing about it.
@@ -192,6 +197,8 @@ def _places_for(
                     if len(difference) < 0.2 * n:
                         continue
                     lift = float(np.median(difference))
+                    if lift + lowest_z < under:
+                        continue
                     below, above_it = (
                         limit[at][shown] - heights[shown] - lift for limit in (scene.lowest, scene.highest)
                     )
