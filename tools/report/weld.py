@@ -28,7 +28,7 @@ from weldcal.welding.record.process import (
     speed_along,
     speed_statistics,
 )
-from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.servo.state import Phase
 
 
@@ -144,7 +144,8 @@ def true_seam(truth: Truth, seam: int = 0) -> SeamCurve | None:
     ups = part.up_P
     line = part.seam_P + TORCH_ABOVE_ROOT_M * ups
     R = truth.X_BP.rotation().matrix()
-    return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=np.broadcast_to(ups, line.shape) @ R.T)
+    line, ups, turn_m = ringed(line @ R.T + truth.X_BP.translation(), np.broadcast_to(ups, line.shape) @ R.T)
+    return SeamCurve.from_points(line, up=ups, length=turn_m)
 
 
 def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:

@@ -15,6 +15,7 @@ from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
 
 _REPEAT_M = 1e-6  # neighbours closer than a micrometre are the same point
+_CLOSED_M = 1e-4  # between the ends of a ring
 _KNOT_M = 1e-3  # knots at most a millimetre apart: a 1 mm radius is still a curve
 
 
@@ -36,6 +37,14 @@ class RepeatedSeamPoints(SeamError):
 
 class NonFiniteSeamPoints(SeamError):
     """A point or normal is not a number."""
+
+
+def ringed(line: Array, ups: Array) -> tuple[Array, Array, float | None]:
+    """A closed line (N,3) m and its ups, three times around, and the length m of one turn; any other as it is, and None."""
+    if np.linalg.norm(line[-1] - line[0]) > _CLOSED_M:
+        return line, ups, None
+    turn = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+    return np.vstack([line, line[1:], line[1:]]), np.vstack([ups, ups[1:], ups[1:]]), turn
 
 
 class SeamFrame(NamedTuple):

@@ -383,7 +383,7 @@ class ServoConfig:
     def __post_init__(self) -> None:
         _check_numbers("", self)
         for group in ("refinement", "plan_fit", "windows"):
-            _check_numbers(f"{group}.", getattr(self, group), zero=("frames_to_commit", "back_up_m"))
+            _check_numbers(f"{group}.", getattr(self, group), ("tilt_rad",), ("frames_to_commit", "back_up_m"))
         _check_numbers("refinement.corner.", self.refinement.corner)
         if self.tool.torch_offset_m < 0.010:
             raise ServoConfigError("The torch must trail the tip by at least 10 mm (tool.torch_offset_m).")

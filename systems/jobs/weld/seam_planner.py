@@ -24,7 +24,7 @@ from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
-from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.room import check_beside, check_ends, check_room
 from weldcal.welding.servo.touch import check_length, touch_start_pose
@@ -62,6 +62,7 @@ def plan_root_anyhow(
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
+OVERLAP_M = 5e-3
 TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
 
 
@@ -111,7 +112,7 @@ class SeamPlanning(Welder):
             tool = self.tool
             check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
-        check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
+        check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s, self.config.windows)
         return find_way(self, seam, X_BP)
 
 
@@ -232,7 +233,13 @@ def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, lengt
 
 
 def _cut(line: Array, ups: Array, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is still in it."""
+    """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is still in it.
+
+    A ring is welded on over its start by OVERLAP_M, and the tip goes round ahead of the torch.
+    """
+    line, ups, turn_m = ringed(line, ups)
+    if turn_m is not None:
+        length_m = turn_m + OVERLAP_M if length_m is None else min(length_m, turn_m + OVERLAP_M)
     if length_m is None:
         return SeamCurve.from_points(line, up=ups)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])

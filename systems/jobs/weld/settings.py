@@ -22,6 +22,7 @@ from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
+from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
     DeflectionControl,
     GapConfig,
@@ -58,7 +59,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
     press = Press(tool.press_axial_m, tool.press_lateral_m)
     cad = numbered(station.cad, seam)
     seat = cad.seated(tool, press)
-    entry = cad.entry(tool, seat)
+    entry, tilt = cad.entry(tool, seat), tool.torch_tilt_rad
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
@@ -73,6 +74,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
+        windows=SeamWindows(travel_rad=max(SeamWindows.travel_rad, abs(tilt)), tilt_rad=tilt),
         torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
     )
 
