@@ -40,7 +40,7 @@ class NonFiniteSeamPoints(SeamError):
 
 
 def ringed(line: Array, ups: Array) -> tuple[Array, Array, float | None]:
-    """A closed line (N,3) m and its ups, three times around, and the length m of one turn; any other as it is, and None.
+    """A closed line (N,3) m and its ups, four times around, and the length m of one turn; any other as it is, and None.
 
     Where it was measured, its ends differ a little: the difference is spread over the line beside them.
     """
@@ -50,7 +50,7 @@ def ringed(line: Array, ups: Array) -> tuple[Array, Array, float | None]:
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     share = np.maximum(1.0 - s / _SPREAD_M, 0.0) - np.maximum(1.0 - (s[-1] - s) / _SPREAD_M, 0.0)
     line = line + 0.5 * share[:, None] * apart
-    return np.vstack([line, line[1:], line[1:]]), np.vstack([ups, ups[1:], ups[1:]]), float(s[-1])
+    return np.vstack([line, *[line[1:]] * 3]), np.vstack([ups, *[ups[1:]] * 3]), float(s[-1])
 
 
 class SeamFrame(NamedTuple):

@@ -33,6 +33,7 @@ MOVES_MM, TURNS_DEG = (25.0, 50.0, 100.0, 150.0, 200.0, 300.0), (15.0, 30.0, 45.
 MM_PER_DEG = 2.0  # of an offered turn, beside an offered move
 _LEVEL = math.cos(math.radians(20.0))
 _POSTURES = 24
+TURNED_RAD = math.pi
 
 
 class SeamObstructed(InfeasiblePath):
@@ -96,7 +97,7 @@ def find_way(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None) -> Ar
     first: InfeasiblePath | None = None
     may = math.degrees(welder.lean_rad) + 1e-6
     leans = [lean for lean in _LEANS if abs(math.degrees(lean)) <= may]
-    ways = itertools.chain(((lean, None) for lean in leans), _postures(welder, seam) if welder.any_posture else ())
+    ways = itertools.chain(((lean, None) for lean in leans), _postures(welder, seam, welder.any_posture))
     for lean, seed in ways:
         try:
             return way_on(welder, seam, X_BP, lean, seed)
@@ -125,7 +126,7 @@ def _offer(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, may_deg
     for lean in _LEANS:
         if abs(math.degrees(lean)) > may_deg and works(still, lean):
             return f"set welding.lean_deg: {abs(math.degrees(lean)):.0f}, with which the tool leans sideways so far where it must"
-    if not welder.any_posture and any(works(still, lean, seed) for lean, seed in _postures(welder, seam)):
+    if not welder.any_posture and any(works(still, lean, seed) for lean, seed in _postures(welder, seam, True)):
         return "set welding.posture: any, with which the arm changes to another branch above the part"
     for X, words in _displacements(seam.frame(0.5 * seam.length).position, welder.arm.up):
         if works(X):
@@ -149,8 +150,8 @@ def _displacements(centre: Array, up: Array) -> Iterator[tuple[RigidTransform, s
     return ((X, words) for _, X, words in sorted(found, key=lambda item: item[0]))
 
 
-def _postures(welder: Welder, seam: SeamCurve) -> Iterator[tuple[float, Array]]:
-    """Every other branch above the seam's start, whole turns of a joint included, the nearest to home first."""
+def _postures(welder: Welder, seam: SeamCurve, any_branch: bool) -> Iterator[tuple[float, Array]]:
+    """Every branch above the seam's start, whole turns of a joint included, or whole turns of wrist 3 only, the nearest to home first."""
     arm, home = welder.arm, welder.q_near
     above = _lifted(arm, seam, touch_start_pose(seam, welder.config), welder.clearance_m) @ welder.tool.X_FT.inverse()
     near, found = nearest_solution(arm, above, home), []
@@ -158,7 +159,9 @@ def _postures(welder: Welder, seam: SeamCurve) -> Iterator[tuple[float, Array]]:
         q = q + 2.0 * np.pi * np.round((home - q) / (2.0 * np.pi))
         turns = np.vstack([np.zeros(6), *(sign * 2.0 * np.pi * np.eye(6)[[0, 3, 4, 5]] for sign in (1.0, -1.0))])
         found += [p for p in q + turns if np.all((p > arm.position_lower) & (p < arm.position_upper))]
-    others = (q for q in found if near is None or float(np.abs(q - near).max()) > 0.1)
+    others = [q for q in found if near is None or float(np.abs(q - near).max()) > 0.1]
+    if not any_branch:
+        others = [q for q in others if near is not None and np.abs(q - near)[:5].max() < 0.1]
     ranked = sorted(others, key=lambda q: float(np.sum(((q - home) / arm.velocity_limit) ** 2)))
     return ((0.0, q) for q in ranked[:_POSTURES])
 
@@ -170,7 +173,13 @@ def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: f
         try:
             q_near = welder.q_near if seed is None else seed
             goals = arm_waypoints(welder.arm, welder.tool, seam, config, q_near, share * welder.clearance_m)
-            along = along or tuple(check_path(welder.arm, goals[0], seam_motions(welder.tool, seam, config)))
+            motions = seam_motions(welder.tool, seam, config)
+            along = along or tuple(check_path(welder.arm, goals[0], motions))
+            q_end = along[-1].q[-1]
+            if float(np.abs(q_end - goals[2]).max()) > TURNED_RAD:  # around a ring: the wrist turns back above the part
+                X_BE = _lifted(welder.arm, seam, motions[-1].X_BT[-1], share * welder.clearance_m + 0.05, seam.length)
+                q_retract = nearest_solution(welder.arm, X_BE @ welder.tool.X_FT.inverse(), q_end)
+                goals = (*goals[:2], goals[2] if q_retract is None else q_retract)
             way = ArmWay(*goals, lean, along)
             _check_clear(welder, way, X_BP, seed is not None)
             break

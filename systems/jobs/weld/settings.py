@@ -59,7 +59,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
     press = Press(tool.press_axial_m, tool.press_lateral_m)
     cad = numbered(station.cad, seam)
     seat = cad.seated(tool, press)
-    entry, tilt = cad.entry(tool, seat), tool.torch_tilt_rad
+    entry = cad.entry(tool, seat)
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
@@ -74,7 +74,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
-        windows=SeamWindows(travel_rad=max(SeamWindows.travel_rad, abs(tilt)), tilt_rad=tilt),
+        windows=SeamWindows.of(tool),
         torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
     )
 
