@@ -17,7 +17,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import numbered
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, seated_tip, work_point
+from weldcal.systems.jobs.weld.settings import seated_tip, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
 from weldcal.systems.station import Truth
 from weldcal.welding.record.process import (
@@ -29,6 +29,7 @@ from weldcal.welding.record.process import (
     speed_statistics,
 )
 from weldcal.welding.seam.curve import SeamCurve, ringed
+from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M
 from weldcal.welding.servo.state import Phase
 
 

@@ -6,19 +6,13 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from pydrake.math import RigidTransform
 
 from weldcal.models.errors import WeldcalError
-from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.tool import WeldingTool
-from weldcal.welding.numerics import Array
 from weldcal.welding.seam.chord_map import ChordMap, chord_map
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.room import check_room
 
 _SPACING_M = 1.0e-3
-_SPEED_M_S = 8.0e-3  # of a ring that is only checked: its windows do not depend on it
-PIPES_M, PIPE_STEP_M = (0.005, 0.5), 5e-4  # radii among which the least one for a tool is searched
 
 
 class InfeasibleSeam(WeldcalError):
@@ -104,41 +98,6 @@ def check_feasible(plan: SeamCurve, d: float, weld_speed: float, windows: SeamWi
         )
         raise InfeasibleSeam(f"Plan infeasible: {report.problems[0].sentence}; {action}.")
     return report.chart
-
-
-def check_ring(
-    mesh: TriMesh, line: Array, up: Array, height_m: float, tool: WeldingTool, lean_rad: float = 0.0
-) -> None:
-    """Check that a tool fits along a line (N,3) m, its tip `height_m` above it along up (N,3), and can follow it.
-
-    Raises:
-        NoRoom: its body would touch the part.
-        InfeasibleSeam: its torch cannot follow its tip, or leaves its windows.
-    """
-    seam = SeamCurve.from_points(line + height_m * up, up=up)
-    check_feasible(seam, tool.chord_m, _SPEED_M_S, SeamWindows.of(tool))
-    check_room(mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, tool.chord_m, lean_rad)
-
-
-def least_pipe_m(tool: WeldingTool, wall_m: float, lean_rad: float = 0.0) -> float:
-    """Diameter m of the least pipe whose outside the tool can weld onto a plate, both as far as `wall_m` from the seam.
-
-    With both ends of the chord d on a ring of radius R at the bisector's 45 deg the chord's pitch is asin(sin 45 d / 2R).
-    """
-    around = np.linspace(0.0, 2.0 * math.pi, 181)
-    circle, (low, high) = np.stack([np.cos(around), np.sin(around)], axis=1), PIPES_M
-    up = np.hstack([circle, np.ones((181, 1))]) / math.sqrt(2.0)
-    while high - low > PIPE_STEP_M:
-        radius = 0.5 * (low + high)
-        plate = (radius + wall_m) * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-        mesh = merge(extrude(radius * circle[:-1], 0.0, wall_m), extrude(plate, -0.01, 0.0))
-        line = np.pad(radius * circle, ((0, 0), (0, 1)))
-        try:
-            check_ring(mesh, line, up, math.sqrt(2.0) * tool.tip_radius_m, tool, lean_rad)
-            high = radius
-        except WeldcalError:
-            low = radius
-    return 2.0 * high
 
 
 def split_seam(

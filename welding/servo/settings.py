@@ -67,6 +67,9 @@ def weave_at(config: WeaveConfig, since: float) -> tuple[float, float]:
     return config.amplitude_m * share * wave, config.amplitude_m * (share * rate + growth * wave)
 
 
+TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
+
+
 class ServoConfigError(InputError):
     """A servo setting that cannot be used."""
 

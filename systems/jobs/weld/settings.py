@@ -24,6 +24,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
+    TORCH_ABOVE_ROOT_M,
     DeflectionControl,
     GapConfig,
     ServoConfig,
@@ -36,7 +37,6 @@ _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
-TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
 
 
 def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:

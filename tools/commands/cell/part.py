@@ -28,8 +28,9 @@ from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.feasibility import InfeasibleSeam, check_ring, least_pipe_m
+from weldcal.welding.seam.feasibility import InfeasibleSeam
 from weldcal.welding.seam.room import NoRoom, check_room
+from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
 
 COLUMNS = ("id", "kind", "length_mm", "angle_deg", "radius_mm", "start", "end")
 COLOURS = {"concave": "#c2281f", "flush": "#8a2be2", "convex": "#2b5fc4", "boundary": "#b37400"}
@@ -115,7 +116,7 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
     try:
         check_weldable(section, tool.tip_radius_m)
         if ring is not None:
-            check_ring(shape.mesh, *ring, hard_height(section, tool.tip_radius_m), tool)
+            check_ring(shape.mesh, *ring, section, tool)
         for id in joint.edges if ring is None else ():
             edge = shape.edge(id)
             assert edge.up_P is not None
