@@ -278,7 +278,7 @@ class MotionLimits:
 
     Attributes:
         tip_speed_max_m_s, omega_max_rad_s, pitch_rate_max_rad_s: largest speeds.
-        tip_acceleration_m_s2, omega_acceleration_rad_s2: rate limits of tip speed and turning.
+        tip_acceleration_m_s2, omega_acceleration_rad_s2, pitch_acceleration_rad_s2: rate limits of tip speed, turning and pitch.
         turn_rate_max_rad_s: the tip speed is at most this times the seam's radius; tip_speed_floor: but not below this
             share of the weld speed.
         creep: share of the weld speed that a tip square to the chord keeps.
@@ -292,6 +292,7 @@ class MotionLimits:
     pitch_rate_max_rad_s: float = 0.3
     tip_acceleration_m_s2: float = 0.3
     omega_acceleration_rad_s2: float = 4.0
+    pitch_acceleration_rad_s2: float = 100.0
     turn_rate_max_rad_s: float = 1.2
     tip_speed_floor: float = 0.35
     creep: float = 0.4
