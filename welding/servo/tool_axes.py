@@ -181,16 +181,21 @@ def least_pipe_m(tool: WeldingTool, wall_m: float, lean_rad: float = 0.0) -> flo
 
     Tip and torch stand on the ring, a chord apart: nothing but the lean across the chord is free.
     """
-    around = np.linspace(0.0, 2.0 * math.pi, 181)
-    circle, (low, high) = np.stack([np.cos(around), np.sin(around)], axis=1), PIPES_M
-    up = np.hstack([circle, np.ones((181, 1))]) / math.sqrt(2.0)
+    low, high = PIPES_M
     while high - low > PIPE_STEP_M:
         radius = 0.5 * (low + high)
+        whole, part = (
+            np.linspace(0.0, a, 181) for a in (2.0 * math.pi, min(2.0 * math.pi, 3.0 * tool.chord_m / radius))
+        )
+        circle, arc = (
+            np.stack([np.cos(a), np.sin(a)], axis=1) for a in (whole, part)
+        )  # all places of a ring are alike
+        up = np.hstack([arc, np.ones((181, 1))]) / math.sqrt(2.0)
         plate = (radius + wall_m) * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
         mesh = merge(extrude(radius * circle[:-1], 0.0, wall_m), extrude(plate, -0.01, 0.0))
         section = JointSection(0.25 * math.pi, wall_m, wall_m)
         try:
-            check_ring(mesh, np.pad(radius * circle, ((0, 0), (0, 1))), up, section, tool, lean_rad)
+            check_ring(mesh, np.pad(radius * arc, ((0, 0), (0, 1))), up, section, tool, lean_rad)
             high = radius
         except WeldcalError:
             low = radius
