@@ -19,7 +19,7 @@ class InfeasibleSeam(WeldcalError):
     """A trailing torch cannot weld this seam in one go: it would have to run backwards, stop, or leave its windows."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SeamWindows:
     """Limits on the motion that a seam may require of the tool.
 

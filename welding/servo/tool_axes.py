@@ -171,9 +171,9 @@ def check_ring(
         windows=SeamWindows.of(tool),
     )
     seam = SeamCurve.from_points(line + above * up, up=up)
+    check_room(mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, tool.chord_m, lean_rad)
     check_feasible(seam, tool.chord_m, config.weld_speed_m_s, config.windows)
     check_travel(seam, config)
-    check_room(mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, tool.chord_m, lean_rad)
 
 
 def least_pipe_m(tool: WeldingTool, wall_m: float, lean_rad: float = 0.0) -> float:
