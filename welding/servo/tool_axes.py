@@ -146,7 +146,8 @@ def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
     if travel[k] > windows.travel_rad + TRAVEL_MARGIN_RAD:
         raise InfeasibleSeam(
             f"Plan infeasible: the torch's travel angle would be {math.degrees(travel[k]):.0f} deg at {1e3 * path.s_torch[k]:.0f} mm of "
-            f"the seam, and its window is {math.degrees(windows.travel_rad):.0f} deg; take a tool whose torch is nearer to its tip."
+            f"the seam, and its window is {math.degrees(windows.travel_rad):.0f} deg; "
+            "take a tool whose torch is nearer to its tip, or weld the straight edges as seams of their own."
         )
 
 

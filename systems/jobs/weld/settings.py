@@ -14,7 +14,7 @@ from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
-from weldcal.models.workpieces.part import numbered
+from weldcal.models.workpieces.part import WeldPart, numbered, seam_count
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
@@ -167,10 +167,11 @@ def work_point(scenario: Scenario) -> np.ndarray:
     return np.array(scenario.calibration.work_point_m)
 
 
-def job_plan(scenario: Scenario) -> JobPlan:
+def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
     """The job's parameters; time limits are longer for slower moves and more seams."""
     c, job = scenario.calibration, scenario.job
-    seams = max(1, len(scenario.workpiece.seams)) if scenario.workpiece is not None else 1
+    listed = 1 if scenario.workpiece is None else len(scenario.workpiece.seams)
+    seams = max(1, listed if cad is None else seam_count(cad))
     slower = 1.0 / job.speed_factor
     return JobPlan(
         calibrate=job.calibrate,
