@@ -3,7 +3,7 @@
 import dataclasses as dc
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -88,16 +88,47 @@ def leaning(config: ServoConfig, lean_rad: float) -> ServoConfig:
     return dc.replace(config, torch=dc.replace(config.torch, work_angle_rad=lean_rad)) if lean_rad else config
 
 
-def find_way(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None) -> ArmWay:
+def leans_with_room(welder: Welder, seam: SeamCurve, X_BP: RigidTransform) -> list[float]:
+    """Leans, rad, that the job may use and with which the tool's body fits the part; the upright tool's only where that fits.
+
+    Raises:
+        NoRoom: none fits, with the least lean that would.
+    """
+    assert welder.workpiece is not None
+    mesh, tool, refused, fits = welder.workpiece.mesh, welder.tool, None, []
+    for lean in LEANS:
+        try:
+            check_room(mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
+        except NoRoom as problem:
+            refused = refused or problem
+            continue
+        if refused is None:
+            return [lean for lean in LEANS if abs(lean) <= welder.lean_rad + 1e-6]
+        fits.append(lean)
+    assert refused is not None
+    if may := [lean for lean in fits if abs(lean) <= welder.lean_rad + 1e-6]:
+        return may
+    if not fits:
+        raise refused
+    advice = f"set welding.lean_deg: {abs(math.degrees(fits[0])):.0f}, with which the tool leans so far where it must"
+    raise NoRoom(f"{refused} Or {advice}.", refused.short_m)
+
+
+def find_way(
+    welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, leans: Sequence[float] | None = None
+) -> ArmWay:
     """The first way that works, of the upright tool on the branch of home and of what else the job may use by itself.
+
+    leans: with which the tool has room at the part; None: as far as the job may.
 
     Raises:
         InfeasiblePath: of the first of them, with the change that makes the seam feasible where one was found.
     """
     first: InfeasiblePath | None = None
     may = math.degrees(welder.lean_rad) + 1e-6
-    leans = [lean for lean in _LEANS if abs(math.degrees(lean)) <= may]
-    ways = itertools.chain(((lean, None) for lean in leans), _postures(welder, seam, welder.any_posture))
+    leans = [lean for lean in LEANS if abs(math.degrees(lean)) <= may] if leans is None else leans
+    others = _postures(welder, seam, welder.any_posture) if 0.0 in leans else ()
+    ways = itertools.chain(((lean, None) for lean in leans), others)
     for lean, seed in ways:
         try:
             return way_on(welder, seam, X_BP, lean, seed)
@@ -109,7 +140,7 @@ def find_way(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None) -> Ar
     raise first.advised(_offer(welder, seam, X_BP, may)) from first
 
 
-_LEANS = sorted(np.radians(np.arange(-LEAN_MOST_DEG, LEAN_MOST_DEG + 1.0, LEAN_STEP_DEG)).tolist(), key=abs)
+LEANS = sorted(np.radians(np.arange(-LEAN_MOST_DEG, LEAN_MOST_DEG + 1.0, LEAN_STEP_DEG)).tolist(), key=abs)
 
 
 def _offer(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, may_deg: float) -> str:
@@ -123,7 +154,7 @@ def _offer(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, may_deg
         return True
 
     still = RigidTransform()
-    for lean in _LEANS:
+    for lean in LEANS:
         if abs(math.degrees(lean)) > may_deg and works(still, lean):
             return f"set welding.lean_deg: {abs(math.degrees(lean)):.0f}, with which the tool leans sideways so far where it must"
     if not welder.any_posture and any(works(still, lean, seed) for lean, seed in _postures(welder, seam, True)):

@@ -20,13 +20,13 @@ from weldcal.models.workpieces.part import Part, WeldPart, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way
+from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leans_with_room
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.room import check_beside, check_ends, check_room
+from weldcal.welding.seam.room import check_beside, check_ends
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
@@ -109,13 +109,13 @@ class SeamPlanning(Welder):
             WeldcalError: the seam is too short or not feasible, or the tool has no room beside the part at X_BP.
         """
         check_length(seam, self.config)
+        leans = None
         if X_BP is not None:
-            tool = self.tool
-            check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
+            tool, leans = self.tool, leans_with_room(self, seam, X_BP)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s, self.config.windows)
         check_travel(seam, self.config)
-        return find_way(self, seam, X_BP)
+        return find_way(self, seam, X_BP, leans)
 
 
 class SeamPlanner(BackgroundSystem):
