@@ -37,8 +37,7 @@ from weldcal.welding.servo.settings import (
 _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
-# a torch nearer to the tip turns the tool faster for the same error: its feedback is less, and the pitch is ramped, so that
-# no joint is slower than the others
+# a torch nearer to the tip turns the tool faster for the same error: the pitch is ramped, so that no joint lags behind the others
 NEAR_M, NEAR_PITCH_RAD_S2 = 0.060, 1.0
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
 
@@ -63,7 +62,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
     press = Press(tool.press_axial_m, tool.press_lateral_m)
     cad = numbered(station.cad, seam)
     seat = cad.seated(tool, press)
-    entry, near = cad.entry(tool, seat), min(1.0, tool.chord_m / NEAR_M)
+    entry = cad.entry(tool, seat)
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
@@ -79,11 +78,8 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
         windows=SeamWindows.of(tool),
-        torch=TorchControl(
-            ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s(),
-            feedback_limit_m=TorchControl.feedback_limit_m * near,
-        ),
-        limits=MotionLimits() if near == 1.0 else MotionLimits(pitch_acceleration_rad_s2=NEAR_PITCH_RAD_S2),
+        torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
+        limits=MotionLimits(pitch_acceleration_rad_s2=NEAR_PITCH_RAD_S2) if tool.chord_m < NEAR_M else MotionLimits(),
     )
 
 
