@@ -6,6 +6,8 @@ import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,8 +17,10 @@ from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, plain_station,
 from tests.systems.placements import Placement, draw, follow, offered, placed
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
+from weldcal.models.mesh import extrude, merge
 from weldcal.models.tools.loading import load_tool, tool_file
-from weldcal.systems.jobs.weld.arm_way import Welder, find_way
+from weldcal.models.workpieces.part import WeldPart
+from weldcal.systems.jobs.weld.arm_way import Welder, find_way, leans_with_room
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_drawn_seam, seam_above
 from weldcal.systems.jobs.weld.settings import servo_config
@@ -27,6 +31,7 @@ from weldcal.tools.worlds.weld.plant import groove_config, simulate
 from weldcal.tools.worlds.weld.seams import get_seam
 from weldcal.welding.locate.planning import RootPlan
 from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.room import NoRoom
 from weldcal.welding.servo.settings import ServoConfig, ToolGeometry
 from weldcal.welding.servo.state import Phase
 from weldcal.welding.servo.tool_axes import tool_path
@@ -159,3 +164,25 @@ def test_a_ring_is_welded_round_within_the_wrists_limits() -> None:
     end, above = (forward_kinematics(arm, joints) @ tool.X_FT for joints in (q[-1], way.q_retract))
     assert above.rotation().matrix() == pytest.approx(end.rotation().matrix(), abs=1e-6)
     assert (above.translation() - end.translation()) @ seam.up(seam.length) == pytest.approx(0.075, abs=1e-3)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_a_tool_leans_off_the_bisector_where_it_has_no_room_upright(sense: float) -> None:
+    """Around a pipe of 136 mm: the least is 148 mm upright, and less where the tool leans away from it."""
+    tool = load_tool(tool_file(Path("welding"))).tool
+    a = sense * np.linspace(0.0, 1.5 * np.pi, 181)
+    out = np.column_stack([np.cos(a), np.sin(a), np.zeros(181)])
+    up = (out + np.array([0.0, 0.0, 1.0])) / np.sqrt(2.0)
+    round_ = 0.068 * np.column_stack([np.cos(a), np.sin(a)])[:: int(sense)]
+    pipe = extrude(round_, 0.0, 0.1)
+    plate = extrude(0.17 * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]), -0.01, 0.0)
+    part = cast(WeldPart, SimpleNamespace(mesh=merge(pipe, plate)))
+    seam = SeamCurve.from_points(0.068 * out + 0.0033 * up, up=up)
+    welder = Welder(
+        arm=plain_station().arm, tool=tool, config=ServoConfig(), q_near=np.zeros(6), clearance_m=0.025, workpiece=part
+    )
+    with pytest.raises(NoRoom, match=r"does not fit at .* Or set welding.lean_deg: 2, with which") as refused:
+        leans_with_room(welder, seam, RigidTransform())
+    assert 0.0 < refused.value.short_m < 0.01
+    leans = np.degrees(leans_with_room(replace(welder, lean_rad=np.radians(3.0)), seam, RigidTransform()))
+    assert leans == pytest.approx([2.0 * sense])
