@@ -10,11 +10,14 @@ import pytest
 
 from weldcal.models.arrays import Array
 from weldcal.models.tools.loading import load_tool, tool_file
+from weldcal.welding.numerics import pose
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows, assess_seam
-from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry
+from weldcal.welding.servo.settings import DeflectionControl, MotionLimits, ServoConfig, ToolGeometry
+from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import check_travel, least_pipe_m
+from weldcal.welding.servo.track import TorchTarget, guarded_motion
 
 D, V = 0.025, 0.008
 PRESS = DeflectionControl(delta_d_m=1e-3, axial_d_m=4e-3)
@@ -109,3 +112,19 @@ def test_the_pipe_tool_welds_pipes_from_40_mm() -> None:
     shipped = load_tool(tool_file(Path("welding"))).tool
     upright, leaning = least_pipe_m(shipped, 0.08), least_pipe_m(shipped, 0.08, math.radians(2.0))
     assert 0.060 < leaning < upright < 0.160
+
+
+@pytest.mark.parametrize(("ramp", "pitch"), [(100.0, 2.5 * 1e-3 / D), (1.0, 1.0 * 0.008)])
+def test_the_pitch_of_a_near_torch_is_ramped(ramp: float, pitch: float) -> None:
+    """A torch 1 mm low pitches the tool by k_h e / d, in the first tick no faster than the ramp."""
+    line = SeamCurve.from_points([[0.65, -0.1 + 0.01 * k, 0.0] for k in range(21)], up=(-1.0, 0.0, 1.0))
+    tool = ToolGeometry(torch_offset_m=D, torch_height_m=0.0)
+    config = ServoConfig(tool=tool, limits=MotionLimits(pitch_acceleration_rad_s2=ramp))
+    tip, torch = line.frame(0.1), line.frame(0.1 - D)
+    R = np.column_stack([tip.tangent, np.cross(tip.up, tip.tangent), tip.up])
+    X_BT = pose(R, tip.position)
+    s, above = 0.1 - D, torch.position + 1e-3 * torch.up
+    target = TorchTarget(above, torch.tangent, torch.normal, torch.up, s, s, np.zeros(2))
+    motion = guarded_motion(WeldingState(), X_BT, tip, target, (0.0, 0.0), config, 0.008)
+    # nose down: the torch rises about the tip
+    assert motion.V_BT[:3] @ tip.normal == pytest.approx(pitch, rel=0.02)
