@@ -90,6 +90,7 @@ class WeldingTool:
     camera_distance_m: float = 0.040  # from the finger camera's centre to the tag
     chord_m: float = 0.060  # |d| of Eq. 14
     torch_height_m: float = -0.0015  # z of the wire point in T
+    torch_tilt_rad: float = 0.0  # how far the wire's axis leans back from the tip's, away from it
     mass_kg: float = 1.4
     centre_of_mass_m: tuple[float, float, float] = (0.03, 0.0, 0.05)
     ring: FlangeStandard | None = RING  # what the scanner measures; None: the arm's bare flange

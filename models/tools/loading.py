@@ -205,6 +205,7 @@ def _load(path: Path, changed: int | None) -> LoadedTool:
         tag_id=tag.id,
         chord_m=chord,
         torch_height_m=height,
+        torch_tilt_rad=_tilt(R_FT, part.torch.axis),
         mass_kg=part.mass_kg,
         centre_of_mass_m=_metres(part.centre_of_gravity_mm),
         ring=None if part.ring is None else _ring(path.name, part.ring),
@@ -329,6 +330,12 @@ def _tip_frame(file: str, part: ToolPart) -> tuple[RotationMatrix, float, float]
     if np.abs(R.matrix() - R_FLIPPED.matrix()).max() < 1e-12:
         R = R_FLIPPED
     return R, chord, round(float(-(to_tip @ z)), 12)
+
+
+def _tilt(R_FT: RotationMatrix, axis: Triple) -> float:
+    """How far the wire's axis leans back from the tip's in the plane of tip and torch, rad."""
+    x, _, z = R_FT.matrix().T @ _unit(axis)
+    return round(float(np.arctan2(x, -z)), 4)
 
 
 def _ring(file: str, part: RingPart) -> FlangeStandard:

@@ -10,11 +10,13 @@ from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import Part, bowed
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
-from weldcal.models.workpieces.seams import JOINTS
-from weldcal.models.workpieces.shape import UNITS_M
+from weldcal.models.workpieces.seams import JOINTS, DrawnSeam
+from weldcal.models.workpieces.shape import UNITS_M, PartShape
 from weldcal.systems.scenario.schema import SeamConfig, WorkpieceConfig
 
 OF_PLATES = ("bend_radius_mm", "hole_from_mm")
+CORNER_RAD = math.radians(15.0)  # by which the bisector turns at one of a seam's points
+ROUNDED_M = 0.002  # to each side of a corner the drawing is rounded
 
 
 def check_workpiece(spec: WorkpieceConfig) -> None:
@@ -67,8 +69,40 @@ def part_of(spec: WorkpieceConfig) -> Part:
     assert spec.file is not None
     assert spec.joint is not None
     shape = read_shape(Path(spec.file), spec.units)
-    first, *others = (seam_of(shape, source(seam), spec.joint) for seam in spec.seams)
+    first, *others = (leg for seam in spec.seams for leg in legs(shape, source(seam), spec.joint))
     return Part(shape, first, tuple(others))
+
+
+def legs(shape: PartShape, source: SeamSource, joint: str) -> list[DrawnSeam]:
+    """A seam as drawn, or its legs between sharp outside corners, as those of a square tube: across one, tip and torch cannot both follow.
+
+    Raises:
+        InputError: as seam_of.
+    """
+    whole, ids = seam_of(shape, source, joint), list(source.edges)
+    up, t = whole.up_P, whole.tangents_P
+    angle = np.arccos(np.clip(np.sum(up[1:] * up[:-1], axis=1), -1.0, 1.0))
+    # at an outside corner the seam turns away from the side to which the joint is open
+    after, before = (np.clip(np.arange(len(angle)) + k, 0, len(t) - 1) for k in (3, -2))
+    outside = np.sum((t[after] - t[before]) * (up[1:] + up[:-1]), axis=1) < 0.0
+    corners = whole.points_P[np.flatnonzero((angle > CORNER_RAD) & outside)]
+    groups = [ids[:1]]
+    for k, id in enumerate(ids[1:], start=1):
+        ends = shape.edge(id).points_P[[0, -1]]
+        meet = ends[
+            int(np.argmin(np.linalg.norm(ends[:, None] - shape.edge(ids[k - 1]).points_P[[0, -1]], axis=2).min(axis=1)))
+        ]
+        sharp = len(corners) and np.linalg.norm(corners - meet, axis=1).min() < ROUNDED_M
+        groups = [*groups, [id]] if sharp else [*groups[:-1], [*groups[-1], id]]
+    if len(groups) == 1:
+        return [whole]
+    found = []
+    for group in groups if source.direction == "forward" else groups[::-1]:
+        leg = seam_of(shape, SeamSource(edges=tuple(group)), joint)
+        near = int(np.argmin(np.linalg.norm(whole.points_P - leg.points_P[len(leg.points_P) // 2], axis=1)))
+        found.append(leg if leg.tangents_P[len(leg.points_P) // 2] @ t[near] > 0.0 else leg.reversed())
+    found[0] = found[0].between(source.start_m, found[0].length_m)
+    return [*found[:-1], found[-1].between(0.0, found[-1].length_m - source.end_m)]
 
 
 def made(part: Part, spec: WorkpieceConfig, rng: np.random.Generator) -> Part:

@@ -9,12 +9,14 @@ import pytest
 
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import Part, numbered, seam_count
+from weldcal.models.workpieces.reading import read_shape
 from weldcal.systems.jobs.weld.settings import job_plan, seated_tip, servo_config
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario, SeamConfig, WorkpieceConfig
 from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
 from weldcal.tools.worlds.parts.cells import Trial, write_cell
-from weldcal.tools.worlds.parts.step_parts import PARTS
+from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, less, write_step
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +118,27 @@ def test_a_press_that_climbs_out_is_refused(cell: Path) -> None:
     scenario = load_scenario(str(cell), "welding: {deflection_mm: 2.5, axial_deflection_mm: 3.0}")
     with pytest.raises(InputError, match="climbs out"):
         make_station(scenario, seed=0)
+
+
+def test_a_square_tube_is_welded_leg_by_leg(tmp_path: Path) -> None:
+    """Across a sharp outside corner tip and torch cannot both follow; a rectangle that is drawn on a plate's edge is closed."""
+    tube = less(box((-30, -20, 0), (60, 40, 50)), box((-26, -16, -1), (52, 32, 60)))
+    write_step(assembly(box((-90, -90, -10), (180, 180, 10)), tube), tmp_path / "tube.step")
+    shape = read_shape(tmp_path / "tube.step")
+    joint = max(shape.joints, key=lambda j: j.length_m)
+    spec = WorkpieceConfig(
+        file=str(tmp_path / "tube.step"), seams=[SeamConfig(edges=list(joint.edges))], joint="fillet"
+    )
+    part = part_of(spec)
+    assert seam_count(part) == 4
+    assert job_plan(Scenario(workpiece=spec), part).seams == 4
+    corners = 1e3 * np.array([numbered(part, k).seam_P[[0, -1]] for k in range(4)])
+    lengths = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+    assert sorted(lengths) == pytest.approx([40.0, 40.0, 60.0, 60.0], abs=0.2)
+    assert np.abs(corners[..., 0]) == pytest.approx(np.full((4, 2), 30.0), abs=0.15)
+    assert np.abs(corners[..., 1]) == pytest.approx(np.full((4, 2), 20.0), abs=0.15)
+    assert np.linalg.norm(corners[1:, 0] - corners[:-1, 1], axis=1).max() < 0.2  # one leg begins where the other ends
+    for k in range(4):
+        up = numbered(part, k).up_P
+        assert (up @ up[len(up) // 2]).min() > 0.999
+        assert up[0, 2] == pytest.approx(np.sqrt(0.5), abs=0.02)

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import matplotlib
@@ -22,11 +23,13 @@ from weldcal.models.tools.enclosing import shape_mesh
 from weldcal.models.tools.loading import LoadedTool
 from weldcal.systems.drivers.simulated.tag_view import TagView
 from weldcal.tools.report.render import render
+from weldcal.welding.servo.tool_axes import least_pipe_m
 
 COLOURS = {"dark": "#4a525c", "steel": "#a5abb3", "copper": "#c47a3d", "soft": "#3d7aa6", "white": "#f4f4f4"}
 KEEP, AXIS = "#b04a3a", "#20262c"
 _SEGMENTS = 32
 NAMES_APART_MM = 9.0
+WALL_M = 0.1  # of pipe and plate beside the seam
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +88,7 @@ class ToolCheck:
             },
             "shapes": len(t.drawn()),
             "keep_clear": len(t.capsules()),
+            "least_pipe_mm": self.least_pipe_mm,
             "carried_by": self.carriers,
             "folder": None if self.folder is None else str(self.folder),
         }
@@ -94,6 +98,11 @@ class ToolCheck:
         """Angle between wire and finger."""
         finger = -self.loaded.tool.X_FT.rotation().matrix()[:, 2]
         return float(np.rad2deg(np.arccos(np.clip(finger @ self.loaded.torch_axis, -1.0, 1.0))))
+
+    @cached_property
+    def least_pipe_mm(self) -> float:
+        """Diameter of the least pipe whose outside the tool can weld onto a plate, both WALL_M wide beside the seam."""
+        return round(1e3 * least_pipe_m(self.loaded.tool, WALL_M))
 
     def rows(self) -> dict[str, str]:
         """What was understood, in lines."""
@@ -114,6 +123,7 @@ class ToolCheck:
             f"{_text(t.X_FK.translation())} mm",
             "tag": f"{t.tag_dictionary} number {t.tag_id}, {1e3 * t.tag_size_m:.2f} mm, {tag['from_camera_mm']:.1f} mm from the camera: "
             f"{tag['side_px']:.0f} px wide",
+            "least pipe": f"{self.least_pipe_mm:g} mm across, welded onto a plate from outside",
             "bodies": f"{len(t.drawn())} drawn, {len(t.capsules())} capsules kept clear",
         }
 

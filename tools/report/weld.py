@@ -17,7 +17,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import numbered
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, seated_tip, work_point
+from weldcal.systems.jobs.weld.settings import seated_tip, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
 from weldcal.systems.station import Truth
 from weldcal.welding.record.process import (
@@ -28,7 +28,8 @@ from weldcal.welding.record.process import (
     speed_along,
     speed_statistics,
 )
-from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve, ringed
+from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M
 from weldcal.welding.servo.state import Phase
 
 
@@ -144,7 +145,8 @@ def true_seam(truth: Truth, seam: int = 0) -> SeamCurve | None:
     ups = part.up_P
     line = part.seam_P + TORCH_ABOVE_ROOT_M * ups
     R = truth.X_BP.rotation().matrix()
-    return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=np.broadcast_to(ups, line.shape) @ R.T)
+    line, ups, turn_m = ringed(line @ R.T + truth.X_BP.translation(), np.broadcast_to(ups, line.shape) @ R.T)
+    return SeamCurve.from_points(line, up=ups, length=turn_m)
 
 
 def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:

@@ -15,6 +15,7 @@ from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
 
 _REPEAT_M = 1e-6  # neighbours closer than a micrometre are the same point
+_CLOSED_M, _SPREAD_M = 1e-3, 0.010  # between the ends of a ring, and over how much of it their difference is spread
 _KNOT_M = 1e-3  # knots at most a millimetre apart: a 1 mm radius is still a curve
 
 
@@ -36,6 +37,20 @@ class RepeatedSeamPoints(SeamError):
 
 class NonFiniteSeamPoints(SeamError):
     """A point or normal is not a number."""
+
+
+def ringed(line: Array, ups: Array) -> tuple[Array, Array, float | None]:
+    """A closed line (N,3) m and its ups, four times around, and the length m of one turn; any other as it is, and None.
+
+    Where it was measured, its ends differ a little: the difference is spread over the line beside them.
+    """
+    apart = line[-1] - line[0]
+    if np.linalg.norm(apart) > _CLOSED_M:
+        return line, ups, None
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    share = np.maximum(1.0 - s / _SPREAD_M, 0.0) - np.maximum(1.0 - (s[-1] - s) / _SPREAD_M, 0.0)
+    line = line + 0.5 * share[:, None] * apart
+    return np.vstack([line, *[line[1:]] * 3]), np.vstack([ups, *[ups[1:]] * 3]), float(s[-1])
 
 
 class SeamFrame(NamedTuple):

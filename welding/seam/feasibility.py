@@ -3,10 +3,12 @@
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
+from weldcal.models.tool import WeldingTool
 from weldcal.welding.seam.chord_map import ChordMap, chord_map
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -17,7 +19,7 @@ class InfeasibleSeam(WeldcalError):
     """A trailing torch cannot weld this seam in one go: it would have to run backwards, stop, or leave its windows."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SeamWindows:
     """Limits on the motion that a seam may require of the tool.
 
@@ -26,6 +28,7 @@ class SeamWindows:
         conditioning: least sqrt(cos^2 th_r + cos^2 th_t).
         sharp_rad: largest turn within 4 mm: beyond it the seam reverses in a cusp.
         travel_rad: largest travel angle, unsigned; work_rad: largest lean off the wanted work angle.
+        tilt_rad: how far the torch leans back from the tool's axis; it adds to the chord's pitch.
         speed_loss: largest share of torch speed that the limits may take away.
     """
 
@@ -35,6 +38,13 @@ class SeamWindows:
     travel_rad: float = math.radians(20.0)
     work_rad: float = math.radians(10.0)
     speed_loss: float = 1.0
+    tilt_rad: float = 0.0
+
+    @classmethod
+    def of(cls, tool: WeldingTool) -> Self:
+        """The windows of a tool; a torch that leans back further than the travel window was built for that angle."""
+        tilt = tool.torch_tilt_rad
+        return cls(travel_rad=max(cls.travel_rad, abs(tilt)), tilt_rad=tilt)
 
 
 @dataclass(frozen=True)
@@ -128,10 +138,11 @@ def _problems(plan: SeamCurve, chart: ChordMap, d: float, limits: SeamWindows) -
     if sharp > limits.sharp_rad:
         text = f"the seam reverses at {1e3 * where:.0f} mm: it turns {math.degrees(sharp):.0f} deg within 4 mm"
         found.append(SeamProblem("cusp", where, text))
-    if chart.max_travel > limits.travel_rad:
-        k = int(np.argmax(np.abs(chart.travel)))
+    travel = np.abs(chart.travel + limits.tilt_rad)
+    k = int(np.argmax(travel))
+    if travel[k] > limits.travel_rad:
         text = (
-            f"the travel angle would be {math.degrees(chart.max_travel):.1f} deg at {1e3 * chart.s_torch[k]:.0f} mm, "
+            f"the travel angle would be {math.degrees(travel[k]):.1f} deg at {1e3 * chart.s_torch[k]:.0f} mm, "
             f"and its window is {math.degrees(limits.travel_rad):.0f} deg"
         )
         found.append(SeamProblem("travel angle", float(chart.s_torch[k]), text))

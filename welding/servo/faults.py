@@ -92,7 +92,7 @@ def angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> str
     """Fault sentence for a work or travel angle beyond its window plus a margin for the plan's error, or None."""
     R = sample.X_BT.rotation().matrix()
     margin = math.radians(5.0)
-    travel = math.asin(clip(dot(R[:, 0], target.up), -1.0, 1.0))
+    travel = math.asin(clip(dot(R[:, 0], target.up), -1.0, 1.0)) + config.windows.tilt_rad
     work = math.asin(clip(dot(R[:, 1], target.up), -1.0, 1.0)) - config.torch.work_angle_rad
     for name, angle, limit in (
         ("travel", travel, config.windows.travel_rad),

@@ -67,6 +67,9 @@ def weave_at(config: WeaveConfig, since: float) -> tuple[float, float]:
     return config.amplitude_m * share * wave, config.amplitude_m * (share * rate + growth * wave)
 
 
+TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
+
+
 class ServoConfigError(InputError):
     """A servo setting that cannot be used."""
 
@@ -275,7 +278,7 @@ class MotionLimits:
 
     Attributes:
         tip_speed_max_m_s, omega_max_rad_s, pitch_rate_max_rad_s: largest speeds.
-        tip_acceleration_m_s2, omega_acceleration_rad_s2: rate limits of tip speed and turning.
+        tip_acceleration_m_s2, omega_acceleration_rad_s2, pitch_acceleration_rad_s2: rate limits of tip speed, turning and pitch.
         turn_rate_max_rad_s: the tip speed is at most this times the seam's radius; tip_speed_floor: but not below this
             share of the weld speed.
         creep: share of the weld speed that a tip square to the chord keeps.
@@ -289,6 +292,7 @@ class MotionLimits:
     pitch_rate_max_rad_s: float = 0.3
     tip_acceleration_m_s2: float = 0.3
     omega_acceleration_rad_s2: float = 4.0
+    pitch_acceleration_rad_s2: float = 100.0
     turn_rate_max_rad_s: float = 1.2
     tip_speed_floor: float = 0.35
     creep: float = 0.4
@@ -383,7 +387,7 @@ class ServoConfig:
     def __post_init__(self) -> None:
         _check_numbers("", self)
         for group in ("refinement", "plan_fit", "windows"):
-            _check_numbers(f"{group}.", getattr(self, group), zero=("frames_to_commit", "back_up_m"))
+            _check_numbers(f"{group}.", getattr(self, group), ("tilt_rad",), ("frames_to_commit", "back_up_m"))
         _check_numbers("refinement.corner.", self.refinement.corner)
         if self.tool.torch_offset_m < 0.010:
             raise ServoConfigError("The torch must trail the tip by at least 10 mm (tool.torch_offset_m).")

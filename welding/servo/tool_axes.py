@@ -1,4 +1,4 @@
-"""Computes the tool's chord and axes on the seam, the roll rate that holds the work angle, and the tool's path along a seam."""
+"""Computes the tool's chord and axes on the seam, the roll rate that holds the work angle, its path along a seam, and the least pipe for it."""
 
 import math
 from typing import NamedTuple
@@ -6,10 +6,19 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.models.errors import WeldcalError
+from weldcal.models.mesh import TriMesh, extrude, merge
+from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces.seat import JointSection, press_for, seat
 from weldcal.welding.numerics import Array, clip, cross, dot, norm, pose, unit
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows, check_feasible
+from weldcal.welding.seam.room import check_room
+from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M, DeflectionControl, ServoConfig, ToolGeometry
+
+TRAVEL_MARGIN_RAD = math.radians(3.0)  # the weld stops 5 deg beyond the window: 2 deg are left for the plan's error
+PIPES_M, PIPE_STEP_M = (0.005, 0.5), 5e-4  # radii among which the least one for a tool is searched
 
 
 class ToolAxes(NamedTuple):
@@ -92,9 +101,7 @@ def tool_path(plan: SeamCurve, config: ServoConfig) -> ToolPath:
     line = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan
     chart = chord_map(line, tool.torch_offset_m, config.weld_speed_m_s, spacing=1e-3, tip_left=press.delta_d_m)
     tip, torch = chart.s_tip, chart.s_torch
-    rest = line.position(tip) + press.delta_d_m * line.normal(tip) - press.axial_d_m * line.up(tip)
-    up = line.up(torch)
-    wire = line.position(torch) + config.clearance_m * up + tool.side_offset_m * line.normal(torch)
+    rest, wire, up = _pressed(line, tip, torch, config)
     u = rest - wire
     u = u / np.linalg.norm(u, axis=1, keepdims=True)
     y = np.cross(up, u)
@@ -109,3 +116,88 @@ def tool_path(plan: SeamCurve, config: ServoConfig) -> ToolPath:
     speed = np.maximum(np.hypot(chart.tip_speed, chart.torch_speed), 1e-6)
     time = np.concatenate([[0.0], np.cumsum(2.0 * steps / (speed[1:] + speed[:-1]))])
     return ToolPath(torch, tip, time, poses)
+
+
+def _pressed(line: SeamCurve, tip: Array, torch: Array, config: ServoConfig) -> tuple[Array, Array, Array]:
+    """Rest points, wire points and ups at the torch (n,3) for arc lengths (n,) m of tip and torch on the tip's line."""
+    press, up = config.deflection, line.up(torch)
+    rest = line.position(tip) + press.delta_d_m * line.normal(tip) - press.axial_d_m * line.up(tip)
+    return rest, line.position(torch) + config.clearance_m * up + config.tool.side_offset_m * line.normal(torch), up
+
+
+def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
+    """Check the torch's travel angle along a planned seam, with the pressed tip's rest point deeper in the joint than the torch.
+
+    Raises:
+        InfeasibleSeam: the angle leaves its window by more than TRAVEL_MARGIN_RAD.
+    """
+    tool, windows = config.tool, config.windows
+    line, path = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan, tool_path(plan, config)
+    tip, chord = path.s_tip, math.hypot(tool.torch_offset_m, tool.torch_height_m)
+    for _ in range(
+        4
+    ):  # the pressed rest point is a chord from the torch: in a ring this is further along than on the tip's line
+        rest, wire, up = _pressed(line, tip, path.s_torch, config)
+        far = np.linalg.norm(rest - wire, axis=1)
+        tip = tip + (chord - far) * far / np.maximum(np.sum((rest - wire) * line.tangent(tip), axis=1), 0.3 * far)
+    rise = np.clip(np.sum((rest - wire) * up, axis=1) / chord, -1.0, 1.0)
+    travel = np.abs(np.arcsin(rise) + math.atan2(tool.torch_height_m, tool.torch_offset_m) + windows.tilt_rad)
+    k = int(np.argmax(travel))
+    if travel[k] > windows.travel_rad + TRAVEL_MARGIN_RAD:
+        raise InfeasibleSeam(
+            f"Plan infeasible: the torch's travel angle would be {math.degrees(travel[k]):.0f} deg at {1e3 * path.s_torch[k]:.0f} mm of "
+            f"the seam, and its window is {math.degrees(windows.travel_rad):.0f} deg; "
+            "take a tool whose torch is nearer to its tip, or weld the straight edges as seams of their own."
+        )
+
+
+def check_ring(
+    mesh: TriMesh, line: Array, up: Array, section: JointSection, tool: WeldingTool, lean_rad: float = 0.0
+) -> None:
+    """Check that a tool fits along a root (N,3) m of a joint with directions up (N,3) out of it, and that its torch can follow.
+
+    Raises:
+        NoRoom: its body would touch the part.
+        InfeasibleSeam: its torch cannot follow its tip, or leaves its windows.
+    """
+    press = press_for(section, tool, None, None)
+    above = seat(section, tool, press).above_m
+    config = ServoConfig(
+        tool=ToolGeometry(
+            torch_offset_m=tool.chord_m,
+            torch_height_m=tool.torch_height_m,
+            torch_clearance_m=TORCH_ABOVE_ROOT_M - above,
+        ),
+        deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
+        windows=SeamWindows.of(tool),
+    )
+    seam = SeamCurve.from_points(line + above * up, up=up)
+    check_room(mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, tool.chord_m, lean_rad)
+    check_feasible(seam, tool.chord_m, config.weld_speed_m_s, config.windows)
+    check_travel(seam, config)
+
+
+def least_pipe_m(tool: WeldingTool, wall_m: float, lean_rad: float = 0.0) -> float:
+    """Diameter m of the least pipe whose outside the tool can weld onto a plate, both as far as `wall_m` from the seam.
+
+    Tip and torch stand on the ring, a chord apart: nothing but the lean across the chord is free.
+    """
+    low, high = PIPES_M
+    while high - low > PIPE_STEP_M:
+        radius = 0.5 * (low + high)
+        whole, part = (
+            np.linspace(0.0, a, 181) for a in (2.0 * math.pi, min(2.0 * math.pi, 3.0 * tool.chord_m / radius))
+        )
+        circle, arc = (
+            np.stack([np.cos(a), np.sin(a)], axis=1) for a in (whole, part)
+        )  # all places of a ring are alike
+        up = np.hstack([arc, np.ones((181, 1))]) / math.sqrt(2.0)
+        plate = (radius + wall_m) * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+        mesh = merge(extrude(radius * circle[:-1], 0.0, wall_m), extrude(plate, -0.01, 0.0))
+        section = JointSection(0.25 * math.pi, wall_m, wall_m)
+        try:
+            check_ring(mesh, np.pad(radius * arc, ((0, 0), (0, 1))), up, section, tool, lean_rad)
+            high = radius
+        except WeldcalError:
+            low = radius
+    return 2.0 * high

@@ -255,6 +255,8 @@ def guarded_motion(
         (w_low, max(w_low, w_high)),
     )
     w_p = clip(-(v * up_v + w * up_w + up_0) / (d * ab), -limits.pitch_rate_max_rad_s, limits.pitch_rate_max_rad_s)
+    w_p_then, w_p_step = dot(state.V[:3], m), limits.pitch_acceleration_rad_s2 * dt
+    w_p = clip(w_p, w_p_then - w_p_step, w_p_then + w_p_step)
 
     # Roll about the level chord holds the work angle; the roll caused by yaw about a tilted tool axis is subtracted.
     level = unit(u - dot(u, up) * up, u)

@@ -3,7 +3,7 @@
 import dataclasses as dc
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -33,6 +33,7 @@ MOVES_MM, TURNS_DEG = (25.0, 50.0, 100.0, 150.0, 200.0, 300.0), (15.0, 30.0, 45.
 MM_PER_DEG = 2.0  # of an offered turn, beside an offered move
 _LEVEL = math.cos(math.radians(20.0))
 _POSTURES = 24
+TURNED_RAD = math.pi
 
 
 class SeamObstructed(InfeasiblePath):
@@ -87,16 +88,47 @@ def leaning(config: ServoConfig, lean_rad: float) -> ServoConfig:
     return dc.replace(config, torch=dc.replace(config.torch, work_angle_rad=lean_rad)) if lean_rad else config
 
 
-def find_way(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None) -> ArmWay:
+def leans_with_room(welder: Welder, seam: SeamCurve, X_BP: RigidTransform) -> list[float]:
+    """Leans, rad, that the job may use and with which the tool's body fits the part; the upright tool's only where that fits.
+
+    Raises:
+        NoRoom: none fits, with the least lean that would.
+    """
+    assert welder.workpiece is not None
+    mesh, tool, refused, fits = welder.workpiece.mesh, welder.tool, None, []
+    for lean in LEANS:
+        try:
+            check_room(mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
+        except NoRoom as problem:
+            refused = refused or problem
+            continue
+        if refused is None:
+            return [lean for lean in LEANS if abs(lean) <= welder.lean_rad + 1e-6]
+        fits.append(lean)
+    assert refused is not None
+    if may := [lean for lean in fits if abs(lean) <= welder.lean_rad + 1e-6]:
+        return may
+    if not fits:
+        raise refused
+    advice = f"set welding.lean_deg: {abs(math.degrees(fits[0])):.0f}, with which the tool leans so far where it must"
+    raise NoRoom(f"{refused} Or {advice}.", refused.short_m)
+
+
+def find_way(
+    welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, leans: Sequence[float] | None = None
+) -> ArmWay:
     """The first way that works, of the upright tool on the branch of home and of what else the job may use by itself.
+
+    leans: with which the tool has room at the part; None: as far as the job may.
 
     Raises:
         InfeasiblePath: of the first of them, with the change that makes the seam feasible where one was found.
     """
     first: InfeasiblePath | None = None
     may = math.degrees(welder.lean_rad) + 1e-6
-    leans = [lean for lean in _LEANS if abs(math.degrees(lean)) <= may]
-    ways = itertools.chain(((lean, None) for lean in leans), _postures(welder, seam) if welder.any_posture else ())
+    leans = [lean for lean in LEANS if abs(math.degrees(lean)) <= may] if leans is None else leans
+    others = _postures(welder, seam, welder.any_posture) if 0.0 in leans else ()
+    ways = itertools.chain(((lean, None) for lean in leans), others)
     for lean, seed in ways:
         try:
             return way_on(welder, seam, X_BP, lean, seed)
@@ -108,7 +140,7 @@ def find_way(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None) -> Ar
     raise first.advised(_offer(welder, seam, X_BP, may)) from first
 
 
-_LEANS = sorted(np.radians(np.arange(-LEAN_MOST_DEG, LEAN_MOST_DEG + 1.0, LEAN_STEP_DEG)).tolist(), key=abs)
+LEANS = sorted(np.radians(np.arange(-LEAN_MOST_DEG, LEAN_MOST_DEG + 1.0, LEAN_STEP_DEG)).tolist(), key=abs)
 
 
 def _offer(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, may_deg: float) -> str:
@@ -122,10 +154,10 @@ def _offer(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, may_deg
         return True
 
     still = RigidTransform()
-    for lean in _LEANS:
+    for lean in LEANS:
         if abs(math.degrees(lean)) > may_deg and works(still, lean):
             return f"set welding.lean_deg: {abs(math.degrees(lean)):.0f}, with which the tool leans sideways so far where it must"
-    if not welder.any_posture and any(works(still, lean, seed) for lean, seed in _postures(welder, seam)):
+    if not welder.any_posture and any(works(still, lean, seed) for lean, seed in _postures(welder, seam, True)):
         return "set welding.posture: any, with which the arm changes to another branch above the part"
     for X, words in _displacements(seam.frame(0.5 * seam.length).position, welder.arm.up):
         if works(X):
@@ -149,8 +181,8 @@ def _displacements(centre: Array, up: Array) -> Iterator[tuple[RigidTransform, s
     return ((X, words) for _, X, words in sorted(found, key=lambda item: item[0]))
 
 
-def _postures(welder: Welder, seam: SeamCurve) -> Iterator[tuple[float, Array]]:
-    """Every other branch above the seam's start, whole turns of a joint included, the nearest to home first."""
+def _postures(welder: Welder, seam: SeamCurve, any_branch: bool) -> Iterator[tuple[float, Array]]:
+    """Every branch above the seam's start, whole turns of a joint included, or whole turns of wrist 3 only, the nearest to home first."""
     arm, home = welder.arm, welder.q_near
     above = _lifted(arm, seam, touch_start_pose(seam, welder.config), welder.clearance_m) @ welder.tool.X_FT.inverse()
     near, found = nearest_solution(arm, above, home), []
@@ -158,7 +190,9 @@ def _postures(welder: Welder, seam: SeamCurve) -> Iterator[tuple[float, Array]]:
         q = q + 2.0 * np.pi * np.round((home - q) / (2.0 * np.pi))
         turns = np.vstack([np.zeros(6), *(sign * 2.0 * np.pi * np.eye(6)[[0, 3, 4, 5]] for sign in (1.0, -1.0))])
         found += [p for p in q + turns if np.all((p > arm.position_lower) & (p < arm.position_upper))]
-    others = (q for q in found if near is None or float(np.abs(q - near).max()) > 0.1)
+    others = [q for q in found if near is None or float(np.abs(q - near).max()) > 0.1]
+    if not any_branch:
+        others = [q for q in others if near is not None and np.abs(q - near)[:5].max() < 0.1]
     ranked = sorted(others, key=lambda q: float(np.sum(((q - home) / arm.velocity_limit) ** 2)))
     return ((0.0, q) for q in ranked[:_POSTURES])
 
@@ -170,7 +204,13 @@ def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: f
         try:
             q_near = welder.q_near if seed is None else seed
             goals = arm_waypoints(welder.arm, welder.tool, seam, config, q_near, share * welder.clearance_m)
-            along = along or tuple(check_path(welder.arm, goals[0], seam_motions(welder.tool, seam, config)))
+            motions = seam_motions(welder.tool, seam, config)
+            along = along or tuple(check_path(welder.arm, goals[0], motions))
+            q_end = along[-1].q[-1]
+            if float(np.abs(q_end - goals[2]).max()) > TURNED_RAD:  # around a ring: the wrist turns back above the part
+                X_BE = _lifted(welder.arm, seam, motions[-1].X_BT[-1], share * welder.clearance_m + 0.05, seam.length)
+                q_retract = nearest_solution(welder.arm, X_BE @ welder.tool.X_FT.inverse(), q_end)
+                goals = (*goals[:2], goals[2] if q_retract is None else q_retract)
             way = ArmWay(*goals, lean, along)
             _check_clear(welder, way, X_BP, seed is not None)
             break

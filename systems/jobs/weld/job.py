@@ -235,7 +235,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         config = servo_config(scenario, station)
         X_FR, standard = feature_on_flange(scenario, station), feature_standard(scenario)
         X_BC_guess = c.mounting_guess.pose()
-        times = job_plan(scenario)
+        times = job_plan(scenario, station.cad)
         sequencer = wiring.add("job_sequencer", JobSequencer(times))
         command, history = sequencer.GetOutputPort("job"), spine.arm.history
         estimator = wiring.add(

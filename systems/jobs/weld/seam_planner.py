@@ -20,14 +20,15 @@ from weldcal.models.workpieces.part import Part, WeldPart, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way
+from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leans_with_room
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
-from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.room import check_beside, check_ends, check_room
+from weldcal.welding.seam.room import check_beside, check_ends
+from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
@@ -65,6 +66,7 @@ def plan_root_anyhow(
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
+OVERLAP_M = 5e-3
 TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
 
 
@@ -110,12 +112,13 @@ class SeamPlanning(Welder):
             WeldcalError: the seam is too short or not feasible, or the tool has no room beside the part at X_BP.
         """
         check_length(seam, self.config)
+        leans = None
         if X_BP is not None:
-            tool = self.tool
-            check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
+            tool, leans = self.tool, leans_with_room(self, seam, X_BP)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
-        check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
-        return find_way(self, seam, X_BP)
+        check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s, self.config.windows)
+        check_travel(seam, self.config)
+        return find_way(self, seam, X_BP, leans)
 
 
 class SeamPlanner(BackgroundSystem):
@@ -263,7 +266,13 @@ def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, lengt
 
 
 def _cut(line: Array, ups: Array, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is still in it."""
+    """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is still in it.
+
+    A ring is welded on over its start by OVERLAP_M, and the tip goes round ahead of the torch.
+    """
+    line, ups, turn_m = ringed(line, ups)
+    if turn_m is not None:
+        length_m = turn_m + OVERLAP_M if length_m is None else min(length_m, turn_m + OVERLAP_M)
     if length_m is None:
         return SeamCurve.from_points(line, up=ups)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])

@@ -17,7 +17,7 @@ from weldcal.models.arms.chain import chain_of
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
-from weldcal.models.workpieces.part import numbered
+from weldcal.models.workpieces.part import WeldPart, numbered, seam_count
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
@@ -26,9 +26,12 @@ from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.checks import check_home
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
+from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import (
+    TORCH_ABOVE_ROOT_M,
     DeflectionControl,
     GapConfig,
+    MotionLimits,
     ServoConfig,
     ToolGeometry,
     TorchControl,
@@ -38,9 +41,10 @@ from weldcal.welding.servo.settings import (
 _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
+# a torch nearer to the tip turns the tool faster for the same error: the pitch is ramped, so that no joint lags behind the others
+NEAR_M, NEAR_PITCH_RAD_S2 = 0.060, 1.0
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
 SCAN_CLEAR_M = 0.02  # from a part that is not found yet
-TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
 
 
 def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
@@ -78,7 +82,9 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
+        windows=SeamWindows.of(tool),
         torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
+        limits=MotionLimits(pitch_acceleration_rad_s2=NEAR_PITCH_RAD_S2) if tool.chord_m < NEAR_M else MotionLimits(),
     )
 
 
@@ -219,10 +225,11 @@ def work_point(scenario: Scenario) -> np.ndarray:
     return np.array(scenario.calibration.work_point_m)
 
 
-def job_plan(scenario: Scenario) -> JobPlan:
+def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
     """The job's parameters; time limits are longer for slower moves and more seams."""
     c, job = scenario.calibration, scenario.job
-    seams = max(1, len(scenario.workpiece.seams)) if scenario.workpiece is not None else 1
+    listed = 1 if scenario.workpiece is None else len(scenario.workpiece.seams)
+    seams = max(1, listed if cad is None else seam_count(cad))
     slower = 1.0 / job.speed_factor
     return JobPlan(
         calibrate=job.calibrate,

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,17 +15,23 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, plain_station, scenario
 from tests.systems.placements import Placement, draw, follow, offered, placed
+from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.weld.arm_way import find_way
+from weldcal.models.mesh import extrude, merge
+from weldcal.models.tools.loading import load_tool, tool_file
+from weldcal.models.workpieces.part import WeldPart
+from weldcal.systems.jobs.weld.arm_way import Welder, find_way, leans_with_room
 from weldcal.systems.jobs.weld.job import seam_planning
-from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_drawn_seam
+from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_drawn_seam, seam_above
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.tools.worlds.weld.budgets import PERFECT
 from weldcal.tools.worlds.weld.plant import groove_config, simulate
 from weldcal.tools.worlds.weld.seams import get_seam
+from weldcal.welding.locate.planning import RootPlan
 from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.room import NoRoom
 from weldcal.welding.servo.settings import ServoConfig, ToolGeometry
 from weldcal.welding.servo.state import Phase
 from weldcal.welding.servo.tool_axes import tool_path
@@ -124,3 +133,56 @@ def test_an_offered_turn_of_a_refused_placement_is_followed() -> None:
     seam = replace(old.seam, points=X.multiply(old.seam.points.T).T, up=R.multiply(old.seam.up))
     new = Placement(seam, old.plan.transformed(X), old.welder)
     assert follow(new, find_way(new.welder, new.plan, None).q_start, 12)["end"] == "done"
+
+
+def test_a_ring_is_welded_round_within_the_wrists_limits() -> None:
+    """From this start wrist 3 would reach -360 deg: it begins a whole turn higher, and turns back where the weld ends."""
+    tool = load_tool(tool_file(Path("pipe"))).tool
+    a = np.linspace(np.pi, 3.0 * np.pi, 361)
+    out = np.column_stack([np.cos(a), np.sin(a), np.zeros(361)])
+    root = np.array([0.65, 0.0, 0.01]) + 0.030 * out
+    up = (out + np.array([0.0, 0.0, 1.0])) / np.sqrt(2.0)
+    found = RootPlan(
+        root=root, up=up, half_angle_rad=np.pi / 4, X_BP=None, sigma_m=0.0, rms_m=0.0, confidence=1.0, summary=""
+    )
+    seam = seam_above(found, tool, None, 0.003)
+    turn = 2.0 * np.pi * (0.030 + 0.003 / np.sqrt(2.0))
+    assert seam.length == pytest.approx(turn + 0.005, abs=2e-5)
+    assert seam.position(seam.length) == pytest.approx(seam.position(0.005), abs=1e-5)
+    assert seam.drawn_m > seam.length + tool.chord_m
+    arm, home = plain_station().arm, np.radians([190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
+    geometry = ToolGeometry(torch_offset_m=tool.chord_m, torch_height_m=tool.torch_height_m)
+    welder = Welder(
+        arm=arm, tool=tool, config=ServoConfig(tool=geometry), q_near=home, clearance_m=0.025, advises=False
+    )
+    way = find_way(welder, seam, None)
+    q = way.along[-1].q
+    assert np.degrees(q[0, 5] - q[-1, 5]) > 360.0
+    assert np.degrees(q[:, 5]).max() > 300.0
+    assert (np.abs(q[:, 5]) < arm.position_upper[5]).all()
+    assert np.degrees(np.abs(way.q_retract - q[-1])).max() < 30.0
+    end, above = (forward_kinematics(arm, joints) @ tool.X_FT for joints in (q[-1], way.q_retract))
+    assert above.rotation().matrix() == pytest.approx(end.rotation().matrix(), abs=1e-6)
+    assert (above.translation() - end.translation()) @ seam.up(seam.length) == pytest.approx(0.075, abs=1e-3)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_a_tool_leans_off_the_bisector_where_it_has_no_room_upright(sense: float) -> None:
+    """Around a pipe of 136 mm: the least is 148 mm upright, and less where the tool leans away from it."""
+    tool = load_tool(tool_file(Path("welding"))).tool
+    a = sense * np.linspace(0.0, 1.5 * np.pi, 181)
+    out = np.column_stack([np.cos(a), np.sin(a), np.zeros(181)])
+    up = (out + np.array([0.0, 0.0, 1.0])) / np.sqrt(2.0)
+    round_ = 0.068 * np.column_stack([np.cos(a), np.sin(a)])[:: int(sense)]
+    pipe = extrude(round_, 0.0, 0.1)
+    plate = extrude(0.17 * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]), -0.01, 0.0)
+    part = cast(WeldPart, SimpleNamespace(mesh=merge(pipe, plate)))
+    seam = SeamCurve.from_points(0.068 * out + 0.0033 * up, up=up)
+    welder = Welder(
+        arm=plain_station().arm, tool=tool, config=ServoConfig(), q_near=np.zeros(6), clearance_m=0.025, workpiece=part
+    )
+    with pytest.raises(NoRoom, match=r"does not fit at .* Or set welding.lean_deg: 2, with which") as refused:
+        leans_with_room(welder, seam, RigidTransform())
+    assert 0.0 < refused.value.short_m < 0.01
+    leans = np.degrees(leans_with_room(replace(welder, lean_rad=np.radians(3.0)), seam, RigidTransform()))
+    assert leans == pytest.approx([2.0 * sense])

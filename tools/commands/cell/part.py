@@ -18,7 +18,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.models.mesh import TriMesh, extrude, merge
+from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.reading import STEP_SUFFIXES, read_shape
@@ -28,7 +28,9 @@ from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.feasibility import InfeasibleSeam
 from weldcal.welding.seam.room import NoRoom, check_room
+from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
 
 COLUMNS = ("id", "kind", "length_mm", "angle_deg", "radius_mm", "start", "end")
 COLOURS = {"concave": "#c2281f", "flush": "#8a2be2", "convex": "#2b5fc4", "boundary": "#b37400"}
@@ -36,7 +38,6 @@ MOST_DRAWN = 20_000  # triangles of a picture
 SHARES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9)  # of an edge's length, where its number may be
 DPI = 110
 SMALL_M = 0.012  # a part this small may be drawn in inches
-PIPES_M, PIPE_STEP_M = (0.005, 0.5), 5e-4  # radii among which the least one for a tool is searched
 SHOWN = ("length_mm", "angle_deg", "gap_mm", "throat_mm")
 NO_SEAMS = {
     True: "no two bodies meet within 3 mm in a concave joint, and no body has a concave edge.",
@@ -115,7 +116,7 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
     try:
         check_weldable(section, tool.tip_radius_m)
         if ring is not None:
-            _check_ring(shape.mesh, *ring, hard_height(section, tool.tip_radius_m), tool)
+            check_ring(shape.mesh, *ring, section, tool)
         for id in joint.edges if ring is None else ():
             edge = shape.edge(id)
             assert edge.up_P is not None
@@ -128,7 +129,7 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
             check_room(shape.mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, 0.0)
     except WeldcalError as error:
         reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
-        if ring is not None and isinstance(error, NoRoom):
+        if ring is not None and isinstance(error, (NoRoom, InfeasibleSeam)):
             reason += least_pipe(shape, joint, tool)
         return reason, error.short_m if isinstance(error, NoRoom) else math.inf
     return "", 0.0
@@ -146,31 +147,12 @@ def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:
     return line, (edge.up_P @ axis) * axis + (edge.up_P @ radial[len(line) // 2]) * radial
 
 
-def _check_ring(mesh: TriMesh, line: Array, up: Array, height_m: float, tool: WeldingTool) -> None:
-    """Raise NoRoom where the tool does not fit all around a circle, its torch behind its tip."""
-    seam = SeamCurve.from_points(line + height_m * up, up=up)
-    check_room(mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, tool.chord_m)
-
-
 def least_pipe(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> str:
     """What the least pipe is whose outside the tool can weld onto a plate, both as far as the joint's longer wall; "" for a joint that is none of these."""
     ring = _ring(shape, joint)
     if ring is None or float(ring[1][0] @ (ring[0][0] - ring[0][:-1].mean(axis=0))) <= 0.0:
         return ""
-    around = np.linspace(0.0, 2.0 * math.pi, 181)
-    circle, far, (low, high) = np.stack([np.cos(around), np.sin(around)], axis=1), max(joint.walls_m), PIPES_M
-    up = np.hstack([circle, np.ones((181, 1))]) / math.sqrt(2.0)
-    while high - low > PIPE_STEP_M:
-        radius = 0.5 * (low + high)
-        plate = (radius + far) * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-        mesh = merge(extrude(radius * circle[:-1], 0.0, far), extrude(plate, -0.01, 0.0))
-        line = np.pad(radius * circle, ((0, 0), (0, 1)))
-        try:
-            _check_ring(mesh, line, up, math.sqrt(2.0) * tool.tip_radius_m, tool)
-            high = radius
-        except NoRoom:
-            low = radius
-    return f" The least pipe for this tool is {2e3 * high:.0f} mm across."
+    return f" The least pipe for this tool is {1e3 * least_pipe_m(tool, max(joint.walls_m)):.0f} mm across."
 
 
 def unit_hint(shape: PartShape) -> str:
