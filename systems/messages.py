@@ -224,6 +224,7 @@ class PlannedSeam(Message):
     points_B: NDArray[np.float64] | None = None
     reason: str | None = None
     sigma_m: float = np.nan  # lateral sigma of the planned root
+    felt: bool = True  # by the tip; else sigma_m is the largest one across the seam, of all that is known
     summary: str = ""  # the result of the scan, in one sentence
     # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and torch at one place
     arm_sigma_m: float = np.nan

@@ -1,5 +1,6 @@
 """Makes a scenario's workpiece from its file: the part as drawn with its seam, and the part as it was made."""
 
+import dataclasses as dc
 import math
 from pathlib import Path
 
@@ -67,7 +68,7 @@ def part_of(spec: WorkpieceConfig) -> Part:
     assert spec.file is not None
     assert spec.joint is not None
     shape = read_shape(Path(spec.file), spec.units)
-    first, *others = (seam_of(shape, source(seam), spec.joint) for seam in spec.seams)
+    first, *others = (dc.replace(seam_of(shape, source(seam), spec.joint), feel=seam.feel) for seam in spec.seams)
     return Part(shape, first, tuple(others))
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
+import numpy as np
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
 from weldcal.tools.worlds.parts.cells import Trial, write_cell
-from weldcal.tools.worlds.parts.step_parts import PARTS
+from weldcal.tools.worlds.parts.step_parts import PARTS, MadePart, assembly, box
 
 
 def test_two_fillets_are_welded_one_after_the_other_from_a_step_file(tmp_path: Path) -> None:
@@ -37,3 +39,31 @@ def test_two_fillets_are_welded_one_after_the_other_from_a_step_file(tmp_path: P
         assert seam["torch_max_mm"] < 0.40
     assert max(seam["torch_max_mm"] for seam in found["seams"]) == found["torch_max_mm"]
     assert 35.0 < found["welded_mm"] < 48.0
+
+
+def test_two_plates_without_a_gap_are_welded_and_the_tip_stays_off(tmp_path: Path) -> None:
+    """The arm is exact, the part lies elsewhere than the guess says; nothing is felt, and the report says so."""
+    plates = assembly(
+        box((0, 0, -8), (220, 60, 8)), box((0, -90, -8), (220, 90, 8)), box((20, -80, 0), (30, 30, 20))
+    )  # the block tells the ends apart
+    line = np.array([[0.0, 0.0, 0.0], [220.0, 0.0, 0.0]])
+    part = MadePart(name="plates", shape=plates, joint="butt", line_mm=line, length_mm=220.0, opening_deg=180.0)
+    cell = write_cell(part, tmp_path, Trial(bow_mm=0.0, arm_mm=0.0))
+    text = cell.read_text().replace("plates.csv}", "plates.csv, start_mm: 80, end_mm: 100}")
+    text = text.replace("welding: {", "job: {X_BC_sigma_mm: 0.05}\nwelding: {speed_mm_s: 20.0, ")
+    cell.write_text(text)
+    out = tmp_path / "run"
+    result = CliRunner().invoke(
+        app, ["weld", "--scenario", str(cell), "--json", "--no-browser", "--seed", "0", "--out", str(out)]
+    )
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout.splitlines()[-1])
+    assert found["felt"] == [False]
+    assert "followed from the scan and the drawing; not felt" in found["plan_words"]
+    assert found["torch_lateral_max_mm"] < 4.0 * found["plan_sigma_mm"] < 1.0
+    assert 36.0 < found["welded_mm"] < 41.0
+    assert "not felt" in (out / "report.html").read_text()
+    assert json.loads((out / "weld.json").read_text())["settings"]["felt"] == [False]
+    with (out / "weld.csv").open() as table:
+        bent = [float(row["deflection_z_m"]) for row in csv.DictReader(table) if row["deflection_z_m"]]
+    assert np.abs(bent).max() < 3e-4  # of the tag's picture, not of a touch

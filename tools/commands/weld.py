@@ -28,7 +28,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
-from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, felt_seams, live_errors
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
@@ -290,6 +290,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "omega_max_rad_s": config.limits.omega_max_rad_s,
         "chord_m": config.tool.torch_offset_m,
         "law": config.law,
+        "felt": felt_seams(run),
         "ended": run.reason or "done",
     }
     phase = np.array([PHASE_NAMES[int(k)] for k in named["phase"]], dtype=np.str_)

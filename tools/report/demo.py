@@ -8,8 +8,10 @@ from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
+from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.seam_planner import UNFELT
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
@@ -126,8 +128,10 @@ class DemoResult:
 
     @property
     def arm_note(self) -> tuple[str, ...]:
-        """What errors of the arm may do between tip and torch, where a planned seam is bent enough for that to matter."""
+        """What errors of the arm may do between tip and torch, where that matters; or that the seam was not felt."""
         plan = self.run.cell.job.planned_seam(self.run.root)
+        if self.weld is not None and not plan.felt:
+            return (f"The seam was {UNFELT}. The plan's sigma across it is {1e3 * plan.sigma_m:.2f} mm.",)
         if self.weld is None or not plan.arm_sigma_m > ARM_NOTE_M:
             return ()
         refinement = self.status.refinement
@@ -227,6 +231,7 @@ class DemoResult:
             if np.isfinite(plan.sigma_m):
                 found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
             found["plan_words"] = plan.summary
+            found["felt"] = felt_seams(self.run)
             if np.isfinite(plan.arm_sigma_m):
                 found["plan_arm_sigma_mm"] = 1e3 * plan.arm_sigma_m
                 found["plan_arm_turn_deg"] = float(np.degrees(plan.arm_turn_rad))
@@ -252,6 +257,12 @@ class DemoResult:
         advice = next_scan(self.status, self.run.cell.job.poses, work_point(self.run.cell.scenario))
         found["next_pose"] = None if advice is None else advice.sentence()
         return found
+
+
+def felt_seams(run: Run[WeldJob]) -> list[bool]:
+    """Whether the tip feels each of the seams, in the order of welding."""
+    cad, tool = run.cell.station.cad, run.cell.station.tool
+    return [] if cad is None or tool is None else [is_felt(numbered(cad, k), tool) for k in range(seam_count(cad))]
 
 
 def seam_document(error: PathError) -> dict[str, float]:
@@ -345,6 +356,8 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
             ("sigma of the planned root, sideways", f"{fixed(1e3 * plan.sigma_m, 3)} mm, as the planner states it")
         )
         rows.append(("confidence", fixed(plan.confidence, 2)))
+    if not plan.felt:
+        rows.append(("seam", UNFELT))
     return rows
 
 

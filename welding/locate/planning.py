@@ -48,6 +48,7 @@ class RootPlan:
     root, up      (N,3) m and unit normals of the face; half_angle_rad between a wall and the groove's middle plane
     X_BP          where the drawing lies, where one was used
     sigma_m       of the root sideways, rms along it: with a drawing that of the drawn groove, from which the real one may differ
+    across_m      (N,) of a part: that of the drawn root sideways, by the scan where it shows the root, else by the registration
     rms_m         of the face's points about their plane; confidence 0 to 1; summary: what was found, in a sentence
     """
 
@@ -59,6 +60,7 @@ class RootPlan:
     rms_m: float
     confidence: float
     summary: str
+    across_m: Floats | None = None
 
 
 def plan_part_root(
@@ -75,6 +77,8 @@ def plan_part_root(
         )
     found, joint = locate_part(points_B, part.mesh, part.seam, None, eye_B, X_BP_hint=X_BP_guess)
     seam = joint.seam.transformed(found.X_BP)
+    left_P = joint.seam.left_P
+    across_m = np.sqrt(np.einsum("ni,nij,nj->n", left_P, found.spread_at(part.seam_P), left_P))
     sigma_m = float(np.sqrt(np.mean(found.sigma_at(part.seam_P) ** 2)))
     return RootPlan(
         root=seam.points_P,
@@ -85,6 +89,7 @@ def plan_part_root(
         rms_m=found.rms_m,
         confidence=found.confidence,
         summary=f"{found.summary}; {joint.summary}",
+        across_m=np.full(len(left_P), joint.sigma_m) if math.isfinite(joint.sigma_m) else across_m,
     )
 
 

@@ -9,7 +9,8 @@ from pydrake.systems.framework import Context, OutputPort
 from weldcal.calibration.motion.drift.sequential import DriftConfig
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.models.arrays import Array
-from weldcal.models.workpieces.part import seam_count
+from weldcal.models.errors import InputError
+from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
@@ -306,6 +307,8 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
     assert spec is not None
     assert station.tool is not None
     assert station.cad is not None
+    # a live calibration states its own
+    sigma_mm = scenario.calibration.required_error_mm if scenario.job.calibrate else scenario.job.X_BC_sigma_mm
     return SeamPlanning(
         arm=station.arm,
         tool=station.tool,
@@ -320,6 +323,8 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         table_z_m=scenario.table_height_m(),
         lean_rad=np.deg2rad(welding.lean_deg),
         any_posture=welding.posture == "any",
+        X_BC_sigma_m=None if sigma_mm is None else 1e-3 * sigma_mm,
+        tolerance_m=1e-3 * welding.tolerance_mm,
     )
 
 
@@ -341,6 +346,12 @@ def _add_welding(
     out, command, job = wiring.out, sequencer.GetOutputPort("job"), scenario.job
     position = spine.arm.position
     kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
+    if kind is DrawnSeamPlanner and not all(
+        is_felt(numbered(station.cad, k), tool) for k in range(seam_count(station.cad))
+    ):
+        raise InputError(
+            "A seam that the tip does not feel is located by the scan, for a drawing states no sigma: write workpiece.located_by: scan."
+        )
     planner = wiring.add(
         "seam_planner",
         kind(

@@ -12,16 +12,17 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces.part import Part, WeldPart, numbered
+from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way
-from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
+from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
@@ -62,6 +63,13 @@ def plan_root_anyhow(
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
+UNFELT = "followed from the scan and the drawing; not felt"
+
+
+class UncertainSeam(WeldcalError):
+    """A seam that the tip does not feel is not known well enough."""
+
+
 TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
 
 
@@ -75,6 +83,9 @@ class SeamPlanning(Welder):
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
     local_field: LocalField | None = None
     arm_errors: Mapping[str, Any] | None = None  # as the refinement states them, where there is one
+    estimate: CalibrationEstimate | None = None  # by which the scan is in the base; None: by a known pose
+    X_BC_sigma_m: float | None = None  # of the known pose
+    tolerance_m: float = math.inf  # of sigma across a seam that is not felt
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -157,6 +168,7 @@ class SeamPlanner(BackgroundSystem):
             planning = dc.replace(
                 planning,
                 arm=status.arm_or(planning.arm),
+                estimate=status.estimate,
                 local_field=status.local_field,
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
@@ -193,22 +205,62 @@ def plan_seam(
             check_beside(
                 points_B, planning.workpiece.mesh, found.X_BP, seam, planning.tool, plan.lean_rad, planning.table_z_m
             )
+        sigma_m, summary, felt = found.sigma_m, found.summary, is_felt(planning.workpiece, planning.tool)
+        if not felt:
+            sigma_m, summary = unfelt_sigma(planning, found, seam, plan)
         return dc.replace(
             plan,
+            felt=felt,
             rms_m=found.rms_m,
             confidence=found.confidence,
             points_B=points_B,
-            sigma_m=found.sigma_m,
-            summary=found.summary,
+            sigma_m=sigma_m,
+            summary=summary,
         )
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
 
 
+def unfelt_sigma(planning: SeamPlanning, found: RootPlan, seam: SeamCurve, plan: PlannedSeam) -> tuple[float, str]:
+    """The largest sigma of the torch across a seam that is not felt, m, and the plan's summary with it.
+
+    It is that of the root in the scan, with those of the scanner's pose and of the arm. Of a calibration by the same arm the spread of its
+    residuals counts for the arm; of a known pose its stated sigma, or else an arm as its maker leaves it.
+
+    Raises:
+        UncertainSeam: it is over the tolerance.
+    """
+    assert found.across_m is not None
+    left = np.cross(found.up, np.gradient(found.root, axis=0))
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    at, estimate = np.linspace(0, len(left) - 1, 9).astype(int), planning.estimate
+    if estimate is not None:
+        spread = [left[k] @ point_error_covariance(estimate, found.root[k]) @ left[k] for k in at]
+        others = np.array(spread) + estimate.sigma_position_m**2
+        advice = "calibrate with more scans or with calibration.refine: links"
+    else:
+        given, advice = planning.X_BC_sigma_m, "calibrate in the same job (job.calibrate), or state job.X_BC_sigma_mm"
+        assert plan.q_start is not None
+        arm = torch_sigma(planning.arm, planning.tool, seam, plan.q_start) if given is None else given
+        others = np.full(len(at), arm**2)
+    worst = int(np.argmax(found.across_m[at] ** 2 + others))
+    part, other = float(found.across_m[at[worst]]), math.sqrt(others[worst])
+    sigma = math.hypot(part, other)
+    words = f"{1e3 * sigma:.2f} mm across it (part {1e3 * part:.2f} mm, scanner and arm {1e3 * other:.2f} mm)"
+    if not sigma <= planning.tolerance_m:
+        advice = advice if other > part else "scan the part from nearer, or so that more of its sides are visible"
+        raise UncertainSeam(
+            f"The tip does not feel this seam, and its plan has a sigma of {words}, over welding.tolerance_mm "
+            f"({1e3 * planning.tolerance_m:g} mm): {advice}."
+        )
+    return sigma, f"{found.summary}; {UNFELT}: sigma {words}"
+
+
 def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: RigidTransform | None) -> PlannedSeam:
     """The plan of a seam that has been found; raises WeldcalError where it cannot be welded."""
     way = planning.way(seam, X_BP)
-    share = planning.tip_to_torch(seam, way.q_start)
+    felt = is_felt(planning.workpiece, planning.tool)
+    share = planning.tip_to_torch(seam, way.q_start) if felt else TipToTorch(math.nan, math.nan)
     return PlannedSeam(
         sequence=sequence,
         seam=seam,

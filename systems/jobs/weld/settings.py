@@ -14,7 +14,7 @@ from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
-from weldcal.models.workpieces.part import numbered
+from weldcal.models.workpieces.part import is_felt, numbered
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
@@ -34,6 +34,7 @@ from weldcal.welding.servo.settings import (
 _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
+_UNPRESSED_M = 1e-9  # of a tip that is not used
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
 TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
 
@@ -59,6 +60,9 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
     cad = numbered(station.cad, seam)
     seat = cad.seated(tool, press)
     entry = cad.entry(tool, seat)
+    felt = is_felt(cad, tool)
+    if not felt:
+        press = Press(_UNPRESSED_M, _UNPRESSED_M)
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
@@ -73,6 +77,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
+        felt=felt,
         torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
     )
 

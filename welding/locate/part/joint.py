@@ -28,6 +28,7 @@ NEAR_ROOT_M = 0.0012  # points nearer to the root, and a point distance, may be 
 ALONG_WALL_COS = math.cos(math.radians(25.0))
 PRIOR_M, PRIOR_TILT_RAD, PRIOR_KNOTS = 0.0005, math.radians(1.0), 10  # shared by so many knots
 BEND_M, BEND_TILT_RAD = 2e-5, math.radians(0.1)  # second difference from knot to knot
+SHOWN_GAP = 1.5  # point distances: a narrower gap is not told from the distance of two points
 EDGE_SIGMA = 0.3  # of the middle between the outermost points of two edges, in point distances
 SIGMA_FLOOR_M = 3e-5
 KNOWN_SHARE = 0.4  # of the deviation by the drawing alone: a knot that is known better was measured
@@ -85,7 +86,7 @@ def measure_joint(points: Floats, normals: Floats, pitch_m: float, model: PartMo
     shift = np.column_stack([np.interp(s, at, x), np.interp(s, at, y)])
     size = np.linalg.norm(shift, axis=1)
     shift *= np.minimum(1.0, MOST_M / np.maximum(size, 1e-12))[:, None]
-    moved = seam.points_P + shift[:, :1] * _left(seam) + shift[:, 1:] * seam.up_P
+    moved = seam.points_P + shift[:, :1] * seam.left_P + shift[:, 1:] * seam.up_P
     return MeasuredJoint(
         replace(seam, points_P=moved),
         np.linalg.norm(shift, axis=1),
@@ -105,12 +106,6 @@ class _Cut:
     offset: Floats
 
 
-def _left(seam: DrawnSeam) -> Floats:
-    """(N,3) the unit vector to the left of the travel, square to the bisector."""
-    left = np.cross(seam.up_P, seam.tangents_P)
-    return np.asarray(left / np.linalg.norm(left, axis=1, keepdims=True))
-
-
 def _cut(points: Floats, normals: Floats, seam: DrawnSeam) -> _Cut:
     away, k = cKDTree(seam.points_P).query(points, distance_upper_bound=REACH_M + MOST_M)
     near = np.isfinite(np.asarray(away))
@@ -125,7 +120,7 @@ def _wall_rows(cut: _Cut, model: PartModel, seam: DrawnSeam, side: str, pitch: f
     """The points of one wall: their distance from the part's surface, by the root's shift and the wall's tilt."""
     left = side == "left"
     normal = (seam.wall_left_P if left else seam.wall_right_P)[cut.k]
-    to_left = _left(seam)[cut.k]
+    to_left = seam.left_P[cut.k]
     along = np.cross(seam.tangents_P[cut.k], normal)
     along *= np.sign(np.sum(along * to_left, axis=1))[:, None] * (1.0 if left else -1.0)
     a = np.sum(cut.offset * along, axis=1) - 0.5 * seam.gap_m
@@ -151,11 +146,11 @@ def _wall_rows(cut: _Cut, model: PartModel, seam: DrawnSeam, side: str, pitch: f
 
 def _gap_rows(cut: _Cut, seam: DrawnSeam, pitch: float) -> Rows | None:
     """The middle of a gap, by the outermost points of the faces on its two sides, in strips across the seam."""
-    x = np.sum(cut.offset * _left(seam)[cut.k], axis=1)
+    x = np.sum(cut.offset * seam.left_P[cut.k], axis=1)
     y = np.sum(cut.offset * seam.up_P[cut.k], axis=1)
     s = seam.arc_length_m[cut.k]
     beside = (np.abs(x) > 0.5 * seam.gap_m - MOST_M) & (np.abs(x) < 0.5 * seam.gap_m + REACH_M) & (np.abs(y) < MOST_M)
-    if np.count_nonzero(beside) < 12:
+    if np.count_nonzero(beside) < 12 or seam.gap_m <= SHOWN_GAP * pitch:
         return None
     level = float(np.median(y[beside]))
     beside &= np.abs(y - level) < 0.0008
