@@ -18,6 +18,7 @@ from weldcal.calibration.published.algorithm1 import Algorithm1State
 from weldcal.calibration.published.icp import Verification
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.welding.locate.part.joint import FitUp
 from weldcal.welding.seam.curve import SeamCurve
 
 
@@ -225,6 +226,7 @@ class PlannedSeam(Message):
     reason: str | None = None
     sigma_m: float = np.nan  # lateral sigma of the planned root
     felt: bool = True  # by the tip; else sigma_m is the largest one across the seam, of all that is known
+    fit_ups: tuple[FitUp | None, ...] = ()  # of the seams so far, this one the last
     summary: str = ""  # the result of the scan, in one sentence
     # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and torch at one place
     arm_sigma_m: float = np.nan

@@ -28,7 +28,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
-from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, felt_seams, live_errors
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, felt_seams, fit_up_csv, live_errors
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
@@ -39,6 +39,7 @@ from weldcal.welding.servo.state import Phase
 
 SCANS: Final = "scans"
 SUMMARY: Final = "summary.json"
+FIT_UP_CSV: Final = "fit_up.csv"
 PRESET: Final = "straight_groove"
 PHASE_NAMES = [str(phase) for phase in Phase]
 
@@ -113,7 +114,7 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:
-    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, summary.json, report.html."""
+    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, fit_up.csv, plots/, recording.html, summary.json, report.html."""
     folder, run = result.folder, result.run
     with whole_result(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -122,6 +123,8 @@ def write_result(result: DemoResult, finished: JobRun) -> None:
         if result.weld is not None:
             record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
             write_weld_log(record, folder)
+        if fit_ups := run.cell.job.planned_seam(run.root).fit_ups:
+            write_atomic(folder / FIT_UP_CSV, fit_up_csv(fit_ups))
         finished.write_recording(folder)
         pictures = demo_pictures(result)
         for name, picture in pictures.items():

@@ -1,5 +1,6 @@
 """The result of a weld job, the JSON object of `demo` and `weld`, and its report."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
 from weldcal.tools.report import plots_weld
 from weldcal.tools.report.calibration import error_summary
+from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import (
     SCANNER,
     Expected,
@@ -37,6 +39,7 @@ from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.run import RunOptions, robot_timing
 from weldcal.tools.report.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
+from weldcal.welding.locate.part.joint import FIT_UP, FitUp
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
@@ -236,6 +239,8 @@ class DemoResult:
                 found["plan_arm_sigma_mm"] = 1e3 * plan.arm_sigma_m
                 found["plan_arm_turn_deg"] = float(np.degrees(plan.arm_turn_rad))
             found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
+        if fit_ups := self.run.cell.job.planned_seam(self.run.root).fit_ups:
+            found["fit_up"] = [fit_up_document(f) for f in fit_ups]
         found |= self.run.timing()
         return found
 
@@ -263,6 +268,35 @@ def felt_seams(run: Run[WeldJob]) -> list[bool]:
     """Whether the tip feels each of the seams, in the order of welding."""
     cad, tool = run.cell.station.cad, run.cell.station.tool
     return [] if cad is None or tool is None else [is_felt(numbered(cad, k), tool) for k in range(seam_count(cad))]
+
+
+def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:
+    """Least, mean and largest value of gap, misalignment and angle along a seam, mm and deg, with their typical sigma."""
+    if found is None:
+        return {}
+    rows = {}
+    for name, value in found.values.items():
+        unit, factor = FIT_UP[name]
+        figures = (np.nanmin(value), np.nanmean(value), np.nanmax(value), np.nanmedian(found.sigmas[name]))
+        rows[f"{name}_{unit}"] = dict(
+            zip(("least", "mean", "most", "sigma"), (factor * float(v) for v in figures), strict=True)
+        )
+    return rows
+
+
+def fit_up_csv(fit_ups: Sequence[FitUp | None]) -> str:
+    """One line per seam and place: gap, misalignment and angle with their sigmas; empty where the scan does not show them."""
+    columns = [f"{name}{kind}_{unit}" for name, (unit, _) in FIT_UP.items() for kind in ("", "_sigma")]
+    rows = []
+    for seam, found in enumerate(fit_ups, start=1):
+        for k, s in enumerate(() if found is None else found.s_m):
+            row: list[object] = [seam, f"{1e3 * s:.1f}"]
+            for name, (_, factor) in FIT_UP.items():
+                for values in (found.values, found.sigmas):  # type: ignore[union-attr]  # it has places
+                    value = factor * float(values[name][k]) if name in values else np.nan
+                    row.append(f"{value:.3f}" if np.isfinite(value) else "")
+            rows.append(row)
+    return csv_text(("seam", "place_mm", *columns), rows)
 
 
 def seam_document(error: PathError) -> dict[str, float]:
@@ -358,6 +392,13 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
         rows.append(("confidence", fixed(plan.confidence, 2)))
     if not plan.felt:
         rows.append(("seam", UNFELT))
+    for k, found in enumerate(plan.fit_ups, start=1):
+        for name, row in fit_up_document(found).items():
+            what, unit = name.rsplit("_", 1)
+            figures = (
+                f"{row['least']:.2f} to {row['most']:.2f} {unit}, mean {row['mean']:.2f} (sigma {row['sigma']:.2f})"
+            )
+            rows.append((f"fit-up of seam {k}: {what}", figures))
     return rows
 
 

@@ -12,6 +12,7 @@ from weldcal.models.workpieces.part import Part, WeldPart
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
+from weldcal.welding.locate.part.joint import FitUp
 from weldcal.welding.locate.part.locating import locate_part
 from weldcal.welding.locate.planes import Floats
 from weldcal.welding.locate.registration import register_workpiece
@@ -49,6 +50,7 @@ class RootPlan:
     X_BP          where the drawing lies, where one was used
     sigma_m       of the root sideways, rms along it: with a drawing that of the drawn groove, from which the real one may differ
     across_m      (N,) of a part: that of the drawn root sideways, by the scan where it shows the root, else by the registration
+    fit_up        of a part: how the two sides of the joint stand to each other
     rms_m         of the face's points about their plane; confidence 0 to 1; summary: what was found, in a sentence
     """
 
@@ -61,6 +63,7 @@ class RootPlan:
     confidence: float
     summary: str
     across_m: Floats | None = None
+    fit_up: FitUp | None = None
 
 
 def plan_part_root(
@@ -89,6 +92,7 @@ def plan_part_root(
         rms_m=found.rms_m,
         confidence=found.confidence,
         summary=f"{found.summary}; {joint.summary}",
+        fit_up=joint.fit_up,
         across_m=np.full(len(left_P), joint.sigma_m) if math.isfinite(joint.sigma_m) else across_m,
     )
 

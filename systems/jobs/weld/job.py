@@ -1,6 +1,7 @@
 """The weld job: calibrate, verify, scan the workpiece, plan the seam, weld it; or the calibration only."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -40,6 +41,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
+from weldcal.welding.locate.part.joint import read_limits
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase
 
@@ -325,6 +327,7 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         any_posture=welding.posture == "any",
         X_BC_sigma_m=None if sigma_mm is None else 1e-3 * sigma_mm,
         tolerance_m=1e-3 * welding.tolerance_mm,
+        limits={} if welding.fit_up is None else read_limits(Path(welding.fit_up)),
     )
 
 

@@ -24,6 +24,7 @@ from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
+from weldcal.welding.locate.part.joint import FitUp, check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
@@ -86,6 +87,8 @@ class SeamPlanning(Welder):
     estimate: CalibrationEstimate | None = None  # by which the scan is in the base; None: by a known pose
     X_BC_sigma_m: float | None = None  # of the known pose
     tolerance_m: float = math.inf  # of sigma across a seam that is not felt
+    limits: Mapping[str, tuple[float, float]] = dc.field(default_factory=dict)  # of the fit-up, see read_limits
+    earlier: tuple[FitUp | None, ...] = ()  # of the seams before this one
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -172,7 +175,8 @@ class SeamPlanner(BackgroundSystem):
                 local_field=status.local_field,
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
-        planning = dc.replace(planning, workpiece=numbered(planning.workpiece, job.seam))
+        earlier = newest.fit_ups[: job.seam]
+        planning = dc.replace(planning, workpiece=numbered(planning.workpiece, job.seam), earlier=earlier)
         return self.plan(planning, scan, X_BC, correction)
 
     def plan(
@@ -195,10 +199,14 @@ def plan_seam(
     points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
     if planning.local_field is not None:
         points_B = points_B - planning.field_at(points_B)
+    fit_ups = planning.earlier
     try:
         found = plan_root_anyhow(
             points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
         )
+        fit_ups = (*fit_ups, found.fit_up)
+        if found.fit_up is not None and isinstance(planning.workpiece, Part):
+            check_fit_up(found.fit_up, planning.limits, planning.workpiece.seam.joint)
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
         plan = _planned(planning, scan.sequence, seam, found.X_BP)
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
@@ -211,6 +219,7 @@ def plan_seam(
         return dc.replace(
             plan,
             felt=felt,
+            fit_ups=fit_ups,
             rms_m=found.rms_m,
             confidence=found.confidence,
             points_B=points_B,
@@ -218,7 +227,7 @@ def plan_seam(
             summary=summary,
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=scan.sequence, reason=str(error))
+        return PlannedSeam(sequence=scan.sequence, reason=str(error), fit_ups=fit_ups)
 
 
 def unfelt_sigma(planning: SeamPlanning, found: RootPlan, seam: SeamCurve, plan: PlannedSeam) -> tuple[float, str]:

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
 
 from tests.systems.jobs.test_tip_to_torch import ARM, PRIOR, Q_HOME, STRAIGHT, TOOL
+from tests.welding.locate.lying import FLOOR, TABLE, looking, put, scan
+from tests.welding.locate.lying import pose as lying_pose
+from tests.welding.locate.test_fit_up import drawn, parts
 from weldcal.calibration.calibrate import Steps, calibrate
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
@@ -21,9 +28,11 @@ from weldcal.models.workpieces.part import HOVER_M, Part
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.seat import JointNotWeldable, Press
-from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, UncertainSeam, unfelt_sigma
+from weldcal.models.workpieces.shape import PartShape
+from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, UncertainSeam, plan_seam, unfelt_sigma
 from weldcal.systems.jobs.weld.tip_to_torch import torch_sigma
-from weldcal.systems.messages import PlannedSeam
+from weldcal.systems.messages import PlannedSeam, Scan
+from weldcal.tools.report.demo import fit_up_csv, fit_up_document
 from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 from weldcal.tools.worlds.wrong_arm import station
 from weldcal.welding.locate.planning import RootPlan
@@ -157,3 +166,28 @@ def test_over_the_tolerance_it_is_refused_with_both_numbers_and_what_helps() -> 
     sigma, words = unfelt_sigma(planning(X_BC_sigma_m=3e-4, tolerance_m=3.2e-4), at, STRAIGHT, plan)
     assert sigma == pytest.approx(math.hypot(3e-4, 1e-4))
     assert "followed from the scan and the drawing; not felt" in words
+
+
+def test_parts_that_stand_apart_are_refused_before_the_arc_with_what_was_found() -> None:
+    """A sheet 1.2 mm above the other, scanned by a ray caster of its own."""
+    limits = {"gap": (0.0, 0.0008)}
+    X = lying_pose((0.6, 0.0, 0.008), (0.0, 0.0, 0.3))
+    eye = X[:3, :3] @ np.array([0.05, 0.4, 0.75]) + X[:3, 3]
+    solids = parts("lap", 0.0012, 0.0, 0.0)
+    X_BC = looking(eye, X[:3, 3])
+    cloud = (scan([*put(solids, X), TABLE, FLOOR], X_BC, np.random.default_rng(4)) - X_BC[:3, 3]) @ X_BC[:3, :3]
+    model, seam = drawn("lap")
+    part = Part(PartShape("lap", model.mesh, (), 1.0), seam)
+    given = replace(planning(), workpiece=part, X_BP_guess=RigidTransform(X), limits=limits)
+    seen = Scan(sequence=1, points_C=cloud.astype(np.float32))
+    plan = plan_seam(given, seen, RigidTransform(X_BC), ScannerCorrection())
+    assert plan.seam is None
+    assert re.search(r"at \d+ mm of the seam the gap is 1\.[1-3]\d mm .* its limit is 0\.8 mm", str(plan.reason)), (
+        plan.reason
+    )
+    assert plan.fit_ups[0] is not None
+    document = fit_up_document(plan.fit_ups[0])
+    assert document["gap_mm"]["mean"] == pytest.approx(1.2, abs=0.1)
+    rows = list(csv.DictReader(io.StringIO(fit_up_csv(plan.fit_ups))))
+    assert np.mean([float(row["gap_mm"]) for row in rows if row["gap_mm"]]) == pytest.approx(1.2, abs=0.1)
+    assert {row["misalignment_mm"] for row in rows} == {""}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from pydrake.math import RigidTransform
 from weldcal.models.mesh import TriMesh
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.welding.locate.part.fit import into
-from weldcal.welding.locate.part.joint import MOST_M, REACH_M, MeasuredJoint, measure_joint
+from weldcal.welding.locate.part.joint import MOST_M, REACH_M, MeasuredJoint, measure_fit_up, measure_joint
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_prepared
 from weldcal.welding.locate.part.result import PartConfig, PartRegistration
@@ -42,7 +43,8 @@ def locate_part(
     found = register_prepared(scan, model, X_BP_guess, X_BP_hint=X_BP_hint, matters_P=seam.points_P, config=config)
     near = [_about_seam(into(found.X_BP, v.measured), into(found.X_BP, v.eye[None])[0], seam) for v in scan.views]
     points, normals = (np.concatenate(part) for part in zip(*near, strict=True))
-    return found, measure_joint(points, normals, scan.pitch_m, model, seam)
+    seen = (points, normals, scan.pitch_m, model, seam)
+    return found, replace(measure_joint(*seen), fit_up=measure_fit_up(*seen))
 
 
 def _about_seam(points: Floats, eye: Floats, seam: DrawnSeam) -> tuple[Floats, Floats]:
