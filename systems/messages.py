@@ -122,6 +122,7 @@ class JobCommand(Message):
     reason: str | None = None
     speed_share: float = 1.0  # of the mover's speed, 0 to 1
     seam: int = 0  # number of the seam that is planned and welded, from 0
+    piece: int = 0  # number of its piece, where it is interrupted
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -210,6 +211,15 @@ class CalibrationStatus(Message):
         return ScannerCorrection() if found is None else found
 
 
+@dataclass(frozen=True, eq=False)
+class SeamRecord(Message):
+    """One plan: the number of its seam, how its parts stand to each other, and the stretches (from, to) m that are not welded."""
+
+    seam: int
+    fit_up: FitUp | None = None
+    left_out: tuple[tuple[float, float], ...] = ()
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlannedSeam(Message):
     """The SeamPlanner's result for the workpiece scan."""
@@ -226,7 +236,9 @@ class PlannedSeam(Message):
     reason: str | None = None
     sigma_m: float = np.nan  # lateral sigma of the planned root
     felt: bool = True  # by the tip; else sigma_m is the largest one across the seam, of all that is known
-    fit_ups: tuple[FitUp | None, ...] = ()  # of the seams so far, this one the last
+    records: tuple[SeamRecord, ...] = ()  # of this plan, the last, and those before it
+    more: bool = False  # another piece of this seam follows
+    touch_arc_m: float | None = None  # where the tip comes down; None: near the start
     summary: str = ""  # the result of the scan, in one sentence
     # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and torch at one place
     arm_sigma_m: float = np.nan

@@ -169,6 +169,8 @@ class WeldingConfig:
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must
     # CSV of limits of gap, misalignment and angle along the seam: out of them it is not welded
     fit_up: str | None = dc.field(default=None, metadata=FILE)
+    # where something that the drawing does not have is in the way, the seam is interrupted; else it is not welded
+    pass_obstacles: bool = False
     # largest sigma across a seam that the tip does not feel: with a larger one it is not welded
     tolerance_mm: float = 0.5
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)

@@ -231,6 +231,7 @@ welding:
   law: fixed
   lean_deg: 4.0
   tolerance_mm: 0.4
+  pass_obstacles: true
   fit_up: limits.csv
   posture: any
 job:

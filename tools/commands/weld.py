@@ -123,8 +123,8 @@ def write_result(result: DemoResult, finished: JobRun) -> None:
         if result.weld is not None:
             record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
             write_weld_log(record, folder)
-        if fit_ups := run.cell.job.planned_seam(run.root).fit_ups:
-            write_atomic(folder / FIT_UP_CSV, fit_up_csv(fit_ups))
+        if records := run.cell.job.planned_seam(run.root).records:
+            write_atomic(folder / FIT_UP_CSV, fit_up_csv(records))
         finished.write_recording(folder)
         pictures = demo_pictures(result)
         for name, picture in pictures.items():

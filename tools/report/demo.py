@@ -14,7 +14,7 @@ from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.seam_planner import UNFELT
 from weldcal.systems.jobs.weld.settings import work_point
-from weldcal.systems.messages import CalibrationStatus
+from weldcal.systems.messages import CalibrationStatus, SeamRecord
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
 from weldcal.tools.report import plots_weld
@@ -239,8 +239,11 @@ class DemoResult:
                 found["plan_arm_sigma_mm"] = 1e3 * plan.arm_sigma_m
                 found["plan_arm_turn_deg"] = float(np.degrees(plan.arm_turn_rad))
             found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
-        if fit_ups := self.run.cell.job.planned_seam(self.run.root).fit_ups:
-            found["fit_up"] = [fit_up_document(f) for f in fit_ups]
+        if records := self.run.cell.job.planned_seam(self.run.root).records:
+            found["fit_up"] = [fit_up_document(r.fit_up) for r in records]
+            found["left_out_mm"] = [
+                [1e3 * a, 1e3 * b] for r in {r.seam: r for r in records}.values() for a, b in r.left_out
+            ]
         found |= self.run.timing()
         return found
 
@@ -284,13 +287,14 @@ def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:
     return rows
 
 
-def fit_up_csv(fit_ups: Sequence[FitUp | None]) -> str:
-    """One line per seam and place: gap, misalignment and angle with their sigmas; empty where the scan does not show them."""
+def fit_up_csv(records: Sequence[SeamRecord]) -> str:
+    """One line per plan and place: gap, misalignment and angle with their sigmas; empty where the scan does not show them."""
     columns = [f"{name}{kind}_{unit}" for name, (unit, _) in FIT_UP.items() for kind in ("", "_sigma")]
     rows = []
-    for seam, found in enumerate(fit_ups, start=1):
+    for record in records:
+        found = record.fit_up
         for k, s in enumerate(() if found is None else found.s_m):
-            row: list[object] = [seam, f"{1e3 * s:.1f}"]
+            row: list[object] = [record.seam + 1, f"{1e3 * s:.1f}"]
             for name, (_, factor) in FIT_UP.items():
                 for values in (found.values, found.sigmas):  # type: ignore[union-attr]  # it has places
                     value = factor * float(values[name][k]) if name in values else np.nan
@@ -392,8 +396,13 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
         rows.append(("confidence", fixed(plan.confidence, 2)))
     if not plan.felt:
         rows.append(("seam", UNFELT))
-    for k, found in enumerate(plan.fit_ups, start=1):
-        for name, row in fit_up_document(found).items():
+    for record in plan.records:
+        k = record.seam + 1
+        rows += [
+            (f"not welded, seam {k}", f"{1e3 * a:.0f} to {1e3 * b:.0f} mm: something is in the way")
+            for a, b in record.left_out
+        ]
+        for name, row in fit_up_document(record.fit_up).items():
             what, unit = name.rsplit("_", 1)
             figures = (
                 f"{row['least']:.2f} to {row['most']:.2f} {unit}, mean {row['mean']:.2f} (sigma {row['sigma']:.2f})"

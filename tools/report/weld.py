@@ -228,10 +228,11 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     speed = _together([speed_statistics(log.time[p], log.p_BTorch[p], log.torch_on[p], wanted) for p in parts])
     if seam is None:
         return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=speed, plan_error=plan_error)
+    numbers = dict(enumerate(record.seam for record in cell.job.planned_seam(root).records))
     errors = tuple(
         path_error(log.p_BTorch[part & log.torch_on], true)
         for k, part in enumerate(welds(log))
-        if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, k)) is not None
+        if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, numbers.get(k, k))) is not None
     )
     error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
     return WeldOutcome(

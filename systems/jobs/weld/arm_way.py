@@ -82,8 +82,10 @@ class Welder:
     advises: bool = True
 
 
-def leaning(config: ServoConfig, lean_rad: float) -> ServoConfig:
-    """Settings of a servo that leans the tool."""
+def leaning(config: ServoConfig, lean_rad: float, touch_arc_m: float | None = None) -> ServoConfig:
+    """Settings of a servo that leans the tool, and whose tip comes down elsewhere."""
+    if touch_arc_m is not None:
+        config = dc.replace(config, touch=dc.replace(config.touch, arc_m=touch_arc_m))
     return dc.replace(config, torch=dc.replace(config.torch, work_angle_rad=lean_rad)) if lean_rad else config
 
 

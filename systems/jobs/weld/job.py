@@ -327,6 +327,7 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         any_posture=welding.posture == "any",
         X_BC_sigma_m=None if sigma_mm is None else 1e-3 * sigma_mm,
         tolerance_m=1e-3 * welding.tolerance_mm,
+        pass_obstacles=welding.pass_obstacles,
         limits={} if welding.fit_up is None else read_limits(Path(welding.fit_up)),
     )
 

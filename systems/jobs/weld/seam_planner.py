@@ -21,14 +21,14 @@ from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way
+from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
-from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
-from weldcal.welding.locate.part.joint import FitUp, check_fit_up
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, SeamRecord
+from weldcal.welding.locate.part.joint import check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.room import check_beside, check_ends, check_room
+from weldcal.welding.seam.room import NoRoom, check_beside, check_ends, check_room, clear_pieces
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
 _Z = (0.0, 0.0, 1.0)
@@ -64,6 +64,7 @@ def plan_root_anyhow(
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
+RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
 UNFELT = "followed from the scan and the drawing; not felt"
 
 
@@ -88,7 +89,10 @@ class SeamPlanning(Welder):
     X_BC_sigma_m: float | None = None  # of the known pose
     tolerance_m: float = math.inf  # of sigma across a seam that is not felt
     limits: Mapping[str, tuple[float, float]] = dc.field(default_factory=dict)  # of the fit-up, see read_limits
-    earlier: tuple[FitUp | None, ...] = ()  # of the seams before this one
+    pass_obstacles: bool = False  # the seam is interrupted there
+    piece: int = 0  # of an interrupted seam
+    number: int = 0  # of the seam
+    earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -175,8 +179,13 @@ class SeamPlanner(BackgroundSystem):
                 local_field=status.local_field,
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
-        earlier = newest.fit_ups[: job.seam]
-        planning = dc.replace(planning, workpiece=numbered(planning.workpiece, job.seam), earlier=earlier)
+        planning = dc.replace(
+            planning,
+            workpiece=numbered(planning.workpiece, job.seam),
+            number=job.seam,
+            piece=job.piece,
+            earlier=newest.records,
+        )
         return self.plan(planning, scan, X_BC, correction)
 
     def plan(
@@ -199,27 +208,35 @@ def plan_seam(
     points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
     if planning.local_field is not None:
         points_B = points_B - planning.field_at(points_B)
-    fit_ups = planning.earlier
+    record, more = SeamRecord(planning.number), False
     try:
         found = plan_root_anyhow(
             points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
         )
-        fit_ups = (*fit_ups, found.fit_up)
+        record = SeamRecord(planning.number, found.fit_up)
         if found.fit_up is not None and isinstance(planning.workpiece, Part):
             check_fit_up(found.fit_up, planning.limits, planning.workpiece.seam.joint)
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
+        if isinstance(planning.workpiece, Part) and found.X_BP is not None:
+            beside = (points_B, planning.workpiece.mesh, found.X_BP)
+            if planning.pass_obstacles:
+                stops: list[float] = []
+                check_beside(*beside, seam, planning.tool, 0.0, planning.table_z_m, stops)
+                if stops:
+                    planning, seam, record, more = interrupted(planning, seam, stops, record)
         plan = _planned(planning, scan.sequence, seam, found.X_BP)
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
-            check_beside(
-                points_B, planning.workpiece.mesh, found.X_BP, seam, planning.tool, plan.lean_rad, planning.table_z_m
-            )
+            arc = planning.config.touch.arc_m if record.left_out else 0.0
+            check_beside(*beside, seam, planning.tool, plan.lean_rad, planning.table_z_m, from_m=arc)
         sigma_m, summary, felt = found.sigma_m, found.summary, is_felt(planning.workpiece, planning.tool)
         if not felt:
             sigma_m, summary = unfelt_sigma(planning, found, seam, plan)
         return dc.replace(
             plan,
             felt=felt,
-            fit_ups=fit_ups,
+            records=(*planning.earlier, record),
+            more=more,
+            touch_arc_m=planning.config.touch.arc_m if record.left_out else None,
             rms_m=found.rms_m,
             confidence=found.confidence,
             points_B=points_B,
@@ -227,7 +244,30 @@ def plan_seam(
             summary=summary,
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=scan.sequence, reason=str(error), fit_ups=fit_ups)
+        return PlannedSeam(sequence=scan.sequence, reason=str(error), records=(*planning.earlier, record))
+
+
+def interrupted(
+    planning: SeamPlanning, seam: SeamCurve, stops: list[float], record: SeamRecord
+) -> tuple[SeamPlanning, SeamCurve, SeamRecord, bool]:
+    """The piece of an interrupted seam whose turn it is: its planning, its line, its record, and whether another one follows.
+
+    Raises:
+        NoRoom: nothing is left of the seam.
+    """
+    chord = planning.tool.chord_m
+    pieces = clear_pieces(seam, stops, chord, RUN_UP_S * planning.config.weld_speed_m_s)
+    if planning.piece >= len(pieces):
+        raise NoRoom("Nothing of the seam is left beside what is in the tool's way: remove it and scan again.", 0.0)
+    start, end, down = pieces[planning.piece]
+    ends = [0.0, *(s for a, b, _ in pieces for s in (a, b)), seam.length]
+    left_out = tuple((a, b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b - a > 1e-6)
+    last = min(max(seam.drawn_m, seam.length), end + chord)
+    s = np.linspace(start, last, max(9, round((last - start) / 0.5e-3)))
+    line = SeamCurve.from_points(seam.position(s), up=seam.up(s), length=end - start if end < last else None)
+    arc = max(down - start, planning.config.touch.arc_m)
+    planning = dc.replace(planning, config=leaning(planning.config, 0.0, arc))
+    return planning, line, dc.replace(record, left_out=left_out), planning.piece + 1 < len(pieces)
 
 
 def unfelt_sigma(planning: SeamPlanning, found: RootPlan, seam: SeamCurve, plan: PlannedSeam) -> tuple[float, str]:

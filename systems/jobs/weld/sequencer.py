@@ -47,7 +47,7 @@ class JobState(ProcedureState):
         label: of the newest scan.
         streaming: the finger camera streams.
         process_on: the process is enabled.
-        seam: number of the seam that is planned and welded, from 0.
+        seam: number of the seam that is planned and welded, from 0; piece: of its pieces, where it is interrupted.
         log: start time, s, and name of every phase.
         warnings: sentences that hold nothing.
     """
@@ -57,6 +57,7 @@ class JobState(ProcedureState):
     streaming: bool = False
     process_on: bool = False
     seam: int = 0
+    piece: int = 0
     log: tuple[tuple[float, str], ...] = ((0.0, "start"),)
     warnings: tuple[str, ...] = ()
 
@@ -186,6 +187,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             streaming=s.streaming and not s.held,
             process_on=s.process_on and not s.held,
             seam=s.seam,
+            piece=s.piece,
         )
 
     def flag(self, name: str, s: JobState) -> bool:
@@ -276,10 +278,12 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         return s
 
     def _retracted(self, s: JobState, now: JobInputs) -> JobState:
+        if now.planned_seam.more:
+            return self._homeward(s, now, "park", piece=s.piece + 1)
         number = s.seam + 1
         if number < self._plan.seams:
             # The part is scanned again, for the seam that was welded may have moved it.
-            return self._homeward(s, now, "park", seam=number)
+            return self._homeward(s, now, "park", seam=number, piece=0)
         return self._homeward(s, now, "home")
 
     steps: ClassVar = {

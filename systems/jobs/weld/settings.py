@@ -166,6 +166,8 @@ def job_plan(scenario: Scenario) -> JobPlan:
     """The job's parameters; time limits are longer for slower moves and more seams."""
     c, job = scenario.calibration, scenario.job
     seams = max(1, len(scenario.workpiece.seams)) if scenario.workpiece is not None else 1
+    if scenario.welding.pass_obstacles:
+        seams *= 2  # pieces
     slower = 1.0 / job.speed_factor
     return JobPlan(
         calibrate=job.calibrate,
@@ -179,7 +181,7 @@ def job_plan(scenario: Scenario) -> JobPlan:
         scan_timeout_s=SCAN_TIMEOUT_S if c.refine == PLAIN else TIME_S,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
         maximum_time_s=job.maximum_time_s * slower * seams,
-        seams=seams,
+        seams=max(1, len(scenario.workpiece.seams)) if scenario.workpiece is not None else 1,
     )
 
 

@@ -8,6 +8,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,7 +75,7 @@ def test_a_tip_that_is_not_used_hangs_clear_of_both_walls(tmp_path: Path) -> Non
     assert centre[2] == pytest.approx(TOOL.tip_radius_m + HOVER_M, abs=1e-6)  # from the plate
 
 
-def planning(estimate: CalibrationEstimate | None = None, **more: float) -> SeamPlanning:
+def planning(estimate: CalibrationEstimate | None = None, **more: Any) -> SeamPlanning:
     return SeamPlanning(
         arm=ARM,
         tool=TOOL,
@@ -185,9 +186,9 @@ def test_parts_that_stand_apart_are_refused_before_the_arc_with_what_was_found()
     assert re.search(r"at \d+ mm of the seam the gap is 1\.[1-3]\d mm .* its limit is 0\.8 mm", str(plan.reason)), (
         plan.reason
     )
-    assert plan.fit_ups[0] is not None
-    document = fit_up_document(plan.fit_ups[0])
+    assert plan.records[0].fit_up is not None
+    document = fit_up_document(plan.records[0].fit_up)
     assert document["gap_mm"]["mean"] == pytest.approx(1.2, abs=0.1)
-    rows = list(csv.DictReader(io.StringIO(fit_up_csv(plan.fit_ups))))
+    rows = list(csv.DictReader(io.StringIO(fit_up_csv(plan.records))))
     assert np.mean([float(row["gap_mm"]) for row in rows if row["gap_mm"]]) == pytest.approx(1.2, abs=0.1)
     assert {row["misalignment_mm"] for row in rows} == {""}

@@ -253,7 +253,7 @@ def read_limits(path: Path) -> dict[str, tuple[float, float]]:
     Raises:
         InputError: naming the line that is at fault.
     """
-    limits = {}
+    limits: dict[str, tuple[float, float]] = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         cells = [cell.strip() for cell in line.split("#")[0].split(",")]
         if cells == [""] or (not limits and cells[0] == "quantity"):
