@@ -245,12 +245,7 @@ class Part:
         """Whether the tip is used on this seam: as the seam's `feel` says, else not where level plates leave too narrow a gap."""
         if self.seam.feel is not None or self.seam.joint != "butt" or self.seam.gap_m > UNFELT_GAP_M:
             return self.seam.feel is not False
-        try:
-            check_weldable(self.section, tip.tip_radius_m)
-            press_for(self.section, tip)
-        except JointNotWeldable:
-            return False
-        return True
+        return feels(self.section, tip)
 
     def seated(self, tip: Tip, press: Press) -> Seated:
         """See WeldPart; a tip that is not used hangs HOVER_M clear of the walls."""
@@ -280,6 +275,16 @@ class Part:
             return Entry(0.0, GUIDED_DROP_M)
         mouth = 0.5 * section.gap_m if section.gap_m else section.right_m * math.sin(section.half_angle_rad)
         return Entry(-(mouth + BESIDE_M), self.depth_m + tip.tip_radius_m - seated.above_m)
+
+
+def feels(section: JointSection, tip: Tip) -> bool:
+    """Whether a ball can feel a joint."""
+    try:
+        check_weldable(section, tip.tip_radius_m)
+        press_for(section, tip)
+    except JointNotWeldable:
+        return False
+    return True
 
 
 def is_felt(part: WeldPart, tip: Tip) -> bool:

@@ -2,7 +2,6 @@
 
 import dataclasses as dc
 import math
-from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin
 
@@ -20,7 +19,6 @@ from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.jobs.discovery import job_of, jobs
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
 from weldcal.systems.scenario.workpiece import check_workpiece
-from weldcal.welding.locate.part.joint import read_limits
 from weldcal.welding.servo.laws import get_law
 
 POSITIVE = {
@@ -294,7 +292,5 @@ def check_scenario(scenario: Scenario) -> None:
         )
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
-    if scenario.welding.fit_up is not None:
-        read_limits(Path(scenario.welding.fit_up))
     if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:
         raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")

@@ -28,11 +28,11 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
-from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, felt_seams, fit_up_csv, live_errors
+from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, live_errors
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.report.weld import WeldOutcome, columns, live_calibration_error, weld_outcome
+from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams, fit_up_csv, live_calibration_error, weld_outcome
 from weldcal.welding.record.process import speed_along, torch_angles
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 from weldcal.welding.servo.state import Phase

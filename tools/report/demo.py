@@ -1,6 +1,5 @@
 """The result of a weld job, the JSON object of `demo` and `weld`, and its report."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,17 +8,15 @@ from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
-from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.seam_planner import UNFELT
 from weldcal.systems.jobs.weld.settings import work_point
-from weldcal.systems.messages import CalibrationStatus, SeamRecord
+from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
 from weldcal.tools.report import plots_weld
 from weldcal.tools.report.calibration import error_summary
-from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import (
     SCANNER,
     Expected,
@@ -38,8 +35,7 @@ from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetre
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.run import RunOptions, robot_timing
-from weldcal.tools.report.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
-from weldcal.welding.locate.part.joint import FIT_UP, FitUp
+from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, heat_input_kJ_mm
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
@@ -265,42 +261,6 @@ class DemoResult:
         advice = next_scan(self.status, self.run.cell.job.poses, work_point(self.run.cell.scenario))
         found["next_pose"] = None if advice is None else advice.sentence()
         return found
-
-
-def felt_seams(run: Run[WeldJob]) -> list[bool]:
-    """Whether the tip feels each of the seams, in the order of welding."""
-    cad, tool = run.cell.station.cad, run.cell.station.tool
-    return [] if cad is None or tool is None else [is_felt(numbered(cad, k), tool) for k in range(seam_count(cad))]
-
-
-def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:
-    """Least, mean and largest value of gap, misalignment and angle along a seam, mm and deg, with their typical sigma."""
-    if found is None:
-        return {}
-    rows = {}
-    for name, value in found.values.items():
-        unit, factor = FIT_UP[name]
-        figures = (np.nanmin(value), np.nanmean(value), np.nanmax(value), np.nanmedian(found.sigmas[name]))
-        rows[f"{name}_{unit}"] = dict(
-            zip(("least", "mean", "most", "sigma"), (factor * float(v) for v in figures), strict=True)
-        )
-    return rows
-
-
-def fit_up_csv(records: Sequence[SeamRecord]) -> str:
-    """One line per plan and place: gap, misalignment and angle with their sigmas; empty where the scan does not show them."""
-    columns = [f"{name}{kind}_{unit}" for name, (unit, _) in FIT_UP.items() for kind in ("", "_sigma")]
-    rows = []
-    for record in records:
-        found = record.fit_up
-        for k, s in enumerate(() if found is None else found.s_m):
-            row: list[object] = [record.seam + 1, f"{1e3 * s:.1f}"]
-            for name, (_, factor) in FIT_UP.items():
-                for values in (found.values, found.sigmas):  # type: ignore[union-attr]  # it has places
-                    value = factor * float(values[name][k]) if name in values else np.nan
-                    row.append(f"{value:.3f}" if np.isfinite(value) else "")
-            rows.append(row)
-    return csv_text(("seam", "place_mm", *columns), rows)
 
 
 def seam_document(error: PathError) -> dict[str, float]:

@@ -33,7 +33,7 @@ from weldcal.models.workpieces.shape import PartShape
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, UncertainSeam, plan_seam, unfelt_sigma
 from weldcal.systems.jobs.weld.tip_to_torch import torch_sigma
 from weldcal.systems.messages import PlannedSeam, Scan
-from weldcal.tools.report.demo import fit_up_csv, fit_up_document
+from weldcal.tools.report.weld import fit_up_csv, fit_up_document
 from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
 from weldcal.tools.worlds.wrong_arm import station
 from weldcal.welding.locate.planning import RootPlan
@@ -80,7 +80,7 @@ def planning(estimate: CalibrationEstimate | None = None, **more: Any) -> SeamPl
         arm=ARM,
         tool=TOOL,
         workpiece=None,  # type: ignore[arg-type]  # it has no share in this
-        X_BP_guess=None,  # type: ignore[arg-type]
+        X_BP_guess=None,
         config=ServoConfig(),
         q_near=Q_HOME,
         clearance_m=0.025,

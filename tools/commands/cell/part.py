@@ -21,7 +21,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
-from weldcal.models.workpieces.part import UNFELT_GAP_M
+from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
 from weldcal.models.workpieces.reading import STEP_SUFFIXES, read_shape
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
@@ -122,7 +122,7 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
     section, felt = JointSection(half, *joint.walls_m, gap), True
     ring = _ring(shape, joint)
     try:
-        felt = not flush or gap > UNFELT_GAP_M or _feels(section, tool)
+        felt = not flush or gap > UNFELT_GAP_M or feels(section, tool)
         if felt:
             check_weldable(section, tool.tip_radius_m)
         if ring is not None:
@@ -143,14 +143,6 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
             reason += least_pipe(shape, joint, tool)
         return reason, error.short_m if isinstance(error, NoRoom) else math.inf, felt
     return "", 0.0, felt
-
-
-def _feels(section: JointSection, tool: WeldingTool) -> bool:
-    try:
-        check_weldable(section, tool.tip_radius_m)
-    except WeldcalError:
-        return False
-    return True
 
 
 def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:

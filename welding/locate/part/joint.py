@@ -258,18 +258,16 @@ def read_limits(path: Path) -> dict[str, tuple[float, float]]:
         cells = [cell.strip() for cell in line.split("#")[0].split(",")]
         if cells == [""] or (not limits and cells[0] == "quantity"):
             continue
-        where = f"'{path.name}' line {number}"
-        if cells[0] not in FIT_UP or len(cells) != 4 or cells[1] != FIT_UP[cells[0]][0]:
-            raise InputError(f"{where}: write quantity,unit,least,most with gap,mm or misalignment,mm or angle,deg.")
         try:
-            least, most = (
-                float(cell) if cell else off for cell, off in zip(cells[2:], (-math.inf, math.inf), strict=True)
-            )
-        except ValueError:
-            raise InputError(f"{where}: least and most must be numbers or empty.") from None
-        if not least <= most:
-            raise InputError(f"{where}: least must not be above most.")
-        limits[cells[0]] = (least / FIT_UP[cells[0]][1], most / FIT_UP[cells[0]][1])
+            name, unit, *ends = cells
+            least, most = (float(end) if end else off for end, off in zip(ends, (-math.inf, math.inf), strict=True))
+            if unit != FIT_UP[name][0] or not least <= most:
+                raise ValueError
+        except (KeyError, ValueError):
+            raise InputError(
+                f"'{path.name}' line {number}: write quantity,unit,least,most, such as gap,mm,0,1.6."
+            ) from None
+        limits[name] = (least / FIT_UP[name][1], most / FIT_UP[name][1])
     return limits
 
 
@@ -310,7 +308,7 @@ def measure_fit_up(points: Floats, normals: Floats, pitch_m: float, model: PartM
     s = seam.arc_length_m[cut.k]
     at = np.linspace(0.0, seam.length_m, max(1, round(seam.length_m / WINDOW_M)) + 1)
     at = 0.5 * (at[1:] + at[:-1])
-    tilt = _faces_apart(cut, model, seam)[2] if seam.joint in ("lap", "v_groove") else 0.0
+    tilt = _faces_apart(cut, model, seam)[2] if seam.joint == "lap" else 0.0
     found: dict[str, Floats] = {}
     for i, middle in enumerate(at):
         here = np.abs(s - middle) < WINDOW_M
@@ -367,20 +365,18 @@ def _fit_up_at(
     if seam.joint == "lap":  # its upper sheet is thin: its face tells more than its edge
         height, sigma, _ = _faces_apart(cut, model, seam, tilt)
         return {"gap": (max(0.0, height if np.argmax(seam.wall_height_m) else -height), sigma)}
-    sides = [_side(cut, s, seam, side, pitch) for side in ("left", "right")]
-    left, right = sides
-    found = {}
-    if seam.joint == "v_groove":
-        found["misalignment"] = _faces_apart(cut, model, seam, tilt)[:2]
+    left, right = (_side(cut, s, seam, side, pitch) for side in ("left", "right"))
     if left is None or right is None:
-        return found
-    found["angle"] = -math.atan(left.line[1]) - math.atan(right.line[1]), math.hypot(left.sigma[1], right.sigma[1])
+        return {}
+    angle = -math.atan(left.line[1]) - math.atan(right.line[1])
+    found = {"angle": (angle, math.hypot(left.sigma[1], right.sigma[1]))}
     if seam.joint == "butt":
         found["misalignment"] = float(left.line[0] - right.line[0]), math.hypot(left.sigma[0], right.sigma[0])
         found["gap"] = _opening(np.vstack([left.rows, right.rows]), pitch)
         return found
     # Directions of the walls as they are, and where they meet.
-    d = [_unit2(side.along + side.line[1] * side.out) for side in (left, right)]
+    d = np.array([side.along + side.line[1] * side.out for side in (left, right)])
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
     start = [side.line[0] * side.out for side in (left, right)]
     root = start[0] + np.linalg.solve(np.column_stack([d[0], -d[1]]), start[1] - start[0])[0] * d[0]
     (one, one_sigma), (other, other_sigma) = (
@@ -394,9 +390,7 @@ def _fit_up_at(
 def _opening(rows: Floats, pitch: float) -> tuple[float, float]:
     """Width m of the gap between level faces, by the widest step across the seam between points (M,3) of both, in strips; and its sigma."""
     widest, usual = [], []
-    strips = np.floor((rows[:, 2] - rows[:, 2].min()) / STRIP_M)
-    for strip in np.unique(strips):
-        x = np.unique(rows[strips == strip, 0])  # a point may be of both sides
+    for x in _strips(rows[:, 0], rows[:, 2]):
         steps = np.diff(x)
         near = np.abs(x[:-1] + 0.5 * steps) < 2.0 * MOST_M
         if np.count_nonzero(near) > 3 and (x < 0.0).any() and (x > 0.0).any():
@@ -409,6 +403,12 @@ def _opening(rows: Floats, pitch: float) -> tuple[float, float]:
     return max(0.0, float(gaps.mean())), math.hypot(float(gaps.std()) / math.sqrt(len(gaps)), EDGE_SIGMA * pitch)
 
 
+def _strips(x: Floats, s: Floats) -> list[Floats]:
+    """Ascending values x (M,) in strips of the places s (M,) along the seam, each once: a point may be of both sides."""
+    strip = np.floor(s / STRIP_M)
+    return [np.unique(x[strip == k]) for k in np.unique(strip)]
+
+
 def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> tuple[float, float]:
     """Distance m from the root (2,) along a wall at which its points end, and its sigma; 0 where they reach the other wall.
 
@@ -417,12 +417,8 @@ def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> t
     flat = side.rows[:, :2] - root
     slant = abs(d[0] * other[1] - d[1] * other[0])
     a, away = flat @ d, np.abs(flat[:, 0] * other[1] - flat[:, 1] * other[0])
-    rows = side.rows[away > clear]
-    a = a[away > clear]
     ends, steps = [], []
-    strips = np.floor((rows[:, 2] - side.rows[:, 2].min()) / STRIP_M)
-    for strip in np.unique(strips):
-        one = np.sort(a[strips == strip])
+    for one in _strips(a[away > clear], side.rows[away > clear, 2]):
         if len(one) >= 3:
             ends.append(one[0])
             steps.append(float(np.median(np.diff(one))))
@@ -438,14 +434,14 @@ def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> t
 
 
 def _faces_apart(cut: _Cut, model: PartModel, seam: DrawnSeam, tilt: float | None = None) -> tuple[float, float, float]:
-    """How far the face on the left lies above that on the right, m, against the drawing, its sigma, and the tilt of both, or that given.
+    """How far the sheet on the left of a lap lies above that on the right, m, against the drawing, its sigma, and the tilt of both, or that given.
 
-    It is that of a lap's two sheets, or of the plates beside a groove; NaN where one is not seen or does not lie so.
+    NaN where one of them is not seen.
     """
-    lap = (seam.wall_left_P, seam.wall_right_P)[int(np.argmax(seam.wall_height_m))]
+    lower = (seam.wall_left_P, seam.wall_right_P)[int(np.argmax(seam.wall_height_m))]
     q, m = model.closest(cut.points)
     off = np.sum((cut.points - q) * m, axis=1)
-    out = (lap if seam.joint == "lap" else seam.up_P)[cut.k]
+    out = lower[cut.k]
     face = (np.sum(m * out, axis=1) > ALONG_WALL_COS) & (np.sum(out * cut.normals, axis=1) > ALONG_WALL_COS)
     face &= (np.linalg.norm(cut.points - q, axis=1) < np.abs(off) + 1e-4) & (np.abs(off) < 2.0 * MOST_M)
     x = np.sum(cut.offset * seam.left_P[cut.k], axis=1)
@@ -462,7 +458,3 @@ def _faces_apart(cut: _Cut, model: PartModel, seam: DrawnSeam, tilt: float | Non
         use &= residual < max(3.5 * noise, 1e-6)
     sigma = noise * math.sqrt(CORRELATED / np.count_nonzero(use & left) + CORRELATED / np.count_nonzero(use & ~left))
     return float(fit[0] - fit[1]), math.hypot(sigma, SIGMA_FLOOR_M), float(fit[-1]) if tilt is None else tilt
-
-
-def _unit2(v: Floats) -> Floats:
-    return np.asarray(v / np.linalg.norm(v))
