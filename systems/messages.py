@@ -18,6 +18,7 @@ from weldcal.calibration.published.algorithm1 import Algorithm1State
 from weldcal.calibration.published.icp import Verification
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.welding.locate.part.joint import FitUp
 from weldcal.welding.seam.curve import SeamCurve
 
 
@@ -123,6 +124,7 @@ class JobCommand(Message):
     seam: int = 0  # number of the seam that is planned and welded, from 0
     view: int = 0  # number of the newest scan of the workpiece, from 0
     views: int = 1  # number of scans that one plan is made from
+    piece: int = 0  # number of its piece, where it is interrupted
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -219,6 +221,15 @@ class ScanView(Message):
     X_BC: RigidTransform | None
 
 
+@dataclass(frozen=True, eq=False)
+class SeamRecord(Message):
+    """One plan: the number of its seam, how its parts stand to each other, and the stretches (from, to) m that are not welded."""
+
+    seam: int
+    fit_up: FitUp | None = None
+    left_out: tuple[tuple[float, float], ...] = ()
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlannedSeam(Message):
     """The SeamPlanner's result for the workpiece scan, or for several; before the last one it holds the `views` so far."""
@@ -235,6 +246,10 @@ class PlannedSeam(Message):
     points_B: NDArray[np.float64] | None = None
     reason: str | None = None
     sigma_m: float = np.nan  # lateral sigma of the planned root
+    felt: bool = True  # by the tip; else sigma_m is the largest one across the seam, of all that is known
+    records: tuple[SeamRecord, ...] = ()  # of this plan, the last, and those before it
+    more: bool = False  # another piece of this seam follows
+    touch_arc_m: float | None = None  # where the tip comes down; None: near the start
     summary: str = ""  # the result of the scan, in one sentence
     # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and torch at one place
     arm_sigma_m: float = np.nan

@@ -18,6 +18,7 @@ Floats = npt.NDArray[np.float64]
 
 FARTHEST_M = 0.003  # between a drawn line and the root of the joint
 WIDEST_GAP_M = 0.008
+NO_GAP_M = 1e-6  # between triangles of one face, or plates that touch: the seam is then where its line is
 OPENINGS_DEG = {"v_groove": (15.0, 155.0), "fillet": (50.0, 155.0), "lap": (50.0, 155.0), "butt": (155.0, 200.0)}
 SHEET_M = 0.012  # a lap's upper sheet is at most this thick
 _SMOOTH_M = 0.0015
@@ -232,7 +233,7 @@ def _gap_at(section: Section, opening: Opening) -> tuple[Floats | None, float]:
         if low > reached and reached < WIDEST_GAP_M and low > -WIDEST_GAP_M and low - reached > best:
             best, middle = float(low) - reached, 0.5 * (float(low) + reached)
         reached = max(reached, float(high))
-    if not 0.0 < best <= WIDEST_GAP_M:
+    if not NO_GAP_M < best <= WIDEST_GAP_M:
         return (None, 0.0) if best > WIDEST_GAP_M else (level * n, 0.0)
     return middle * x + level * n, best
 

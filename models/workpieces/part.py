@@ -16,7 +16,18 @@ from weldcal.models.mesh import TriMesh
 from weldcal.models.workpieces.drawing import goes_on
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.models.workpieces.seams import DrawnSeam
-from weldcal.models.workpieces.seat import Entry, JointSection, Press, Seated, Tip, check_weldable, press_for, seat
+from weldcal.models.workpieces.seat import (
+    Entry,
+    JointNotWeldable,
+    JointSection,
+    Press,
+    Seated,
+    Tip,
+    check_weldable,
+    hard_height,
+    press_for,
+    seat,
+)
 from weldcal.models.workpieces.shape import PartShape
 
 Floats = npt.NDArray[np.float64]
@@ -103,10 +114,12 @@ def divided(mesh: TriMesh, edge_m: float) -> TriMesh:
 
 
 FELT_ABOUT_SEAM_M = 0.030
+UNFELT_GAP_M = 0.002  # a butt joint no wider than this is welded without the tip, where the ball cannot feel it
 BOWED_EDGE_M = 0.006
 SELF_GUIDING_RAD = math.radians(29.0)  # half opening above which a pressed tip slides down either wall (friction 0.2)
 GUIDED_DROP_M = 0.002  # from where it may land to the root, for a plan that is as far beside it
 CHOSEN_END_M, FELT_END_M = 0.0003, 0.0015
+HOVER_M = 0.003  # between the ball and the walls of a joint that it does not feel
 BESIDE_M = 0.0017  # between the joint's mouth and the tip's centre as it lands on the face
 
 
@@ -228,22 +241,55 @@ class Part:
         """See WeldPart: hardly any where the joint goes on beyond the drawn end, for then the end is chosen, not felt."""
         return CHOSEN_END_M if goes_on(self.mesh, self.seam) else FELT_END_M
 
+    def felt_by(self, tip: Tip) -> bool:
+        """Whether the tip is used on this seam: as the seam's `feel` says, else not where level plates leave too narrow a gap."""
+        if self.seam.feel is not None or self.seam.joint != "butt" or self.seam.gap_m > UNFELT_GAP_M:
+            return self.seam.feel is not False
+        return feels(self.section, tip)
+
     def seated(self, tip: Tip, press: Press) -> Seated:
-        """See WeldPart."""
+        """See WeldPart; a tip that is not used hangs HOVER_M clear of the walls."""
+        if not self.felt_by(tip):
+            clear = tip.tip_radius_m + HOVER_M
+            return Seated(0.0, clear if self.section.gap_m > 0.0 else hard_height(self.section, clear))
         return seat(self.section, tip, press)
 
     def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
-        """See WeldPart; raises JointNotWeldable."""
-        check_weldable(self.section, tip.tip_radius_m)
-        return press_for(self.section, tip, axial_m, lateral_m)
+        """See WeldPart: of the first of its seams that is felt; raises JointNotWeldable."""
+        felt = next((p for k in range(seam_count(self)) if is_felt(p := numbered(self, k), tip)), None)
+        if not isinstance(felt, Part):
+            return Press(0.003, 0.002)  # it presses on nothing
+        try:
+            check_weldable(felt.section, tip.tip_radius_m)
+            return press_for(felt.section, tip, axial_m, lateral_m)
+        except JointNotWeldable as error:
+            advice = "Or write feel: false with the seam: it is then followed from the scan and the drawing."
+            raise JointNotWeldable(f"{error} {advice}") from error
 
     def entry(self, tip: Tip, seated: Seated) -> Entry:
         """See WeldPart: a wide joint guides the tip in from above; beside a narrow one it lands on the face and searches."""
         section = self.section
+        if not self.felt_by(tip):
+            return Entry(0.0, GUIDED_DROP_M)
         if section.gap_m == 0.0 and section.half_angle_rad >= SELF_GUIDING_RAD:
             return Entry(0.0, GUIDED_DROP_M)
         mouth = 0.5 * section.gap_m if section.gap_m else section.right_m * math.sin(section.half_angle_rad)
         return Entry(-(mouth + BESIDE_M), self.depth_m + tip.tip_radius_m - seated.above_m)
+
+
+def feels(section: JointSection, tip: Tip) -> bool:
+    """Whether a ball can feel a joint."""
+    try:
+        check_weldable(section, tip.tip_radius_m)
+        press_for(section, tip)
+    except JointNotWeldable:
+        return False
+    return True
+
+
+def is_felt(part: WeldPart, tip: Tip) -> bool:
+    """Whether the tip is used on the part's seam; on a grooved plate it is."""
+    return not isinstance(part, Part) or part.felt_by(tip)
 
 
 def seam_count(part: WeldPart) -> int:

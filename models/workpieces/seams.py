@@ -30,6 +30,7 @@ class DrawnSeam:
     wall_height_m (left, right) usable extent of each wall, from the root line; of a butt joint with a gap the gap's depth
     gap_m         width of the gap of a butt joint, else 0
     closed        the last point continues into the first
+    feel          whether the tip feels it; None: where a ball can
     """
 
     points_P: Floats
@@ -40,6 +41,7 @@ class DrawnSeam:
     wall_height_m: Floats
     gap_m: float = 0.0
     closed: bool = False
+    feel: bool | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points_P)
@@ -64,6 +66,12 @@ class DrawnSeam:
         if self.closed:
             t[0] = t[-1] = self.points_P[1] - self.points_P[-2]
         return np.asarray(t / np.linalg.norm(t, axis=1, keepdims=True))
+
+    @cached_property
+    def left_P(self) -> Floats:
+        """(N,3) unit vector to the left of the travel, square to the bisector."""
+        left = np.cross(self.up_P, self.tangents_P)
+        return np.asarray(left / np.linalg.norm(left, axis=1, keepdims=True))
 
     @cached_property
     def arc_length_m(self) -> Floats:

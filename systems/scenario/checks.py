@@ -28,6 +28,8 @@ POSITIVE = {
         "deflection_mm",
         "axial_deflection_mm",
         "seam_length_mm",
+        "tolerance_mm",
+        "X_BC_sigma_mm",
         "length_mm",
         "hole_from_mm",
         "bend_radius_mm",

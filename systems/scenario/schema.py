@@ -88,6 +88,8 @@ class SeamConfig:
     direction: str = "forward"  # forward or reverse
     start_mm: float = 0.0  # cut off at the start
     end_mm: float = 0.0  # cut off at the end
+    # true: the tip feels it; false: it is followed from the scan and the drawing; null: felt where a ball can feel it
+    feel: bool | None = None
 
 
 @dc.dataclass(kw_only=True)
@@ -167,6 +169,12 @@ class WeldingConfig:
     # how far the tool may lean sideways where the arm cannot follow the seam otherwise, 0 to 10
     lean_deg: float = 0.0
     posture: str = "home"  # branch of the inverse kinematics: home, that of home_deg; any, another one where it must
+    # CSV of limits of gap, misalignment and angle along the seam: out of them it is not welded
+    fit_up: str | None = dc.field(default=None, metadata=FILE)
+    # where something that the drawing does not have is in the way, the seam is interrupted; else it is not welded
+    pass_obstacles: bool = False
+    # largest sigma across a seam that the tip does not feel: with a larger one it is not welded
+    tolerance_mm: float = 0.5
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
 
 
@@ -178,6 +186,8 @@ class JobConfig:
     weld: bool = True
     X_BC: PoseConfig | None = None  # a known calibration, where `calibrate` is off
     X_FC: PoseConfig | None = None  # the same of a scanner on the flange: its pose in the flange's frame
+    # its expected error at the work point, one sigma; null: that of an arm as its maker leaves it
+    X_BC_sigma_mm: float | None = None
     speed_factor: float = 1.0  # speed of the arm's moves, 0.05 to 1; the weld speed does not change
     maximum_time_s: float = 240.0  # at speed_factor 1
 

@@ -1,5 +1,6 @@
 """Makes a scenario's workpiece from its file: the part as drawn with its seam, and the part as it was made."""
 
+import dataclasses as dc
 import math
 from pathlib import Path
 
@@ -69,7 +70,9 @@ def part_of(spec: WorkpieceConfig) -> Part:
     assert spec.file is not None
     assert spec.joint is not None
     shape = read_shape(Path(spec.file), spec.units)
-    first, *others = (leg for seam in spec.seams for leg in legs(shape, source(seam), spec.joint))
+    first, *others = (
+        dc.replace(leg, feel=seam.feel) for seam in spec.seams for leg in legs(shape, source(seam), spec.joint)
+    )
     return Part(shape, first, tuple(others))
 
 

@@ -205,7 +205,7 @@ workpiece:
   units: mm
   joint: fillet
   seams:
-    - {polyline: seam.csv, edges: [12, 13], direction: reverse, start_mm: 5.0, end_mm: 6.0}
+    - {polyline: seam.csv, edges: [12, 13], direction: reverse, start_mm: 5.0, end_mm: 6.0, feel: false}
   length_mm: 250.0
   pose_guess: {xyz_m: [0.6, 0.0, 0.03], rpy_deg: [0.0, 0.0, 80.0]}
   placement_error: {translation_mm: 1.0, rotation_deg: 0.2}
@@ -230,12 +230,16 @@ welding:
   process: {name: TIG, current_A: 90.0, voltage_V: 11.0, efficiency: 0.55, wire_feed_m_min: 1.2}
   law: fixed
   lean_deg: 4.0
+  tolerance_mm: 0.4
+  pass_obstacles: true
+  fit_up: limits.csv
   posture: any
 job:
   calibrate: false
   weld: false
   X_BC: {xyz_m: [0.61, 0.11, 1.01], rpy_deg: [171.0, 3.0, -84.0]}
   X_FC: {xyz_m: [0.01, 0.02, 0.03], rpy_deg: [1.0, 2.0, 3.0]}
+  X_BC_sigma_mm: 0.1
   speed_factor: 0.5
   maximum_time_s: 100.0
 visualization:

@@ -32,13 +32,14 @@ from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report, li
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.report.weld import WeldOutcome, columns, live_calibration_error, weld_outcome
+from weldcal.tools.report.weld import WeldOutcome, columns, felt_seams, fit_up_csv, live_calibration_error, weld_outcome
 from weldcal.welding.record.process import speed_along, torch_angles
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 from weldcal.welding.servo.state import Phase
 
 SCANS: Final = "scans"
 SUMMARY: Final = "summary.json"
+FIT_UP_CSV: Final = "fit_up.csv"
 PRESET: Final = "straight_groove"
 PHASE_NAMES = [str(phase) for phase in Phase]
 
@@ -117,7 +118,7 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:
-    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, summary.json, report.html."""
+    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, fit_up.csv, plots/, recording.html, summary.json, report.html."""
     folder, run = result.folder, result.run
     with whole_result(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -126,6 +127,8 @@ def write_result(result: DemoResult, finished: JobRun) -> None:
         if result.weld is not None:
             record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
             write_weld_log(record, folder)
+        if records := run.cell.job.planned_seam(run.root).records:
+            write_atomic(folder / FIT_UP_CSV, fit_up_csv(records))
         finished.write_recording(folder)
         pictures = demo_pictures(result)
         for name, picture in pictures.items():
@@ -294,6 +297,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "omega_max_rad_s": config.limits.omega_max_rad_s,
         "chord_m": config.tool.torch_offset_m,
         "law": config.law,
+        "felt": felt_seams(run),
         "ended": run.reason or "done",
     }
     phase = np.array([PHASE_NAMES[int(k)] for k in named["phase"]], dtype=np.str_)

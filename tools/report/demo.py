@@ -11,6 +11,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.workpieces.part import Part
 from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.seam_planner import UNFELT
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.phase_words import phase_words
@@ -35,7 +36,7 @@ from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetre
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.run import RunOptions, robot_timing
-from weldcal.tools.report.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
+from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, heat_input_kJ_mm
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig
@@ -127,8 +128,10 @@ class DemoResult:
 
     @property
     def arm_note(self) -> tuple[str, ...]:
-        """What errors of the arm may do between tip and torch, where a planned seam is bent enough for that to matter."""
+        """What errors of the arm may do between tip and torch, where that matters; or that the seam was not felt."""
         plan = self.run.cell.job.planned_seam(self.run.root)
+        if self.weld is not None and not plan.felt:
+            return (f"The seam was {UNFELT}. The plan's sigma across it is {1e3 * plan.sigma_m:.2f} mm.",)
         if self.weld is None or not plan.arm_sigma_m > ARM_NOTE_M:
             return ()
         refinement = self.status.refinement
@@ -228,10 +231,16 @@ class DemoResult:
             if np.isfinite(plan.sigma_m):
                 found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
             found["plan_words"] = plan.summary
+            found["felt"] = felt_seams(self.run)
             if np.isfinite(plan.arm_sigma_m):
                 found["plan_arm_sigma_mm"] = 1e3 * plan.arm_sigma_m
                 found["plan_arm_turn_deg"] = float(np.degrees(plan.arm_turn_rad))
             found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
+        if records := self.run.cell.job.planned_seam(self.run.root).records:
+            found["fit_up"] = [fit_up_document(r.fit_up) for r in records]
+            found["left_out_mm"] = [
+                [1e3 * a, 1e3 * b] for r in {r.seam: r for r in records}.values() for a, b in r.left_out
+            ]
         found |= self.run.timing()
         return found
 
@@ -349,6 +358,20 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
             ("sigma of the planned root, sideways", f"{fixed(1e3 * plan.sigma_m, 3)} mm, as the planner states it")
         )
         rows.append(("confidence", fixed(plan.confidence, 2)))
+    if not plan.felt:
+        rows.append(("seam", UNFELT))
+    for record in plan.records:
+        k = record.seam + 1
+        rows += [
+            (f"not welded, seam {k}", f"{1e3 * a:.0f} to {1e3 * b:.0f} mm: something is in the way")
+            for a, b in record.left_out
+        ]
+        for name, row in fit_up_document(record.fit_up).items():
+            what, unit = name.rsplit("_", 1)
+            figures = (
+                f"{row['least']:.2f} to {row['most']:.2f} {unit}, mean {row['mean']:.2f} (sigma {row['sigma']:.2f})"
+            )
+            rows.append((f"fit-up of seam {k}: {what}", figures))
     return rows
 
 

@@ -14,12 +14,16 @@ from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
-from weldcal.models.workpieces.part import numbered
+from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import seated_tip, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
+from weldcal.systems.messages import SeamRecord
+from weldcal.systems.runner import Run
 from weldcal.systems.station import Truth
+from weldcal.tools.report.files import csv_text
+from weldcal.welding.locate.part.joint import FIT_UP, FitUp
 from weldcal.welding.record.process import (
     PathError,
     SpeedStatistics,
@@ -230,10 +234,11 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     speed = _together([speed_statistics(log.time[p], log.p_BTorch[p], log.torch_on[p], wanted) for p in parts])
     if seam is None:
         return WeldOutcome(log=log, true_seam=seam, planned=plan, error=None, speed=speed, plan_error=plan_error)
+    numbers = dict(enumerate(record.seam for record in cell.job.planned_seam(root).records))
     errors = tuple(
         path_error(log.p_BTorch[part & log.torch_on], true)
         for k, part in enumerate(welds(log))
-        if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, k)) is not None
+        if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, numbers.get(k, k))) is not None
     )
     error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
     return WeldOutcome(
@@ -270,3 +275,39 @@ def heat_input_kJ_mm(weld: WeldOutcome, process: WeldProcess) -> Array | None:
     if process.missing is not None or not weld.log.torch_on.any():
         return None
     return 1e-6 * process.heat_input(speed_along(weld.log.time, weld.log.p_BTorch)[weld.log.torch_on])
+
+
+def felt_seams(run: Run[WeldJob]) -> list[bool]:
+    """Whether the tip feels each of the seams, in the order of welding."""
+    cad, tool = run.cell.station.cad, run.cell.station.tool
+    return [] if cad is None or tool is None else [is_felt(numbered(cad, k), tool) for k in range(seam_count(cad))]
+
+
+def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:
+    """Least, mean and largest value of gap, misalignment and angle along a seam, mm and deg, with their typical sigma."""
+    if found is None:
+        return {}
+    rows = {}
+    for name, value in found.values.items():
+        unit, factor = FIT_UP[name]
+        figures = (np.nanmin(value), np.nanmean(value), np.nanmax(value), np.nanmedian(found.sigmas[name]))
+        rows[f"{name}_{unit}"] = dict(
+            zip(("least", "mean", "most", "sigma"), (factor * float(v) for v in figures), strict=True)
+        )
+    return rows
+
+
+def fit_up_csv(records: Sequence[SeamRecord]) -> str:
+    """One line per plan and place: gap, misalignment and angle with their sigmas; empty where the scan does not show them."""
+    columns = [f"{name}{kind}_{unit}" for name, (unit, _) in FIT_UP.items() for kind in ("", "_sigma")]
+    rows = []
+    for record in records:
+        found = record.fit_up
+        for k, s in enumerate(() if found is None else found.s_m):
+            row: list[object] = [record.seam + 1, f"{1e3 * s:.1f}"]
+            for name, (_, factor) in FIT_UP.items():
+                for values in (found.values, found.sigmas):  # type: ignore[union-attr]  # it has places
+                    value = factor * float(values[name][k]) if name in values else np.nan
+                    row.append(f"{value:.3f}" if np.isfinite(value) else "")
+            rows.append(row)
+    return csv_text(("seam", "place_mm", *columns), rows)

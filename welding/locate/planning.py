@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.part.fit import into
-from weldcal.welding.locate.part.joint import MOST_M, REACH_M, MeasuredJoint, measure_joint
+from weldcal.welding.locate.part.joint import MOST_M, REACH_M, FitUp, MeasuredJoint, measure_fit_up, measure_joint
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_prepared
 from weldcal.welding.locate.part.result import PartConfig, PartRegistration
@@ -57,6 +57,8 @@ class RootPlan:
     root, up      (N,3) m and unit normals of the face; half_angle_rad between a wall and the groove's middle plane
     X_BP          where the drawing lies, where one was used
     sigma_m       of the root sideways, rms along it: with a drawing that of the drawn groove, from which the real one may differ
+    across_m      (N,) of a part: that of the drawn root sideways, by the scan where it shows the root, else by the registration
+    fit_up        of a part: how the two sides of the joint stand to each other
     rms_m         of the face's points about their plane; confidence 0 to 1; summary: what was found, in a sentence
     """
 
@@ -68,6 +70,8 @@ class RootPlan:
     rms_m: float
     confidence: float
     summary: str
+    across_m: Floats | None = None
+    fit_up: FitUp | None = None
 
 
 def locate_part(
@@ -91,7 +95,8 @@ def locate_part(
     found = register_prepared(scan, model, X_BP_guess, X_BP_hint=X_BP_hint, matters_P=seam.points_P, config=config)
     near = [_about_seam(into(found.X_BP, v.measured), into(found.X_BP, v.eye[None])[0], seam) for v in scan.views]
     points, normals = (np.concatenate(part) for part in zip(*near, strict=True))
-    return found, measure_joint(points, normals, scan.pitch_m, model, seam)
+    shown = (points, normals, scan.pitch_m, model, seam)
+    return found, replace(measure_joint(*shown), fit_up=measure_fit_up(*shown))
 
 
 def _about_seam(points: Floats, eye: Floats, seam: DrawnSeam) -> tuple[Floats, Floats]:
@@ -123,6 +128,8 @@ def plan_part_root(
         )
     found, joint = locate_part(points_B, part.mesh, part.seam, None, eye_B, X_BP_hint=X_BP_guess)
     seam = joint.seam.transformed(found.X_BP)
+    left_P = joint.seam.left_P
+    across_m = np.sqrt(np.einsum("ni,nij,nj->n", left_P, found.spread_at(part.seam_P), left_P))
     sigma_m = float(np.sqrt(np.mean(found.sigma_at(part.seam_P) ** 2)))
     return RootPlan(
         root=seam.points_P,
@@ -133,6 +140,8 @@ def plan_part_root(
         rms_m=found.rms_m,
         confidence=found.confidence,
         summary=f"{found.summary}; {joint.summary}",
+        fit_up=joint.fit_up,
+        across_m=np.full(len(left_P), joint.sigma_m) if math.isfinite(joint.sigma_m) else across_m,
     )
 
 

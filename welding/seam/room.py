@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ OTHER_M = 0.0025
 SAMPLES_BESIDE = 400_000  # of a part's 0.2 m2 about 0.7 mm apart, which is small beside OTHER_M
 LEAST_AREA_M2 = 8e-6  # of a thing that is seen: less is a few flying points at an edge
 STEP_BESIDE_M, LIFTED_M = 0.005, 0.1  # between the places along the seam, and above its ends
+LEAST_PIECE_M = 0.010  # of a seam beyond the place where the tip comes down
 WIRE_M = 0.001  # radius of the wire with its play
 
 
@@ -84,10 +86,13 @@ def check_beside(
     tool: WeldingTool,
     lean_rad: float = 0.0,
     table_z_m: float = -math.inf,
+    stops: list[float] | None = None,
+    from_m: float = 0.0,
 ) -> None:
     """Check that nothing that a scan (N,3) shows and the drawing does not, as a clamp or a tack, is in the way of the tool.
 
-    Tip, finger, torch and the tool's body along the seam, and lifted off at both of its ends; below `table_z_m` it is the table.
+    Tip, finger, torch and the tool's body along the seam from `from_m` on, and lifted off at both of its ends; below `table_z_m` it is the
+    table. Where `stops` is given, the places of the tip at which something is in the way are added to it instead.
 
     Raises:
         NoRoom: with the place.
@@ -97,9 +102,9 @@ def check_beside(
     wire, upward = np.array([-tool.chord_m, 0.0, tool.torch_height_m]), np.array([0.0, 0.0, NEAR_TIP_M])
     spans += [(np.zeros(3), upward, tool.tip_radius_m + CLEARANCE_M), (wire, wire + upward, WIRE_M + CLEARANCE_M)]
     last = min(seam.drawn_m, seam.length + tool.chord_m)
-    steps = np.linspace(0.0, last, max(2, math.ceil(last / STEP_BESIDE_M) + 1))
+    steps = np.linspace(from_m, last, max(2, math.ceil((last - from_m) / STEP_BESIDE_M) + 1))
     lifts = np.arange(STEP_BESIDE_M, LIFTED_M, STEP_BESIDE_M)
-    places = [(float(s), 0.0) for s in steps] + [(s, float(lift)) for s in (0.0, last) for lift in lifts]
+    places = [(float(s), 0.0) for s in steps] + [(s, float(lift)) for s in (from_m, last) for lift in lifts]
     held = [(s, lift, *_held(seam, s, tool.chord_m, lean_rad)) for s, lift in places]
     share = np.linspace(0.0, 1.0, SPHERES)[:, None]
     body = np.vstack([a + share * (b - a) for a, b, _ in spans])
@@ -123,7 +128,9 @@ def check_beside(
             ):  # tip and wire may be as near to a table that lies level with a wall as they are to this wall
                 met = met[~flat[met]]
             both, before[k] = np.union1d(met, before[k]), met  # a tack is longer than a step and shorter than two
-            if len(met) and len(both) >= least:
+            if len(met) and len(both) >= least and stops is not None:
+                stops.append(s)
+            elif len(met) and len(both) >= least:
                 x, y, z = np.median(other[both], axis=0)
                 there = f"near ({1e3 * x:.0f}, {1e3 * y:.0f}, {1e3 * z:.0f}) mm in the base, at {1e3 * s:.0f} mm of the seam"
                 if z < table_z_m + OTHER_M:
@@ -131,6 +138,25 @@ def check_beside(
                 else:
                     what, change = f"The tool would touch something that is not in the drawing {there}", "remove it"
                 raise NoRoom(f"{what}: {change}, or cut the seam with start_mm or end_mm, and scan again.", CLEARANCE_M)
+
+
+def clear_pieces(
+    seam: SeamCurve, stops: Sequence[float], chord_m: float, run_up_m: float
+) -> list[tuple[float, float, float]]:
+    """Split a seam where something is in the way of the tool: for each piece its start and end and the place where the tip comes down, m.
+
+    The tip is a chord ahead of the torch. A piece ends where the tip would meet a thing. The next one begins where the torch has passed it, and
+    `run_up_m` later, when the torch is on the seam.
+    """
+    found = []
+    edges = [-math.inf, *sorted(stops), math.inf]
+    for before, after in pairwise(edges):
+        first, last = before + STEP_BESIDE_M, after - STEP_BESIDE_M
+        start = max(0.0, first - chord_m + run_up_m)
+        end = min(seam.length, last - chord_m) if last < math.inf else seam.length
+        if end - start > max(first - start, 0.0) + LEAST_PIECE_M:
+            found.append((start, end, max(first, start)))
+    return found
 
 
 def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:

@@ -27,6 +27,8 @@ def watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Weld
         # The arm may still move, and by a stopped clock no frame is ever late.
         text = f"The robot's clock has stood still for {state.clock_stopped_s:.2f} s; check the robot's connection."
         return fault(state, text)
+    if not config.felt:
+        return state
     # Past the end of a seam cut short the tip is not needed: what it feels, or does not, is no reason to stop the torch.
     needed = state.phase != Phase.TRACK or state.s_tip <= state.s_end or not goes_on(state, config)
     if beyond_limit(state, config) and state.phase != Phase.FINISH:

@@ -362,6 +362,7 @@ class ServoConfig:
         weld_speed_m_s: torch speed, the primary variable; law: a name of welding.servo.laws.
         period_s: servo tick; lag_s: delay between command and motion of the robot, which the torch's equations look
             ahead by.
+        felt: whether the tip is used; else it hangs clear and the torch follows the plan.
     """
 
     tool: ToolGeometry = field(default_factory=ToolGeometry)
@@ -383,6 +384,7 @@ class ServoConfig:
     period_s: float = 0.008
     lag_s: float = 0.025
     law: str = "guarded"
+    felt: bool = True
 
     def __post_init__(self) -> None:
         _check_numbers("", self)

@@ -78,6 +78,7 @@ def wait_for_arc(
     return state, share * V_stop, None
 
 
+_THERE_M = 0.3e-3  # from the plan: a tip that is not used has come down
 _MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
 
 
@@ -110,7 +111,7 @@ def welding_step(
     )
     state = changed(state, time=sample.time, clock_stopped_s=clock_stopped_s)
 
-    is_new = state.phase not in (Phase.DONE, Phase.FAULT) and is_new_frame(state, sample)
+    is_new = config.felt and state.phase not in (Phase.DONE, Phase.FAULT) and is_new_frame(state, sample)
     before = state
     if is_new:
         state = with_frame(state, sample, _frame_at_tip(state), config)
@@ -150,8 +151,15 @@ def _frame_at_tip(state: WeldingState) -> SeamFrame:
 def _touch(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
-    feels_start = config.touch.feel_start and get_law(config.law).guarded
-    if state.touch.step in BACK_STEPS:
+    feels_start = config.felt and config.touch.feel_start and get_law(config.law).guarded
+    if not config.felt:
+        assert state.plan_fit is not None
+        seam, along, ready, problem = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False, None
+        gap = seam.position - sample.X_BT.translation()
+        aside, above = dot(gap, seam.normal), dot(gap, seam.up)
+        seated = math.hypot(aside, above) < _THERE_M
+        lateral, upward = config.deflection.k_follow * aside, config.deflection.k_follow * above
+    elif state.touch.step in BACK_STEPS:
         state, (along, lateral, upward), problem, ready = feel_start_step(before, state, sample, is_new, config)
         assert state.plan_fit is not None
         seam, seated = state.plan_fit.curve.frame(state.s_tip), False
@@ -173,10 +181,9 @@ def _touch(
         s = curve.nearest(p_BT, state.s_tip)
         p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
         s_torch = curve.nearest(p_BW, s - config.tool.torch_offset_m, 0.1)
-        proven = seated or state.proven
-        state = changed(
-            state, phase=Phase.TRACK, proven=proven, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch
-        )
+        proven = config.felt and (seated or state.proven)
+        phase = Phase.TRACK if config.felt else Phase.FINISH  # in which the tool follows the plan, here on its line
+        state = changed(state, phase=phase, proven=proven, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch)
     return _answer(state, V, config, Diagnostics(omega=0.0))
 
 

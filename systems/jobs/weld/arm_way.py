@@ -83,8 +83,10 @@ class Welder:
     advises: bool = True
 
 
-def leaning(config: ServoConfig, lean_rad: float) -> ServoConfig:
-    """Settings of a servo that leans the tool."""
+def leaning(config: ServoConfig, lean_rad: float, touch_arc_m: float | None = None) -> ServoConfig:
+    """Settings of a servo that leans the tool, and whose tip comes down elsewhere."""
+    if touch_arc_m is not None:
+        config = dc.replace(config, touch=dc.replace(config.touch, arc_m=touch_arc_m))
     return dc.replace(config, torch=dc.replace(config.torch, work_angle_rad=lean_rad)) if lean_rad else config
 
 
@@ -232,13 +234,15 @@ def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: f
 def seam_motions(tool: WeldingTool, seam: SeamCurve, config: ServoConfig) -> list[GuardedMotion]:
     """The search for the groove, to its deepest and farthest, and the seam, as the servo moves the tool."""
     X, touch = touch_start_pose(seam, config), config.touch
+    lift = config.tool.tip_drop_m + touch.height_m
     y, z = (X.rotation().matrix()[:, k] for k in (1, 2))
-    down = config.tool.tip_drop_m + touch.height_m + touch.depth_m + config.deflection.axial_d_m
+    down = lift + touch.depth_m + config.deflection.axial_d_m if config.felt else lift
     deep = RigidTransform(X.rotation(), X.translation() - down * z)
     path = tool_path(seam, config)
+    search = straight("the search for the seam", deep, touch.range_m * y, touch.search_m_s, tool.X_FT)
     return [
         straight("the descent to the seam", X, -down * z, touch.fast_m_s, tool.X_FT),
-        straight("the search for the seam", deep, touch.range_m * y, touch.search_m_s, tool.X_FT),
+        *([search] if config.felt else []),
         GuardedMotion(
             name="the seam",
             X_BT=path.X_BT,

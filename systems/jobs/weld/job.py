@@ -1,6 +1,7 @@
 """The weld job: calibrate, verify, scan the workpiece, plan the seam, weld it; or the calibration only."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -9,7 +10,8 @@ from pydrake.systems.framework import Context, OutputPort
 from weldcal.calibration.motion.drift.sequential import DriftConfig
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.models.arrays import Array
-from weldcal.models.workpieces.part import seam_count
+from weldcal.models.errors import InputError
+from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
@@ -41,6 +43,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
+from weldcal.welding.locate.part.joint import read_limits
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase
 
@@ -314,6 +317,8 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
     assert spec is not None
     assert station.tool is not None
     assert station.cad is not None
+    # a live calibration states its own
+    sigma_mm = scenario.calibration.required_error_mm if scenario.job.calibrate else scenario.job.X_BC_sigma_mm
     return SeamPlanning(
         arm=station.arm,
         tool=station.tool,
@@ -328,6 +333,10 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
         table_z_m=scenario.table_height_m(),
         lean_rad=np.deg2rad(welding.lean_deg),
         any_posture=welding.posture == "any",
+        X_BC_sigma_m=None if sigma_mm is None else 1e-3 * sigma_mm,
+        tolerance_m=1e-3 * welding.tolerance_mm,
+        pass_obstacles=welding.pass_obstacles,
+        limits={} if welding.fit_up is None else read_limits(Path(welding.fit_up)),
     )
 
 
@@ -350,6 +359,12 @@ def _add_welding(
     position = spine.arm.position
     kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
     carried = scenario.carried_scanner()
+    if kind is DrawnSeamPlanner and not all(
+        is_felt(numbered(station.cad, k), tool) for k in range(seam_count(station.cad))
+    ):
+        raise InputError(
+            "A seam that the tip does not feel is located by the scan, for a drawing states no sigma: write workpiece.located_by: scan."
+        )
     planner = wiring.add(
         "seam_planner",
         kind(

@@ -12,22 +12,24 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces.part import Part, WeldPart, numbered
+from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leans_with_room
-from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch
-from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView
+from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning, leans_with_room
+from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView, SeamRecord
 from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.welding.locate.part.joint import check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.room import check_beside, check_ends
+from weldcal.welding.seam.room import NoRoom, check_beside, check_ends, clear_pieces
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
@@ -67,6 +69,14 @@ def plan_root_anyhow(
 
 
 OVERLAP_M = 5e-3
+RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
+UNFELT = "followed from the scan and the drawing; not felt"
+
+
+class UncertainSeam(WeldcalError):
+    """A seam that the tip does not feel is not known well enough."""
+
+
 TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the chord
 
 
@@ -80,6 +90,14 @@ class SeamPlanning(Welder):
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
     local_field: LocalField | None = None
     arm_errors: Mapping[str, Any] | None = None  # as the refinement states them, where there is one
+    estimate: CalibrationEstimate | None = None  # by which the scan is in the base; None: by a known pose
+    X_BC_sigma_m: float | None = None  # of the known pose
+    tolerance_m: float = math.inf  # of sigma across a seam that is not felt
+    limits: Mapping[str, tuple[float, float]] = dc.field(default_factory=dict)  # of the fit-up, see read_limits
+    pass_obstacles: bool = False  # the seam is interrupted there
+    piece: int = 0  # of an interrupted seam
+    number: int = 0  # of the seam
+    earlier: tuple[SeamRecord, ...] = ()  # of the plans before this one
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -171,13 +189,20 @@ class SeamPlanner(BackgroundSystem):
             planning = dc.replace(
                 planning,
                 arm=status.arm_or(planning.arm),
+                estimate=status.estimate,
                 local_field=status.local_field,
                 arm_errors=None if status.refinement is None else status.refinement.arm_errors,
             )
-        planning = dc.replace(planning, workpiece=numbered(planning.workpiece, job.seam))
+        planning = dc.replace(
+            planning,
+            workpiece=numbered(planning.workpiece, job.seam),
+            number=job.seam,
+            piece=job.piece,
+            earlier=newest.records,
+        )
         views = (*(newest.views if job.view else ()), ScanView(scan, X_BC))
         if job.view + 1 < job.views and X_BC is not None:
-            return self.background.ask(_kept, PlannedSeam(sequence=scan.sequence, views=views))
+            return self.background.ask(_kept, PlannedSeam(sequence=scan.sequence, views=views, records=newest.records))
         return self.plan(planning, views, correction)
 
     def plan(self, planning: SeamPlanning, views: Views, correction: ScannerCorrection) -> Answer[PlannedSeam]:
@@ -212,6 +237,7 @@ def plan_seam(
         )
     scans = [_points_in_base(planning, one, X, correction) for one, X in known]
     eyes, points_B = np.array([X.translation() for _, X in known]), np.concatenate(scans)
+    record, more = SeamRecord(planning.number), False
     try:
         found = plan_root_anyhow(
             scans if views else points_B,
@@ -221,28 +247,103 @@ def plan_seam(
             eyes if views else eyes[0],
             planning.arm.up,
         )
+        record = SeamRecord(planning.number, found.fit_up)
+        if found.fit_up is not None and isinstance(planning.workpiece, Part):
+            check_fit_up(found.fit_up, planning.limits, planning.workpiece.seam.joint)
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
+        if isinstance(planning.workpiece, Part) and found.X_BP is not None:
+            beside = (points_B, planning.workpiece.mesh, found.X_BP)
+            if planning.pass_obstacles:
+                stops: list[float] = []
+                check_beside(*beside, seam, planning.tool, 0.0, planning.table_z_m, stops)
+                if stops:
+                    planning, seam, record, more = interrupted(planning, seam, stops, record)
         plan = _planned(planning, scan.sequence, seam, found.X_BP)
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
-            check_beside(
-                points_B, planning.workpiece.mesh, found.X_BP, seam, planning.tool, plan.lean_rad, planning.table_z_m
-            )
+            arc = planning.config.touch.arc_m if record.left_out else 0.0
+            check_beside(*beside, seam, planning.tool, plan.lean_rad, planning.table_z_m, from_m=arc)
+        sigma_m, summary, felt = found.sigma_m, found.summary, is_felt(planning.workpiece, planning.tool)
+        if not felt:
+            sigma_m, summary = unfelt_sigma(planning, found, seam, plan)
         return dc.replace(
             plan,
+            felt=felt,
+            records=(*planning.earlier, record),
+            more=more,
+            touch_arc_m=planning.config.touch.arc_m if record.left_out else None,
             rms_m=found.rms_m,
             confidence=found.confidence,
             points_B=points_B,
-            sigma_m=found.sigma_m,
-            summary=found.summary,
+            sigma_m=sigma_m,
+            summary=summary,
         )
     except WeldcalError as error:
-        return PlannedSeam(sequence=scan.sequence, reason=str(error))
+        return PlannedSeam(sequence=scan.sequence, reason=str(error), records=(*planning.earlier, record))
+
+
+def interrupted(
+    planning: SeamPlanning, seam: SeamCurve, stops: list[float], record: SeamRecord
+) -> tuple[SeamPlanning, SeamCurve, SeamRecord, bool]:
+    """The piece of an interrupted seam whose turn it is: its planning, its line, its record, and whether another one follows.
+
+    Raises:
+        NoRoom: nothing is left of the seam.
+    """
+    chord = planning.tool.chord_m
+    pieces = clear_pieces(seam, stops, chord, RUN_UP_S * planning.config.weld_speed_m_s)
+    if planning.piece >= len(pieces):
+        raise NoRoom("Nothing of the seam is left beside what is in the tool's way: remove it and scan again.", 0.0)
+    start, end, down = pieces[planning.piece]
+    ends = [0.0, *(s for a, b, _ in pieces for s in (a, b)), seam.length]
+    left_out = tuple((a, b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b - a > 1e-6)
+    last = min(max(seam.drawn_m, seam.length), end + chord)
+    s = np.linspace(start, last, max(9, round((last - start) / 0.5e-3)))
+    line = SeamCurve.from_points(seam.position(s), up=seam.up(s), length=end - start if end < last else None)
+    arc = max(down - start, planning.config.touch.arc_m)
+    planning = dc.replace(planning, config=leaning(planning.config, 0.0, arc))
+    return planning, line, dc.replace(record, left_out=left_out), planning.piece + 1 < len(pieces)
+
+
+def unfelt_sigma(planning: SeamPlanning, found: RootPlan, seam: SeamCurve, plan: PlannedSeam) -> tuple[float, str]:
+    """The largest sigma of the torch across a seam that is not felt, m, and the plan's summary with it.
+
+    It is that of the root in the scan, with those of the scanner's pose and of the arm. Of a calibration by the same arm the spread of its
+    residuals counts for the arm; of a known pose its stated sigma, or else an arm as its maker leaves it.
+
+    Raises:
+        UncertainSeam: it is over the tolerance.
+    """
+    assert found.across_m is not None
+    left = np.cross(found.up, np.gradient(found.root, axis=0))
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    at, estimate = np.linspace(0, len(left) - 1, 9).astype(int), planning.estimate
+    if estimate is not None:
+        spread = [left[k] @ point_error_covariance(estimate, found.root[k]) @ left[k] for k in at]
+        others = np.array(spread) + estimate.sigma_position_m**2
+        advice = "calibrate with more scans or with calibration.refine: links"
+    else:
+        given, advice = planning.X_BC_sigma_m, "calibrate in the same job (job.calibrate), or state job.X_BC_sigma_mm"
+        assert plan.q_start is not None
+        arm = torch_sigma(planning.arm, planning.tool, seam, plan.q_start) if given is None else given
+        others = np.full(len(at), arm**2)
+    worst = int(np.argmax(found.across_m[at] ** 2 + others))
+    part, other = float(found.across_m[at[worst]]), math.sqrt(others[worst])
+    sigma = math.hypot(part, other)
+    words = f"{1e3 * sigma:.2f} mm across it (part {1e3 * part:.2f} mm, scanner and arm {1e3 * other:.2f} mm)"
+    if not sigma <= planning.tolerance_m:
+        advice = advice if other > part else "scan the part from nearer, or so that more of its sides are visible"
+        raise UncertainSeam(
+            f"The tip does not feel this seam, and its plan has a sigma of {words}, over welding.tolerance_mm "
+            f"({1e3 * planning.tolerance_m:g} mm): {advice}."
+        )
+    return sigma, f"{found.summary}; {UNFELT}: sigma {words}"
 
 
 def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: RigidTransform | None) -> PlannedSeam:
     """The plan of a seam that has been found; raises WeldcalError where it cannot be welded."""
     way = planning.way(seam, X_BP)
-    share = planning.tip_to_torch(seam, way.q_start)
+    felt = is_felt(planning.workpiece, planning.tool)
+    share = planning.tip_to_torch(seam, way.q_start) if felt else TipToTorch(math.nan, math.nan)
     return PlannedSeam(
         sequence=sequence,
         seam=seam,

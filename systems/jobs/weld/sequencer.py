@@ -50,6 +50,7 @@ class JobState(ProcedureState):
         process_on: the process is enabled.
         seam: number of the seam that is planned and welded, from 0.
         view: number of the newest scan of the workpiece, from 0.
+        seam: number of the seam that is planned and welded, from 0; piece: of its pieces, where it is interrupted.
         log: start time, s, and name of every phase.
         warnings: sentences that hold nothing.
     """
@@ -60,6 +61,7 @@ class JobState(ProcedureState):
     process_on: bool = False
     seam: int = 0
     view: int = 0
+    piece: int = 0
     log: tuple[tuple[float, str], ...] = ((0.0, "start"),)
     warnings: tuple[str, ...] = ()
 
@@ -195,6 +197,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             seam=s.seam,
             view=s.view,
             views=max(1, len(self._plan.scan_poses)),
+            piece=s.piece,
         )
 
     def flag(self, name: str, s: JobState) -> bool:
@@ -298,10 +301,12 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         return s
 
     def _retracted(self, s: JobState, now: JobInputs) -> JobState:
+        if now.planned_seam.more:
+            return self._homeward(s, now, "park", piece=s.piece + 1)
         number = s.seam + 1
         if number < self._plan.seams:
             # The part is scanned again, for the seam that was welded may have moved it.
-            return self._homeward(s, now, "park", seam=number)
+            return self._homeward(s, now, "park", seam=number, piece=0)
         return self._homeward(s, now, "home")
 
     steps: ClassVar = {

@@ -17,7 +17,7 @@ from weldcal.models.arms.chain import chain_of
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
-from weldcal.models.workpieces.part import WeldPart, numbered, seam_count
+from weldcal.models.workpieces.part import WeldPart, is_felt, numbered, seam_count
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import TIME_S, CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import SCAN_TIMEOUT_S, JobPlan
@@ -43,6 +43,7 @@ _POOL = (3, 2)
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
 # a torch nearer to the tip turns the tool faster for the same error: the pitch is ramped, so that no joint lags behind the others
 NEAR_M, NEAR_PITCH_RAD_S2 = 0.060, 1.0
+_UNPRESSED_M = 1e-9  # of a tip that is not used
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
 SCAN_CLEAR_M = 0.02  # from a part that is not found yet
 
@@ -68,6 +69,9 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
     cad = numbered(station.cad, seam)
     seat = cad.seated(tool, press)
     entry = cad.entry(tool, seat)
+    felt = is_felt(cad, tool)
+    if not felt:
+        press = Press(_UNPRESSED_M, _UNPRESSED_M)
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
@@ -83,6 +87,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
         windows=SeamWindows.of(tool),
+        felt=felt,
         torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
         limits=MotionLimits(pitch_acceleration_rad_s2=NEAR_PITCH_RAD_S2) if tool.chord_m < NEAR_M else MotionLimits(),
     )
@@ -230,6 +235,7 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
     c, job = scenario.calibration, scenario.job
     listed = 1 if scenario.workpiece is None else len(scenario.workpiece.seams)
     seams = max(1, listed if cad is None else seam_count(cad))
+    pieces = 2 if scenario.welding.pass_obstacles else 1
     slower = 1.0 / job.speed_factor
     return JobPlan(
         calibrate=job.calibrate,
@@ -242,7 +248,7 @@ def job_plan(scenario: Scenario, cad: WeldPart | None = None) -> JobPlan:
         minimum_scans=c.minimum_scans,
         scan_timeout_s=SCAN_TIMEOUT_S if c.refine == PLAIN else TIME_S,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
-        maximum_time_s=job.maximum_time_s * slower * seams,
+        maximum_time_s=job.maximum_time_s * slower * seams * pieces,
         seams=seams,
         scan_poses=tuple(np.deg2rad(pose) for pose in scenario.planning.scan_poses_deg),
     )

@@ -70,6 +70,16 @@ def tip_to_torch(
     return TipToTorch(float(np.sqrt(np.mean(sigma**2))), max(turns))
 
 
+def torch_sigma(arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array) -> float:
+    """The largest standard deviation m, across a seam, of where an arm as its maker leaves it puts the torch; NaN out of its reach."""
+    at = _held(arm, tool, seam, q_near)
+    if at is None:
+        return math.nan
+    s_torch, _, _, q = at
+    across = np.einsum("ni,nik->nk", seam.normal(s_torch), _sensitivities(arm, tool, q, FactoryPrior())[1])
+    return float(np.linalg.norm(across, axis=1)[(s_torch >= 0.0) & (s_torch <= seam.length)].max())
+
+
 def _held(
     arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array
 ) -> tuple[Array, Array, list[RigidTransform], Array] | None:

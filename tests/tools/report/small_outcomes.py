@@ -24,7 +24,7 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.planning.mounting_estimate import solve_mounting
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.tablet.result import TabletResult
-from weldcal.systems.messages import CalibrationStatus, VerificationResult
+from weldcal.systems.messages import CalibrationStatus, PlannedSeam, VerificationResult
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
 from weldcal.tools.report.demo import DemoResult, demo_pictures, demo_report
@@ -281,7 +281,7 @@ def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
         "calibrate_only",
         sequencer=sequencer,
         drift=lambda root: None,
-        planned_seam=lambda root: SimpleNamespace(seam=None),
+        planned_seam=lambda root: PlannedSeam(),
     )
     if held:
         run.held, run.reason = True, "The tag was lost."

@@ -422,12 +422,12 @@ def _candidates(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[Pa
     found, order = [], []
     for seam in ranked(shape, tool):
         chain = [shape.edge(id) for id in seam.joint.edges]
-        if seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
+        if not seam.felt or seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
             bent = all(len(edge.points_P) > 2 for edge in chain)
             for edges in [chain] if bent else [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]:
                 found.append(edges)
                 above = edges[0].up_P is not None and edges[0].up_P[2] > OPEN_ABOVE
-                order.append((bool(seam.reason), round(seam.short_m, 3), not above))
+                order.append((bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above))
     if shape.joints:
         found = [found[k] for k in sorted(range(len(found)), key=lambda k: order[k])]
     else:

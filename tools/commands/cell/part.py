@@ -21,6 +21,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
+from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
 from weldcal.models.workpieces.reading import STEP_SUFFIXES, read_shape
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
@@ -71,12 +72,19 @@ class Seam:
     """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it can).
 
     short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
+    felt: by the tip; else it is followed from the scan and the drawing.
     """
 
     joint: PartJoint
     radius_m: float | None
     reason: str
     short_m: float = 0.0
+    felt: bool = True
+
+    @property
+    def yes(self) -> str:
+        """How it is welded."""
+        return "yes" if self.felt else "yes, by the scan; not felt (its sigma comes with the scan)"
 
     def as_row(self) -> dict[str, Any]:
         """The seam for JSON: millimetres and degrees."""
@@ -91,6 +99,7 @@ class Seam:
             "throat_mm": 1e3 * min(j.walls_m) * math.cos(0.5 * j.angle_rad),
             "closed": j.closed,
             "weldable": not self.reason,
+            "felt": self.felt,
             "reason": self.reason,
         }
 
@@ -104,17 +113,19 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
     for joint in shape.joints:
         radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
         found.append(Seam(joint, min(radii, default=None), *_obstacle(shape, joint, tool)))
-    return sorted(found, key=lambda seam: (bool(seam.reason), seam.short_m, -seam.joint.length_m))
+    return sorted(found, key=lambda seam: (bool(seam.reason), not seam.felt, seam.short_m, -seam.joint.length_m))
 
 
-def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float]:
-    """Why a tool does not fit a joint, its ball at the walls or its body at the middle of one of the edges, and by how much, m."""
+def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float, bool]:
+    """Why a tool does not fit a joint, its ball at the walls or its body at the middle of one of the edges, by how much, m, and if it is felt."""
     flush = joint.angle_rad > math.pi - 0.01
     half, gap = (0.5 * math.pi, joint.gap_m) if flush else (0.5 * joint.angle_rad, 0.0)
-    section = JointSection(half, *joint.walls_m, gap)
+    section, felt = JointSection(half, *joint.walls_m, gap), True
     ring = _ring(shape, joint)
     try:
-        check_weldable(section, tool.tip_radius_m)
+        felt = not flush or gap > UNFELT_GAP_M or feels(section, tool)
+        if felt:
+            check_weldable(section, tool.tip_radius_m)
         if ring is not None:
             check_ring(shape.mesh, *ring, section, tool)
         for id in joint.edges if ring is None else ():
@@ -131,8 +142,8 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
         reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
         if ring is not None and isinstance(error, (NoRoom, InfeasibleSeam)):
             reason += least_pipe(shape, joint, tool)
-        return reason, error.short_m if isinstance(error, NoRoom) else math.inf
-    return "", 0.0
+        return reason, error.short_m if isinstance(error, NoRoom) else math.inf, felt
+    return "", 0.0, felt
 
 
 def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:
@@ -213,7 +224,7 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         row = seam.as_row()
         ids = ", ".join(map(str, seam.joint.edges))
         numbers = "  ".join(f"{row[key]:9.1f}" for key in ("length_mm", "angle_deg", "throat_mm"))
-        typer.echo(f"{row['type']:16}  {numbers}  {ids:16}  {'no: ' + seam.reason if seam.reason else 'yes'}")
+        typer.echo(f"{row['type']:16}  {numbers}  {ids:16}  {'no: ' + seam.reason if seam.reason else seam.yes}")
     if not seams:
         typer.echo(f"No seams are listed: {NO_SEAMS[bool(shape.name.lower().endswith(STEP_SUFFIXES))]}")
     if hint := unit_hint(shape):
@@ -253,7 +264,7 @@ def write_part(shape: PartShape, seams: list[Seam], folder: Path) -> None:
                 row["type"],
                 ", ".join(map(str, seam.joint.edges)),
                 *(fixed(row[key], 1) for key in SHOWN),
-                seam.reason or "yes",
+                seam.reason or seam.yes,
             )
             for seam, row in ((seam, seam.as_row()) for seam in seams)
         ],

@@ -7,13 +7,18 @@ scan's points from the drawn walls; the drawing is a weak prior, and a second di
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.files import read_text
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.welding.locate.part.fit import SURFACE_RATIO, tukey
 from weldcal.welding.locate.part.model import PartModel
@@ -28,8 +33,12 @@ NEAR_ROOT_M = 0.0012  # points nearer to the root, and a point distance, may be 
 ALONG_WALL_COS = math.cos(math.radians(25.0))
 PRIOR_M, PRIOR_TILT_RAD, PRIOR_KNOTS = 0.0005, math.radians(1.0), 10  # shared by so many knots
 BEND_M, BEND_TILT_RAD = 2e-5, math.radians(0.1)  # second difference from knot to knot
+SHOWN_GAP = 1.5  # point distances: a narrower gap is not told from the distance of two points
 EDGE_SIGMA = 0.3  # of the middle between the outermost points of two edges, in point distances
 SIGMA_FLOOR_M = 3e-5
+WINDOW_M, STRIP_M = 0.010, 0.0009  # of the seam, for a place of the fit-up and for one end of a side's points
+CORRELATED = 6.0  # neighbouring points share their noise
+SLOPE_FLOOR = math.radians(0.1)
 KNOWN_SHARE = 0.4  # of the deviation by the drawing alone: a knot that is known better was measured
 
 
@@ -42,6 +51,7 @@ class MeasuredJoint:
     share     of the seam along which the root was measured in both directions of the cut; share_one: in at least one, for one
               wall was seen. Across the other the drawing holds.
     sigma_m   of the root sideways, rms over what was measured in both; nan where nothing was
+    fit_up    how the two parts stand to each other
     """
 
     seam: DrawnSeam
@@ -49,6 +59,7 @@ class MeasuredJoint:
     share: float
     share_one: float
     sigma_m: float
+    fit_up: FitUp | None = None
 
     @property
     def summary(self) -> str:
@@ -85,7 +96,7 @@ def measure_joint(points: Floats, normals: Floats, pitch_m: float, model: PartMo
     shift = np.column_stack([np.interp(s, at, x), np.interp(s, at, y)])
     size = np.linalg.norm(shift, axis=1)
     shift *= np.minimum(1.0, MOST_M / np.maximum(size, 1e-12))[:, None]
-    moved = seam.points_P + shift[:, :1] * _left(seam) + shift[:, 1:] * seam.up_P
+    moved = seam.points_P + shift[:, :1] * seam.left_P + shift[:, 1:] * seam.up_P
     return MeasuredJoint(
         replace(seam, points_P=moved),
         np.linalg.norm(shift, axis=1),
@@ -105,12 +116,6 @@ class _Cut:
     offset: Floats
 
 
-def _left(seam: DrawnSeam) -> Floats:
-    """(N,3) the unit vector to the left of the travel, square to the bisector."""
-    left = np.cross(seam.up_P, seam.tangents_P)
-    return np.asarray(left / np.linalg.norm(left, axis=1, keepdims=True))
-
-
 def _cut(points: Floats, normals: Floats, seam: DrawnSeam) -> _Cut:
     away, k = cKDTree(seam.points_P).query(points, distance_upper_bound=REACH_M + MOST_M)
     near = np.isfinite(np.asarray(away))
@@ -125,7 +130,7 @@ def _wall_rows(cut: _Cut, model: PartModel, seam: DrawnSeam, side: str, pitch: f
     """The points of one wall: their distance from the part's surface, by the root's shift and the wall's tilt."""
     left = side == "left"
     normal = (seam.wall_left_P if left else seam.wall_right_P)[cut.k]
-    to_left = _left(seam)[cut.k]
+    to_left = seam.left_P[cut.k]
     along = np.cross(seam.tangents_P[cut.k], normal)
     along *= np.sign(np.sum(along * to_left, axis=1))[:, None] * (1.0 if left else -1.0)
     a = np.sum(cut.offset * along, axis=1) - 0.5 * seam.gap_m
@@ -151,11 +156,11 @@ def _wall_rows(cut: _Cut, model: PartModel, seam: DrawnSeam, side: str, pitch: f
 
 def _gap_rows(cut: _Cut, seam: DrawnSeam, pitch: float) -> Rows | None:
     """The middle of a gap, by the outermost points of the faces on its two sides, in strips across the seam."""
-    x = np.sum(cut.offset * _left(seam)[cut.k], axis=1)
+    x = np.sum(cut.offset * seam.left_P[cut.k], axis=1)
     y = np.sum(cut.offset * seam.up_P[cut.k], axis=1)
     s = seam.arc_length_m[cut.k]
     beside = (np.abs(x) > 0.5 * seam.gap_m - MOST_M) & (np.abs(x) < 0.5 * seam.gap_m + REACH_M) & (np.abs(y) < MOST_M)
-    if np.count_nonzero(beside) < 12:
+    if np.count_nonzero(beside) < 12 or seam.gap_m <= SHOWN_GAP * pitch:
         return None
     level = float(np.median(y[beside]))
     beside &= np.abs(y - level) < 0.0008
@@ -211,3 +216,245 @@ def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, Floa
     k = 4 * np.arange(count)[:, None, None]
     spread = np.linalg.inv(N)[k + np.array([[0], [1]]), k + np.array([[0, 1]])]
     return at, xi[0::4], xi[1::4], spread, np.sqrt(np.diag(np.linalg.inv(fixed))[0::4])
+
+
+@dataclass(frozen=True, eq=False)
+class FitUp:
+    """How two parts stand to each other along a seam, by the scan; NaN where it does not show that.
+
+    s_m    (K,) places along the seam, m
+    values gap (m, between the edges of the two sides), misalignment (m, the left face above the right one) and angle (rad, how much wider
+           the joint opens than drawn), each (K,); sigmas: their standard deviations
+    """
+
+    s_m: Floats
+    values: Mapping[str, Floats]
+    sigmas: Mapping[str, Floats]
+
+
+FIT_UP = {"gap": ("mm", 1e3), "misalignment": ("mm", 1e3), "angle": ("deg", 180.0 / math.pi)}
+"""The quantities of a fit-up, with the unit in which a person reads them."""
+
+
+SHOWN_BY = {"butt": tuple(FIT_UP), "v_groove": ("angle",), "fillet": ("gap", "angle"), "lap": ("gap",)}
+"""What the scan of a joint shows, unless something hides it."""
+
+
+class FitUpOutside(WeldcalError):
+    """The fit-up is out of the limits that the user gives."""
+
+
+def read_limits(path: Path) -> dict[str, tuple[float, float]]:
+    """Read a table of limits: quantity, unit, least, most; an empty cell is no limit. Angles are deviations from the drawing.
+
+    Returns:
+        (least, most) in m and rad, by quantity.
+
+    Raises:
+        InputError: naming the line that is at fault.
+    """
+    limits: dict[str, tuple[float, float]] = {}
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        cells = [cell.strip() for cell in line.split("#")[0].split(",")]
+        if cells == [""] or (not limits and cells[0] == "quantity"):
+            continue
+        try:
+            name, unit, *ends = cells
+            least, most = (float(end) if end else off for end, off in zip(ends, (-math.inf, math.inf), strict=True))
+            if unit != FIT_UP[name][0] or not least <= most:
+                raise ValueError
+        except (KeyError, ValueError):
+            raise InputError(
+                f"'{path.name}' line {number}: write quantity,unit,least,most, such as gap,mm,0,1.6."
+            ) from None
+        limits[name] = (least / FIT_UP[name][1], most / FIT_UP[name][1])
+    return limits
+
+
+def check_fit_up(found: FitUp, limits: Mapping[str, tuple[float, float]], joint: str) -> None:
+    """Check a fit-up against limits; what the scan shows nowhere is out of its limits too.
+
+    Raises:
+        FitUpOutside: with the place, the value and the limit, of the quantity that is farthest beyond in units of its sigma.
+    """
+    beyond, worst = 0.0, ""
+    for name, (least, most) in limits.items():
+        if name not in found.values:
+            if name in SHOWN_BY[joint]:
+                raise FitUpOutside(
+                    f"The scan does not show the joint's {name}, which has a limit: scan it from another side."
+                )
+            continue
+        value, sigma, (unit, factor) = found.values[name], found.sigmas[name], FIT_UP[name]
+        over = np.nan_to_num(np.maximum(value - most, least - value) / sigma, nan=-1.0)
+        k = int(np.argmax(over))
+        if over[k] > beyond:
+            beyond, limit = float(over[k]), most if value[k] > most else least
+            worst = (
+                f"The fit-up is out of its limits: at {1e3 * found.s_m[k]:.0f} mm of the seam the {name} is {factor * value[k]:.2f} {unit} "
+                f"(sigma {factor * sigma[k]:.2f}), and its limit is {factor * limit:g} {unit}. Fit the parts anew and scan again."
+            )
+    if worst:
+        raise FitUpOutside(worst)
+
+
+def measure_fit_up(points: Floats, normals: Floats, pitch_m: float, model: PartModel, seam: DrawnSeam) -> FitUp:
+    """Measure gap, misalignment and angle of a joint in windows along its seam; the arguments are those of `measure_joint`.
+
+    On each side a plane is fitted to the points of the wall. The gap is the distance between the places where the two sides' points end,
+    and the drawing only says which points are of which side.
+    """
+    cut = _cut(points, normals, seam)
+    s = seam.arc_length_m[cut.k]
+    at = np.linspace(0.0, seam.length_m, max(1, round(seam.length_m / WINDOW_M)) + 1)
+    at = 0.5 * (at[1:] + at[:-1])
+    tilt = _faces_apart(cut, model, seam)[2] if seam.joint == "lap" else 0.0
+    found: dict[str, Floats] = {}
+    for i, middle in enumerate(at):
+        here = np.abs(s - middle) < WINDOW_M
+        if np.count_nonzero(here) > 40:
+            one = _Cut(cut.points[here], cut.normals[here], cut.k[here], cut.offset[here])
+            for name, pair in _fit_up_at(one, s[here] - middle, model, seam, pitch_m, tilt).items():
+                found.setdefault(name, np.full((len(at), 2), math.nan))[i] = pair
+    measured = {name: found[name] for name in FIT_UP if name in found and np.isfinite(found[name]).any()}
+    return FitUp(at, {n: v[:, 0] for n, v in measured.items()}, {n: v[:, 1] for n, v in measured.items()})
+
+
+class _Side(NamedTuple):
+    """A wall in a window: directions along it and out of it (2,), its height over the drawn one and slope with their sigmas (2,), its points
+    (M,3) by left, up and along the seam, and their noise."""
+
+    along: Floats
+    out: Floats
+    line: Floats
+    sigma: Floats
+    rows: Floats
+    noise: float
+
+
+def _side(cut: _Cut, s: Floats, seam: DrawnSeam, side: str, pitch: float) -> _Side | None:
+    left = side == "left"
+    normal = (seam.wall_left_P if left else seam.wall_right_P)[cut.k]
+    x = np.column_stack([np.sum(normal * v[cut.k], axis=1) for v in (seam.left_P, seam.up_P)]).mean(axis=0)
+    out = x / np.linalg.norm(x)
+    along = np.array([out[1], -out[0]]) if left else np.array([-out[1], out[0]])
+    flat = np.column_stack([np.sum(cut.offset * v[cut.k], axis=1) for v in (seam.left_P, seam.up_P)])
+    a, b = flat @ along, flat @ out
+    extent = float(seam.wall_height_m[0 if left else 1]) if seam.joint != "butt" else REACH_M
+    wall = (np.sum(cut.normals * normal, axis=1) > ALONG_WALL_COS) & (np.abs(b) < 2.0 * MOST_M)
+    use = wall & (a > NEAR_ROOT_M + 0.7 * pitch) & (a < min(extent, REACH_M) - 0.5 * pitch)
+    noise = MOST_M
+    for _ in range(5):
+        if np.count_nonzero(use) < 20 or np.ptp(a[use]) < 3.0 * pitch:
+            return None
+        A = np.column_stack([np.ones(len(a)), a, s])
+        fit = np.linalg.lstsq(A[use], b[use], rcond=None)[0]
+        off = b - A @ fit
+        noise = max(1.4826 * float(np.median(np.abs(off[use]))), 1e-6)
+        use &= np.abs(off) < 3.5 * noise
+    sigma = noise * np.sqrt(CORRELATED * np.diag(np.linalg.inv(A[use].T @ A[use]))[:2])
+    near = np.abs(off) < max(4.0 * noise, 1e-4)
+    rows = np.column_stack([flat, s])[near]
+    return _Side(along, out, fit[:2], np.hypot(sigma, [SIGMA_FLOOR_M, SLOPE_FLOOR]), rows, noise)
+
+
+def _fit_up_at(
+    cut: _Cut, s: Floats, model: PartModel, seam: DrawnSeam, pitch: float, tilt: float
+) -> dict[str, tuple[float, float]]:
+    """Gap, misalignment and angle in one window with their sigmas, as far as they are measured."""
+    if seam.joint == "lap":  # its upper sheet is thin: its face tells more than its edge
+        height, sigma, _ = _faces_apart(cut, model, seam, tilt)
+        return {"gap": (max(0.0, height if np.argmax(seam.wall_height_m) else -height), sigma)}
+    left, right = (_side(cut, s, seam, side, pitch) for side in ("left", "right"))
+    if left is None or right is None:
+        return {}
+    angle = -math.atan(left.line[1]) - math.atan(right.line[1])
+    found = {"angle": (angle, math.hypot(left.sigma[1], right.sigma[1]))}
+    if seam.joint == "butt":
+        found["misalignment"] = float(left.line[0] - right.line[0]), math.hypot(left.sigma[0], right.sigma[0])
+        found["gap"] = _opening(np.vstack([left.rows, right.rows]), pitch)
+        return found
+    # Directions of the walls as they are, and where they meet.
+    d = np.array([side.along + side.line[1] * side.out for side in (left, right)])
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    start = [side.line[0] * side.out for side in (left, right)]
+    root = start[0] + np.linalg.solve(np.column_stack([d[0], -d[1]]), start[1] - start[0])[0] * d[0]
+    (one, one_sigma), (other, other_sigma) = (
+        _end(side, root, d[k], d[1 - k], 4.0 * max(left.noise, right.noise)) for k, side in enumerate((left, right))
+    )
+    if seam.joint == "v_groove" or min(one, other) == 0.0:  # else something hides the root of a fillet
+        found["gap"] = float(np.linalg.norm(one * d[0] - other * d[1])), math.hypot(one_sigma, other_sigma)
+    return found
+
+
+def _opening(rows: Floats, pitch: float) -> tuple[float, float]:
+    """Width m of the gap between level faces, by the widest step across the seam between points (M,3) of both, in strips; and its sigma."""
+    widest, usual = [], []
+    for x in _strips(rows[:, 0], rows[:, 2]):
+        steps = np.diff(x)
+        near = np.abs(x[:-1] + 0.5 * steps) < 2.0 * MOST_M
+        if np.count_nonzero(near) > 3 and (x < 0.0).any() and (x > 0.0).any():
+            widest.append(float(steps[near].max()))
+            usual.append(float(np.median(steps)))
+    if len(widest) < 5:
+        return math.nan, math.nan
+    gaps = np.array(widest) - np.median(usual)
+    gaps = gaps[np.abs(gaps - np.median(gaps)) < 2.0 * pitch]
+    return max(0.0, float(gaps.mean())), math.hypot(float(gaps.std()) / math.sqrt(len(gaps)), EDGE_SIGMA * pitch)
+
+
+def _strips(x: Floats, s: Floats) -> list[Floats]:
+    """Ascending values x (M,) in strips of the places s (M,) along the seam, each once: a point may be of both sides."""
+    strip = np.floor(s / STRIP_M)
+    return [np.unique(x[strip == k]) for k in np.unique(strip)]
+
+
+def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> tuple[float, float]:
+    """Distance m from the root (2,) along a wall at which its points end, and its sigma; 0 where they reach the other wall.
+
+    Points nearer to the other wall than `clear` may be of either.
+    """
+    flat = side.rows[:, :2] - root
+    slant = abs(d[0] * other[1] - d[1] * other[0])
+    a, away = flat @ d, np.abs(flat[:, 0] * other[1] - flat[:, 1] * other[0])
+    ends, steps = [], []
+    for one in _strips(a[away > clear], side.rows[away > clear, 2]):
+        if len(one) >= 3:
+            ends.append(one[0])
+            steps.append(float(np.median(np.diff(one))))
+    if len(ends) < 5:
+        return math.nan, math.nan
+    found, step = np.array(ends), float(np.median(steps))
+    found = found[np.abs(found - np.median(found)) < 2.0 * step]
+    end, sigma = (
+        float(found.mean()) - 0.5 * step,
+        math.hypot(float(found.std()) / math.sqrt(len(found)), EDGE_SIGMA * step),
+    )
+    return (0.0 if end < clear / slant + sigma else end), sigma
+
+
+def _faces_apart(cut: _Cut, model: PartModel, seam: DrawnSeam, tilt: float | None = None) -> tuple[float, float, float]:
+    """How far the sheet on the left of a lap lies above that on the right, m, against the drawing, its sigma, and the tilt of both, or that given.
+
+    NaN where one of them is not seen.
+    """
+    lower = (seam.wall_left_P, seam.wall_right_P)[int(np.argmax(seam.wall_height_m))]
+    q, m = model.closest(cut.points)
+    off = np.sum((cut.points - q) * m, axis=1)
+    out = lower[cut.k]
+    face = (np.sum(m * out, axis=1) > ALONG_WALL_COS) & (np.sum(out * cut.normals, axis=1) > ALONG_WALL_COS)
+    face &= (np.linalg.norm(cut.points - q, axis=1) < np.abs(off) + 1e-4) & (np.abs(off) < 2.0 * MOST_M)
+    x = np.sum(cut.offset * seam.left_P[cut.k], axis=1)
+    use, left = face & (np.abs(x) > NEAR_ROOT_M), x > 0.0
+    A = np.column_stack([left, ~left, x]).astype(float)  # the whole part may be registered askew
+    if tilt is not None:
+        A, off = A[:, :2], off - tilt * x
+    for _ in range(4):
+        if min(np.count_nonzero(use & left), np.count_nonzero(use & ~left)) < 12:
+            return math.nan, math.nan, 0.0
+        fit = np.linalg.lstsq(A[use], off[use], rcond=None)[0]
+        residual = np.abs(off - A @ fit)
+        noise = 1.4826 * float(np.median(residual[use]))
+        use &= residual < max(3.5 * noise, 1e-6)
+    sigma = noise * math.sqrt(CORRELATED / np.count_nonzero(use & left) + CORRELATED / np.count_nonzero(use & ~left))
+    return float(fit[0] - fit[1]), math.hypot(sigma, SIGMA_FLOOR_M), float(fit[-1]) if tilt is None else tilt

@@ -407,10 +407,10 @@ def _decided(
             places = [f.X_BP.multiply(model.center) for f in family]
             far = [p for p in places if np.linalg.norm(p - best.X_BP.multiply(model.center)) > model.radius]
             return best, runner_up, f"; an equal part lies near {_in_mm(far[0])}" if far else ""
-    a = best.agreement
-    if harmful and (a.met < POOR_MET * (1.0 - a.hidden) or a.passed > POOR_PASSED):
+    shown = best.agreement
+    if harmful and (shown.met < POOR_MET * (1.0 - shown.hidden) or shown.passed > POOR_PASSED):
         raise PartNotFound(
-            f"The part does not fit the scan: in its best pose {100 * a.passed:.0f} % of the rays pass through it, and other poses "
+            f"The part does not fit the scan: in its best pose {100 * shown.passed:.0f} % of the rays pass through it, and other poses "
             "fit as badly; check which part this is and the file's unit."
         )
     if harmful:

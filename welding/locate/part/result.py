@@ -77,13 +77,16 @@ class PartRegistration:
     runner_up: float
     summary: str
 
-    def sigma_at(self, points_P: Floats) -> Floats:
-        """Largest standard deviation (N,) of each point (N,3) of the part over all directions, m."""
+    def spread_at(self, points_P: Floats) -> Floats:
+        """Covariance (N,3,3) m^2 of each point (N,3) of the part, in P."""
         cross = np.zeros((len(points_P), 3, 6))
         x, y, z = points_P.T
         cross[:, 0, 1], cross[:, 0, 2] = z, -y
         cross[:, 1, 0], cross[:, 1, 2] = -z, x
         cross[:, 2, 0], cross[:, 2, 1] = y, -x
         cross[:, :, 3:] = np.eye(3)
-        spread = cross @ self.covariance @ cross.transpose(0, 2, 1)
-        return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0.0)))
+        return np.asarray(cross @ self.covariance @ cross.transpose(0, 2, 1))
+
+    def sigma_at(self, points_P: Floats) -> Floats:
+        """Largest standard deviation (N,) of each point (N,3) of the part over all directions, m."""
+        return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(self.spread_at(points_P))[:, -1], 0.0)))

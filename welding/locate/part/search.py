@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -223,16 +224,16 @@ def _places_for(
 class _Scene:
     """What the search compares: heights (H,W), NaN: none, their limits around a cell, and the transforms of the masks."""
 
-    top: npt.NDArray[np.float32]
-    lowest: npt.NDArray[np.float32]
-    highest: npt.NDArray[np.float32]
-    body: npt.NDArray[np.complex64]
-    shown: npt.NDArray[np.complex64]
+    top: npt.NDArray[np.floating]
+    lowest: npt.NDArray[Any]
+    highest: npt.NDArray[Any]
+    body: npt.NDArray[np.complexfloating]
+    shown: npt.NDArray[np.complexfloating]
     covered: bool
 
 
 def _scene(
-    top: npt.NDArray[np.float32], empty: Mask, around: npt.NDArray[np.uint8], full: list[int], covered: bool
+    top: npt.NDArray[np.floating], empty: Mask, around: npt.NDArray[np.uint8], full: list[int], covered: bool
 ) -> _Scene:
     """The scene of heights, with the cells in which only the ground is shown."""
     body = np.isfinite(top)
