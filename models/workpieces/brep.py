@@ -172,14 +172,10 @@ def faces_at(shape: Any, faces: list[Face]) -> list[tuple[Any, list[Face]]]:
 
 
 def middle_of(curve: Any, begin: float, end: float) -> tuple[Floats, Floats, float]:
-    """The middle of a stretch of a curve, its direction there, and how far from it a wall may end, along it.
-
-    A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
-    """
+    """The middle of a stretch of a curve, its direction there, and its length."""
     point, along = gp_Pnt(), gp_Vec()
     curve.D1(0.5 * (begin + end), point, along)
-    length = (end - begin) * along.Magnitude()
-    return array_of(point), unit(array_of(along)), 0.5 * length if length <= BRIDGED_MM else 0.0
+    return array_of(point), unit(array_of(along)), (end - begin) * along.Magnitude()
 
 
 def sampled(curve: Any, begin: float, end: float) -> Floats:

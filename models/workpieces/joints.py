@@ -106,8 +106,7 @@ def _within(bodies: list[Body], k: int) -> Iterable[Piece]:
         line = sampled(curve, curve.FirstParameter(), curve.LastParameter())
         if length_of(line) < LEAST_MM:
             continue
-        x, t, _ = middle_of(curve, curve.FirstParameter(), curve.LastParameter())
-        cut = _cut(bodies, (k, k), f, g, x, t, 0.0)
+        cut = _cut(bodies, (k, k), f, g, *middle_of(curve, curve.FirstParameter(), curve.LastParameter()))
         if cut is not None:
             yield Piece(line=line, bodies=(k, k), **cut)
 
@@ -146,10 +145,10 @@ def _met(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterabl
     for k in range(crossing.NbLines()):
         curve = crossing.Line(k + 1)
         breaks, closed = _breaks(bodies, curve, low, high, (f, g))
-        kept = [(t, u, _cut(bodies, pair, f, g, *middle_of(curve, t, u))) for t, u in pairwise(breaks)]
+        kept = [(t, u, _between(bodies, pair, f, g, curve, t, u)) for t, u in pairwise(breaks)]
         runs: list[list[Any]] = []
         for t, u, cut in kept:
-            if cut is not None and runs and t - runs[-1][1] <= BRIDGED_MM:
+            if cut is not None and runs and length_of(sampled(curve, runs[-1][1], t)) <= BRIDGED_MM:
                 longer = u - t > runs[-1][3]
                 runs[-1] = [runs[-1][0], u, *((cut, u - t) if longer else runs[-1][2:])]
             elif cut is not None:
@@ -161,6 +160,21 @@ def _met(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterabl
             line = sampled(curve, t, u)
             if length_of(line) >= LEAST_MM:
                 yield Piece(line=line, bodies=pair, **cut)
+
+
+def _between(
+    bodies: list[Body], pair: tuple[int, int], f: Face, g: Face, curve: Any, begin: float, end: float
+) -> dict[str, Any] | None:
+    """The joint of two faces along a stretch of their curve; None where they form none.
+
+    A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
+    """
+    x, t, length = middle_of(curve, begin, end)
+    cut = _cut(bodies, pair, f, g, x, t, length)
+    if cut is not None or length > BRIDGED_MM:
+        return cut
+    beyond = _cut(bodies, pair, f, g, x, t, length, 0.5 * length)
+    return beyond if beyond is not None and length <= beyond["gap"] + CHAINED_MM else None
 
 
 def _breaks(
@@ -206,9 +220,21 @@ def _breaks(
 
 
 def _cut(
-    bodies: list[Body], pair: tuple[int, int], f: Face, g: Face, x: Floats, t: Floats, slack: float
+    bodies: list[Body],
+    pair: tuple[int, int],
+    f: Face,
+    g: Face,
+    x: Floats,
+    t: Floats,
+    length: float,
+    slack: float = 0.0,
 ) -> dict[str, Any] | None:
-    """The joint of two faces in the cut at one point of their curve; None where they form no concave joint there."""
+    """The joint of two faces in the cut at one point of their curve; None where they form no concave joint there.
+
+    Args:
+        length: of the stretch about the point, mm.
+        slack: how far from the point a wall may end, along the curve, mm.
+    """
     normals = f.normal(x), g.normal(x)
     cos = float(np.clip(normals[0] @ normals[1], -1.0, 1.0))
     if abs(cos) > math.cos(math.radians(10.0)):
@@ -225,7 +251,7 @@ def _cut(
         if np.linalg.norm(face.foot(p) - p) > 0.05 + slack + (0.0 if face.flat else 0.02 * max(begins) ** 2):
             return None
     gap = min(float(np.linalg.norm(other.foot(foot) - foot)) for other, foot in ((g, feet[0]), (f, feet[1])))
-    if gap > GAP_MM or 2.0 * slack > gap + CHAINED_MM:
+    if gap > GAP_MM:
         return None
     up = unit(normals[0] + normals[1])
     if any(body.holds(x + s * up) for body in bodies for s in (IN_MM, FREE_MM)):
@@ -237,12 +263,13 @@ def _cut(
         skin = x + (begins[k] + IN_MM) * ways[k] - 0.1 * normals[k]
         wall.append(begins[k] + IN_MM + two[k].through(skin, ways[k])[0])
         other, n = two[1 - k], normals[1 - k]
-        exits = two[k].through(
-            x + (begins[k] + IN_MM) * ways[k], -ways[1 - k]
-        )  # a bolt's hole may go through both bodies
+        exits = two[k].through(x + (begins[k] + IN_MM) * ways[k], -ways[1 - k])
         behind = [x - (far + 2.0 * IN_MM) * ways[1 - k] for far in exits]
         goes_on.append(any(other.holds(p - IN_MM * n) and not other.holds(p + IN_MM * n) for p in behind))
-        thick.append(exits[0])
+        # A ray meets a hole at a few places, the hollow of a tube at most.
+        shares = (-0.4, -0.2, 0.2, 0.4) if f.flat and g.flat else ()
+        places = [x + share * length * t + (begins[k] + IN_MM) * ways[k] for share in shares]
+        thick.append(float(np.median([exits[0], *(two[k].through(p, -ways[1 - k])[0] for p in places)])))
     if any(goes_on):
         k = goes_on.index(True)
         kind, side = ("lap" if wall[k] < thick[k] else "T"), ""
@@ -293,13 +320,16 @@ def _flush(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Itera
             if line is None or length_of(line) < LEAST_MM:
                 continue
             x = 0.5 * (line[0] + line[-1]) if f.flat else p + 0.5 * gap * m
-            if any(body.holds(x + IN_MM * n) for body in bodies):
+            if any(body.holds(x + s * n) for body in bodies for s in (IN_MM, FREE_MM)):
                 continue
             starts = [x - (0.5 * gap + IN_MM) * m, x + (0.5 * gap + IN_MM) * m]
             depth = [two[k].through(starts[k], -n)[0] for k in (0, 1)]
             wide = [two[k].through(starts[k] - 0.1 * n, s * m)[0] for k, s in ((0, -1.0), (1, 1.0))]
             if length_of(line) < min(depth) or not _facing(two, x, n, m, gap, min(depth)):
                 continue
+            across = min(body.through(starts[k] + 0.1 * n, n)[0] or math.inf for k, body in enumerate(two))
+            if min(depth) > 0.5 * across:
+                continue  # the rim of a hole or a slot through both bodies
             narrow = [wide[k] < 0.9 * depth[k] for k in (0, 1)]
             kind = "edge" if all(narrow) else "corner" if any(narrow) else "butt"
             side, walls = ("outside" if kind == "corner" else ""), (depth[0], depth[1])

@@ -71,9 +71,49 @@ def test_planes_and_cylinders_that_are_written_as_splines_have_the_same_seams(tm
     assert any(joint.length_m == pytest.approx(2.0 * np.pi * 0.020, abs=1e-5) for joint in splines.joints)
 
 
-def test_a_hole_through_both_bodies_does_not_change_the_type(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seed", [1114, 5017])
+def test_a_saddle_whose_root_is_cut_into_short_stretches_is_one_seam(seed: int) -> None:
+    assert mistakes("pipe_on_pipe", seed) == []
+
+
+def test_a_seam_goes_on_only_where_the_bodies_meet(tmp_path: Path) -> None:
+    """A branch with a slot of 20 mm in its foot: the saddle is open there."""
+    run = cylinder((-150, 0, 0), 60, 300, (1, 0, 0))
+    branch = less(cylinder((0, 0, 0), 40, 150), run, box((20, -10, 0), (40, 20, 80)))
+    write_step(assembly(run, branch), tmp_path / "slot.step")
+    shape = read_shape(tmp_path / "slot.step")
+    points = np.concatenate([1e3 * shape.edge(id).points_P for joint in shape.joints for id in joint.edges])
+    assert (points[:, 0] > 35.0).any()
+    assert not ((points[:, 0] > 25.0) & (np.abs(points[:, 1]) < 9.5)).any()
+
+
+def test_a_hole_beside_the_seam_leaves_its_type(tmp_path: Path) -> None:
+    """A foot is a sheet on its plate: less high than deep, with and without a bolt's hole through both."""
     hole = cylinder((50, 30, -20), 6, 60)
-    plate, foot = less(box((0, 0, -10), (200, 100, 10)), hole), less(box((20, 10, 0), (60, 40, 20)), hole)
-    write_step(assembly(plate, foot), tmp_path / "foot.step")
-    joint = next(joint for joint in read_shape(tmp_path / "foot.step").joints if len(joint.edges) == 4)
-    assert (joint.type, joint.closed) == ("T", True)
+    for name, cut in (("bare", cylinder((0, 0, 90), 1, 1)), ("bolt", hole)):
+        plate, foot = less(box((0, 0, -10), (200, 100, 10)), cut), less(box((20, 10, 0), (60, 40, 20)), cut)
+        write_step(assembly(plate, foot), tmp_path / f"{name}.step")
+        (joint,) = read_shape(tmp_path / f"{name}.step").joints
+        assert (joint.type, joint.closed, len(joint.edges)) == ("lap", True, 4)
+
+
+@pytest.mark.parametrize("slot", [False, True])
+def test_the_rim_of_a_hole_or_a_slot_through_both_bodies_is_no_seam(slot: bool, tmp_path: Path) -> None:
+    at = [(60, 50), (140, 50)]
+    cuts = [box((x - 20, y - 6, -20), (40, 12, 60)) if slot else cylinder((x, y, -20), 6, 60) for x, y in at]
+    plates = [less(box((0, 0, z), (200, 100, t)), *cuts) for z, t in ((-10, 10), (0, 8))]
+    write_step(assembly(*plates), tmp_path / "plates.step")
+    joints = read_shape(tmp_path / "plates.step").joints
+    assert {joint.type for joint in joints} == {"edge"}
+    assert sum(joint.length_m for joint in joints) == pytest.approx(0.6, abs=1e-6)
+
+
+def test_a_screw_that_fills_a_hole_leaves_no_seam_inside(tmp_path: Path) -> None:
+    """A thin ring on a plate, and the screw through both: the rims of their holes are flush."""
+    hole = cylinder((0, 0, -50), 8.5, 100)
+    plate = less(box((-60, -60, -10), (120, 120, 10)), hole)
+    ring = less(cylinder((0, 0, 0), 14, 8), hole)
+    write_step(assembly(plate, ring, cylinder((0, 0, -40), 8, 80)), tmp_path / "screw.step")
+    joints = read_shape(tmp_path / "screw.step").joints
+    assert any(joint.length_m == pytest.approx(2.0 * np.pi * 0.014, abs=1e-5) for joint in joints)
+    assert all(joint.angle_rad == pytest.approx(0.5 * np.pi) for joint in joints)
