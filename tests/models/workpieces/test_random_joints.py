@@ -8,16 +8,65 @@ import numpy as np
 import pytest
 from OCP.BRepBuilderAPI import BRepBuilderAPI_NurbsConvert
 
-from tests.models.workpieces.random_joints import KINDS, mistakes
+from tests.models.workpieces.random_joints import KINDS, found_in_mesh, mistakes, write_stl
+from weldcal.models.mesh import TriMesh
+from weldcal.models.workpieces.joints import joints_of
+from weldcal.models.workpieces.mesh_files import read_surface
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
-from weldcal.tools.worlds.parts.step_parts import assembly, box, cylinder, less, write_step
+from weldcal.tools.worlds.parts.step_parts import assembly, box, cylinder, fused, less, write_step
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_seam_is_listed_and_nothing_else(kind: str) -> None:
     for seed in range(3):
         assert mistakes(kind, seed) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_triangles_of_the_same_solids_have_the_same_seams(kind: str) -> None:
+    assert mistakes(kind, 0, found_in_mesh) == []
+
+
+@pytest.mark.parametrize("gap", [0.0, 1.0, 2.5, -2.0])
+@pytest.mark.parametrize("form", ["shuffled.obj", "merged.ply", "twice.stl"])
+def test_a_mesh_of_two_boxes_is_a_t_in_every_form(gap: float, form: str, tmp_path: Path) -> None:
+    solids = box((0, 0, -10), (200, 100, 10)), box((0, 46, gap), (200, 8, 60))
+    write_stl([*solids, *(solids[:1] if form.startswith("twice") else [])], tmp_path / "twice.stl")
+    soup = read_surface(tmp_path / "twice.stl", 1.0)  # its corners are merged across the bodies
+    order = np.random.default_rng(0).permutation(len(soup.triangles)) if form.startswith("shuffled") else slice(None)
+    mesh = TriMesh(soup.vertices, soup.triangles[order])
+    if form.endswith("obj"):
+        (tmp_path / form).write_text(mesh.to_obj())
+    elif form.endswith("ply"):
+        head = f"ply\nformat ascii 1.0\nelement vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        rows = [*(" ".join(map(str, p)) for p in mesh.vertices), *("3 {} {} {}".format(*t) for t in mesh.triangles)]
+        faces = f"element face {len(mesh.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+        (tmp_path / form).write_text(head + faces + "\n".join(rows) + "\n")
+    shape = read_shape(tmp_path / form)
+    assert shape.bodies == 2
+    assert [(joint.type, joint.side) for joint in shape.joints] in (
+        [("T", "left"), ("T", "right")],
+        [("T", "right"), ("T", "left")],
+    )
+    for joint in shape.joints:
+        assert joint.length_m == pytest.approx(0.2, abs=1e-6)
+        assert joint.gap_m == pytest.approx(1e-3 * max(gap, 0.0), abs=1e-6)
+        seam = seam_of(shape, SeamSource(edges=joint.edges), "fillet")
+        assert np.abs(seam.points_P[:, 2]).max() < 1e-5
+
+
+def test_one_shell_has_the_seams_of_its_creases(tmp_path: Path) -> None:
+    """A pipe and a plate fused to one solid, and the same as triangles."""
+    pipe = less(cylinder((0, 0, 0), 40, 80), cylinder((0, 0, -1), 34, 90))
+    solid = fused(box((-100, -80, -10), (200, 160, 10)), pipe)
+    write_stl([solid], tmp_path / "fused.stl")
+    mesh = read_shape(tmp_path / "fused.stl").joints
+    exact = joints_of(solid)
+    assert len(mesh) == len(exact) == 2
+    assert sorted(joint.type for joint in mesh) == sorted(chain[0].type for chain in exact) == ["pipe on plate"] * 2
+    assert sorted(joint.length_m for joint in mesh) == pytest.approx([2e-3 * np.pi * r for r in (34, 40)], abs=1e-5)
+    assert all(joint.closed for joint in mesh)
 
 
 @pytest.mark.parametrize(("plate", "web"), [((300, 200, 12), 10), ((250, 100, 12), 4), ((500, 150, 12), 7)])
