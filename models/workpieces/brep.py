@@ -16,6 +16,7 @@ from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge
 from OCP.BRepClass3d import BRepClass3d_SolidClassifier
 from OCP.collections import HArray1_gp_Pnt
 from OCP.collections import IndexedDataMap_TopoDS_Shape_List_TopoDS_Shape_TopTools_ShapeMapHasher as EdgeFaces
+from OCP.collections import IndexedMap_TopoDS_Shape_TopTools_ShapeMapHasher as Shapes
 from OCP.ElCLib import ElCLib
 from OCP.GC import GC_MakeCircle
 from OCP.Geom import Geom_CylindricalSurface, Geom_Plane
@@ -322,11 +323,12 @@ def parts_of(shape: Any, kind: Any) -> list[Any]:
 
 def faces_at(shape: Any, faces: list[Face]) -> list[tuple[Any, list[Face]]]:
     """The edges of a shape in the file's order, each with those of its faces that meet there; none within one face."""
-    faces_of, found = EdgeFaces(), []
+    faces_of, found, known = EdgeFaces(), [], Shapes()
+    at = {known.Add(face.face): face for face in faces}
     TopExp.MapShapesAndAncestors_s(shape, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_FACE, faces_of)
     for k in range(faces_of.Extent()):
         edge, met = TopoDS.Edge(faces_of.FindKey(k + 1)), list(faces_of.FindFromIndex(k + 1))
-        own = [face for face in faces if any(face.face.IsSame(one) for one in met)]
+        own = [at[k] for k in sorted({known.FindIndex(one) for one in met} - {0})]
         if not BRep_Tool.Degenerated_s(edge) and (len(own) > 1 or len(met) == 1):
             found.append((edge, own))
     return found

@@ -269,9 +269,9 @@ def _is(edge: PartEdge, line: Floats) -> bool:
     from weldcal.models.workpieces.brep import length_of
 
     p, q = edge.points_P, line
-    if abs(edge.length_m - length_of(q)) > 2e-5:
-        return False
     ends = min(np.abs(p[[0, -1]] - q[[0, -1]]).max(), np.abs(p[[0, -1]] - q[[-1, 0]]).max())
+    if not (ends < 2e-5 or edge.closed) or abs(edge.length_m - length_of(q)) > 2e-5:
+        return False
     middle = 0.5 * (q[0] + q[-1]) if len(q) == 2 else q[len(q) // 2]
     a, d = p[:-1], np.diff(p, axis=0)
     share = np.clip(np.vecdot(middle - a, d) / np.vecdot(d, d), 0.0, 1.0)

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import proj3d
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
@@ -32,7 +32,7 @@ from weldcal.welding.seam.room import NoRoom, check_room
 
 COLUMNS = ("id", "kind", "length_mm", "angle_deg", "radius_mm", "start", "end")
 COLOURS = {"concave": "#c2281f", "flush": "#8a2be2", "convex": "#2b5fc4", "boundary": "#b37400"}
-MOST_DRAWN = 20_000  # triangles of a picture
+MOST_DRAWN, MOST_NUMBERED = 20_000, 150  # triangles of a picture; edges in it with a number, as far as there is space
 SHARES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9)  # of an edge's length, where its number may be
 DPI = 110
 SMALL_M = 0.012  # a part this small may be drawn in inches
@@ -310,12 +310,13 @@ def _number(axes: Axes3D, shape: PartShape) -> None:
     order = {"concave": 0, "flush": 0, "boundary": 1, "convex": 1}
     edges = sorted((e for e in shape.edges if e.kind in order), key=lambda e: (order[e.kind], -e.length_m))
     placed: list[Array] = []
-    for edge in edges:
+    projection = axes.get_proj()
+    for edge in edges[:MOST_NUMBERED]:
         size = 13.0 if order[edge.kind] == 0 else 8.0
         half = 0.5 * size * DPI / 72.0 * np.array([0.75 * len(str(edge.id)) + 0.4, 1.5])
         for share in SHARES:
             p = 1e3 * _along(edge.points_P, share)
-            x, y, _ = proj3d.proj_transform(*p, axes.get_proj())
+            x, y, _ = proj3d.proj_transform(*p, projection)
             box = np.concatenate([axes.transData.transform((x, y)), half])
             if all((np.abs(box[:2] - other[:2]) > box[2:] + other[2:]).any() for other in placed):
                 style = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 0.8}
@@ -335,12 +336,14 @@ def _draw(axes: Axes3D, shape: PartShape, eye: Array) -> None:
     axes.add_collection3d(
         Poly3DCollection(1e3 * mesh.vertices[mesh.triangles[faces]], facecolors=colours, edgecolors="none")
     )
-    for edge in shape.edges:
-        if edge.kind == "smooth":
+    for kind, colour in COLOURS.items():
+        wide = kind in ("concave", "flush")
+        if not any(edge.kind == kind for edge in shape.edges):
             continue
-        colour, wide = COLOURS[edge.kind], edge.kind in ("concave", "flush")
-        x, y, z = 1e3 * edge.points_P.T
-        axes.plot(x, y, z, color=colour, linewidth=2.6 if wide else 0.8, zorder=5 if wide else 3)
+        lines = [1e3 * edge.points_P for edge in shape.edges if edge.kind == kind]
+        axes.add_collection3d(
+            Line3DCollection(lines, colors=colour, linewidths=2.6 if wide else 0.8, zorder=5 if wide else 3)
+        )
     low, high = 1e3 * mesh.bounds
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
