@@ -2,7 +2,7 @@
 
 import io
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +24,7 @@ from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.reading import STEP_SUFFIXES, read_shape
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
+from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import fixed, render, write_atomic
@@ -32,6 +33,7 @@ from weldcal.welding.seam.room import NoRoom, check_room
 
 COLUMNS = ("id", "kind", "length_mm", "angle_deg", "radius_mm", "start", "end")
 COLOURS = {"concave": "#c2281f", "flush": "#8a2be2", "convex": "#2b5fc4", "boundary": "#b37400"}
+MOST_PLANNED = 10
 MOST_DRAWN, MOST_NUMBERED = 20_000, 150  # triangles of a picture; edges in it with a number, as far as there is space
 SHARES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9)  # of an edge's length, where its number may be
 DPI = 110
@@ -55,10 +57,17 @@ def part(
     tool: Annotated[
         Path, option("--tool", "FILE", "Tool that has to fit the seams.", show_default="the shipped one")
     ] = WELDING,
+    plan: Annotated[
+        int, option("--plan", "N", "Seams that the tool fits for which the arm's way is planned, the best first.")
+    ] = MOST_PLANNED,
 ) -> Outcome:
     """List the seams and the edges of a part with their numbers, for workpiece.seams in a scenario, and draw them."""
+    call.progress("find the seams", 0.0)
     shape = read_shape(file, units)
+    call.progress("fit the tool", 0.2)
     seams = ranked(shape, load_tool(tool_file(tool)).tool)
+    seams = with_plans(shape, seams, plan, file, units, tool_file(tool), call.progress)
+    call.progress("draw", 0.9)
     folder = call.folder("part", file.name)
     write_part(shape, seams, folder)
     summary = {**as_json(shape, folder), "seams": [seam.as_row() for seam in seams]}
@@ -70,12 +79,19 @@ class Seam:
     """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it can).
 
     short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
+    planned: whether a new cell's arm was asked, too.
     """
 
     joint: PartJoint
     radius_m: float | None
     reason: str
     short_m: float = 0.0
+    planned: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """Whether it can be welded, for a table."""
+        return f"no: {self.reason}" if self.reason else "yes" if self.planned else "fits the tool, not planned"
 
     def as_row(self) -> dict[str, Any]:
         """The seam for JSON: millimetres and degrees."""
@@ -91,6 +107,7 @@ class Seam:
             "closed": j.closed,
             "weldable": not self.reason,
             "reason": self.reason,
+            "planned": self.planned,
         }
 
 
@@ -104,6 +121,21 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
         radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
         found.append(Seam(joint, min(radii, default=None), *_obstacle(shape, joint, tool)))
     return sorted(found, key=lambda seam: (bool(seam.reason), seam.short_m, -seam.joint.length_m))
+
+
+def with_plans(
+    shape: PartShape, seams: list[Seam], most: int, file: Path, units: str | None, tool: Path, progress: Progress
+) -> list[Seam]:
+    """The seams with the verdict of the job's planner on the first that the tool fits, as `weldcal new` asks it."""
+    from weldcal.tools.commands.cell.new import OwnPart, pieces, planned
+
+    asked = [seam for seam in seams if not seam.reason][:most]
+    if not asked:
+        return seams
+    lines = [pieces([shape.edge(id) for id in seam.joint.edges])[0] for seam in asked]
+    reasons = planned(OwnPart(file, units=units), lines, tool, progress)
+    found = [replace(seam, reason=reason, planned=True) for seam, reason in zip(asked, reasons, strict=True)]
+    return sorted([*found, *(seam for seam in seams if seam not in asked)], key=lambda seam: bool(seam.reason))
 
 
 def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float]:
@@ -224,14 +256,12 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         ends = " -> ".join("({:.1f}, {:.1f}, {:.1f})".format(*(1e3 * p)) for p in (edge.points_P[0], edge.points_P[-1]))
         typer.echo(f"{edge.id:>4}  {edge.kind:8}  {length:>9}  {angle:>9}  {radius:>9}  {ends}")
     if seams:
-        typer.echo(
-            f"{'seam':16}  {'length mm':>9}  {'angle deg':>9}  {'throat mm':>9}  {'edges':16}  weldable with the tool"
-        )
+        typer.echo(f"{'seam':16}  {'length mm':>9}  {'angle deg':>9}  {'throat mm':>9}  {'edges':16}  weldable")
     for seam in seams:
         row = seam.as_row()
         ids = ", ".join(map(str, seam.joint.edges))
         numbers = "  ".join(f"{row[key]:9.1f}" for key in ("length_mm", "angle_deg", "throat_mm"))
-        typer.echo(f"{row['type']:16}  {numbers}  {ids:16}  {'no: ' + seam.reason if seam.reason else 'yes'}")
+        typer.echo(f"{row['type']:16}  {numbers}  {ids:16}  {seam.verdict}")
     if not seams:
         typer.echo(f"No seams are listed: {NO_SEAMS[bool(shape.name.lower().endswith(STEP_SUFFIXES))]}")
     if hint := unit_hint(shape):
@@ -271,7 +301,7 @@ def write_part(shape: PartShape, seams: list[Seam], folder: Path) -> None:
                 row["type"],
                 ", ".join(map(str, seam.joint.edges)),
                 *(fixed(row[key], 1) for key in SHOWN),
-                seam.reason or "yes",
+                seam.verdict,
             )
             for seam, row in ((seam, seam.as_row()) for seam in seams)
         ],
