@@ -49,6 +49,14 @@ def test_the_json_lists_every_edge(step: Path, tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert "2 concave edges" in page
     assert len((tmp_path / "edges.csv").read_text().splitlines()) == 25
+    page = (tmp_path / "seams.html").read_text()
+    assert "http" not in page.replace("http-equiv", "")  # one file, no network
+    scene = json.loads(re.search(r"const \{ vertices, triangles, seams \} = (.*);", page)[1])  # type: ignore[index]
+    assert len(scene["triangles"]) == 24
+    assert [seam["edges"] for seam in scene["seams"]] == [row["edges"] for row in found["seams"]]
+    ends = {tuple(point) for seam in scene["seams"] for line in seam["lines"] for point in line}
+    assert len(ends) == 4
+    assert {abs(x) for x, _, _ in ends} == {90.0}
 
 
 def test_the_table_puts_the_concave_edges_first(step: Path, tmp_path: Path) -> None:

@@ -277,7 +277,7 @@ def _figures(edge: PartEdge) -> tuple[str, str, str]:
 
 
 def write_part(shape: PartShape, seams: list[Seam], folder: Path) -> None:
-    """Write edges.png, edges.csv and report.html."""
+    """Write edges.png, edges.csv, report.html and seams.html."""
     picture = edges_picture(shape)
     rows = [as_row(edge) for edge in shape.edges]
     table = [
@@ -308,6 +308,29 @@ def write_part(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         "rows": [(str(e.id), e.kind, *_figures(e)) for e in chosen],
     }
     write_atomic(folder / "report.html", render("part.html.j2", page=page))
+    write_atomic(folder / "seams.html", render("part_3d.html.j2", page={**page, "scene": _scene(shape, seams)}))
+
+
+def _scene(shape: PartShape, seams: list[Seam]) -> dict[str, Any]:
+    """The part's largest triangles and its seams for the 3D page, mm."""
+    mesh = shape.mesh
+    largest = np.argsort(-np.linalg.norm(mesh.area_vectors, axis=1), kind="stable")[: 4 * MOST_DRAWN]
+    used, index = np.unique(mesh.triangles[largest], return_inverse=True)
+    return {
+        "vertices": (1e3 * mesh.vertices[used]).round(3).tolist(),
+        "triangles": index.reshape(-1, 3).tolist(),
+        "seams": [
+            {
+                "edges": list(seam.joint.edges),
+                "lines": [(1e3 * shape.edge(id).points_P).round(2).tolist() for id in seam.joint.edges],
+                "type": seam.as_row()["type"],
+                "length": f"{1e3 * seam.joint.length_m:.1f}",
+                "verdict": seam.verdict,
+                "state": "no" if seam.reason else "yes" if seam.planned else "fits",
+            }
+            for seam in seams
+        ],
+    }
 
 
 def edges_picture(shape: PartShape) -> bytes:
