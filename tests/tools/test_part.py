@@ -18,7 +18,8 @@ from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
-from weldcal.tools.commands.cell.part import Seam, edges_picture, ranked, with_plans
+from weldcal.tools.commands.cell.part import edges_picture, with_plans
+from weldcal.tools.commands.cell.screen import Seam, ranked
 from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, write_step
 
 

@@ -39,8 +39,8 @@ from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, S
 from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
-from weldcal.tools.commands.cell.part import least_pipe, ranked, unit_hint
 from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
+from weldcal.tools.commands.cell.screen import least_pipe, ranked, unit_hint
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
 from weldcal.tools.report.run import RunOptions

@@ -2,7 +2,7 @@
 
 import io
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,22 +14,18 @@ from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
-from weldcal.models.errors import WeldcalError
-from weldcal.models.mesh import TriMesh, extrude, merge
-from weldcal.models.tool import WeldingTool
+from weldcal.models.mesh import TriMesh
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.reading import STEP_SUFFIXES, read_shape
-from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
-from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
+from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
+from weldcal.tools.commands.cell.new import OwnPart, pieces, planned
+from weldcal.tools.commands.cell.screen import Seam, ranked, unit_hint
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.room import NoRoom, check_room
 
 COLUMNS = ("id", "kind", "length_mm", "angle_deg", "radius_mm", "start", "end")
 COLOURS = {"concave": "#c2281f", "flush": "#8a2be2", "convex": "#2b5fc4", "boundary": "#b37400"}
@@ -37,8 +33,6 @@ MOST_PLANNED = 10
 MOST_DRAWN, MOST_NUMBERED = 20_000, 150  # triangles of a picture; edges in it with a number, as far as there is space
 SHARES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9)  # of an edge's length, where its number may be
 DPI = 110
-SMALL_M = 0.012  # a part this small may be drawn in inches
-PIPES_M, PIPE_STEP_M = (0.005, 0.5), 5e-4  # radii among which the least one for a tool is searched
 SHOWN = ("length_mm", "angle_deg", "gap_mm", "throat_mm")
 NO_SEAMS = {
     True: "no two bodies meet within 3 mm in a concave joint, and no body has a concave edge.",
@@ -74,61 +68,10 @@ def part(
     return Outcome(summary, text=partial(emit_table, shape, seams, folder))
 
 
-@dataclass(frozen=True)
-class Seam:
-    """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it can).
-
-    short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
-    planned: whether a new cell's arm was asked, too.
-    """
-
-    joint: PartJoint
-    radius_m: float | None
-    reason: str
-    short_m: float = 0.0
-    planned: bool = False
-
-    @property
-    def verdict(self) -> str:
-        """Whether it can be welded, for a table."""
-        return f"no: {self.reason}" if self.reason else "yes" if self.planned else "fits the tool, not planned"
-
-    def as_row(self) -> dict[str, Any]:
-        """The seam for JSON: millimetres and degrees."""
-        j = self.joint
-        return {
-            "type": f"{j.type} {j.side}".strip(),
-            "edges": list(j.edges),
-            "length_mm": 1e3 * j.length_m,
-            "angle_deg": math.degrees(j.angle_rad),
-            "gap_mm": 1e3 * j.gap_m,
-            "least_radius_mm": None if self.radius_m is None else 1e3 * self.radius_m,
-            "throat_mm": 1e3 * min(j.walls_m) * math.cos(0.5 * j.angle_rad),
-            "closed": j.closed,
-            "weldable": not self.reason,
-            "reason": self.reason,
-            "planned": self.planned,
-        }
-
-
-def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
-    """The joints of a part: those that the tool can weld first, the longest first, then the others, the nearest miss first.
-
-    The arm is not asked.
-    """
-    found = []
-    for joint in shape.joints:
-        radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
-        found.append(Seam(joint, min(radii, default=None), *_obstacle(shape, joint, tool)))
-    return sorted(found, key=lambda seam: (bool(seam.reason), seam.short_m, -seam.joint.length_m))
-
-
 def with_plans(
     shape: PartShape, seams: list[Seam], most: int, file: Path, units: str | None, tool: Path, progress: Progress
 ) -> list[Seam]:
     """The seams with the verdict of the job's planner on the first that the tool fits, as `weldcal new` asks it."""
-    from weldcal.tools.commands.cell.new import OwnPart, pieces, planned
-
     asked = [seam for seam in seams if not seam.reason][:most]
     if not asked:
         return seams
@@ -136,81 +79,6 @@ def with_plans(
     reasons = planned(OwnPart(file, units=units), lines, tool, progress)
     found = [replace(seam, reason=reason, planned=True) for seam, reason in zip(asked, reasons, strict=True)]
     return sorted([*found, *(seam for seam in seams if seam not in asked)], key=lambda seam: bool(seam.reason))
-
-
-def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float]:
-    """Why a tool does not fit a joint, its ball at the walls or its body at the middle of one of the edges, and by how much, m."""
-    flush = joint.angle_rad > math.pi - 0.01
-    half, gap = (0.5 * math.pi, joint.gap_m) if flush else (0.5 * joint.angle_rad, 0.0)
-    section = JointSection(half, *joint.walls_m, gap)
-    ring = _ring(shape, joint)
-    try:
-        check_weldable(section, tool.tip_radius_m)
-        if ring is not None:
-            _check_ring(shape.mesh, *ring, hard_height(section, tool.tip_radius_m), tool)
-        for id in joint.edges if ring is None else ():
-            edge = shape.edge(id)
-            assert edge.up_P is not None
-            k = max(1, len(edge.points_P) // 2)
-            along = edge.points_P[k] - edge.points_P[k - 1]
-            middle = edge.points_P[k] if len(edge.points_P) > 2 else edge.points_P.mean(axis=0)
-            tip = middle + hard_height(section, tool.tip_radius_m) * edge.up_P
-            line = tip + np.linspace(-2e-3, 2e-3, 5)[:, None] * along / np.linalg.norm(along)
-            seam = SeamCurve.from_points(line, up=np.tile(edge.up_P, (5, 1)))
-            check_room(shape.mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, 0.0)
-    except WeldcalError as error:
-        reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
-        if ring is not None and isinstance(error, NoRoom):
-            reason += least_pipe(shape, joint, tool)
-        return reason, error.short_m if isinstance(error, NoRoom) else math.inf
-    return "", 0.0
-
-
-def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:
-    """Points (N,3) m of a joint that is one circle, and there the directions (N,3) out of it; None for any other."""
-    edge = shape.edge(joint.edges[0])
-    if edge.radius_m is None or not edge.closed or len(joint.edges) > 1 or edge.up_P is None:
-        return None
-    line = edge.points_P
-    radial = (line - line[:-1].mean(axis=0)) / edge.radius_m
-    axis = np.cross(radial[0], radial[len(line) // 4])
-    axis /= np.linalg.norm(axis)
-    return line, (edge.up_P @ axis) * axis + (edge.up_P @ radial[len(line) // 2]) * radial
-
-
-def _check_ring(mesh: TriMesh, line: Array, up: Array, height_m: float, tool: WeldingTool) -> None:
-    """Raise NoRoom where the tool does not fit all around a circle, its torch behind its tip."""
-    seam = SeamCurve.from_points(line + height_m * up, up=up)
-    check_room(mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, tool.chord_m)
-
-
-def least_pipe(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> str:
-    """What the least pipe is whose outside the tool can weld onto a plate, both as far as the joint's longer wall; "" for a joint that is none of these."""
-    ring = _ring(shape, joint)
-    if ring is None or float(ring[1][0] @ (ring[0][0] - ring[0][:-1].mean(axis=0))) <= 0.0:
-        return ""
-    around = np.linspace(0.0, 2.0 * math.pi, 181)
-    circle, far, (low, high) = np.stack([np.cos(around), np.sin(around)], axis=1), max(joint.walls_m), PIPES_M
-    up = np.hstack([circle, np.ones((181, 1))]) / math.sqrt(2.0)
-    while high - low > PIPE_STEP_M:
-        radius = 0.5 * (low + high)
-        plate = (radius + far) * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-        mesh = merge(extrude(radius * circle[:-1], 0.0, far), extrude(plate, -0.01, 0.0))
-        line = np.pad(radius * circle, ((0, 0), (0, 1)))
-        try:
-            _check_ring(mesh, line, up, math.sqrt(2.0) * tool.tip_radius_m, tool)
-            high = radius
-        except NoRoom:
-            low = radius
-    return f" The least pipe for this tool is {2e3 * high:.0f} mm across."
-
-
-def unit_hint(shape: PartShape) -> str:
-    """What a part so small that its file may be in inches asks; "" for any other."""
-    size = np.ptp(shape.mesh.vertices, axis=0)
-    if max(size) >= SMALL_M or shape.unit_m != UNITS_M["mm"]:
-        return ""
-    return "The part is only {:.1f} x {:.1f} x {:.1f} mm: its unit may be inch; check the file.".format(*(1e3 * size))
 
 
 def candidates(shape: PartShape) -> list[PartEdge]:
