@@ -146,17 +146,12 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
         mesh = mesh.flipped()
     bodies = int(body.max()) + 1
     edges, joints = mesh_edges(mesh), tuple[PartJoint, ...]()
-    if with_opencascade():
+    if find_spec("OCP") is not None:  # without OpenCascade no joints are looked for
         from weldcal.models.workpieces.joints import joints_between
         from weldcal.models.workpieces.step import with_joints
 
         edges, joints = with_joints(edges, joints_between(_solids(mesh, body)))
     return PartShape(path.name, mesh, edges, unit_m, bodies, joints)
-
-
-def with_opencascade() -> bool:
-    """Whether OpenCascade is installed: without it no joints are looked for."""
-    return find_spec("OCP") is not None
 
 
 def _bodies(mesh: TriMesh) -> tuple[TriMesh, Ints]:
@@ -309,17 +304,14 @@ def regions(mesh: TriMesh) -> tuple[Ints, list[tuple[Floats, Floats, float] | No
     for k in left[~bent[left]].tolist():
         region[k] = len(fits)
         normal = middle[k] / np.linalg.norm(middle[k])
-        fits.append((points[k].mean(axis=0), normal, 0.0) if _plane(points[k], normal) else None)
+        level = float(np.ptp(points[k] @ normal)) < 2.0 * ROUGH_MM
+        fits.append((points[k].mean(axis=0), normal, 0.0) if level else None)
     both = smooth & bent[patch[a]] & bent[patch[b]]
     group = _components(count, np.column_stack([patch[a[both]], patch[b[both]]]))
     for g in np.unique(group[bent]):
         region[bent & (group == g)] = len(fits)
         fits.append(None)
     return region[patch], fits
-
-
-def _plane(points: Floats, normal: Floats) -> bool:
-    return float(np.ptp(points @ normal)) < 2.0 * ROUGH_MM
 
 
 def _cylinder(

@@ -24,7 +24,6 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
-from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.models.workpieces.step import referenced
 from weldcal.systems.drivers.config import DEVICES, NoDevice
@@ -450,13 +449,10 @@ def _candidates(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[Pa
                 found.append(edges)
                 above = edges[0].up_P is not None and edges[0].up_P[2] > OPEN_ABOVE
                 order.append((bool(seam.reason), round(seam.short_m, 3), not above))
-    if shape.joints:
-        found = [found[k] for k in sorted(range(len(found)), key=lambda k: order[k])]
-    else:
-        concave = sorted((edge for edge in shape.edges if edge.kind == "concave"), key=lambda edge: -edge.length_m)
-        found = [[edge] for edge in concave]
-        if first := next((chain for chain in found if _open_above(shape, chain[0])), None):
-            found.insert(0, found.pop(found.index(first)))
+    found = [found[k] for k in sorted(range(len(found)), key=lambda k: order[k])]
+    if not shape.joints:  # of a mesh of other surfaces
+        concave = [edge for edge in shape.edges if edge.kind == "concave"]
+        found = [[edge] for edge in sorted(concave, key=lambda edge: -edge.length_m)]
     if not found:
         raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
     return found[:MOST_TRIED]
@@ -467,15 +463,6 @@ def pieces(chain: list[PartEdge]) -> list[list[PartEdge]]:
     if all(len(edge.points_P) > 2 for edge in chain):
         return [chain]
     return [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]
-
-
-def _open_above(shape: PartShape, edge: PartEdge) -> bool:
-    """Whether the joint at an edge opens upwards, as the part is drawn."""
-    try:
-        seam = seam_of(shape, SeamSource(edges=(edge.id,)), _joint(edge))
-    except WeldcalError:
-        return False
-    return float(seam.up_P[:, 2].mean()) > OPEN_ABOVE
 
 
 def _joint(edge: PartEdge) -> str:

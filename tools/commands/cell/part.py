@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
-from weldcal.models.workpieces.reading import STEP_SUFFIXES, read_shape
+from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
@@ -34,10 +34,6 @@ MOST_DRAWN, MOST_NUMBERED = 20_000, 150  # triangles of a picture; edges in it w
 SHARES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9)  # of an edge's length, where its number may be
 DPI = 110
 SHOWN = ("length_mm", "angle_deg", "gap_mm", "throat_mm")
-NO_SEAMS = {
-    True: "no two bodies meet within 3 mm in a concave joint, and no body has a concave edge.",
-    False: "the file is a mesh. Choose a concave edge, or the edge of a body where it meets another.",
-}
 VIEWS = ((32.0, -60.0), (32.0, 120.0))  # elevation, azimuth
 
 
@@ -131,7 +127,9 @@ def emit_table(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         numbers = "  ".join(f"{row[key]:9.1f}" for key in ("length_mm", "angle_deg", "throat_mm"))
         typer.echo(f"{row['type']:16}  {numbers}  {ids:16}  {seam.verdict}")
     if not seams:
-        typer.echo(f"No seams are listed: {NO_SEAMS[bool(shape.name.lower().endswith(STEP_SUFFIXES))]}")
+        typer.echo(
+            "No seams are listed: no two bodies meet within 3 mm in a concave joint, and no body has a concave edge."
+        )
     if hint := unit_hint(shape):
         typer.echo(hint)
     typer.echo(
