@@ -166,3 +166,11 @@ def test_a_screw_that_fills_a_hole_leaves_no_seam_inside(tmp_path: Path) -> None
     joints = read_shape(tmp_path / "screw.step").joints
     assert any(joint.length_m == pytest.approx(2.0 * np.pi * 0.014, abs=1e-5) for joint in joints)
     assert all(joint.angle_rad == pytest.approx(0.5 * np.pi) for joint in joints)
+
+
+def test_a_pipe_through_a_ring_may_be_drawn_from_either_end() -> None:
+    ring = less(cylinder((0, 0, 30), 60, 10), cylinder((0, 0, 0), 31, 90))
+    for at, axis in (((0, 0, 0), (0, 0, 1)), ((0, 0, 90), (0, 0, -1))):
+        pipe = less(cylinder(at, 30, 90, axis), cylinder(at, 26, 90, axis))
+        found = joints_of(assembly(pipe, ring))
+        assert [chain[0].type for chain in found] == ["flange on pipe", "flange on pipe"]
