@@ -194,7 +194,7 @@ class MeshFace(Face):
             origin, along, radius = fit
             place = gp_Ax3(gp_Pnt(*origin), gp_Dir(*along))
             self.surface = Geom_CylindricalSurface(place, abs(radius)) if self.round else Geom_Plane(place)
-            self.along = along
+            self.along = along if self.flat else None
             self.axis, self.sign = place.Axis() if self.round else None, -1.0 if radius < 0.0 else 1.0
             self.by_point = ShapeAnalysis_Surface(self.surface)
             x = array_of(place.XDirection())

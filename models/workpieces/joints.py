@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import Any
@@ -74,7 +74,7 @@ def joints_of(shape: Any) -> list[list[Piece]]:
     return joints_between([Body(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)])
 
 
-def joints_between(bodies: list[Body]) -> list[list[Piece]]:
+def joints_between(bodies: Sequence[Body]) -> list[list[Piece]]:
     """The joints between bodies, and where there are none those inside each of them, each as its pieces in the order of travel.
 
     Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece may
@@ -99,7 +99,7 @@ def joints_between(bodies: list[Body]) -> list[list[Piece]]:
     return [_named(chain, found) for chain in found]
 
 
-def _within(bodies: list[Body], k: int) -> Iterable[Piece]:
+def _within(bodies: Sequence[Body], k: int) -> Iterable[Piece]:
     """The pieces along the concave edges of one body."""
     for edge, met in bodies[k].edges:
         if len(met) != 2:
@@ -137,7 +137,7 @@ def _far(a: Face | Body, b: Face | Body) -> bool:
     return bool((np.maximum(a.low, b.low) > np.minimum(a.high, b.high) + GAP_MM).any())
 
 
-def _met(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
+def _met(bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces meet in a concave joint."""
     if f.surface is None or g.surface is None:
         return
@@ -170,7 +170,7 @@ def _met(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterabl
 
 
 def _between(
-    bodies: list[Body], pair: tuple[int, int], f: Face, g: Face, curve: Any, begin: float, end: float
+    bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face, curve: Any, begin: float, end: float
 ) -> dict[str, Any] | None:
     """The joint of two faces along a stretch of their curve; None where they form none.
 
@@ -185,7 +185,7 @@ def _between(
 
 
 def _breaks(
-    bodies: list[Body], curve: Any, low: Floats, high: Floats, own: tuple[Face, Face]
+    bodies: Sequence[Body], curve: Any, low: Floats, high: Floats, own: tuple[Face, Face]
 ) -> tuple[list[float], bool]:
     """Ascending parameters between which a curve is a joint as a whole or not at all, and whether it is closed."""
     closed = bool(curve.IsClosed())
@@ -205,9 +205,9 @@ def _breaks(
                 crossed = GeomAPI_IntCS(curve, face.surface)
             except Exception:  # of several types: no crossing can be computed
                 continue
-            at = [crossed.Parameters(k + 1)[2] for k in range(crossed.NbPoints())] if crossed.IsDone() else []
+            met = [crossed.Parameters(k + 1)[2] for k in range(crossed.NbPoints())] if crossed.IsDone() else []
             # A plane along the line crosses it anywhere, by rounding.
-            found += [t for t in at if not face.flat or abs(middle_of(curve, t, t)[1] @ face.along) > GRAZING]
+            found += [t for t in met if face.along is None or abs(middle_of(curve, t, t)[1] @ face.along) > GRAZING]
     for face in own:
         for corner in face.corners:
             near = GeomAPI_ProjectPointOnCurve(corner, curve)
@@ -229,7 +229,7 @@ def _breaks(
 
 
 def _cut(
-    bodies: list[Body],
+    bodies: Sequence[Body],
     pair: tuple[int, int],
     f: Face,
     g: Face,
@@ -317,7 +317,7 @@ def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[Body, Body]) -> str:
     return "flange on pipe" if coaxial else "pipe on plate"
 
 
-def _flush(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
+def _flush(bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces go on in each other: a square butt, the outside of a corner, an edge joint."""
     two = bodies[pair[0]], bodies[pair[1]]
     if f.flat != g.flat or f.round != g.round or not (f.flat or f.round):
