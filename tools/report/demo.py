@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
+from weldcal.models.workpieces.part import Part
 from weldcal.systems.jobs.weld.iterative_calibrator import next_scan
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point
@@ -274,6 +275,9 @@ def demo_pictures(result: DemoResult) -> dict[str, bytes]:
         required = cell.scenario.calibration.required_error_mm * 1e-3
         pictures["convergence"] = convergence(status, required)
     if weld is not None:
+        plan, part = cell.job.planned_seam(result.run.root), cell.station.cad
+        if isinstance(part, Part) and plan.X_BP is not None and plan.points_B is not None:
+            pictures["part"] = plots_weld.part_in_scan(plan.points_B, part.mesh, plan.X_BP)
         trace = weld_trace(weld, cell.job.servo_config)
         if len(trace.s) > 1:
             pictures["seam"] = plots_weld.paths(trace)

@@ -8,12 +8,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from scipy.spatial import cKDTree
 
 from weldcal.models.arrays import Array
-from weldcal.tools.report.pictures import OURS, PLANNED, ROBOT, TORCH, TRUTH, plain, svg
+from weldcal.models.mesh import TriMesh
+from weldcal.tools.report.pictures import GREY, OURS, PLANNED, ROBOT, TORCH, TRUTH, plain, svg
+from weldcal.welding.locate.part.fit import into
+from weldcal.welding.locate.part.model import PartModel
 
 _SMALL = 8
 _ALONG = 0.99  # a chord that lies along the seam has no place worth a mark
+_AGREES_M, _BESIDE_M, _MOST_DOTS = 0.001, 0.015, 6000  # registration.TOLERANCE_M; what is drawn beside the part
 _DOTTED = (0, (1.2, 0.7))
 
 
@@ -58,6 +64,37 @@ class WeldTrace:
     windows: tuple[float, float] = (np.inf, np.inf)
     axes: tuple[int, int] = (0, 1)
     names: tuple[str, str] = field(default=("x, mm", "y, mm"))
+
+
+def part_in_scan(points_B: Array, mesh: TriMesh, X_BP: RigidTransform) -> bytes:
+    """Draw where the scan (N,3) m agrees with the drawn part: its surface towards the scan, from above and from two sides."""
+    model = PartModel(mesh)
+    scan = into(X_BP, points_B[np.isfinite(points_B).all(axis=1)])
+    low, high = mesh.bounds
+    scan = scan[((scan > low - _BESIDE_M) & (scan < high + _BESIDE_M)).all(axis=1)]
+    scan = scan[:: 1 + len(scan) // _MOST_DOTS]
+    away = np.linalg.norm(scan - model.closest(scan)[0], axis=1) if len(scan) else np.zeros(0)
+    surface = model.points[:: max(1, len(model.points) // _MOST_DOTS)]
+    spacing = 0.0 if len(scan) < 2 else float(np.median(np.asarray(cKDTree(scan).query(scan, k=2)[0])[:, 1]))
+    shown = np.isfinite(np.asarray(cKDTree(scan).query(surface, distance_upper_bound=_AGREES_M + 3.0 * spacing)[0]))
+    R = X_BP.rotation().matrix()
+    drawn, found = (1e3 * (p @ R.T + X_BP.translation()) for p in (surface, scan))
+    picture = Figure(figsize=(8.2, 3.4), layout="constrained")
+    groups = (
+        ("drawn, not in the scan", GREY, drawn[~shown]),
+        ("the scan shows the drawn surface", ROBOT, found[away < _AGREES_M]),
+        ("the scan shows another thing", TRUTH, found[away >= _AGREES_M]),
+    )
+    panes = picture.subplots(1, 3)
+    for axes, (i, j) in zip(panes, ((0, 1), (0, 2), (1, 2)), strict=True):
+        for name, colour, p in groups:
+            axes.plot(p[:, i], p[:, j], ".", ms=1.2, color=colour, label=name, rasterized=True)
+        axes.set_aspect("equal")
+        plain(axes, f"{'xyz'[i]}, mm", f"{'xyz'[j]}, mm")
+    picture.legend(
+        *panes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=8, fontsize=_SMALL
+    )
+    return svg(picture, *panes)
 
 
 def paths(trace: WeldTrace) -> bytes:

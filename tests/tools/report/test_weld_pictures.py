@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from pydrake.math import RigidTransform
 
-from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, paths, zero_crossings
+from tests.welding.locate.lying import box as solid_box
+from tests.welding.locate.lying import triangles
+from weldcal.models.mesh import TriMesh
+from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, part_in_scan, paths, zero_crossings
 
 N = 120
 S = np.linspace(-0.06, 0.2, N)
@@ -37,6 +43,31 @@ def trace() -> WeldTrace:
         axial_d=0.003,
         omega_max=0.8,
     )
+
+
+def test_the_part_in_the_scan_shows_what_agrees_and_what_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scan of a web that leans by 10 mm over the drawn one, of the drawn base, and of nothing of its right end."""
+    drawn: dict[str, int] = {}
+
+    def counted(axes: Axes, *data: Any, **more: Any) -> Any:
+        drawn[more["label"]] = len(data[0])
+        return plot(axes, *data, **more)
+
+    plot = Axes.plot
+    monkeypatch.setattr(Axes, "plot", counted)
+    base = solid_box((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.01))
+    mesh = TriMesh(*triangles([base]))
+    x, y = np.meshgrid(np.arange(-0.1, 0.05, 0.001), np.arange(-0.05, 0.05, 0.001))
+    top = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.01)])
+    web = np.column_stack([np.linspace(-0.1, 0.04, 500), np.zeros(500), np.full(500, 0.02)])
+    svg = part_in_scan(np.vstack([top, web]), mesh, RigidTransform())
+    assert svg.startswith(b"<")
+    shown, other = drawn["the scan shows the drawn surface"], drawn["the scan shows another thing"]
+    assert shown / len(top) == pytest.approx(6000 / 15500, rel=0.35)
+    assert other / shown == pytest.approx(500 / 15000, rel=0.3)
+    # A quarter of the top, the whole underside and the sides are not in the scan: 0.64 of the area.
+    hidden = (0.25 * 0.02 + 0.02 + 2 * 0.01 * 0.3) / (2 * 0.02 + 2 * 0.01 * 0.3)
+    assert drawn["drawn, not in the scan"] / 6000 == pytest.approx(hidden, abs=0.06)
 
 
 def test_zero_is_found_between_the_samples_and_not_across_a_gap() -> None:

@@ -538,7 +538,7 @@ def mirrored(seed: int, rng: np.random.Generator) -> Lying:
     s = clamped(3 * seed, rng)
     flip = np.diag([-1.0, 1.0, 1.0, 1.0])
     boxes: list[Solid] = [Box(flip @ b.X @ flip, b.half) for b in s.part if isinstance(b, Box)]
-    return replace(s, kind="mirror image", looked_for=boxes, cause="ambiguous|does not fit|fits the part")
+    return replace(s, kind="mirror image", looked_for=boxes, cause="mirror image fits better")
 
 
 def two_unnamed(seed: int, rng: np.random.Generator) -> Lying:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.mesh import TriMesh
 from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near, views_off
@@ -19,12 +19,13 @@ from weldcal.welding.locate.part.rivals import (
     describe_turn,
     free_directions,
     harmless,
+    own_axes,
     same_pose,
     same_set,
     turned_poses,
 )
 from weldcal.welding.locate.part.scan import PreparedScan, finite_points, prepare
-from weldcal.welding.locate.part.search import LARGE_GATES, LARGE_M, rough_places
+from weldcal.welding.locate.part.search import LARGE_GATES, LARGE_M, rough_places, sinks
 
 Floats = npt.NDArray[np.float64]
 
@@ -32,11 +33,16 @@ COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
 SHEET = 0.5  # the same of a sheet, in its thickness: nearer to the sheet than to its table
 SHEET_TOLERANCE_M = 0.0004  # at least: four times a scan's noise of 0.1 mm
-FINE_PLACES, FINE_RIVALS = 10, 5
+FINE_PLACES, FINE_RIVALS, MIRRORED = 10, 5, 2
 LARGE_PLACES = 40  # of a large part: the true place of the tests' beam 7009 is the 32nd
 CLEAN = 0.98  # least share of the rays that meets a pose that ends the search; a beam turned by 180 deg has 0.97
 PASSED = 0.005  # largest share that passes through it; of the true pose flying points are 0.002, of a wrong one 0.012
 NEAR_HINT_DEG = 40.0
+EQUAL_PART = 0.75  # of the best coarse score: a start at another place that may be an equal part
+MUCH_HIDDEN = 0.4  # share of the rays that end before the part, which a refusal names as its cause
+POOR_MET, POOR_PASSED = 0.9, 0.04  # a pose that agrees less than this is not ambiguous: another part lies there
+HIDDEN = 0.15  # share of the rays that end before the part, above which something hides it
+PLAIN_PLACES, COVERED_PLACES = 7, 6  # fitted finely before others: by all rays, and by those that nothing keeps from it
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
 COMPARABLE = 0.5  # of the best score: a rival with less meets the table only
 CLEAR = 0.25  # of the best pose's rays: a rival with less has one ray in five where the two differ
@@ -109,21 +115,30 @@ def register_prepared(
         raise PartNotFound(
             "The scan shows nothing that fits the part: move it into view, or check the file and its unit."
         )
+    # Of a part that is half hidden few rays speak: those that nothing keeps from it decide among poses that agree.
+    fits.sort(key=lambda f: (not _agrees(f.agreement, config), -f.agreement.score_of_rest))
+    standing = [f for f in fits if not sinks(scan, model, f.X_BP)]
+    fits = standing if standing and _agrees(standing[0].agreement, config) else fits
     best = fits[0]
     if X_BP_guess is not None:
         _check_near(best.X_BP, X_BP_guess, model, config)
-    rivals = fits[1:]
+    rivals, best_sinks = fits[1:], sinks(scan, model, best.X_BP)
     if X_BP_guess is None:
         others = turned_poses(model, best.X_BP)
         found = _fine(scan, model, _screened(scan, model, others, best, hint), FINE_RIVALS, None)
         known = [f.X_BP for f in fits]
-        rivals = rivals + [f for f in found if not any(same_pose(f.X_BP, X, model) for X in known)]
+        rivals += [
+            f
+            for f in found
+            if not any(same_pose(f.X_BP, X, model) for X in known) and (sinks(scan, model, f.X_BP) <= best_sinks)
+        ]
         better = [r for r in rivals if _better(r, best, scan, model)]
         if better:
             rivals = [f for f in (best, *rivals) if f is not better[0]]
             best = better[0]
     _check_fused(best, scan, model)
     _check_fit(best, scan, model, config)
+    _check_hand(best, scan, model)
     _check_known(best, model, matters_P, config)
     best, runner_up, note = _decided(best, rivals, scan, model, hint, matters_P, config)
     return _result(best, runner_up, note, model, matters_P)
@@ -141,17 +156,30 @@ def _check_size(scan: PreparedScan, model: PartModel) -> None:
 
 def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[RigidTransform]:
     """Poses from the search, fitted to the coarse points, best first."""
-    scored: list[tuple[float, RigidTransform]] = []
+    scored: list[tuple[float, float, RigidTransform]] = []
+    sunk: list[RigidTransform] = []
     for place in rough_places(scan, model, config):
         # A flat part may slide along itself in the coarse fit, or a fixture may pull it: the pose before is a start.
         wide = tuple(g * model.radius for g in LARGE_GATES) if model.radius > LARGE_M else ()
         gates = (*wide, *COARSE_GATES)
         for X in (place.X_BP, coarse_fit(scan, model, place.X_BP, gates)):
-            if X is not None and not any(same_pose(X, Y, model) for _, Y in scored):
-                rays = rays_near(scan, model, X)[::5]
-                scored.append((agreement(rays, scan, model, X, COARSE_TOLERANCE_M).score, X))
+            if X is None or any(same_pose(X, Y, model) for _, _, Y in scored):
+                continue
+            if sinks(scan, model, X):
+                sunk.append(X)
+                continue
+            a = agreement(rays_near(scan, model, X)[::5], scan, model, X, COARSE_TOLERANCE_M)
+            scored.append((a.score, a.score_of_rest if a.hidden > HIDDEN else 0.0, X))
+    # Of a part that something hides, the rays that nothing keeps from it decide.
+    behind = sorted((s for s in scored if s[1] > 0.0), key=lambda s: -s[1])[:COVERED_PLACES]
     scored.sort(key=lambda s: -s[0])
-    return [X for _, X in scored]
+    first = [s for s in scored[:PLAIN_PLACES] if s not in behind]
+    # An equal part at another place is a rival that must not be missed.
+    second = [
+        s for s in scored if s[0] > EQUAL_PART * scored[0][0] and _apart(s[2], scored[0][2], model) and s not in behind
+    ]
+    first = [*first[:2], *second[:1], *(s for s in first[2:] if s not in second[:1])]
+    return [X for _, _, X in [*first, *behind, *(s for s in scored if s not in first and s not in behind)]] + sunk
 
 
 def _near_starts(scan: PreparedScan, model: PartModel, guess: RigidTransform) -> list[RigidTransform]:
@@ -203,10 +231,13 @@ def _tolerance(model: PartModel) -> float:
     return min(TOLERANCE_M, max(SHEET_TOLERANCE_M, SHEET * model.thickness_m))
 
 
-def _evidence(a: _Judged, b: _Judged, scan: PreparedScan, model: PartModel) -> tuple[int, int, int]:
+def _evidence(
+    a: _Judged, b: _Judged, scan: PreparedScan, model: PartModel, model_b: PartModel | None = None
+) -> tuple[int, int, int]:
     """Numbers of rays that speak for a and for b where the two differ, and of those that meet a."""
-    rays = np.unique(np.vstack([rays_near(scan, model, a.X_BP), rays_near(scan, model, b.X_BP)]), axis=0)
-    va, vb = (agreement(rays, scan, model, x.X_BP, _tolerance(model)).verdict.astype(int) for x in (a, b))
+    both = [(a.X_BP, model), (b.X_BP, model_b or model)]
+    rays = np.unique(np.vstack([rays_near(scan, m, X) for X, m in both]), axis=0)
+    va, vb = (agreement(rays, scan, m, X, _tolerance(m)).verdict.astype(int) for X, m in both)
     return int(np.sum(va > vb)), int(np.sum(vb > va)), int(np.sum(va == 1))
 
 
@@ -214,8 +245,16 @@ def _better(rival: _Judged, best: _Judged, scan: PreparedScan, model: PartModel)
     # Rays that meet a table speak for any pose on it: its score must be comparable too.
     if rival.agreement.score < COMPARABLE * best.agreement.score:
         return False
+    # Elsewhere other rays speak: what stands before one of the two must not speak for the other.
+    if _apart(best.X_BP, rival.X_BP, model) and rival.agreement.score_of_rest < best.agreement.score_of_rest:
+        return False
     more, less, met = _evidence(rival, best, scan, model)
     return more > less + max(30, 0.01 * met)
+
+
+def _apart(A: RigidTransform, B: RigidTransform, model: PartModel) -> bool:
+    """Whether two poses are at different places: their middles are more than half the part's radius apart."""
+    return bool(np.linalg.norm(A.multiply(model.center) - B.multiply(model.center)) > 0.5 * model.radius)
 
 
 def _check_near(X: RigidTransform, guess: RigidTransform, model: PartModel, config: PartConfig) -> None:
@@ -252,15 +291,51 @@ def _check_fused(best: _Judged, scan: PreparedScan, model: PartModel) -> None:
         )
 
 
+def _check_hand(best: _Judged, scan: PreparedScan, model: PartModel) -> None:
+    """Raise PartNotFound where the part's mirror image agrees better with the scan than the part."""
+    flip = np.diag([-1.0, 1.0, 1.0])
+    mirror = PartModel(TriMesh(model.mesh.vertices @ flip, model.mesh.triangles[:, ::-1]))
+    starts: list[tuple[float, RigidTransform]] = []
+    for a in own_axes(model):
+        R = (np.eye(3) - 2.0 * np.outer(a, a)) @ flip  # turns the mirror image in x to that in the plane across a
+        at = best.X_BP @ RigidTransform(RotationMatrix(R), model.center - R @ flip @ model.center)
+        X = coarse_fit(scan, mirror, at, COARSE_GATES[2:])
+        if X is not None:
+            rays = rays_near(scan, mirror, X)[::3]
+            starts.append((agreement(rays, scan, mirror, X, COARSE_TOLERANCE_M).score, X))
+    starts.sort(key=lambda s: -s[0])
+    for other in _fine(scan, mirror, [X for _, X in starts], MIRRORED, None):
+        more, less, met = _evidence(other, best, scan, mirror, model)
+        if more > less + max(30, 0.004 * met):
+            raise PartNotFound(
+                f"The part does not fit the scan: its mirror image fits better ({more} rays for it, {less} against). "
+                "The part of the other hand lies there, or the file is mirrored."
+            )
+
+
+def _agrees(a: Agreement, config: PartConfig) -> bool:
+    """Whether nothing in the scan refuses a pose."""
+    return (
+        a.n_met >= config.min_points
+        and a.seen >= config.min_seen
+        and a.goes_on <= config.max_goes_on
+        and a.met >= max(config.min_met, config.min_agreement * (1.0 - a.hidden))
+        and a.passed <= config.max_violation
+    )
+
+
 def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: PartConfig) -> None:
     """Raise PartNotFound where the best pose does not agree with the scan."""
     a, shown, size = best.agreement, scan.extent_m, 2.0 * model.radius
-    advice = "clear the view, or scan it from elsewhere"
+    advice, check = "clear the view, or scan it from elsewhere", "check which part this is and the file's unit"
+    if a.hidden > MUCH_HIDDEN:
+        advice = check = f"something hides {100 * a.hidden:.0f} % of it: clear the view, or scan it from elsewhere"
     if size > LARGER * shown:
         advice = (
             f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
             "scan it from farther away, or give register_part a list of several scans along it"
         )
+        check = advice
     if a.n_met < config.min_points:
         raise PartNotFound(
             f"The scan shows only {a.n_met} points of the part, and {config.min_points} are needed: {advice}."
@@ -271,7 +346,7 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
         )
     if a.goes_on > config.max_goes_on:
         raise PartNotFound(
-            f"The part does not fit the scan: at {100 * a.goes_on:.0f} % of its edges the face does not end; check which part this is and the file's unit."
+            f"The part does not fit the scan: at {100 * a.goes_on:.0f} % of its edges the face does not end; {check}."
         )
     if a.met < config.min_met:
         raise PartNotFound(
@@ -307,9 +382,8 @@ def _decided(
         for_best, for_rival, met = _evidence(best, rival, scan, model)
         share = for_rival / max(1, for_best)
         runner_up = max(runner_up, min(1.0, rival.agreement.score / max(best.agreement.score, 1e-9)))
-        apart = float(np.linalg.norm(best.X_BP.multiply(model.center) - rival.X_BP.multiply(model.center)))
         # Another part of the kind is as good where something hides a share of it.
-        if apart > 0.5 * model.radius and (
+        if _apart(best.X_BP, rival.X_BP, model) and (
             rival.agreement.met < config.min_met
             or rival.agreement.score_of_rest < ELSEWHERE * best.agreement.score_of_rest
         ):
@@ -328,6 +402,12 @@ def _decided(
             places = [f.X_BP.multiply(model.center) for f in family]
             far = [p for p in places if np.linalg.norm(p - best.X_BP.multiply(model.center)) > model.radius]
             return best, runner_up, f"; an equal part lies near {_in_mm(far[0])}" if far else ""
+    a = best.agreement
+    if harmful and (a.met < POOR_MET * (1.0 - a.hidden) or a.passed > POOR_PASSED):
+        raise PartNotFound(
+            f"The part does not fit the scan: in its best pose {100 * a.passed:.0f} % of the rays pass through it, and other poses "
+            "fit as badly; check which part this is and the file's unit."
+        )
     if harmful:
         motion = best.X_BP.InvertAndCompose(harmful[0].X_BP)
         near = float(np.linalg.norm(motion.multiply(model.center) - model.center)) < 0.5 * model.radius

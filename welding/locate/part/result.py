@@ -41,7 +41,7 @@ class PartConfig:
 
     min_points: int = 250
     min_agreement: float = 0.72
-    min_met: float = 0.5
+    min_met: float = 0.3
     max_violation: float = 0.13
     max_goes_on: float = 0.35
     min_seen: float = 0.35

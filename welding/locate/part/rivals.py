@@ -29,20 +29,25 @@ class FreeDirection:
 
 
 def turned_poses(model: PartModel, X_BP: RigidTransform) -> list[RigidTransform]:
-    """The pose turned about the part's own axes (its frame's and its principal ones) through its middle."""
+    """The pose turned about the part's own axes through its middle."""
     middle = model.gravity
+    poses = []
+    for a in own_axes(model):
+        for degrees in TURNS_DEG:
+            R = Rotation.from_rotvec(math.radians(degrees) * a).as_matrix()
+            poses.append(X_BP @ RigidTransform(RotationMatrix(R), middle - R @ middle))
+    return poses
+
+
+def own_axes(model: PartModel) -> list[Floats]:
+    """The axes (3,) of the part's frame, and its principal ones where they differ by more than 3 deg."""
     _, axes = np.linalg.eigh(np.cov(model.points.T))
     candidates = [*np.eye(3), *axes.T]
     chosen: list[Floats] = []
     for a in candidates:
         if not any(abs(a @ b) > math.cos(math.radians(3.0)) for b in chosen):
             chosen.append(a)
-    poses = []
-    for a in chosen:
-        for degrees in TURNS_DEG:
-            R = Rotation.from_rotvec(math.radians(degrees) * a).as_matrix()
-            poses.append(X_BP @ RigidTransform(RotationMatrix(R), middle - R @ middle))
-    return poses
+    return chosen
 
 
 def same_set(points_P: Floats | None, X_PP: RigidTransform) -> bool:

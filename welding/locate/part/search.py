@@ -20,11 +20,13 @@ from weldcal.welding.locate.part.result import PartConfig
 from weldcal.welding.locate.part.scan import Plane, PreparedScan
 
 Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 MOST_CELLS = 150  # along a side of the scene's map
 SAME_HEIGHT_M = 0.007
 RING_CELLS, RING_SHARE = 3, 0.5
-PEAKS, MOST_PLACES, MOST_UPS = 3, 24, 4
+PEAKS, MOST_PLACES, MOST_UPS = 3, (24, 16, 4), 4
+LEAST_KNOWN = 0.3  # least share of a covered part that the scan shows
 LEAST_FILLED = (
     0.4  # Plane.filled of a ground: 1 for a square, 0.79 for a disc; less where a plane cuts across several things
 )
@@ -36,16 +38,18 @@ WIDE_CELLS = 3.0  # in config.cell_m: 12 mm, in which a web and the plate beside
 RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, and of a turn at its ends
 # Gates of a large part, in its radius: the second is half a turn and half a cell's diagonal, (0.5 * 1.8 + 0.71) / 40.
 LARGE_GATES = (0.053, 0.04)
+SUNK_M, LEAST_GROUND = 0.008, 30  # depth of a part's middle in its ground, and the coarse points that show this ground
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
 _BOX = {n: np.ones((n, n), np.uint8) for n in (1, 3, 2 * RING_CELLS + 1)}
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A rough pose and its score, 1 for a perfect match."""
+    """A rough pose and its score, 1 for a perfect match; covered: judged by what nothing above the part hides."""
 
     score: float
     X_BP: RigidTransform
+    covered: bool = False
 
 
 def frame_with_z(z: Floats) -> Floats:
@@ -56,34 +60,57 @@ def frame_with_z(z: Floats) -> Floats:
 
 
 def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Place]:
-    """Rough poses of the part in the scan, best first, at most MOST_PLACES."""
+    """Rough poses of the part in the scan, best first: at most MOST_PLACES of each kind."""
     ups: list[tuple[Floats, Plane | None]] = []
-    if scan.planes:
-        least = GROUND_EXTENT * model.radius
-        if model.radius > LARGE_M:
-            least = min(least, GROUND_SHARE * scan.extent_m)
-        large = [p for p in scan.planes if p.extent_m > least and p.filled > LEAST_FILLED]
-        for plane in [*large, *scan.planes]:
-            # The part lies on a large plane, a tilted positioner's too, or a smaller plane is a face of the part.
-            is_ground = plane in large
-            known = [g for u, g in ups if float(plane.normal @ u) > math.cos(math.radians(7.0))]
-            if not is_ground and ups and float(plane.normal @ ups[0][0]) < math.cos(math.radians(50.0)):
-                continue
-            if is_ground:
-                known = [g for g in known if g is plane or g is None or abs(g.level - plane.level) < SAME_HEIGHT_M]
-            if len(ups) < MOST_UPS and not known:
-                ups.append((plane.normal, plane if is_ground else large[0] if large else None))
+    large = grounds(scan, model)
+    for plane in [*large, *scan.planes]:
+        # The part lies on a large plane, a tilted positioner's too, or a smaller plane is a face of the part.
+        is_ground = plane in large
+        known = [g for u, g in ups if float(plane.normal @ u) > math.cos(math.radians(7.0))]
+        if not is_ground and ups and float(plane.normal @ ups[0][0]) < math.cos(math.radians(50.0)):
+            continue
+        if is_ground:
+            known = [g for g in known if g is plane or g is None or abs(g.level - plane.level) < SAME_HEIGHT_M]
+        if len(ups) < MOST_UPS and not known:
+            ups.append((plane.normal, plane if is_ground else large[0] if large else None))
     places: list[Place] = []
     for k, (up, ground) in enumerate(ups or [(np.array([0.0, 0.0, 1.0]), None)]):
         places += _places_for(scan, model, config, up, config.turn_step_rad * (1.0 if k == 0 else 1.5), ground)
     places.sort(key=lambda place: -place.score)
+    # 2: the part would stick in its ground; 1: something covers it; 0: neither.
+    kinds = [2 if sinks(scan, model, p.X_BP) else int(p.covered) for p in places]
     kept: list[Place] = []
-    for place in places:
-        if len(kept) == MOST_PLACES:
-            break
-        if not any(_near(place.X_BP, other.X_BP, model) for other in kept):
-            kept.append(place)
+    for kind, more in enumerate(MOST_PLACES):
+        most = len(kept) + more
+        for place in (p for p, k in zip(places, kinds, strict=True) if k == kind):
+            if len(kept) == most:
+                break
+            if not any(_near(place.X_BP, other.X_BP, model) for other in kept):
+                kept.append(place)
     return kept
+
+
+def grounds(scan: PreparedScan, model: PartModel) -> list[Plane]:
+    """The planes on which the part may lie: too large to be its own faces."""
+    least = GROUND_EXTENT * model.radius
+    if model.radius > LARGE_M:
+        least = min(least, GROUND_SHARE * scan.extent_m)
+    return [p for p in scan.planes if p.extent_m > least and p.filled > LEAST_FILLED]
+
+
+def sinks(scan: PreparedScan, model: PartModel, X_BP: RigidTransform) -> bool:
+    """Whether the part would stick in its ground, its middle beneath a plane that it meets and that is shown there."""
+    middle, points = X_BP.multiply(model.center), X_BP.multiply(model.points[::30].T).T
+    for plane in scan.planes:
+        if plane.extent_m < GROUND_EXTENT * model.radius or plane.filled < LEAST_FILLED:
+            continue
+        depth = plane.level - float(middle @ plane.normal)
+        if depth < SUNK_M or (points @ plane.normal).max() < plane.level - SAME_HEIGHT_M:
+            continue
+        near = scan.coarse[np.linalg.norm(scan.coarse - middle - depth * plane.normal, axis=1) < model.radius]
+        if np.count_nonzero(np.abs(near @ plane.normal - plane.level) < plane.own_m) > LEAST_GROUND:
+            return True
+    return False
 
 
 def _near(A: RigidTransform, B: RigidTransform, model: PartModel) -> bool:
@@ -119,15 +146,21 @@ def _places_for(
     body_seen = np.isfinite(top)
     # In the wide cells of a large part a web may lie in the next cell: heights are compared with those around.
     around = _BOX[3] if cell > WIDE_CELLS * config.cell_m else _BOX[1]
-    lowest = cv2.erode(np.where(body_seen, top, np.float32(np.inf)), around)
-    highest = cv2.dilate(np.where(body_seen, top, np.float32(-np.inf)), around)
-    mask = body_seen.astype(np.float32) - (known & ~body_seen).astype(np.float32)
-    scene_body, scene_seen = fft.rfft2(mask, s=full), fft.rfft2(body_seen.astype(np.float32), s=full)
+    known_ground = known & ~body_seen
+    everything = _scene(top, known_ground, around, full, False)
     places: list[Place] = []
     points, normals = model.points - model.center, model.normals
     for direction in model.directions:
         R_UP = frame_with_z(direction).T  # turns `direction` into z
-        p = (points @ R_UP.T)[normals @ R_UP.T[:, 2] > 0.05]
+        p = points @ R_UP.T
+        scenes = [everything]
+        if ground is not None and ground.normal is up:
+            # What is higher than the part, if it lies on the ground, hides it: there the scan says nothing about it.
+            ceiling = ground.level + float(np.ptp(p[:, 2])) + SAME_HEIGHT_M
+            above_part = body_seen & (np.nan_to_num(top) > ceiling)
+            if above_part.any():
+                scenes.append(_scene(np.where(above_part, np.nan, top), known_ground, around, full, True))
+        p = p[normals @ R_UP.T[:, 2] > 0.05]
         p = p[np.argsort(p[:, 2])]
         for turn in np.arange(0.0, 2.0 * math.pi, step):
             c, s = math.cos(turn), math.sin(turn)
@@ -140,36 +173,70 @@ def _places_for(
             n = float(body.sum())
             f_body = fft.rfft2(body.astype(np.float32) / np.float32(n), s=full)
             f_ring = fft.rfft2(ring.astype(np.float32) * np.float32(RING_SHARE / max(1, int(ring.sum()))), s=full)
-            match = fft.irfft2(scene_body * np.conj(f_body) - scene_seen * np.conj(f_ring), s=full)
-            match = match[: size[1] - 2 * reach, : size[0] - 2 * reach]
-            rows, columns = np.nonzero(body)
-            heights = shape[rows, columns]
-            best = 0.0
-            for _ in range(PEAKS):
-                _, value, _, (column, row) = cv2.minMaxLoc(match)
-                if value < max(0.1, 0.5 * best):
-                    break
-                best = max(best, value)
-                cv2.circle(match, (column, row), 3, -1.0, -1)
-                difference = top[row + rows, column + columns] - heights
-                shown = np.isfinite(difference)
-                difference = difference[shown]
-                if len(difference) < 0.2 * n:
-                    continue
-                lift = float(np.median(difference))
-                below, above_it = (
-                    (at[row + rows, column + columns] - heights)[shown] - lift for at in (lowest, highest)
-                )
-                same = (below < SAME_HEIGHT_M) & (above_it > -SAME_HEIGHT_M)
-                score = float(value) - float(len(difference) - np.count_nonzero(same)) / n
-                middle = corner + (np.array([column, row]) + reach + 0.5) * cell
-                R = R_BU @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_UP
-                level = np.abs(difference - lift) < SAME_HEIGHT_M  # a web in the next cell does not count for the lift
-                lift = float(np.mean(difference[level])) if level.any() else lift
-                origin = R_BU @ np.array([middle[0], middle[1], lift]) - R @ model.center
-                places.append(Place(score, RigidTransform(RotationMatrix(_orthogonal(R)), origin)))
+            for scene in scenes:
+                match = fft.irfft2(scene.body * np.conj(f_body) - scene.shown * np.conj(f_ring), s=full)
+                match = match[: size[1] - 2 * reach, : size[0] - 2 * reach]
+                rows, columns = np.nonzero(body)
+                heights = shape[rows, columns]
+                best = 0.0
+                for _ in range(PEAKS):
+                    _, value, _, (column, row) = cv2.minMaxLoc(match)
+                    if value < max(0.1, 0.5 * best):
+                        break
+                    best = max(best, value)
+                    cv2.circle(match, (column, row), 3, -1.0, -1)
+                    at = (row + rows, column + columns)
+                    difference = scene.top[at] - heights
+                    shown = np.isfinite(difference)
+                    difference = difference[shown]
+                    if len(difference) < 0.2 * n:
+                        continue
+                    lift = float(np.median(difference))
+                    below, above_it = (
+                        limit[at][shown] - heights[shown] - lift for limit in (scene.lowest, scene.highest)
+                    )
+                    same = (below < SAME_HEIGHT_M) & (above_it > -SAME_HEIGHT_M)
+                    score = float(value) - float(len(difference) - np.count_nonzero(same)) / n
+                    if scene.covered:
+                        score /= max(LEAST_KNOWN, float(np.mean(shown | known_ground[at])))
+                    middle = corner + (np.array([column, row]) + reach + 0.5) * cell
+                    R = R_BU @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_UP
+                    level = (
+                        np.abs(difference - lift) < SAME_HEIGHT_M
+                    )  # a web in the next cell does not count for the lift
+                    lift = float(np.mean(difference[level])) if level.any() else lift
+                    origin = R_BU @ np.array([middle[0], middle[1], lift]) - R @ model.center
+                    X = RigidTransform(RotationMatrix(_orthogonal(R)), origin)
+                    places.append(Place(score, X, scene.covered))
     places.sort(key=lambda place: -place.score)
-    return places[:400]
+    return [p for p in places if not p.covered][:400] + [p for p in places if p.covered][:400]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Scene:
+    """What the search compares: heights (H,W), NaN: none, their limits around a cell, and the transforms of the masks."""
+
+    top: npt.NDArray[np.float32]
+    lowest: npt.NDArray[np.float32]
+    highest: npt.NDArray[np.float32]
+    body: npt.NDArray[np.complex64]
+    shown: npt.NDArray[np.complex64]
+    covered: bool
+
+
+def _scene(
+    top: npt.NDArray[np.float32], empty: Mask, around: npt.NDArray[np.uint8], full: list[int], covered: bool
+) -> _Scene:
+    """The scene of heights, with the cells in which only the ground is shown."""
+    body = np.isfinite(top)
+    return _Scene(
+        top=top,
+        lowest=cv2.erode(np.where(body, top, np.float32(np.inf)), around),
+        highest=cv2.dilate(np.where(body, top, np.float32(-np.inf)), around),
+        body=fft.rfft2(body.astype(np.float32) - empty.astype(np.float32), s=full),
+        shown=fft.rfft2(body.astype(np.float32), s=full),
+        covered=covered,
+    )
 
 
 def _orthogonal(R: Floats) -> Floats:
