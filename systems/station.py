@@ -15,7 +15,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
 from weldcal.models.tool import LAST_LINK, WeldingTool
-from weldcal.models.workpieces.part import WeldPart, bend
+from weldcal.models.workpieces.part import Part, WeldPart, bend
 from weldcal.models.workpieces.plate import make_workpiece, seeded_groove_error
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Background, Inline, OwnProcess
@@ -352,7 +352,9 @@ def _workpieces(
     placed = _lying_error(
         rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
     )
-    return cad, real, spec.pose_guess.pose() @ placed
+    # A part turns about its middle: the origin of its file may be far away.
+    middle = RigidTransform(0.5 * cad.mesh.bounds.sum(axis=0)) if isinstance(cad, Part) else RigidTransform()
+    return cad, real, spec.pose_guess.pose() @ middle @ placed @ middle.inverse()
 
 
 def _plates(spec: WorkpieceConfig, rng: np.random.Generator) -> tuple[WeldPart, WeldPart]:

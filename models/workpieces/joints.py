@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from OCP.BRep import BRep_Tool
 from OCP.BRepAdaptor import BRepAdaptor_Curve
+from OCP.Geom import Geom_BSplineCurve
 from OCP.GeomAbs import GeomAbs_CurveType
 from OCP.GeomAPI import GeomAPI_IntCS, GeomAPI_IntSS, GeomAPI_ProjectPointOnCurve
 from OCP.gp import gp_Pnt, gp_Vec
 from OCP.TopAbs import TopAbs_ShapeEnum
-from OCP.TopoDS import TopoDS
 
 from weldcal.models.workpieces.brep import (
     BRIDGED_MM,
@@ -25,7 +24,6 @@ from weldcal.models.workpieces.brep import (
     Body,
     Face,
     array_of,
-    faces_at,
     length_of,
     middle_of,
     parts_of,
@@ -41,6 +39,7 @@ CHAINED_MM = 0.05  # between the ends of pieces of one seam
 LEAST_MM = 0.5  # length of a piece
 FLUSH_MM = 0.2  # between two faces in one plane
 FREE_MM = 2.0  # the joint is open at least this far: a clearance is no joint
+GRAZING = 1e-3  # rad, between a line and a plane that crosses it
 NARROW_RAD = math.radians(80.0)  # a V or HV is narrower
 
 
@@ -71,12 +70,16 @@ class Piece:
 
 
 def joints_of(shape: Any) -> list[list[Piece]]:
-    """The joints between the solids of a shape, and where there are none those inside each solid, each as its pieces in the order of travel.
+    """The joints of a shape: see `joints_between`."""
+    return joints_between([Body(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)])
+
+
+def joints_between(bodies: Sequence[Body]) -> list[list[Piece]]:
+    """The joints between bodies, and where there are none those inside each of them, each as its pieces in the order of travel.
 
     Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece may
     end; each stretch between two crossings is a joint or is none.
     """
-    bodies = [Body(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)]
     found: list[list[Piece]] = []
     for i, j in combinations(range(len(bodies)), 2):
         a, b = bodies[i], bodies[j]
@@ -96,9 +99,9 @@ def joints_of(shape: Any) -> list[list[Piece]]:
     return [_named(chain, found) for chain in found]
 
 
-def _within(bodies: list[Body], k: int) -> Iterable[Piece]:
+def _within(bodies: Sequence[Body], k: int) -> Iterable[Piece]:
     """The pieces along the concave edges of one body."""
-    for edge, met in faces_at(bodies[k].solid, bodies[k].faces):
+    for edge, met in bodies[k].edges:
         if len(met) != 2:
             continue
         f, g = met
@@ -106,8 +109,7 @@ def _within(bodies: list[Body], k: int) -> Iterable[Piece]:
         line = sampled(curve, curve.FirstParameter(), curve.LastParameter())
         if length_of(line) < LEAST_MM:
             continue
-        x, t, _ = middle_of(curve, curve.FirstParameter(), curve.LastParameter())
-        cut = _cut(bodies, (k, k), f, g, x, t, 0.0)
+        cut = _cut(bodies, (k, k), f, g, *middle_of(curve, curve.FirstParameter(), curve.LastParameter()))
         if cut is not None:
             yield Piece(line=line, bodies=(k, k), **cut)
 
@@ -135,9 +137,11 @@ def _far(a: Face | Body, b: Face | Body) -> bool:
     return bool((np.maximum(a.low, b.low) > np.minimum(a.high, b.high) + GAP_MM).any())
 
 
-def _met(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
+def _met(bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces meet in a concave joint."""
-    if f.round and g.round and f.axis.IsCoaxial(g.axis, 0.01, GAP_MM):
+    if f.surface is None or g.surface is None:
+        return
+    if f.round and g.round and _coaxial(f, g, 0.01):
         return  # a pin in its hole
     crossing = GeomAPI_IntSS(f.surface, g.surface, 1e-6)
     if not crossing.IsDone():
@@ -145,11 +149,13 @@ def _met(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterabl
     low, high = np.maximum(f.low, g.low) - REACH_MM, np.minimum(f.high, g.high) + REACH_MM
     for k in range(crossing.NbLines()):
         curve = crossing.Line(k + 1)
+        if curve.IsClosed() and isinstance(curve, Geom_BSplineCurve):
+            curve.SetPeriodic()  # a stretch may go on past its first point
         breaks, closed = _breaks(bodies, curve, low, high, (f, g))
-        kept = [(t, u, _cut(bodies, pair, f, g, *middle_of(curve, t, u))) for t, u in pairwise(breaks)]
+        kept = [(t, u, _between(bodies, pair, f, g, curve, t, u)) for t, u in pairwise(breaks)]
         runs: list[list[Any]] = []
         for t, u, cut in kept:
-            if cut is not None and runs and t - runs[-1][1] <= BRIDGED_MM:
+            if cut is not None and runs and length_of(sampled(curve, runs[-1][1], t)) <= BRIDGED_MM:
                 longer = u - t > runs[-1][3]
                 runs[-1] = [runs[-1][0], u, *((cut, u - t) if longer else runs[-1][2:])]
             elif cut is not None:
@@ -163,8 +169,23 @@ def _met(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterabl
                 yield Piece(line=line, bodies=pair, **cut)
 
 
+def _between(
+    bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face, curve: Any, begin: float, end: float
+) -> dict[str, Any] | None:
+    """The joint of two faces along a stretch of their curve; None where they form none.
+
+    A stretch no longer than the gap may lie beyond a wall's end: there the clearance of a slot's end is crossed.
+    """
+    x, t, length = middle_of(curve, begin, end)
+    cut = _cut(bodies, pair, f, g, x, t, length)
+    if cut is not None or length > BRIDGED_MM:
+        return cut
+    beyond = _cut(bodies, pair, f, g, x, t, length, 0.5 * length)
+    return beyond if beyond is not None and length <= beyond["gap"] + CHAINED_MM else None
+
+
 def _breaks(
-    bodies: list[Body], curve: Any, low: Floats, high: Floats, own: tuple[Face, Face]
+    bodies: Sequence[Body], curve: Any, low: Floats, high: Floats, own: tuple[Face, Face]
 ) -> tuple[list[float], bool]:
     """Ascending parameters between which a curve is a joint as a whole or not at all, and whether it is closed."""
     closed = bool(curve.IsClosed())
@@ -178,16 +199,18 @@ def _breaks(
     found = [begin, end]
     for body in bodies:
         for face in () if (body.low > high).any() or (body.high < low).any() else body.faces:
-            if face in own or (face.low > high).any() or (face.high < low).any():
+            if face in own or face.surface is None or (face.low > high).any() or (face.high < low).any():
                 continue
             try:
                 crossed = GeomAPI_IntCS(curve, face.surface)
             except Exception:  # of several types: no crossing can be computed
                 continue
-            found += [crossed.Parameters(k + 1)[2] for k in range(crossed.NbPoints())] if crossed.IsDone() else []
+            met = [crossed.Parameters(k + 1)[2] for k in range(crossed.NbPoints())] if crossed.IsDone() else []
+            # A plane along the line crosses it anywhere, by rounding.
+            found += [t for t in met if face.along is None or abs(middle_of(curve, t, t)[1] @ face.along) > GRAZING]
     for face in own:
-        for vertex in parts_of(face.face, TopAbs_ShapeEnum.TopAbs_VERTEX):
-            near = GeomAPI_ProjectPointOnCurve(BRep_Tool.Pnt_s(TopoDS.Vertex(vertex)), curve)
+        for corner in face.corners:
+            near = GeomAPI_ProjectPointOnCurve(corner, curve)
             if near.NbPoints() and near.LowerDistance() < REACH_MM:
                 found.append(near.LowerDistanceParameter())
     if closed:
@@ -206,9 +229,21 @@ def _breaks(
 
 
 def _cut(
-    bodies: list[Body], pair: tuple[int, int], f: Face, g: Face, x: Floats, t: Floats, slack: float
+    bodies: Sequence[Body],
+    pair: tuple[int, int],
+    f: Face,
+    g: Face,
+    x: Floats,
+    t: Floats,
+    length: float,
+    slack: float = 0.0,
 ) -> dict[str, Any] | None:
-    """The joint of two faces in the cut at one point of their curve; None where they form no concave joint there."""
+    """The joint of two faces in the cut at one point of their curve; None where they form no concave joint there.
+
+    Args:
+        length: of the stretch about the point, mm.
+        slack: how far from the point a wall may end, along the curve, mm.
+    """
     normals = f.normal(x), g.normal(x)
     cos = float(np.clip(normals[0] @ normals[1], -1.0, 1.0))
     if abs(cos) > math.cos(math.radians(10.0)):
@@ -225,7 +260,7 @@ def _cut(
         if np.linalg.norm(face.foot(p) - p) > 0.05 + slack + (0.0 if face.flat else 0.02 * max(begins) ** 2):
             return None
     gap = min(float(np.linalg.norm(other.foot(foot) - foot)) for other, foot in ((g, feet[0]), (f, feet[1])))
-    if gap > GAP_MM or 2.0 * slack > gap + CHAINED_MM:
+    if gap > GAP_MM:
         return None
     up = unit(normals[0] + normals[1])
     if any(body.holds(x + s * up) for body in bodies for s in (IN_MM, FREE_MM)):
@@ -237,12 +272,14 @@ def _cut(
         skin = x + (begins[k] + IN_MM) * ways[k] - 0.1 * normals[k]
         wall.append(begins[k] + IN_MM + two[k].through(skin, ways[k])[0])
         other, n = two[1 - k], normals[1 - k]
-        exits = two[k].through(
-            x + (begins[k] + IN_MM) * ways[k], -ways[1 - k]
-        )  # a bolt's hole may go through both bodies
+        back = begins[k] * ways[k] + IN_MM * (ways[k] - ways[1 - k])
+        exits = [IN_MM + far for far in two[k].through(x + back, -ways[1 - k])]
         behind = [x - (far + 2.0 * IN_MM) * ways[1 - k] for far in exits]
         goes_on.append(any(other.holds(p - IN_MM * n) and not other.holds(p + IN_MM * n) for p in behind))
-        thick.append(exits[0])
+        # A ray meets a hole at a few places, the hollow of a tube at most.
+        shares = (-0.4, -0.2, 0.2, 0.4) if f.flat and g.flat else ()
+        places = [x + share * length * t + back for share in shares]
+        thick.append(float(np.median([exits[0], *(IN_MM + two[k].through(p, -ways[1 - k])[0] for p in places)])))
     if any(goes_on):
         k = goes_on.index(True)
         kind, side = ("lap" if wall[k] < thick[k] else "T"), ""
@@ -263,6 +300,11 @@ def _cut(
     return {"up": up, "type": kind, "angle": angle, "gap": gap, "side": side, "walls": walls, "pipe": pipe}
 
 
+def _coaxial(a: Face, b: Face, angle_rad: float) -> bool:
+    """Whether two cylinders have one axis, also where these point against each other."""
+    return any(a.axis.IsCoaxial(axis, angle_rad, GAP_MM) for axis in (b.axis, b.axis.Reversed()))
+
+
 def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[Body, Body]) -> str:
     """The joint of a pipe, "" for none: along a cylinder's axis it is as between plates."""
     axes = [(face, face.axis) for face in (f, g) if face.round]
@@ -271,19 +313,22 @@ def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[Body, Body]) -> str:
     if abs(float(array_of(axes[0][1].Direction()) @ t)) > 0.99:
         return ""
     pipe, plate = (f, two[1]) if f.round else (g, two[0])
-    coaxial = two[0] is not two[1] and any(
-        h.round and h.axis.IsCoaxial(pipe.axis, 1e-3, GAP_MM) and h.sign > 0 for h in plate.faces
-    )
+    coaxial = two[0] is not two[1] and any(h.round and _coaxial(h, pipe, 1e-3) and h.sign > 0 for h in plate.faces)
     return "flange on pipe" if coaxial else "pipe on plate"
 
 
-def _flush(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
+def _flush(bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
     """The pieces along which two faces go on in each other: a square butt, the outside of a corner, an edge joint."""
     two = bodies[pair[0]], bodies[pair[1]]
     if f.flat != g.flat or f.round != g.round or not (f.flat or f.round):
         return
     for first, (p, n, m) in f.ends:
         for second, (q, other_n, other_m) in g.ends:
+            if g.round:  # a circle may begin anywhere
+                circle = BRepAdaptor_Curve(second).Circle()
+                v = p - array_of(circle.Location())
+                q = p - v + circle.Radius() * unit(v - (v @ other_m) * other_m)
+                other_n = g.normal(q)
             if n @ other_n < 0.9999 or m @ other_m > -0.9999:
                 continue
             gap = float((q - p) @ m)
@@ -293,13 +338,16 @@ def _flush(bodies: list[Body], pair: tuple[int, int], f: Face, g: Face) -> Itera
             if line is None or length_of(line) < LEAST_MM:
                 continue
             x = 0.5 * (line[0] + line[-1]) if f.flat else p + 0.5 * gap * m
-            if any(body.holds(x + IN_MM * n) for body in bodies):
+            if any(body.holds(x + s * n) for body in bodies for s in (IN_MM, FREE_MM)):
                 continue
             starts = [x - (0.5 * gap + IN_MM) * m, x + (0.5 * gap + IN_MM) * m]
-            depth = [two[k].through(starts[k], -n)[0] for k in (0, 1)]
+            depth = [IN_MM + two[k].through(starts[k] - IN_MM * n, -n)[0] for k in (0, 1)]
             wide = [two[k].through(starts[k] - 0.1 * n, s * m)[0] for k, s in ((0, -1.0), (1, 1.0))]
             if length_of(line) < min(depth) or not _facing(two, x, n, m, gap, min(depth)):
                 continue
+            across = min(body.through(starts[k] + 0.1 * n, n)[0] or math.inf for k, body in enumerate(two))
+            if min(depth) > 0.5 * across:
+                continue  # the rim of a hole or a slot through both bodies
             narrow = [wide[k] < 0.9 * depth[k] for k in (0, 1)]
             kind = "edge" if all(narrow) else "corner" if any(narrow) else "butt"
             side, walls = ("outside" if kind == "corner" else ""), (depth[0], depth[1])

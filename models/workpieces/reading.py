@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.shape import UNITS_M, PartShape
+from weldcal.models.workpieces.step import read_step, referenced
 
 LEAST_SIZE_M, LARGEST_SIZE_M = 0.005, 10.0
 STEP_SUFFIXES = (".step", ".stp")
@@ -25,10 +27,20 @@ def read_shape(path: Path, units: str | None = None) -> PartShape:
     """
     if units is not None and units not in UNITS_M:
         raise InputError(f"units must be {', '.join(UNITS_M)}, not '{units}'.")
+    files = (path, *referenced(path)) if path.is_file() else (path,)
+    return _read(path, units, tuple(_stamp(file) for file in files))
+
+
+def _stamp(file: Path) -> tuple[Path, int, int]:
+    found = file.stat() if file.is_file() else None
+    return (file, 0, 0) if found is None else (file, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, units: str | None, written: tuple[tuple[Path, int, int], ...]) -> PartShape:
+    """Read a part once while its files, with their times and sizes, stay as they are: each seam that is planned asks for it."""
     suffix = path.suffix.lower()
     if suffix in STEP_SUFFIXES:
-        from weldcal.models.workpieces.step import read_step
-
         shape = read_step(path, units)
     elif suffix in MESH_SUFFIXES:
         from weldcal.models.workpieces.mesh_files import read_mesh_shape

@@ -17,6 +17,7 @@ from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartSh
 
 if TYPE_CHECKING:
     from weldcal.models.workpieces.brep import Face
+    from weldcal.models.workpieces.joints import Piece
 
 Floats = npt.NDArray[np.float64]
 
@@ -42,10 +43,12 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
     for file in (path, *referenced(path)):
         _check_text(file)
     shape, unit = _transferred(path)
+    from weldcal.models.workpieces.joints import joints_of
+
     if units is not None and unit is not None and unit != units:
         raise InputError(f"'{path.name}' is in {unit}, not in {units}: give units {unit}.")
     mesh, bodies = _mesh(shape, path)
-    edges, joints = _with_joints(_edges(shape), shape)
+    edges, joints = with_joints(_edges(shape), joints_of(shape))
     return PartShape(path.name, mesh, edges, UNITS_M[unit or units or "mm"], bodies, joints)
 
 
@@ -226,13 +229,15 @@ def _met(curve: Any, edge: Any, first: Face, second: Face) -> tuple[str, float]:
     return ("concave" if n_2 @ inward > 0.0 else "convex"), math.pi - turn
 
 
-def _with_joints(edges: tuple[PartEdge, ...], shape: Any) -> tuple[tuple[PartEdge, ...], tuple[PartJoint, ...]]:
+def with_joints(
+    edges: tuple[PartEdge, ...], chains: list[list[Piece]]
+) -> tuple[tuple[PartEdge, ...], tuple[PartJoint, ...]]:
     """The edges of a part with those of its joints that are no edge of a body added at the end, and its joints."""
     from weldcal.models.workpieces.brep import length_of
-    from weldcal.models.workpieces.joints import closes, joints_of
+    from weldcal.models.workpieces.joints import closes
 
     known, joints = list(edges), []
-    for chain in joints_of(shape):
+    for chain in chains:
         ids = []
         for piece in chain:
             kind = "concave" if piece.angle < math.pi - 0.01 else "flush"
@@ -264,9 +269,9 @@ def _is(edge: PartEdge, line: Floats) -> bool:
     from weldcal.models.workpieces.brep import length_of
 
     p, q = edge.points_P, line
-    if abs(edge.length_m - length_of(q)) > 2e-5:
-        return False
     ends = min(np.abs(p[[0, -1]] - q[[0, -1]]).max(), np.abs(p[[0, -1]] - q[[-1, 0]]).max())
+    if not (ends < 2e-5 or edge.closed) or abs(edge.length_m - length_of(q)) > 2e-5:
+        return False
     middle = 0.5 * (q[0] + q[-1]) if len(q) == 2 else q[len(q) // 2]
     a, d = p[:-1], np.diff(p, axis=0)
     share = np.clip(np.vecdot(middle - a, d) / np.vecdot(d, d), 0.0, 1.0)

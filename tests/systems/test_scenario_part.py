@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
+from weldcal.models.mesh import extrude
 from weldcal.models.workpieces.part import Part, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.systems.jobs.weld.settings import job_plan, seated_tip, servo_config
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.scenario.schema import Scenario, SeamConfig, WorkpieceConfig
+from weldcal.systems.scenario.schema import ErrorConfig, Scenario, SeamConfig, WorkpieceConfig
 from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
 from weldcal.tools.worlds.parts.cells import Trial, write_cell
@@ -142,3 +144,30 @@ def test_a_square_tube_is_welded_leg_by_leg(tmp_path: Path) -> None:
         up = numbered(part, k).up_P
         assert (up @ up[len(up) // 2]).min() > 0.999
         assert up[0, 2] == pytest.approx(np.sqrt(0.5), abs=0.02)
+
+
+def test_a_part_lies_off_by_its_middle_and_not_by_the_origin_of_its_file(cell: Path, tmp_path: Path) -> None:
+    """1.5 deg about an origin that is 3 m away would be 78 mm."""
+    angle = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])
+    path = tmp_path / "far.obj"
+    path.write_text(extrude(angle + np.array([3000.0, 0.0]), 0.0, 150.0).to_obj())
+    scenario = load_scenario(str(cell))
+    assert scenario.workpiece is not None
+    scenario.workpiece = replace(
+        scenario.workpiece,
+        file=str(path),
+        units=None,
+        seams=[SeamConfig(edges=[1])],
+        placement_error=ErrorConfig(6.0, 1.5),
+    )
+    station = make_station(scenario, 0)
+    try:
+        middle = np.array([3.04, 0.03, 0.075])
+        assert station.truth.X_BP is not None
+        guess = scenario.workpiece.pose_guess.pose()
+        off = station.truth.X_BP.multiply(middle) - guess.multiply(middle)
+        assert np.linalg.norm(off) == pytest.approx(0.006, abs=1e-9)
+        turned = guess.rotation().inverse() @ station.truth.X_BP.rotation()
+        assert np.degrees(turned.ToAngleAxis().angle()) == pytest.approx(1.5)
+    finally:
+        station.close()

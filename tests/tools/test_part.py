@@ -17,7 +17,9 @@ from typer.testing import CliRunner
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.cell.part import edges_picture, ranked
+from weldcal.tools.commands.cell.new import OwnPart, write_cell
+from weldcal.tools.commands.cell.part import edges_picture, with_plans
+from weldcal.tools.commands.cell.screen import Seam, ranked
 from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, cylinder, less, write_step
 
 
@@ -28,7 +30,9 @@ def step(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_json_lists_every_edge(step: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["part", str(step), "--units", "mm", "--json", "--out", str(tmp_path)])
+    result = CliRunner().invoke(
+        app, ["part", str(step), "--units", "mm", "--json", "--plan", "0", "--out", str(tmp_path)]
+    )
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout.splitlines()[-1])
     assert (found["state"], found["unit"], found["bodies"]) == ("done", "mm", 2)
@@ -46,10 +50,18 @@ def test_the_json_lists_every_edge(step: Path, tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert "2 concave edges" in page
     assert len((tmp_path / "edges.csv").read_text().splitlines()) == 25
+    page = (tmp_path / "seams.html").read_text()
+    assert "http" not in page.replace("http-equiv", "")  # one file, no network
+    scene = json.loads(re.search(r"const \{ vertices, triangles, seams \} = (.*);", page)[1])  # type: ignore[index]
+    assert len(scene["triangles"]) == 24
+    assert [seam["edges"] for seam in scene["seams"]] == [row["edges"] for row in found["seams"]]
+    ends = {tuple(point) for seam in scene["seams"] for line in seam["lines"] for point in line}
+    assert len(ends) == 4
+    assert {abs(x) for x, _, _ in ends} == {90.0}
 
 
 def test_the_table_puts_the_concave_edges_first(step: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["part", str(step), "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["part", str(step), "--plan", "0", "--out", str(tmp_path)])
     rows = [line.split() for line in result.stdout.splitlines()[2:]]
     assert [row[1] for row in rows[:3]] == ["concave", "concave", "convex"]
     assert rows[0][2:4] == ["180.00", "90.0"]
@@ -73,7 +85,9 @@ def write_pipe(path: Path, radius: float) -> None:
 
 def test_each_seam_says_whether_the_tool_fits_it(tmp_path: Path) -> None:
     write_pipe(tmp_path / "pipe.step", 80)
-    result = CliRunner().invoke(app, ["part", str(tmp_path / "pipe.step"), "--json", "--out", str(tmp_path / "out")])
+    result = CliRunner().invoke(
+        app, ["part", str(tmp_path / "pipe.step"), "--json", "--plan", "0", "--out", str(tmp_path / "out")]
+    )
     outside, inside = json.loads(result.stdout.splitlines()[-1])["seams"]
     assert [outside["type"], outside["weldable"]] == ["pipe on plate", True]
     assert outside["length_mm"] == pytest.approx(2.0 * math.pi * 80.0, abs=0.05)
@@ -81,9 +95,28 @@ def test_each_seam_says_whether_the_tool_fits_it(tmp_path: Path) -> None:
     assert outside["closed"]
     assert not inside["weldable"]
     assert re.search(r"tool does not fit: .* \(-\d+\.\d mm\)", inside["reason"])
-    text = CliRunner().invoke(app, ["part", str(tmp_path / "pipe.step"), "--out", str(tmp_path / "text")]).stdout
-    assert re.search(r"pipe on plate +502\.7 +90\.0 .*  yes", text)
+    text = (
+        CliRunner()
+        .invoke(app, ["part", str(tmp_path / "pipe.step"), "--plan", "0", "--out", str(tmp_path / "text")])
+        .stdout
+    )
+    assert re.search(r"pipe on plate +502\.7 +90\.0 .*  fits the tool, not planned", text)
     assert "Seams</h2>" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_planner_refuses_in_part_what_it_refuses_in_new(tmp_path: Path) -> None:
+    """Beside a web between two walls the tool fits in the middle; the way along the seam ends at a wall."""
+    walls = [box((x, 0, 0), (8, 100, 60)) for x in (0, 192)]
+    write_step(assembly(box((0, 0, -10), (200, 100, 10)), box((8, 46, 0), (184, 8, 60)), *walls), tmp_path / "h.step")
+    shape = read_shape(tmp_path / "h.step")
+    inner = next(joint for joint in shape.joints if joint.length_m == pytest.approx(0.184))
+    asked = Seam(inner, None, "")
+    found = with_plans(shape, [asked], 1, tmp_path / "h.step", None, WELDING, lambda stage, share: None)[0]
+    assert found.planned
+    written, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "h.step", inner.edges), WELDING)
+    assert written.name == "unfinished.yaml"
+    assert found.verdict.startswith("no: ")
+    assert found.reason in reason
 
 
 def test_a_part_without_seams_says_so(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Random joints of separate solids with the seams that they have, and the share that is found; mm.
 
-python tests/models/workpieces/random_joints.py [COUNT] [FIRST SEED] prints the figure.
+python tests/models/workpieces/random_joints.py [COUNT] [FIRST SEED] [stl] prints the figure; with stl of the same solids as triangles.
 """
 
 from __future__ import annotations
@@ -8,12 +8,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from OCP.TopAbs import TopAbs_ShapeEnum
 
+from weldcal.models.workpieces.brep import parts_of
 from weldcal.models.workpieces.joints import closes, joints_of
+from weldcal.models.workpieces.reading import read_shape
 from weldcal.tools.worlds.parts.step_parts import assembly, box, cylinder, fused, less, prism
 
 Floats = npt.NDArray[np.float64]
@@ -227,17 +232,52 @@ def turned(shape: Any, rng: np.random.Generator) -> tuple[Any, Floats, Floats]:
     return BRepBuilderAPI_Transform(shape, trsf, True).Shape(), R, shift
 
 
-def mistakes(name: str, seed: int) -> list[str]:
+def write_stl(solids: list[Any], path: Path) -> None:
+    """Write solids one after another as a binary STL file, as CAD programs export them."""
+    from weldcal.models.workpieces.step import _mesh
+
+    meshes = [_mesh(solid, path)[0] for solid in solids]
+    corners = np.concatenate([1e3 * mesh.vertices[mesh.triangles] for mesh in meshes]).astype("<f4")
+    rows = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("word", "<u2")])
+    rows["corners"] = corners
+    path.write_bytes(b" " * 80 + len(rows).to_bytes(4, "little") + rows.tobytes())
+
+
+def found_in(shape: Any) -> list[tuple[str, Floats, float, bool]]:
+    """Type, points mm, length mm and whether it is closed, of each seam of a shape."""
+    found = []
+    for pieces in joints_of(shape):
+        longest = max(pieces, key=lambda p: float(np.linalg.norm(np.diff(p.line, axis=0), axis=1).sum()))
+        length = sum(float(np.linalg.norm(np.diff(p.line, axis=0), axis=1).sum()) for p in pieces)
+        found.append((longest.type, np.concatenate([piece.line for piece in pieces]), length, closes(pieces)))
+    return found
+
+
+def found_in_mesh(shape: Any) -> list[tuple[str, Floats, float, bool]]:
+    """The same of its triangles."""
+    with TemporaryDirectory() as folder:
+        write_stl(parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID), Path(folder) / "part.stl")
+        read = read_shape(Path(folder) / "part.stl")
+    found = []
+    for joint in read.joints:
+        lines = [1e3 * read.edge(id).points_P for id in joint.edges]
+        for k in range(1, len(lines)):  # an edge of the mesh keeps its own direction
+            ends = np.linalg.norm(lines[k][[0, -1], None] - lines[k - 1][[0, -1]], axis=2)
+            if k == 1 and ends[:, 0].min() < ends[:, 1].min():
+                lines[0] = lines[0][::-1]
+                ends = ends[:, ::-1]
+            if ends[1, 1] < ends[0, 1]:
+                lines[k] = lines[k][::-1]
+        found.append((joint.type, np.concatenate(lines), 1e3 * joint.length_m, joint.closed))
+    return found
+
+
+def mistakes(name: str, seed: int, of: Callable[[Any], list[tuple[str, Floats, float, bool]]] = found_in) -> list[str]:
     """What is wrong with the seams that are found at one random joint."""
     rng = np.random.default_rng([seed, list(KINDS).index(name)])
     solids, seams = KINDS[name](rng)
     shape, R, shift = turned(assembly(*solids), rng)
-    found = []
-    for pieces in joints_of(shape):
-        pts = np.concatenate([piece.line for piece in pieces])
-        longest = max(pieces, key=lambda p: float(np.linalg.norm(np.diff(p.line, axis=0), axis=1).sum()))
-        length = sum(float(np.linalg.norm(np.diff(p.line, axis=0), axis=1).sum()) for p in pieces)
-        found.append((longest.type, (pts - shift) @ R, length, closes(pieces)))
+    found = [(type, (points - shift) @ R, length, closed) for type, points, length, closed in of(shape)]
     wrong = []
     for seam in seams:
         k = next((k for k, f in enumerate(found) if _same(seam, f)), None)
@@ -262,11 +302,13 @@ def _same(seam: Seam, found: tuple[str, Floats, float, bool]) -> bool:
 
 
 if __name__ == "__main__":
-    count, first = (int(word) for word in (sys.argv[1:] + ["2000", "0"][len(sys.argv) - 1 :]))
+    words = [word for word in sys.argv[1:] if word != "stl"]
+    count, first = (int(word) for word in (words + ["2000", "0"][len(words) :]))
+    of = found_in_mesh if "stl" in sys.argv else found_in
     bad = 0
     for n in range(count):
         name, seed = list(KINDS)[n % len(KINDS)], first + n // len(KINDS)
-        wrong = mistakes(name, seed)
+        wrong = mistakes(name, seed, of)
         if wrong:
             bad += 1
             print(name, seed, *wrong, sep="\n    ", flush=True)

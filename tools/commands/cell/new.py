@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,7 +24,6 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
 from weldcal.models.workpieces.part import Part, WeldPart, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
-from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.models.workpieces.step import referenced
 from weldcal.systems.drivers.config import DEVICES, NoDevice
@@ -38,14 +38,14 @@ from weldcal.systems.scenario.schema import ErrorConfig, PoseConfig, Scenario, S
 from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
-from weldcal.tools.commands.cell.part import least_pipe, ranked, unit_hint
 from weldcal.tools.commands.cell.scan_poses import add_scan_poses
 from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
+from weldcal.tools.commands.cell.screen import least_pipe, ranked, unit_hint
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
 from weldcal.tools.report.run import RunOptions
 
-EXAMPLE = "calibrate_only"
+BASE, EXAMPLE = "s_groove", "calibrate_only"
 SMALL = "scanner: {width: 412, height: 308}"  # pixels of the example's scans: a few hundred kB each
 README = """# An example of a calibration dataset
 
@@ -106,7 +106,7 @@ CANNOT_WELD = """# A cell of your own, unfinished: the arm cannot weld the seam 
 def new(
     call: Call,
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to write it.")],
-    base: Annotated[str, option("--from", "NAME", "Scenario that the cell begins as, by name or path.")] = "s_groove",
+    base: Annotated[str, option("--from", "NAME", "Scenario that the cell begins as, by name or path.")] = BASE,
     part: Annotated[
         Path | None, option("--part", "FILE", "A part of your own: STEP, STL, OBJ or PLY. It is copied there.")
     ] = None,
@@ -221,9 +221,7 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
         assert scenario.workpiece is not None
         standing, nearest = scenario.workpiece.pose_guess, ""
         for seam, joint in candidates:  # the reason is that of the first one
-            scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
-            _write(unfinished, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=unfinished))
-            scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(unfinished)), not nearest)
+            reason = _refused(unfinished, scenario, seam, joint, standing, not nearest)
             reason = add_scan_poses(scenario, unfinished, reason)
             nearest = nearest or reason
             if not reason:
@@ -239,6 +237,32 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     _write(path, scenario, RUNS.format(path=path))
     unfinished.unlink(missing_ok=True)
     return path, ""
+
+
+def _refused(path: Path, scenario: Scenario, seam: SeamConfig, joint: str, standing: PoseConfig, advises: bool) -> str:
+    """Write a scenario with a seam, and place its part; why the arm can weld it in no pose, else ""."""
+    assert scenario.workpiece is not None
+    scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
+    _write(path, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=path))
+    scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(path)), advises)
+    return reason
+
+
+def planned(part: OwnPart, seams: list[list[PartEdge]], tool: Path, progress: Progress) -> list[str]:
+    """Why a new cell's arm cannot weld each seam of a part, given by its edges, in any pose that is tried; "" where it can."""
+    found = []
+    with TemporaryDirectory() as folder:
+        scenario = load_scenario(BASE)
+        first = dc.replace(part, edges=tuple(edge.id for edge in seams[0]))
+        add_part(scenario, Path(folder), first, load_tool(tool).tool)
+        add_tool(scenario, Path(folder), tool)
+        assert scenario.workpiece is not None
+        standing = scenario.workpiece.pose_guess
+        for k, edges in enumerate(seams):
+            progress(f"plan seam {k + 1} of {len(seams)}", 0.3 + 0.6 * k / len(seams))
+            seam = SeamConfig(edges=[edge.id for edge in edges])
+            found.append(_refused(Path(folder) / CELL, scenario, seam, _joint(edges[0]), standing, False))
+    return found
 
 
 def _write(path: Path, scenario: Scenario, state: str) -> None:
@@ -423,30 +447,24 @@ def _candidates(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[Pa
     for seam in ranked(shape, tool):
         chain = [shape.edge(id) for id in seam.joint.edges]
         if not seam.felt or seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
-            bent = all(len(edge.points_P) > 2 for edge in chain)
-            for edges in [chain] if bent else [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]:
+            for edges in pieces(chain):
                 found.append(edges)
                 above = edges[0].up_P is not None and edges[0].up_P[2] > OPEN_ABOVE
                 order.append((bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above))
-    if shape.joints:
-        found = [found[k] for k in sorted(range(len(found)), key=lambda k: order[k])]
-    else:
-        concave = sorted((edge for edge in shape.edges if edge.kind == "concave"), key=lambda edge: -edge.length_m)
-        found = [[edge] for edge in concave]
-        if first := next((chain for chain in found if _open_above(shape, chain[0])), None):
-            found.insert(0, found.pop(found.index(first)))
+    found = [found[k] for k in sorted(range(len(found)), key=lambda k: order[k])]
+    if not shape.joints:  # of a mesh of other surfaces
+        concave = [edge for edge in shape.edges if edge.kind == "concave"]
+        found = [[edge] for edge in sorted(concave, key=lambda edge: -edge.length_m)]
     if not found:
         raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
     return found[:MOST_TRIED]
 
 
-def _open_above(shape: PartShape, edge: PartEdge) -> bool:
-    """Whether the joint at an edge opens upwards, as the part is drawn."""
-    try:
-        seam = seam_of(shape, SeamSource(edges=(edge.id,)), _joint(edge))
-    except WeldcalError:
-        return False
-    return float(seam.up_P[:, 2].mean()) > OPEN_ABOVE
+def pieces(chain: list[PartEdge]) -> list[list[PartEdge]]:
+    """The seams along the edges of a joint, the longest first: one along a bent line, one for each edge between corners."""
+    if all(len(edge.points_P) > 2 for edge in chain):
+        return [chain]
+    return [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]
 
 
 def _joint(edge: PartEdge) -> str:

@@ -1,0 +1,133 @@
+"""Which joints of a part a tool fits, and why not the others; the arm is not asked."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.models.arrays import Array
+from weldcal.models.errors import WeldcalError
+from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
+from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
+from weldcal.models.workpieces.shape import UNITS_M, PartJoint, PartShape
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.feasibility import InfeasibleSeam
+from weldcal.welding.seam.room import NoRoom, check_room
+from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
+
+SMALL_M = 0.012  # a part this small may be drawn in inches
+
+
+@dataclass(frozen=True)
+class Seam:
+    """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it can).
+
+    short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
+    felt: by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was asked, too.
+    """
+
+    joint: PartJoint
+    radius_m: float | None
+    reason: str
+    short_m: float = 0.0
+    felt: bool = True
+    planned: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """Whether it can be welded, for a table."""
+        if self.reason:
+            return f"no: {self.reason}"
+        yes = "yes" if self.planned else "fits the tool, not planned"
+        return yes if self.felt else f"{yes}; by the scan, not felt (its sigma comes with the scan)"
+
+    def as_row(self) -> dict[str, Any]:
+        """The seam for JSON: millimetres and degrees."""
+        j = self.joint
+        return {
+            "type": f"{j.type} {j.side}".strip(),
+            "edges": list(j.edges),
+            "length_mm": 1e3 * j.length_m,
+            "angle_deg": math.degrees(j.angle_rad),
+            "gap_mm": 1e3 * j.gap_m,
+            "least_radius_mm": None if self.radius_m is None else 1e3 * self.radius_m,
+            "throat_mm": 1e3 * min(j.walls_m) * math.cos(0.5 * j.angle_rad),
+            "closed": j.closed,
+            "weldable": not self.reason,
+            "reason": self.reason,
+            "planned": self.planned,
+            "felt": self.felt,
+        }
+
+
+def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
+    """The joints of a part: those that the tool can weld first, the longest first, then the others, the nearest miss first.
+
+    The arm is not asked.
+    """
+    found = []
+    for joint in shape.joints:
+        radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
+        found.append(Seam(joint, min(radii, default=None), *_obstacle(shape, joint, tool)))
+    return sorted(found, key=lambda seam: (bool(seam.reason), not seam.felt, seam.short_m, -seam.joint.length_m))
+
+
+def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float, bool]:
+    """Why a tool does not fit a joint, its ball at the walls or its body at the middle of one of the edges, by how much, m, and if it is felt."""
+    flush = joint.angle_rad > math.pi - 0.01
+    half, gap = (0.5 * math.pi, joint.gap_m) if flush else (0.5 * joint.angle_rad, 0.0)
+    section, felt = JointSection(half, *joint.walls_m, gap), True
+    ring = _ring(shape, joint)
+    try:
+        felt = not flush or gap > UNFELT_GAP_M or feels(section, tool)
+        if felt:
+            check_weldable(section, tool.tip_radius_m)
+        if ring is not None:
+            check_ring(shape.mesh, *ring, section, tool)
+        for id in joint.edges if ring is None else ():
+            edge = shape.edge(id)
+            assert edge.up_P is not None
+            k = max(1, len(edge.points_P) // 2)
+            along = edge.points_P[k] - edge.points_P[k - 1]
+            middle = edge.points_P[k] if len(edge.points_P) > 2 else edge.points_P.mean(axis=0)
+            tip = middle + hard_height(section, tool.tip_radius_m) * edge.up_P
+            line = tip + np.linspace(-2e-3, 2e-3, 5)[:, None] * along / np.linalg.norm(along)
+            seam = SeamCurve.from_points(line, up=np.tile(edge.up_P, (5, 1)))
+            check_room(shape.mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, 0.0)
+    except WeldcalError as error:
+        reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
+        if ring is not None and isinstance(error, (NoRoom, InfeasibleSeam)):
+            reason += least_pipe(shape, joint, tool)
+        return reason, error.short_m if isinstance(error, NoRoom) else math.inf, felt
+    return "", 0.0, felt
+
+
+def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:
+    """Points (N,3) m of a joint that is one circle, and there the directions (N,3) out of it; None for any other."""
+    edge = shape.edge(joint.edges[0])
+    if edge.radius_m is None or not edge.closed or len(joint.edges) > 1 or edge.up_P is None:
+        return None
+    line = edge.points_P
+    radial = (line - line[:-1].mean(axis=0)) / edge.radius_m
+    axis = np.cross(radial[0], radial[len(line) // 4])
+    axis /= np.linalg.norm(axis)
+    return line, (edge.up_P @ axis) * axis + (edge.up_P @ radial[len(line) // 2]) * radial
+
+
+def least_pipe(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> str:
+    """What the least pipe is whose outside the tool can weld onto a plate, both as far as the joint's longer wall; "" for a joint that is none of these."""
+    ring = _ring(shape, joint)
+    if ring is None or float(ring[1][0] @ (ring[0][0] - ring[0][:-1].mean(axis=0))) <= 0.0:
+        return ""
+    return f" The least pipe for this tool is {1e3 * least_pipe_m(tool, max(joint.walls_m)):.0f} mm across."
+
+
+def unit_hint(shape: PartShape) -> str:
+    """What a part so small that its file may be in inches asks; "" for any other."""
+    size = np.ptp(shape.mesh.vertices, axis=0)
+    if max(size) >= SMALL_M or shape.unit_m != UNITS_M["mm"]:
+        return ""
+    return "The part is only {:.1f} x {:.1f} x {:.1f} mm: its unit may be inch; check the file.".format(*(1e3 * size))
