@@ -178,7 +178,7 @@ class WeldingConfig:
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
 
 
-@dc.dataclass
+@dc.dataclass(kw_only=True)
 class JobConfig:
     """The parts of the job to run, and its limits."""
 

@@ -124,7 +124,9 @@ def test_the_pitch_of_a_near_torch_is_ramped(ramp: float, pitch: float) -> None:
     R = np.column_stack([tip.tangent, np.cross(tip.up, tip.tangent), tip.up])
     X_BT = pose(R, tip.position)
     s, above = 0.1 - D, torch.position + 1e-3 * torch.up
-    target = TorchTarget(above, torch.tangent, torch.normal, torch.up, s, s, np.zeros(2))
+    target = TorchTarget(
+        point=above, tangent=torch.tangent, normal=torch.normal, up=torch.up, arc=s, s=s, residual=np.zeros(2)
+    )
     motion = guarded_motion(WeldingState(), X_BT, tip, target, (0.0, 0.0), config, 0.008)
     # nose down: the torch rises about the tip
     assert motion.V_BT[:3] @ tip.normal == pytest.approx(pitch, rel=0.02)
