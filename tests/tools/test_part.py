@@ -137,6 +137,12 @@ def test_the_least_pipe_that_a_tool_can_weld_is_named(tmp_path: Path) -> None:
     least = re.search(r"least pipe for this tool is (\d+) mm across", reasons[0])
     assert least is not None
     assert 140 <= int(least[1]) <= 150
+    # The advice, followed literally.
+    assert "The tool pipe fits: part --tool pipe, new --tool-file pipe." in reasons[0]
+    advised = ["part", str(tmp_path / "70.step"), "--tool", "pipe", "--plan", "1", "--json", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, advised)
+    first = json.loads(result.stdout.splitlines()[-1])["seams"][0]
+    assert [first["type"], first["weldable"], first["planned"]] == ["pipe on plate", True, True]
 
 
 def test_a_lap_of_thin_sheets_needs_the_small_ball(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydrake.math import RigidTransform
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
+from weldcal.models.tools.loading import load_tool, tool_file
 from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartJoint, PartShape
@@ -18,6 +20,7 @@ from weldcal.welding.seam.feasibility import InfeasibleSeam
 from weldcal.welding.seam.room import NoRoom, check_room
 from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
 
+PIPE_TOOL = "pipe"
 SMALL_M = 0.012  # a part this small may be drawn in inches
 
 
@@ -122,7 +125,12 @@ def least_pipe(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> str:
     ring = _ring(shape, joint)
     if ring is None or float(ring[1][0] @ (ring[0][0] - ring[0][:-1].mean(axis=0))) <= 0.0:
         return ""
-    return f" The least pipe for this tool is {1e3 * least_pipe_m(tool, max(joint.walls_m)):.0f} mm across."
+    far, across = max(joint.walls_m), 2.0 * float(np.linalg.norm(ring[0][0] - ring[0][:-1].mean(axis=0)))
+    words = f" The least pipe for this tool is {1e3 * least_pipe_m(tool, far):.0f} mm across."
+    other = load_tool(tool_file(Path(PIPE_TOOL))).tool
+    if tool.chord_m <= other.chord_m or across < least_pipe_m(other, far):
+        return words
+    return f"{words} The tool {PIPE_TOOL} fits: part --tool {PIPE_TOOL}, new --tool-file {PIPE_TOOL}."
 
 
 def unit_hint(shape: PartShape) -> str:
