@@ -90,6 +90,13 @@ def _bracket(path: Path) -> None:
     write_step(PARTS["bracket"]().shape, path)
 
 
+def _beam(path: Path) -> None:
+    """A T of two solids, 1 m long."""
+    from weldcal.tools.worlds.parts.step_parts import assembly, box, write_step
+
+    write_step(assembly(box((0, -50, 0), (1000, 100, 8)), box((0, -4, 8), (1000, 8, 92))), path)
+
+
 def _bracket_scan(path: Path) -> None:
     from weldcal.tools.worlds.parts.scenes import scan_scene, subject
 
@@ -182,6 +189,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "fixed_camera.npz": lambda path: _hand_eye(path, "eye_on_base"),
     "two_robots.npz": _two_robots,
     "bracket.step": _bracket,
+    "beam.step": _beam,
     "bracket_scan.npz": _bracket_scan,
     "my_arm.urdf": lambda path: path.write_text(arm_urdf(load_arm("ur10e")), encoding="utf-8"),
     "clamp.stl": lambda path: path.write_text(stl(), encoding="utf-8"),

@@ -222,7 +222,6 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
         standing, nearest = scenario.workpiece.pose_guess, ""
         for seam, joint in candidates:  # the reason is that of the first one
             reason = _refused(unfinished, scenario, seam, joint, standing, not nearest)
-            reason = add_scan_poses(scenario, unfinished, reason)
             nearest = nearest or reason
             if not reason:
                 break
@@ -245,7 +244,7 @@ def _refused(path: Path, scenario: Scenario, seam: SeamConfig, joint: str, stand
     scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
     _write(path, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=path))
     scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(path)), advises)
-    return reason
+    return add_scan_poses(scenario, path, reason)
 
 
 def planned(part: OwnPart, seams: list[list[PartEdge]], tool: Path, progress: Progress) -> list[str]:

@@ -115,6 +115,7 @@ def register_prepared(
         raise PartNotFound(
             "The scan shows nothing that fits the part: move it into view, or check the file and its unit."
         )
+    _check_fused(fits[0], scan, model)
     # Of a part that is half hidden few rays speak: those that nothing keeps from it decide among poses that agree.
     fits.sort(key=lambda f: (not _agrees(f.agreement, config), -f.agreement.score_of_rest))
     standing = [f for f in fits if not sinks(scan, model, f.X_BP)]
@@ -398,6 +399,7 @@ def _decided(
         if for_best - for_rival < least or share > config.rival:
             alike.append(rival)
     harmful = [r for r in alike if not same_set(matters_P, best.X_BP.InvertAndCompose(r.X_BP))]
+    harmful.sort(key=lambda r: -r.agreement.score)  # the first is named
     if hint is not None and alike:
         family = [best, *alike]
         cost = np.array([_away(f.X_BP, hint, model) for f in family])
