@@ -123,9 +123,21 @@ def views_off(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolera
     origin = into(X_BP, rays[:, 3:])
     d = into(X_BP, rays[:, :3]) - origin
     far = np.linalg.norm(d, axis=1)
-    gap = np.abs(far - model.ranges(origin, d / far[:, None])[0])
-    near = [gap[(rays[:, 3:] == eye).all(axis=1) & (gap < NEAR_M)] for eye in scan.eyes]
-    return [k for k, g in enumerate(near) if len(g) > LEAST_NEAR and np.mean(g < 2.0 * tolerance_m) < LEAST_MET]
+    hit, normal = model.ranges(origin, d / far[:, None])
+    gap = np.abs(far - hit)
+    main = np.argmax(np.abs(normal), axis=1)
+    side = 2 * main + (normal[np.arange(len(normal)), main] > 0.0)  # of the six sides of the part
+    # A scan that is off along one side agrees at the others: each side is judged by itself where another scan shows it.
+    met = np.full((len(scan.eyes), 7), np.nan)
+    for k, eye in enumerate(scan.eyes):
+        own = (rays[:, 3:] == eye).all(axis=1) & (gap < NEAR_M)
+        for group in range(7):
+            chosen = own if group == 6 else own & (side == group)
+            if np.count_nonzero(chosen) > LEAST_NEAR:
+                met[k, group] = np.mean(gap[chosen] < 2.0 * tolerance_m)
+    off = met < LEAST_MET
+    off[:, :6] &= (met[:, :6] >= LEAST_MET).any(axis=0)
+    return [int(k) for k in np.flatnonzero(off.any(axis=1))]
 
 
 def _goes_on(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float) -> float:
