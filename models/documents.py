@@ -32,7 +32,10 @@ def read_document(path: Path) -> Any:
 
 
 def parse_document(name: str, text: str, kind: str = "YAML") -> Any:
-    """The contents of a text of YAML or JSON, ``name`` of which appears in messages. Raises InputError as read_document."""
+    """The contents of a text of YAML or JSON, ``name`` of which appears in messages.
+
+    Raises InputError as read_document.
+    """
     if not text.strip():
         raise InputError(f"'{name}' is empty.")
     try:
@@ -146,7 +149,8 @@ def _too_much(name: str) -> InputError:
 
 @dataclass(frozen=True)
 class Section:
-    """A mapping of a document; its getters raise InputError naming ``file`` and key where a value is missing or wrong."""
+    """A mapping of a document; its getters raise InputError naming ``file`` and key where a value is missing or
+    wrong."""
 
     file: str
     values: Mapping[Any, Any]
@@ -248,7 +252,8 @@ class Section:
 
 
 def as_number(value: Any) -> float:
-    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text); NaN for anything else, true and false included."""
+    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text); NaN for anything else, true and false
+    included."""
     try:
         return math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):

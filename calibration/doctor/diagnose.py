@@ -1,8 +1,9 @@
 """Names the causes that the scans give evidence of, the likeliest first.
 
-Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the Bayesian
-information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a size that matters. The
-thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its false alarms are counted on.
+Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the
+Bayesian information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a
+size that matters. The thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its
+false alarms are counted on.
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from weldcal.calibration.doctor.readings import (
     best_reading,
     looks_wrong,
     mixed_units,
-)  # fmt: skip
+)
 from weldcal.calibration.geometry.robust import f_tail
 from weldcal.calibration.geometry.se3 import log_rotation
 from weldcal.models.arrays import Array
@@ -36,7 +37,8 @@ _NOISE_CHANCE = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A cause that shows without a model of the residuals: its name, its weight (twice a log-likelihood ratio) and its numbers."""
+    """A cause that shows without a model of the residuals: its name, its weight (twice a log-likelihood ratio) and its
+    numbers."""
 
     cause: str
     score: float
@@ -45,7 +47,8 @@ class Finding:
 
 
 def outliers(case: Case, null: Fit) -> Explained | None:
-    """Single scans that disagree with all others, each of them anywhere (uniform in the ball that holds their errors)."""
+    """Single scans that disagree with all others, each of them anywhere (uniform in the ball that holds their
+    errors)."""
     r = np.linalg.norm(null.e, axis=1)
     scale = max(float(np.median(r)) / 1.5382, 2e-5)
     bad = r > _GROSS * scale
@@ -71,7 +74,8 @@ def outliers(case: Case, null: Fit) -> Explained | None:
 
 
 def sure_outliers(case: Case, null: Fit) -> Finding | None:
-    """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the residuals."""
+    """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the
+    residuals."""
     r = np.linalg.norm(null.e, axis=1)
     chance = f_tail((r / null.sigma_m) ** 2 / 3.0, 3, NU)
     bad = (chance * case.n < _ODD) & (r > _GROSS_M)
@@ -96,9 +100,11 @@ def partial_views(case: Case) -> Finding | None:
     if share < _REFUSED or int(few.sum()) + len(lost) < 2:
         return None
     return Finding(
-        "outlier scans or partial views", 40.0 * share + 12.0, {"share": share, "refused": float(len(lost))},
+        "outlier scans or partial views",
+        40.0 * share + 12.0,
+        {"share": share, "refused": float(len(lost))},
         (*tuple(np.array(case.ids)[few]), *lost),
-    )  # fmt: skip
+    )
 
 
 def noise_growth(case: Case) -> Finding | None:
@@ -134,7 +140,10 @@ def noise_growth(case: Case) -> Finding | None:
 
 
 def too_alike(case: Case) -> Finding | None:
-    """Poses that differ too little to fix the camera. One orientation alone is no fault where the places differ enough."""
+    """Poses that differ too little to fix the camera.
+
+    One orientation alone is no fault where the places differ enough.
+    """
     b = case.b - case.b.mean(axis=0)
     width = np.linalg.svd(b, compute_uv=False) / np.sqrt(case.n)
     R = case.X_BF[:, :3, :3]
@@ -147,7 +156,8 @@ def too_alike(case: Case) -> Finding | None:
 
 
 def installation(case: Case, one: Fit) -> Finding | None:
-    """The camera is elsewhere than somebody measured it, by more than the measurement's stated error, while all scans agree."""
+    """The camera is elsewhere than somebody measured it, by more than the measurement's stated error, while all scans
+    agree."""
     if case.guess is None:
         return None
     seen = case.c @ one.R[0].T + one.p[0]
@@ -177,7 +187,8 @@ def _off(u: Array, z: Array) -> float:
 
 
 def rotations_disagree(case: Case) -> dict[str, float] | None:
-    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind; None where both agree."""
+    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind; None where both
+    agree."""
     seen = np.asarray(np.isfinite(case.m).all(axis=1))
     if seen.sum() < 5:
         return None
@@ -197,7 +208,8 @@ THRESHOLDS = {
     "outlier scans or partial views": 20.0,
     "scanner scale error": 20.0,
 }
-"""Least difference of the criterion at which each is named; the evidence of a difference of 10 is called very strong (Raftery 1995)."""
+"""Least difference of the criterion at which each is named; the evidence of a difference of 10 is called very strong
+(Raftery 1995)."""
 LEAST_EFFECT_M = {
     "scanner moved": 3e-4,
     "TCP set at the controller": 2e-3,
@@ -215,8 +227,10 @@ CLEAR = 1.2  # factor by which a cause must bring the median residual down
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """A named cause: ``confidence`` 0 to 1 (its weight among the models that were compared), ``score`` (twice the log-likelihood ratio
-    less the cost of its numbers), the ``numbers`` of the evidence, ``words`` of a misreading and the scans ``where`` it shows."""
+    """A named cause: ``confidence`` 0 to 1 (its weight among the models that were compared), ``score`` (twice the
+    log-likelihood ratio less the cost of its numbers), the ``numbers`` of the evidence, ``words`` of a misreading and
+    the scans ``where`` it shows.
+    """
 
     name: str
     confidence: float
@@ -228,7 +242,8 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The causes, likeliest first; the number of scans, and the spread (m) of their centres about what explains them best."""
+    """The causes, likeliest first; the number of scans, and the spread (m) of their centres about what explains them
+    best."""
 
     causes: tuple[Cause, ...]
     n: int

@@ -29,7 +29,8 @@ _ZERO_RAD, _LENGTH_M = 5e-3, 4e-3  # what joint zeros and link lengths of two ar
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """A cause's model fitted: its criterion (less is better), the fit, how far it moves the centres (rms, m) and its numbers."""
+    """A cause's model fitted: its criterion (less is better), the fit, how far it moves the centres (rms, m) and its
+    numbers."""
 
     cause: str
     bic: float
@@ -42,8 +43,13 @@ class Explained:
 def explanations(case: Case, null: Fit) -> Iterator[Explained]:
     """Every model of a disturbance that these scans can bear."""
     for one in (
-        moved(case), tcp(case, null), drift(case, null), loose(case, null), kinematics(case, null), scaled(case, null),
-    ):  # fmt: skip
+        moved(case),
+        tcp(case, null),
+        drift(case, null),
+        loose(case, null),
+        kinematics(case, null),
+        scaled(case, null),
+    ):
         if one is not None:
             yield one
 
@@ -96,7 +102,8 @@ def tcp(case: Case, null: Fit) -> Explained | None:
 
 
 def _faces_straight(case: Case, found: Fit) -> Case | None:
-    """The case with the poses turned so that the faces seen look along z; None where they do, or no normals were seen."""
+    """The case with the poses turned so that the faces seen look along z; None where they do, or no normals were
+    seen."""
     has = np.isfinite(case.m).all(axis=1)
     if has.sum() < 4:
         return None
@@ -142,7 +149,8 @@ def _tcp_starts(case: Case, null: Fit) -> Iterator[Fit]:
 
 
 def scaled(case: Case, null: Fit) -> Explained:
-    """The scanner's scale free of what is usual: least squares along the undisturbed fit, then twice by the fit itself."""
+    """The scanner's scale free of what is usual: least squares along the undisturbed fit, then twice by the fit
+    itself."""
     b, c = case.b - case.b.mean(axis=0), (case.c - case.c.mean(axis=0)) @ null.R[0].T
     ratio = float((b * c).sum() / max(float((c * c).sum()), 1e-12))
     for _ in range(2):
@@ -177,7 +185,8 @@ def drift(case: Case, null: Fit) -> Explained | None:
 
 
 def loose(case: Case, null: Fit) -> Explained | None:
-    """Two states that the scans fall into in no order: an offset in the flange's frame, or of the camera, in some of them."""
+    """Two states that the scans fall into in no order: an offset in the flange's frame, or of the camera, in some of
+    them."""
     n = case.n
     if n < 8:
         return None
@@ -251,7 +260,8 @@ def kinematics(case: Case, null: Fit) -> Explained | None:
 
 
 def with_arm_errors(case: Case) -> Case:
-    """The case with the errors of its arm as it leaves the factory, on the branch of joint angles that suits the scans best."""
+    """The case with the errors of its arm as it leaves the factory, on the branch of joint angles that suits the scans
+    best."""
     if not case.robot or case.n < FEWEST_FOR_ARM:
         return case
     try:
@@ -272,7 +282,8 @@ def with_arm_errors(case: Case) -> Case:
 
 
 def another_arm(case: Case, null: Fit, arm: Chain) -> Explained | None:
-    """The poses as another arm makes them from the same joint angles; None where no other arm explains the scans better."""
+    """The poses as another arm makes them from the same joint angles; None where no other arm explains the scans
+    better."""
     best: Explained | None = None
     if null.rms < _ANOTHER_ARM_M or arm.name not in known_arms():
         return None
@@ -314,8 +325,8 @@ def joint_angles(case: Case, arm: Chain) -> Iterator[Array]:
 
 
 def _arm_columns(case: Case, arm: Chain, q: Array) -> tuple[Array, Array, Array, tuple[str, ...]]:
-    """Change (n, 3, p) of the feature's centre and of its normal by joint zeros and link lengths (but those that only move base or
-    flange), and one sigma (p,) of those numbers between two files of one arm."""
+    """Change (n, 3, p) of the feature's centre and of its normal by joint zeros and link lengths (but those that only
+    move base or flange), and one sigma (p,) of those numbers between two files of one arm."""
     poses = chain_poses(arm, q)
     made: list[Array] = []
     sigma: list[float] = []

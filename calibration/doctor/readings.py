@@ -1,4 +1,5 @@
-"""Tries the ways in which poses and scans are misread: rotations, the inverse, a mirrored scanner, the order of rows, units."""
+"""Tries the ways in which poses and scans are misread: rotations, the inverse, a mirrored scanner, the order of rows,
+units."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -94,7 +95,8 @@ def looks_wrong(one: Fit) -> bool:
 
 
 def best_reading(case: Case, null: Fit) -> Reading | None:
-    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's; else None."""
+    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's; else
+    None."""
     found: list[Reading] = []
     for cause, words, given, other in _misreadings(case):
         one = fit(other)
@@ -114,8 +116,8 @@ def best_reading(case: Case, null: Fit) -> Reading | None:
 def mixed_units(case: Case) -> tuple[Case, float, tuple[str, ...]] | None:
     """The case in one unit, the factor and the scans that were in another one; None where all are in one.
 
-    Distances of poses from the base, or of scans from the camera, in two groups that a unit's factor separates: those within the reach of
-    an arm are in metres. Else one factor between the spreads of both sides.
+    Distances of poses from the base, or of scans from the camera, in two groups that a unit's factor separates: those
+    within the reach of an arm are in metres. Else one factor between the spreads of both sides.
     """
     for name, points in (("poses", case.X_BF[:, :3, 3]), ("scans", case.c)):
         size = np.linalg.norm(points, axis=1)

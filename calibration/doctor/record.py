@@ -60,7 +60,8 @@ def case_of(
 
 
 def case_text(case: Case) -> str:
-    """The table: a row for each scan (m, rad), with the feature, the guess and the refused scans as rows of their own."""
+    """The table: a row for each scan (m, rad), with the feature, the guess and the refused scans as rows of their
+    own."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     words = {

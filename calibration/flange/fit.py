@@ -26,10 +26,11 @@ _MAX_ISLANDS = 40  # bodies that are tried, largest first
 _GOOD_COVERAGE = 0.8  # a face seen this well, with its bore, ends the search
 _WARP = 0.2  # and so much of that along the normal: a scanner's warp tilts a half more than it tilts the whole
 _TRACKED_RADIUS = 0.7  # of the flange's diameter: about the fit of the scan before
-# What the centre is off, per axis of the face, where there is no grid, beside the noise: ray-cast scans with noise of 0.05 and 0.2 mm and
-# 0.4 to 1 mm between points (tests/calibration/flange/test_forms.py).
+# What the centre is off, per axis of the face, where there is no grid, beside the noise: ray-cast scans with noise of
+# 0.05 and 0.2 mm and 0.4 to 1 mm between points (tests/calibration/flange/test_forms.py).
 _PULL_M, _PULL_SHARE = 2e-5, 0.22
-# How far the chamfers of edge and holes draw the plane down, rms^2 over this: 4 um at 0.2 and 10 um at 0.3 mm of noise, in ray-cast scans.
+# How far the chamfers of edge and holes draw the plane down, rms^2 over this: 4 um at 0.2 and 10 um at 0.3 mm of noise,
+# in ray-cast scans.
 _SINK_M = 9e-3
 _OUT_OF_ROUND_M = 7e-5  # per axis, from half of an edge: halves of recorded clouds against the whole ones
 
@@ -80,15 +81,16 @@ def fit_flange(
 ) -> FlangeFit:
     """Find the flange face in a cloud (N, 3), or organised (H, W, 3) with NaN where invalid, in metres, camera frame.
 
-    The method follows from what is given, fastest first; where one finds nothing or doubts its result, the next one decides.
-    Organised scans: tracking within 3 mm of a guess that has a normal, a fit of the window about that guess, a search of the
-    guess's surroundings; without a guess a search of the whole scan. Unordered clouds: the same on the
-    sensor's rebuilt grid; where it cannot be rebuilt, a search about the guess, or of every separate body of about the flange's size.
+    The method follows from what is given, fastest first; where one finds nothing or doubts its result, the next one
+    decides. Organised scans: tracking within 3 mm of a guess that has a normal, a fit of the window about that guess, a
+    search of the guess's surroundings; without a guess a search of the whole scan. Unordered clouds: the same on the
+    sensor's rebuilt grid; where it cannot be rebuilt, a search about the guess, or of every separate body of about the
+    flange's size.
 
-    ``guess`` limits the search; a FlangeFit of the scan before is a guess, too. Deterministic for ``config.seed``. Raises
-    FlangeNotFound with the reason: nothing there, no plane, wrong size (also millimetres taken for metres), too little of the
-    edge seen, too rough an edge, no bore. Feature and check of radius: paper, section 2.1.4; edges instead of its 3-point
-    circle search, which repeats to 0.4 mm.
+    ``guess`` limits the search; a FlangeFit of the scan before is a guess, too. Deterministic for ``config.seed``.
+    Raises FlangeNotFound with the reason: nothing there, no plane, wrong size (also millimetres taken for metres), too
+    little of the edge seen, too rough an edge, no bore. Feature and check of radius: paper, section 2.1.4; edges
+    instead of its 3-point circle search, which repeats to 0.4 mm.
     """
     config = config or FlangeFitConfig()
     cloud = np.asarray(points_C)
@@ -109,7 +111,8 @@ def fit_flange(
 def _unordered(
     cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
 ) -> FlangeFit | None:
-    """A list of points: on its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then searched."""
+    """A list of points: on its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then
+    searched."""
     grid = rebuild_grid(cloud)
     if grid is not None:
         on_grid = Refusal()
@@ -151,8 +154,8 @@ def _organised(
         if inside is None:
             refusal.note(
                 0,
-                f"Only 0 valid points lie within {1e3 * guess.radius_m:.0f} mm of the expected flange; the flange needs "
-                f"{config.min_points}.",
+                f"Only 0 valid points lie within {1e3 * guess.radius_m:.0f} mm of the expected flange; the flange needs"
+                f" {config.min_points}.",
             )
             return None
         if guess.normal_C is not None:
@@ -203,7 +206,8 @@ def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, re
 
 
 def _islands(points: Array, diameter: float) -> list[Array]:
-    """Centres (3,) of the separate bodies among points (N, 3) that are about ``diameter`` m across, largest first, at most 40.
+    """Centres (3,) of the separate bodies among points (N, 3) that are about ``diameter`` m across, largest first, at
+    most 40.
 
     Bodies end where space is empty for 3 mm.
     """
@@ -274,7 +278,8 @@ def _result(face: Face) -> FlangeFit:
     axes = np.column_stack(plane_axes(face.plane.normal))
     circles = [face.outer] + ([face.bore] if face.bore is not None else [])
     center, cov = fuse([c.center for c in circles], [c.covariance[:2, :2] for c in circles])
-    # edges of real faces are no perfect circles: round the whole of one it averages out, over a half it moves the centre
+    # edges of real faces are no perfect circles: round the whole of one it averages out, over a half it moves the
+    # centre
     missing = max(_GOOD_COVERAGE - face.coverage, 0.0) / (_GOOD_COVERAGE - 0.5)
     cov = cov + (_OUT_OF_ROUND_M * missing) ** 2 * np.eye(2)
     # the plane pivots about the middle of its points, where `center` is measured from

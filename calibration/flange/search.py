@@ -46,8 +46,10 @@ def search_frame(
     refusal: Refusal,
     measured: NDArray[np.bool_] | None = None,
 ) -> Face | None:
-    """The best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted. Of a thinned scan,
-    whose missing pixels are interpolated, ``measured`` (H, W) says which were not."""
+    """The best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted.
+
+    Of a thinned scan, whose missing pixels are interpolated, ``measured`` (H, W) says which were not.
+    """
     pitches = typical_pitches(cloud)
     if pitches is None:
         refusal.note(0, "The cloud holds no valid point.")
@@ -94,8 +96,8 @@ def search_frame(
 
 
 def typical_pitches(cloud: Array) -> tuple[float, float] | None:
-    """Distances (m) between neighbouring pixels on the nearest things and on nearer than middling ones; None where no two
-    neighbours were measured. Quantiles (1 and 25 %) over a few thousand of them."""
+    """Distances (m) between neighbouring pixels on the nearest things and on nearer than middling ones; None where no
+    two neighbours were measured. Quantiles (1 and 25 %) over a few thousand of them."""
     step = max(1, int(np.sqrt(cloud.shape[0] * cloud.shape[1] / 4000.0)))
     a, b = cloud[:-1:step, :-1:step], cloud[:-1:step, 1::step]
     h, w = min(a.shape[0], b.shape[0]), min(a.shape[1], b.shape[1])
@@ -108,8 +110,8 @@ def typical_pitches(cloud: Array) -> tuple[float, float] | None:
 
 
 def window_about(cloud: Array, center: Array, radius: float, step: int | tuple[int, int]) -> tuple[slice, slice] | None:
-    """The rows and columns of a scan that hold all pixels within ``radius`` (m) of a centre (3,), found on every ``step``-th one, or
-    every so many rows and columns."""
+    """The rows and columns of a scan that hold all pixels within ``radius`` (m) of a centre (3,), found on every
+    ``step``-th one, or every so many rows and columns."""
     sv, su = (step, step) if isinstance(step, int) else step
     thin = cloud[::sv, ::su]
     with np.errstate(invalid="ignore"):
@@ -162,8 +164,9 @@ def flat_parts(
 
 
 def _noise(bend: NDArray[np.float32], inverse: NDArray[np.float32], *, by_depth: bool) -> NDArray[np.float32]:
-    """Noise (h, w) of the bend at each pixel: what the lower third of all pixels, or of those of about its depth, shows, most of a
-    scan being smooth. A floor far behind the flange may have another noise in inverse depth than the flange."""
+    """Noise (h, w) of the bend at each pixel: what the lower third of all pixels, or of those of about its depth,
+    shows, most of a scan being smooth. A floor far behind the flange may have another noise in inverse depth than the
+    flange."""
     with np.errstate(invalid="ignore", divide="ignore"):
         layer = np.rint(_LAYERS * np.log(np.abs(inverse)))
     known = np.isfinite(bend) & np.isfinite(layer)
@@ -266,7 +269,8 @@ def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> t
 
 
 def _hull_circle(hull: Array, bounds: tuple[float, float]) -> tuple[Array, float, float] | None:
-    """A circle through most of a convex outline (N, 2) with a radius within ``bounds`` (m): centre, radius, misfit (m)."""
+    """A circle through most of a convex outline (N, 2) with a radius within ``bounds`` (m): centre, radius, misfit
+    (m)."""
     if len(hull) < 6:
         return None
     n = len(hull)

@@ -152,7 +152,10 @@ class _View:
 
 
 def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) -> tuple[list[CircleFit], float]:
-    """Outer edge and bore, and the pitch of the pixels on the plane. Raises CircleFitError where either does not show."""
+    """Outer edge and bore, and the pitch of the pixels on the plane.
+
+    Raises CircleFitError where either does not show.
+    """
     h, w = view.shape
     corner = view.places(0.5 * w + np.array([0.0, 1.0, 0.0]), 0.5 * h + np.array([0.0, 0.0, 1.0]))
     along, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -266,8 +269,8 @@ def ring_points(
 def borders(face: Mask, known: Mask, turned: Array, at: Array, near: Array) -> tuple[Single, Mask, Index]:
     """Crossings of the face mask (h, w) between two neighbouring known pixels.
 
-    ``turned`` and ``at`` as in ``places``; ``near`` (2,) m is a point on the plane. Returns the places (2, N) m about it
-    in its axes, whether the face lies on the inner side of each, and the flat index of the pixel off the face.
+    ``turned`` and ``at`` as in ``places``; ``near`` (2,) m is a point on the plane. Returns the places (2, N) m about
+    it in its axes, whether the face lies on the inner side of each, and the flat index of the pixel off the face.
     """
     h, w = face.shape
     first, down = np.empty(2 * h * w, np.int64), np.empty(2 * h * w, np.bool_)

@@ -138,13 +138,7 @@ def _noise(z: Array, rays: tuple[Array, Array], plane: PlaneFit) -> float:
 
 
 def _window(
-    z: Array,
-    valid: Mask,
-    rays: tuple[Array, Array],
-    plane: PlaneFit,
-    axes: Array,
-    height: float,
-    measured: Mask | None,
+    z: Array, valid: Mask, rays: tuple[Array, Array], plane: PlaneFit, axes: Array, height: float, measured: Mask | None
 ) -> _Window:
     rx, ry = rays
     n, p = plane.normal, plane.point
@@ -179,8 +173,8 @@ def _edges(
     radius: float,
     standard: FlangeStandard,
 ) -> tuple[CircleFit, CircleFit | None, Mask, float]:
-    """Outer edge, bore (None where it does not show), the directions (sectors,) in which the outer edge is hidden, and the
-    pitch of the pixels on the plane."""
+    """Outer edge, bore (None where it does not show), the directions (sectors,) in which the outer edge is hidden, and
+    the pitch of the pixels on the plane."""
     v, u = w.x.shape[0] // 2, w.x.shape[1] // 2
     pitch = float(
         np.sqrt(
@@ -242,8 +236,8 @@ def _sector(dx: Array, dy: Array, sectors: int) -> NDArray[np.intp]:
 
 
 def _hidden_directions(w: _Window, center: Array, radius: float, pitch: float, clear: float, *, outer: bool) -> Mask:
-    """Directions (sectors,) in which the face does not show beside an edge, nor anything that lies lower: it is hidden, by
-    a cable, a shadow or the image's border, and what looks like an edge there is none."""
+    """Directions (sectors,) in which the face does not show beside an edge, nor anything that lies lower: it is hidden,
+    by a cable, a shadow or the image's border, and what looks like an edge there is none."""
     way = -1.0 if outer else 1.0
     count = int(np.clip(2.0 * np.pi * radius / (4.0 * pitch), 18, 72))
     low, high = sorted(radius + way * d for d in (pitch, max(2.5 * pitch, min(5.0 * pitch, clear))))
@@ -356,8 +350,8 @@ def _face(
         coverage=_seen(w, outer, hidden, pitch),
         bore_coverage=0.0 if bore is None else _seen(w, bore, None, pitch),
         count=count,
-        # a bore that is hidden is no bore seen, but lone pixels without a return say nothing (half of a dark bore's floor);
-        # a ring of which less than half is seen is no ring
+        # a bore that is hidden is no bore seen, but lone pixels without a return say nothing (half of a dark bore's
+        # floor); a ring of which less than half is seen is no ring
         core_share=1.0 - float(np.count_nonzero(core & w.known & ~w.face)) / max(int(np.count_nonzero(said)), 1),
         ring_share=count / max(on_ring, int(_RING_SEEN * np.count_nonzero(ring)), 1),
     )

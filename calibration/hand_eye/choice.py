@@ -24,7 +24,8 @@ _SUBSETS = 60
 
 
 USUAL_DISCORD_RAD = 5e-3
-"""Angle, an axis, by which positions and rotations of usual cameras disagree: six pixels of the principal point at a focal length of 1,200."""
+"""Angle, an axis, by which positions and rotations of usual cameras disagree: six pixels of the principal point at a
+focal length of 1,200."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,9 @@ def solve(
 ) -> Choice:
     """Solve one problem; ``known`` holds the poses that are not free. Deterministic for ``seed``.
 
-    Where the rotations can be had without the translations, a discord between both is estimated (see Scaled) whose size is
-    ``usual_discord`` (rad) beforehand; 0: least squares, without discord. Raises InconsistentPoses where no rigid poses explain enough observations.
+    Where the rotations can be had without the translations, a discord between both is estimated (see Scaled) whose size
+    is ``usual_discord`` (rad) beforehand; 0: least squares, without discord. Raises InconsistentPoses where no rigid
+    poses explain enough observations.
     """
     state, name = _start(problem, known, seed, starts)
     state = _concentrated(problem, state)
@@ -74,8 +76,8 @@ def solve(
     need = max(3, int(np.ceil((1.0 - max_outliers) * len(problem) - 1e-9)))
     if int(keep.sum()) < need and len(problem) > 4:
         raise InconsistentPoses(
-            f"Only {int(keep.sum())} of {len(problem)} poses agree on one answer; check units, pose order, the quaternion"
-            " order, and which pose is stated from which frame."
+            f"Only {int(keep.sum())} of {len(problem)} poses agree on one answer; check units, pose order, the"
+            " quaternion order, and which pose is stated from which frame."
         )
     seen = bool((problem.full | problem.normal).any())
     turned = float(np.sqrt(base.noise.rotation)) if seen else 0.0
@@ -104,10 +106,11 @@ def solve(
 
 
 def _concentrated(problem: Problem, state: State) -> State:
-    """The state of the poses that agree best, where some may be outliers: few outliers of few poses hide in the noise that they cause.
+    """The state of the poses that agree best, where some may be outliers: few outliers of few poses hide in the noise
+    that they cause.
 
-    Least trimmed squares by concentration steps (Rousseeuw and Van Driessen 1999). Poses with less than three numbers for each unknown
-    are not trimmed.
+    Least trimmed squares by concentration steps (Rousseeuw and Van Driessen 1999). Poses with less than three numbers
+    for each unknown are not trimmed.
     """
     n, kept, begin, least = len(problem), None, state, np.inf
     most = int(np.ceil(_AGREEING * n))

@@ -113,12 +113,12 @@ def fit(
 ) -> Fit:
     """Newton's method on the robust cost from a good start; the variances are re-estimated at every step.
 
-    Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. The noise centre is
-    an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
-    displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so the
-    answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``usual_discord``:
-    see Scaled. ``keep`` (n,): observations that count; the others get residuals
-    only. ``begin``: the derivatives at the start, where known. ``tolerance``: of what is left, in standard deviations.
+    Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. The noise centre
+    is an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
+    displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so
+    the answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``usual_discord``:
+    see Scaled. ``keep`` (n,): observations that count; the others get residuals only. ``begin``: the derivatives at the
+    start, where known. ``tolerance``: of what is left, in standard deviations.
     """
     sub = problem if keep.all() else problem.pick(keep)
     floor = sub.extent**2 * TINY
@@ -168,14 +168,4 @@ def fit(
         before = leap
     # every observation, at the same state
     w, d = (lin.w, lin.d) if sub is problem else residuals(problem, state, centre)
-    return Fit(
-        state=state,
-        noise=noise,
-        centre=centre,
-        loss=loss,
-        keep=keep,
-        scaled=s,
-        lin=lin,
-        w=w,
-        d=d,
-    )
+    return Fit(state=state, noise=noise, centre=centre, loss=loss, keep=keep, scaled=s, lin=lin, w=w, d=d)

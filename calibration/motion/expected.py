@@ -19,9 +19,9 @@ _LARGEST = 1e6  # sigmas beyond this are of directions that the motion does not 
 
 @dataclass(frozen=True)
 class Expected:
-    """What a motion is expected to tell, one sigma: ``work_m`` of a point among the flange's places (3-D), ``turn_rad`` of X_BC's
-    rotation (3-D), ``offset_s`` of the clock, ``shared`` the largest correlation 0..1 of the offset with a shift of the scanner. Infinite
-    where the motion does not show it."""
+    """What a motion is expected to tell, one sigma: ``work_m`` of a point among the flange's places (3-D), ``turn_rad``
+    of X_BC's rotation (3-D), ``offset_s`` of the clock, ``shared`` the largest correlation 0..1 of the offset with a
+    shift of the scanner. Infinite where the motion does not show it."""
 
     work_m: float
     turn_rad: float
@@ -39,9 +39,11 @@ def expected_of_motion(
     jitter_s: float = 0.015,
     X_FR: RigidTransform | None = None,
 ) -> Expected:
-    """Expected sigmas of a calibration from a planned motion, with a frame every ``frame_s``, as the joint fit would state them.
+    """Expected sigmas of a calibration from a planned motion, with a frame every ``frame_s``, as the joint fit would
+    state them.
 
-    ``jitter_s`` is that of the arrivals; for device times give their own, 0.0001 for instance. Raises InputError: less than six frames.
+    ``jitter_s`` is that of the arrivals; for device times give their own, 0.0001 for instance. Raises InputError: less
+    than six frames.
     """
     begin, end = motion.span
     t = np.arange(begin, end, frame_s)

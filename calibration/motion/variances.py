@@ -1,4 +1,5 @@
-"""Variances of what is random in frames taken in motion, by restricted maximum likelihood, and the weights that follow."""
+"""Variances of what is random in frames taken in motion, by restricted maximum likelihood, and the weights that
+follow."""
 
 from dataclasses import dataclass
 
@@ -17,7 +18,8 @@ FREE_S2 = 1.0  # variance of the time of a frame that is grossly late
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """``factor`` of the fits' own covariances; ``spread`` m^2 and ``lean`` rad^2 beyond them, an axis; ``jitter`` s^2."""
+    """``factor`` of the fits' own covariances; ``spread`` m^2 and ``lean`` rad^2 beyond them, an axis; ``jitter``
+    s^2."""
 
     factor: float
     spread: float
@@ -32,8 +34,8 @@ class Variances:
 
 @dataclass(eq=False)
 class Linearised:
-    """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5), Jacobians J (N, 5, 15),
-    rates g (N, 5) and the unit covariances of the three kinds of noise in 5 x 5."""
+    """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5),
+    Jacobians J (N, 5, 15), rates g (N, 5) and the unit covariances of the three kinds of noise in 5 x 5."""
 
     y: Array
     J: Array
@@ -43,8 +45,10 @@ class Linearised:
 
 
 def total_variances(linear: Linearised, variances: Variances, keep: Flags) -> Array:
-    """Mean variances of a centre and a normal, an axis, and of the time: what the weights follow from. The share of the fits' own noise
-    in them converges slowly, and matters little."""
+    """Mean variances of a centre and a normal, an axis, and of the time: what the weights follow from.
+
+    The share of the fits' own noise in them converges slowly, and matters little.
+    """
     own = np.einsum("nii->", linear.own[keep]) / (3.0 * np.count_nonzero(keep))
     lean = np.einsum("nii->", linear.own_lean[keep]) / (2.0 * np.count_nonzero(keep))
     return np.array(

@@ -57,7 +57,8 @@ def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
 
 @compiled()
 def _smallest_gap(ends: Array, links: NDArray[np.int64], radii: Array, samples: Array) -> float:
-    """Smallest gap between bodies at least three links apart; ``ends`` (n, 2, 3) m, ``samples`` (s,) where their axes are sampled."""
+    """Smallest gap between bodies at least three links apart; ``ends`` (n, 2, 3) m, ``samples`` (s,) where their axes
+    are sampled."""
     n, m = len(ends), len(samples)
     points = np.empty((n, m, 3))
     for i in range(n):
@@ -83,7 +84,8 @@ def _smallest_gap(ends: Array, links: NDArray[np.int64], radii: Array, samples: 
 def path_clearance(
     arm: ArmModel, bodies: list[Body], q_a: Array, q_b: Array, step_rad: float = 0.1
 ) -> tuple[float, float]:
-    """Lowest height (m over B's origin, along the arm's ``up``) of the moving bodies and smallest gap (m) between bodies on a path straight in joint space.
+    """Lowest height (m over B's origin, along the arm's ``up``) of the moving bodies and smallest gap (m) between
+    bodies on a path straight in joint space.
 
     ``q_a``, ``q_b`` (6,) rad; the path is sampled so that no joint turns by more than ``step_rad`` between samples.
     """

@@ -27,8 +27,12 @@ _STEEPEST_RAD = float(np.radians(60.0))
 
 @dataclass(frozen=True)
 class View:
-    """Visible volume. ``tan_x``, ``tan_y``: half field of view; ``near``, ``far``: along the optical axis, in the unit of the data; ``tilt_rad``:
-    largest angle between the target's normal and the line of sight; ``source``: its description for messages."""
+    """Visible volume.
+
+    ``tan_x``, ``tan_y``: half field of view; ``near``, ``far``: along the optical axis, in the unit of the data;
+    ``tilt_rad``: largest angle between the target's normal and the line of sight; ``source``: its description for
+    messages.
+    """
 
     tan_x: float
     tan_y: float
@@ -53,8 +57,8 @@ def tilt(G: Array) -> Array:
 
 
 def view_of(seen: Array, K: Array | None = None, scanner: ScannerPreset | None = None) -> View:
-    """View of a scanner preset, else of a camera matrix ``K`` (picture centred on its principal point), else of what was
-    ``seen`` (n, 4, 4) so far, a little wider. Distances of a camera matrix are those seen, too."""
+    """View of a scanner preset, else of a camera matrix ``K`` (picture centred on its principal point), else of what
+    was ``seen`` (n, 4, 4) so far, a little wider. Distances of a camera matrix are those seen, too."""
     steep = max(_STEEPEST_RAD, float(np.quantile(tilt(seen), 0.9)))
     if scanner is not None:
         wide = [min(c, size - 1 - c) / f for c, size, f in _axes(scanner)]
@@ -91,9 +95,9 @@ _MOST = 0.8  # of the poses so far that a robot must reach, to be the one that t
 
 @dataclass(frozen=True, kw_only=True)
 class NextPose:
-    """A pose to add: robot pose X_BF (the first robot's, or None where the mounting leaves it open) with joint angles ``q``
-    (rad) where a robot was named, target in the camera X_CM, like which taken sample and turned how, the predicted sigma (3-D)
-    at the work point before and after, and what was ``checked``."""
+    """A pose to add: robot pose X_BF (the first robot's, or None where the mounting leaves it open) with joint angles
+    ``q`` (rad) where a robot was named, target in the camera X_CM, like which taken sample and turned how, the
+    predicted sigma (3-D) at the work point before and after, and what was ``checked``."""
 
     X_BF: RigidTransform | None
     X_CM: RigidTransform
@@ -120,8 +124,9 @@ class NextPose:
         if self.q is not None:
             joints = " Joints (" + ", ".join(f"{v:.1f}" for v in np.degrees(self.q)) + ") deg."
         return (
-            f"Like sample {self.like}, with the target seen turned by {self.turn_deg:.0f} deg about {a} of the camera: the "
-            f"uncertainty at the work point goes from {before} to {1e3 * self.sigma_after:.2f} mm.{where}{joints} {self.checked}"
+            f"Like sample {self.like}, with the target seen turned by {self.turn_deg:.0f} deg about {a} of the camera:"
+            f" the uncertainty at the work point goes from {before} to {1e3 * self.sigma_after:.2f} mm.{where}{joints}"
+            f" {self.checked}"
         ).rstrip()
 
 
@@ -134,12 +139,14 @@ def next_pose(
     arm: Chain | None = None,
     view: View | None = None,
 ) -> NextPose | None:
-    """Choose the most informative of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there or elsewhere.
+    """Choose the most informative of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there
+    or elsewhere.
 
-    Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for it
-    within its limits; where none is named, or where it does not even reach the poses so far (another base or tool frame), the
-    flange stays about where it has been, and ``checked`` says so. The work point is the mean place of the target before the
-    camera. None where no candidate is left. For a scanner that watches a flange, pose_planning plans with the arm's bodies too.
+    Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for
+    it within its limits; where none is named, or where it does not even reach the poses so far (another base or tool
+    frame), the flange stays about where it has been, and ``checked`` says so. The work point is the mean place of the
+    target before the camera. None where no candidate is left. For a scanner that watches a flange, pose_planning plans
+    with the arm's bodies too.
     """
     state = _state(result, known, problem)
     # one sample of each observation: repeats add nothing

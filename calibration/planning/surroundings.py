@@ -1,4 +1,5 @@
-"""The cell's surroundings as surfaces in the base: how near the arm comes to them, and which lines of sight they block."""
+"""The cell's surroundings as surfaces in the base: how near the arm comes to them, and which lines of sight they
+block."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -92,8 +92,8 @@ def blocks_of(text: str, name: str) -> list[Block]:
             for k, row in enumerate(rows):
                 if len(row) > width and np.isfinite(row[width:]).any():
                     raise InputError(
-                        f"'{name}', line {first + k}: {len(row)} cells, and the header names {width} columns; decimal commas need "
-                        "semicolons or tabs between the columns."
+                        f"'{name}', line {first + k}: {len(row)} cells, and the header names {width} columns; decimal"
+                        " commas need semicolons or tabs between the columns."
                     )
                 table[k, : min(len(row), width)] = row[:width]
             found.append(Block(header, caption, table, first))

@@ -9,13 +9,7 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.results import (
-    export_ros2,
-    export_ur_pose,
-    export_urdf,
-    matrix4,
-    software_version,
-)
+from weldcal.calibration.data.results import export_ros2, export_ur_pose, export_urdf, matrix4, software_version
 from weldcal.models.documents import Section, as_number, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER
@@ -30,10 +24,10 @@ PARENT, CHILD = "flange", "camera_optical_frame"
 class TabletResult:
     """Contents of tablet.yaml.
 
-    ``model``: closed_form, pnp, pnp_free_scale (planar, an upright pen) or wrist (full poses); ``parameters`` by name, m and
-    rad, and their ``covariance`` in that order. ``leave_one_out_mm`` is empty where nothing could be held out. Only for wrist:
-    ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the flange side about the camera's origin), ``p_FP_m`` and
-    its covariance (3, 3).
+    ``model``: closed_form, pnp, pnp_free_scale (planar, an upright pen) or wrist (full poses); ``parameters`` by name,
+    m and rad, and their ``covariance`` in that order. ``leave_one_out_mm`` is empty where nothing could be held out.
+    Only for wrist: ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the flange side about the camera's
+    origin), ``p_FP_m`` and its covariance (3, 3).
     """
 
     model: str

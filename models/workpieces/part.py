@@ -38,8 +38,8 @@ SEEN_EDGE_M, FELT_EDGE_M = 0.012, 0.003  # longest edges: over 150 mm their midd
 def bend(workpiece: Workpiece, radius_m: float) -> Workpiece:
     """The workpiece rolled over a cylinder of that radius (at its top face) whose axis lies along -y below its middle.
 
-    Lengths along x stay what they are in the top face; (x, y, z) comes to ((r + z) sin(x/r), y, (r + z) cos(x/r) - r). The
-    groove's walls keep their angle to the surface to within depth / radius.
+    Lengths along x stay what they are in the top face; (x, y, z) comes to ((r + z) sin(x/r), y, (r + z) cos(x/r) - r).
+    The groove's walls keep their angle to the surface to within depth / radius.
 
     Raises:
         InputError: a radius below 100 mm, or a plate that would be bent by more than 60 degrees to either side.
@@ -126,8 +126,8 @@ BESIDE_M = 0.0017  # between the joint's mouth and the tip's centre as it lands 
 class WeldPart(Protocol):
     """What a weld needs to know of a workpiece in its frame P, m: a grooved plate or a part from a file.
 
-    mesh is what a scanner sees, groove_mesh what the tip feels; seam_P, tangents_P (N,3) the root line, up_P (N,3) or (1,3)
-    the bisector of its walls, depth_m from their upper end to the root.
+    mesh is what a scanner sees, groove_mesh what the tip feels; seam_P, tangents_P (N,3) the root line, up_P (N,3) or
+    (1,3) the bisector of its walls, depth_m from their upper end to the root.
     """
 
     @property
@@ -166,7 +166,10 @@ class WeldPart(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part in its frame P (that of its file) with a seam, and others that are welded before or after it, m. See WeldPart."""
+    """A part in its frame P (that of its file) with a seam, and others that are welded before or after it, m.
+
+    See WeldPart.
+    """
 
     shape: PartShape
     seam: DrawnSeam
@@ -233,16 +236,19 @@ class Part:
 
     @property
     def depth_m(self) -> float:
-        """From the end of the lower wall to the root, along the bisector; of a gap 0, for its root is level with the faces."""
+        """From the end of the lower wall to the root, along the bisector; of a gap 0, for its root is level with the
+        faces."""
         return min(self.section.left_m, self.section.right_m) * math.cos(self.half_angle_rad)
 
     @cached_property
     def end_window_m(self) -> float:
-        """See WeldPart: hardly any where the joint goes on beyond the drawn end, for then the end is chosen, not felt."""
+        """See WeldPart: hardly any where the joint goes on beyond the drawn end, for then the end is chosen, not
+        felt."""
         return CHOSEN_END_M if goes_on(self.mesh, self.seam) else FELT_END_M
 
     def felt_by(self, tip: Tip) -> bool:
-        """Whether the tip is used on this seam: as the seam's `feel` says, else not where level plates leave too narrow a gap."""
+        """Whether the tip is used on this seam: as the seam's `feel` says, else not where level plates leave too narrow
+        a gap."""
         if self.seam.feel is not None or self.seam.joint != "butt" or self.seam.gap_m > UNFELT_GAP_M:
             return self.seam.feel is not False
         return feels(self.section, tip)
@@ -267,7 +273,8 @@ class Part:
             raise JointNotWeldable(f"{error} {advice}") from error
 
     def entry(self, tip: Tip, seated: Seated) -> Entry:
-        """See WeldPart: a wide joint guides the tip in from above; beside a narrow one it lands on the face and searches."""
+        """See WeldPart: a wide joint guides the tip in from above; beside a narrow one it lands on the face and
+        searches."""
         section = self.section
         if not self.felt_by(tip):
             return Entry(0.0, GUIDED_DROP_M)
@@ -317,7 +324,8 @@ def about(mesh: TriMesh, points: Floats, reach_m: float) -> TriMesh:
 
 
 def bowed(part: Part, amplitude_m: float, direction: Floats) -> Part:
-    """The part as made, bowed by an amplitude at its middle in a direction (3,): its seam is not where the drawing has it.
+    """The part as made, bowed by an amplitude at its middle in a direction (3,): its seam is not where the drawing has
+    it.
 
     A point moves by amplitude cos(pi x) along the direction, x from -1/2 to 1/2 along the seam's chord; the ends stay.
 

@@ -67,7 +67,8 @@ def referenced(path: Path) -> list[Path]:
             other = path.parent / Path(name.decode(errors="replace").replace("\\", "/")).name
             if not other.is_file():
                 raise InputError(
-                    f"'{one.name}' takes a body from '{other.name}': put that file beside it, or export the assembly as one file."
+                    f"'{one.name}' takes a body from '{other.name}': put that file beside it, or export the assembly as"
+                    " one file."
                 )
             if other not in (path, *found):
                 found.append(other)

@@ -29,7 +29,8 @@ def station_bodies(station: Station) -> list[Body]:
 
 
 def clear_move(scenario: Scenario, station: Station, bodies: list[Body], q_a: Joints, q_b: Joints) -> bool:
-    """Whether a straight move in joint space stays above the table, clear of the surroundings and of the arm itself; (6,) rad."""
+    """Whether a straight move in joint space stays above the table, clear of the surroundings and of the arm itself;
+    (6,) rad."""
     if station.surroundings.touched_on_path(station.arm, bodies, q_a, q_b):
         return False
     lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)
@@ -50,8 +51,8 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
     stands = ", ".join(f"{angle:.0f}" for angle in np.rad2deg(station.q_start))
     wanted = ", ".join(f"{angle:.0f}" for angle in scenario.home_deg)
     raise InputError(
-        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table, the surroundings or the arm itself: "
-        f"move it by hand near home_deg [{wanted}] first."
+        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table, the"
+        f" surroundings or the arm itself: move it by hand near home_deg [{wanted}] first."
     )
 
 
@@ -74,7 +75,7 @@ def clear_poses(
     needed = 1 + c.maximum_scans + c.verification_scans
     if len(kept) < needed:
         raise UnreachableScanner(
-            f"Only {len(kept)} of {needed} calibration poses can be reached without contact of the arm with the table, the surroundings or itself; "
-            "choose another home_deg or fewer maximum_scans."
+            f"Only {len(kept)} of {needed} calibration poses can be reached without contact of the arm with the table,"
+            " the surroundings or itself; choose another home_deg or fewer maximum_scans."
         )
     return tuple(kept)

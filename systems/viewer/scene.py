@@ -1,4 +1,5 @@
-"""What the 3D view's colours mean and how it is scaled: one place for the scene itself and for the legends beside it."""
+"""What the 3D view's colours mean and how it is scaled: one place for the scene itself and for the legends beside
+it."""
 
 from typing import NamedTuple
 
@@ -21,8 +22,8 @@ WELDING_PHASES = ("approach_above", "approach", "weld", "retract")
 
 
 class Uncertainty(NamedTuple):
-    """The 3-sigma ellipsoid of a scanned point: half axes (3,) m, their directions (3, 3) in B as columns, and the magnification
-    at which it is drawn."""
+    """The 3-sigma ellipsoid of a scanned point: half axes (3,) m, their directions (3, 3) in B as columns, and the
+    magnification at which it is drawn."""
 
     half_axes: Array
     R_BE: Array
@@ -48,8 +49,8 @@ class Key(NamedTuple):
 
 
 def legend(phase: str, magnification: int | None = None) -> list[Key]:
-    """The legend of a phase of the weld job; `magnification` of the drawn uncertainty, 0 where it is written beside it, None
-    where there is none yet."""
+    """The legend of a phase of the weld job; `magnification` of the drawn uncertainty, 0 where it is written beside it,
+    None where there is none yet."""
     if phase in WELDING_PHASES:
         return [
             Key(_css(PLANNED), "dashed", "planned seam"),

@@ -1,4 +1,5 @@
-"""What the robot link does when something fails: the arm stops within 0.3 s, stays, says why, and starts again when asked."""
+"""What the robot link does when something fails: the arm stops within 0.3 s, stays, says why, and starts again when
+asked."""
 
 from __future__ import annotations
 

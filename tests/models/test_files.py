@@ -1,4 +1,5 @@
-"""Only regular files of bounded size are read, and whatever else a person hands in is refused in a sentence, at once."""
+"""Only regular files of bounded size are read, and whatever else a person hands in is refused in a sentence, at
+once."""
 
 from __future__ import annotations
 

@@ -77,7 +77,8 @@ def test_two_plates_without_a_gap_are_welded_and_the_tip_stays_off(tmp_path: Pat
 
 
 def test_a_nut_beside_the_seam_is_passed_by_lifting_the_tip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A web on a plate with a nut that the drawing does not have: refused, and with pass_obstacles welded before and after it."""
+    """A web on a plate with a nut that the drawing does not have: refused, and with pass_obstacles welded before and
+    after it."""
     nut = extrude(0.006 * np.column_stack([f(np.arange(6) * np.pi / 3.0) for f in (np.cos, np.sin)]), 0.0, 0.006)
     nut = nut.transformed(RigidTransform([-0.02, -0.0075, 0.0]))
 

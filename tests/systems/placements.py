@@ -1,4 +1,5 @@
-"""Random placements of part, tool and arm: whether the path check accepts them, and how the arm then follows the seam."""
+"""Random placements of part, tool and arm: whether the path check accepts them, and how the arm then follows the
+seam."""
 
 import math
 import sys
@@ -123,10 +124,12 @@ def _seam(rng: np.random.Generator) -> Array:
 
 
 def placed(seed: int, drive: bool = True) -> dict[str, Any]:
-    """Check one placement and drive it, a refused one only where its seed is even: what the check says, and how the drive ends.
+    """Check one placement and drive it, a refused one only where its seed is even: what the check says, and how the
+    drive ends.
 
-    `state` is accepted, refused, or unsuitable (the seam itself cannot be welded in one go). `end` is done, guard (stopped, or slowed to
-    a standstill), joint limit, slowed (below LEAST_SHARE of the speed), fault (of the servo), or no start (no pose above the seam).
+    `state` is accepted, refused, or unsuitable (the seam itself cannot be welded in one go). `end` is done, guard
+    (stopped, or slowed to a standstill), joint limit, slowed (below LEAST_SHARE of the speed), fault (of the servo), or
+    no start (no pose above the seam).
     """
     placement = draw(seed)
     welder, plan = placement.welder, placement.plan
@@ -175,7 +178,8 @@ def offered(seed: int) -> str:
 
 
 def main(first: int, last: int) -> None:
-    """Print how many placements of the seeds first to last - 1 are accepted and refused, how the drives end, and what disagrees."""
+    """Print how many placements of the seeds first to last - 1 are accepted and refused, how the drives end, and what
+    disagrees."""
     ends: Counter[tuple[str, str]] = Counter()
     for seed in range(first, last):
         row = placed(seed)

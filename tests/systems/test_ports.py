@@ -1,4 +1,5 @@
-"""Every system has exactly the ports that its docstring shows, of the size and kind that the rest of the cell counts on."""
+"""Every system has exactly the ports that its docstring shows, of the size and kind that the rest of the cell counts
+on."""
 
 from __future__ import annotations
 
@@ -428,13 +429,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "servo_velocity": 6,
         "velocity_wanted": 6,
     },
-    FlangeMover: {
-        "job": JobCommand,
-        "position_measured": 6,
-        "velocity_measured": 6,
-        "velocity": 6,
-        "settled_goal": 1,
-    },
+    FlangeMover: {"job": JobCommand, "position_measured": 6, "velocity_measured": 6, "velocity": 6, "settled_goal": 1},
     DriftView: {"drift": DriftStatus, "flange_estimate": FlangeEstimate},
     DriftMonitor: {
         "flange_estimate": FlangeEstimate,

@@ -123,7 +123,8 @@ def test_a_press_that_climbs_out_is_refused(cell: Path) -> None:
 
 
 def test_a_square_tube_is_welded_leg_by_leg(tmp_path: Path) -> None:
-    """Across a sharp outside corner tip and torch cannot both follow; a rectangle that is drawn on a plate's edge is closed."""
+    """Across a sharp outside corner tip and torch cannot both follow; a rectangle that is drawn on a plate's edge is
+    closed."""
     tube = less(box((-30, -20, 0), (60, 40, 50)), box((-26, -16, -1), (52, 32, 60)))
     write_step(assembly(box((-90, -90, -10), (180, 180, 10)), tube), tmp_path / "tube.step")
     shape = read_shape(tmp_path / "tube.step")

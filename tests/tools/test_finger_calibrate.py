@@ -1,4 +1,5 @@
-"""The finger is calibrated from pictures drawn ray by ray through a lens with distortion, with a tag that is not as large as it says."""
+"""The finger is calibrated from pictures drawn ray by ray through a lens with distortion, with a tag that is not as
+large as it says."""
 
 from __future__ import annotations
 
@@ -47,7 +48,8 @@ def rays(samples: int = 3) -> np.ndarray:
 
 
 def drawn(texture: np.ndarray, pixels_per_m: float, X_KP: RigidTransform, number: int) -> np.ndarray:
-    """What the camera sees of a plane's print; `texture` has its first pixel's corner at the plane's origin, x right, y down."""
+    """What the camera sees of a plane's print; `texture` has its first pixel's corner at the plane's origin, x right, y
+    down."""
     R, p = X_KP.rotation().matrix(), X_KP.translation()
     t = (R[:, 2] @ p) / (rays() @ R[:, 2])
     on = (rays() * t[..., None] - p) @ R

@@ -1,6 +1,7 @@
 """Finds the commands: every function under `@command(...)` in the modules of tools/commands and tools/studies.
 
-A module is imported when its command is called. Until then only the text of its decorator is read, so that `weldcal --help` is fast.
+A module is imported when its command is called. Until then only the text of its decorator is read, so that `weldcal
+--help` is fast.
 """
 
 import ast

@@ -1,4 +1,5 @@
-"""Makes one command of several studies of a subject: `--what WORD` chooses, and each old command stays as a hidden one."""
+"""Makes one command of several studies of a subject: `--what WORD` chooses, and each old command stays as a hidden
+one."""
 
 import copy
 import inspect
@@ -32,8 +33,8 @@ def one_of(first: str, **studies: Command) -> Callable[[Body], Body]:
         def doctor(call: Call) -> None:
             \"\"\"Measure which causes the doctor names.\"\"\"
 
-    Each study is a command of the same module, hidden under its old name. An option of several studies has one type, and
-    the default and the bounds of the chosen study.
+    Each study is a command of the same module, hidden under its old name. An option of several studies has one type,
+    and the default and the bounds of the chosen study.
 
     Args:
         first: the word of the study that runs without --what.

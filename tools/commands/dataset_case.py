@@ -1,4 +1,5 @@
-"""Makes the doctor's case of a dataset, the poses as stated and what the scans show of the flange, and writes it beside a result."""
+"""Makes the doctor's case of a dataset, the poses as stated and what the scans show of the flange, and writes it beside
+a result."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -55,9 +56,11 @@ def write_case(folder: Path, case: Case) -> None:
 def examined_where_refused(
     out: Path, data: Dataset, seen: FlangeObservations, standard: FlangeStandard, seed: int
 ) -> Iterator[None]:
-    """Writes the case to ``out`` where the block refuses five scans or more, and lets the error go on, with the doctor's first cause.
+    """Writes the case to ``out`` where the block refuses five scans or more, and lets the error go on, with the
+    doctor's first cause.
 
-    Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be wrong.
+    Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be
+    wrong.
     """
     try:
         yield
@@ -79,6 +82,9 @@ def _name_cause(problem: WeldcalError, case: Case) -> None:
         return
     cause = causes[0]
     problem.args = (
-        f"{problem} The likely cause is: {cause.name} ({100.0 * cause.confidence:.0f} %). {cause.evidence} {cause.next}",
+        (
+            f"{problem} The likely cause is: {cause.name} ({100.0 * cause.confidence:.0f} %). {cause.evidence}"
+            f" {cause.next}"
+        ),
         *problem.args[1:],
     )

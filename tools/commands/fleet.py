@@ -40,8 +40,8 @@ def fleet(
         ),
     ] = None,
 ) -> Outcome:
-    """Calibrate every dataset, verify each cell's first calibration on its later datasets, and write one page: which cells
-    drift, and which need a visit."""
+    """Calibrate every dataset, verify each cell's first calibration on its later datasets, and write one page: which
+    cells drift, and which need a visit."""
     find_cells(folder)
     out = call.folder("fleet", folder.resolve().name)
     report = run_fleet(folder, Farm.of(out, call.given, call.progress), limit_mm=limit_mm, seed=call.seed)
@@ -56,11 +56,12 @@ def fleet(
 
 
 def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: int = 0) -> FleetReport:
-    """Calibrate every dataset and verify each cell's first calibration on its later datasets; write report.html and fleet.json.
+    """Calibrate every dataset and verify each cell's first calibration on its later datasets; write report.html and
+    fleet.json.
 
-    A folder with dataset.yaml is a dataset. Datasets in one folder below ``folder`` are of one cell, the oldest first by
-    name; a dataset directly in ``folder`` is a cell by itself. A second run with the same output folder does only what is
-    missing.
+    A folder with dataset.yaml is a dataset. Datasets in one folder below ``folder`` are of one cell, the oldest first
+    by name; a dataset directly in ``folder`` is a cell by itself. A second run with the same output folder does only
+    what is missing.
 
     Raises:
         InputError: no dataset is there.
@@ -82,8 +83,12 @@ def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: 
             first = out / "calibrations" / cell / made[0]
             into = out / "verifications" / cell / name
             tasks[_key(cell, name)] = {
-                "result": str(first), "dataset": str(datasets[name]), "out": str(into), "limit_mm": limit_mm, "seed": seed,
-            }  # fmt: skip
+                "result": str(first),
+                "dataset": str(datasets[name]),
+                "out": str(into),
+                "limit_mm": limit_mm,
+                "seed": seed,
+            }
     verifications = _step(farm, "verifications").run(verify_one, tasks) if tasks else {}
     checked = {
         cell: [_checked(cell, name, calibrations, verifications) for name in datasets]
@@ -96,7 +101,8 @@ def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: 
 
 
 def find_cells(folder: Path) -> dict[str, dict[str, Path]]:
-    """Datasets by cell and name, sorted: a cell is the folder that holds its datasets, or a dataset directly in ``folder``.
+    """Datasets by cell and name, sorted: a cell is the folder that holds its datasets, or a dataset directly in
+    ``folder``.
 
     Raises:
         InputError: there is none, or ``folder`` is one dataset itself.

@@ -1,4 +1,5 @@
-"""Puts what the page shows into words and numbers of JSON: the state in large letters, steps, plots, last and next scan."""
+"""Puts what the page shows into words and numbers of JSON: the state in large letters, steps, plots, last and next
+scan."""
 
 from __future__ import annotations
 
@@ -167,9 +168,9 @@ def scene_values(facts: Facts, moment: Moment, views: Views) -> dict[str, Any]:
         if estimate is not None and phase not in (*WELDING_PHASES, "scan_workpiece", "park", "home", "done", "held"):
             scale = RESIDUAL_MM
     return {
-        "cameras": [{"key": name, "name": CAMERAS[name]} for name in (FOLLOW, *views.known)]
-        if len(views.known) > 1
-        else [],
+        "cameras": (
+            [{"key": name, "name": CAMERAS[name]} for name in (FOLLOW, *views.known)] if len(views.known) > 1 else []
+        ),
         "wanted": views.wanted,
         "showing": views.showing,
         "legend": [key._asdict() for key in keys],

@@ -1,4 +1,5 @@
-"""The result of `weldcal hand-eye` and its page: poses and how sure they are, errors of every sample, comparison of methods."""
+"""The result of `weldcal hand-eye` and its page: poses and how sure they are, errors of every sample, comparison of
+methods."""
 
 from base64 import b64encode
 from collections.abc import Mapping
@@ -33,7 +34,8 @@ class MethodRow:
 @dataclass(frozen=True, kw_only=True)
 class HandEyeReport:
     """A finished calibration: the result, the comparison, the next pose (``advice``: as a sentence) and the files;
-    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were given."""
+    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were given.
+    """
 
     result: HandEyeResult
     mounting: Mounting
@@ -66,9 +68,11 @@ class HandEyeReport:
         found = Findings(
             against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
         )
-        after = Next(f"To know it better, add a pose. {self.advice}") if self.advice else Next(
-            "Compare with poses that were not in the file: the target must stay where the result puts it."
-        )  # fmt: skip
+        after = (
+            Next(f"To know it better, add a pose. {self.advice}")
+            if self.advice
+            else Next("Compare with poses that were not in the file: the target must stay where the result puts it.")
+        )
         return FirstScreen(found, expected, after, shown_poses(r, self.mounting))
 
     def summary(self) -> dict[str, object]:
@@ -106,7 +110,8 @@ class HandEyeReport:
         )
 
     def text(self) -> str:
-        """What is printed between the poses' diversity and the first screen: directions, sketch, uncertainty, comparison.
+        """What is printed between the poses' diversity and the first screen: directions, sketch, uncertainty,
+        comparison.
 
         The first screen has the poses themselves, the warnings and the next pose.
         """
@@ -211,7 +216,8 @@ def undetermined(r: HandEyeResult, *, everything: bool = False) -> list[str]:
 
 
 def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
-    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and the number of poses."""
+    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and the number of
+    poses."""
     used = held_out_used(r)
     seen = np.isfinite(used.translation)
     held = 1e3 * used.translation[seen]
@@ -223,7 +229,10 @@ def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
             0,
         )
     p95 = float(np.percentile(held, 95))
-    backing = f"of {held_out_set(r)}, each unseen by its calibration; rms {used.rms_deg:.3f} degrees; in place of a work point"
+    backing = (
+        f"of {held_out_set(r)}, each unseen by its calibration; rms {used.rms_deg:.3f} degrees; in place of a work"
+        " point"
+    )
     return Expected(what, f"{p95:.3f} mm", backing), p95, len(np.unique(r.observation[r.inliers][seen]))
 
 
@@ -279,7 +288,8 @@ def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:
 
 
 def unknown_tables(result: HandEyeResult, mounting: Mounting, off: Mapping[str, str]) -> list[Table]:
-    """For each pose a caption and rows: component, value, one sigma; ``off`` adds words to the caption, by the pose's symbol."""
+    """For each pose a caption and rows: component, value, one sigma; ``off`` adds words to the caption, by the pose's
+    symbol."""
     found = []
     for k, X in result.poses.items():
         u, sigma = mounting.unknowns[k], np.sqrt(np.diag(result.covariance[k]))

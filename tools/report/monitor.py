@@ -36,7 +36,10 @@ class MonitorReport:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. The tolerance is the test's threshold, which --false-alarms sets; there is no work point in a watch."""
+        """The first screen.
+
+        The tolerance is the test's threshold, which --false-alarms sets; there is no work point in a watch.
+        """
         w = self.watched
         largest = float(np.nanmax(w.statistic)) if len(w.statistic) else float("nan")
         source = f"--false-alarms {self.false_alarms_per_hour:g} per hour"

@@ -28,8 +28,8 @@ from weldcal.tools.report.render import fixed, render
 
 @dataclass(frozen=True)
 class PoseError:
-    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face normals
-    (None where none was seen), and whether the calibration used this scan."""
+    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face
+    normals (None where none was seen), and whether the calibration used this scan."""
 
     id: str
     error_mm: float
@@ -42,8 +42,8 @@ NONE = "not a verification"
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict of a verification (one of the four above), its limit for the median of the new scans in mm (None: the calibration
-    states none) and the reason, a sentence."""
+    """The verdict of a verification (one of the four above), its limit for the median of the new scans in mm (None: the
+    calibration states none) and the reason, a sentence."""
 
     verdict: str
     limit_mm: float | None
@@ -184,16 +184,18 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
             stated=None if stated is None else (stated, "stated by the calibration"),
             median_of=median_of,
         ),
-        tilt_bars=error_bars(
-            [i for i, s in zip(ids, seen, strict=True) if s],
-            tilts[seen],
-            fresh[seen],
-            "tilt, deg",
-            stated=None if stated_tilt is None else (stated_tilt, "stated by the calibration"),
-            median_of=median_of,
-        )
-        if seen.any()
-        else None,
+        tilt_bars=(
+            error_bars(
+                [i for i, s in zip(ids, seen, strict=True) if s],
+                tilts[seen],
+                fresh[seen],
+                "tilt, deg",
+                stated=None if stated_tilt is None else (stated_tilt, "stated by the calibration"),
+                median_of=median_of,
+            )
+            if seen.any()
+            else None
+        ),
         field=error_field(report.result.X_BC, report.observations),
         hashes=list(report.hashes.items()),
     )

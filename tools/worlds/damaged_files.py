@@ -1,4 +1,5 @@
-"""Damaged files for every reader of a file that a user can write: an example is built, damaged and read; a verdict says what was read."""
+"""Damaged files for every reader of a file that a user can write: an example is built, damaged and read; a verdict says
+what was read."""
 
 import os
 import pickle
@@ -52,8 +53,8 @@ Values = Sequence[Any]
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader: ``target`` is the file of the example that is damaged, by the grammar ``kind``; ``read`` takes the folder and
-    returns what was read, all numbers of which must be finite where ``finite``."""
+    """A reader: ``target`` is the file of the example that is damaged, by the grammar ``kind``; ``read`` takes the
+    folder and returns what was read, all numbers of which must be finite where ``finite``."""
 
     name: str
     kind: str
@@ -204,7 +205,8 @@ class Verdict:
 
 
 def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, str]:
-    """The example, the damaged files, whether they contradict themselves, and what is there instead of a file ("" a file)."""
+    """The example, the damaged files, whether they contradict themselves, and what is there instead of a file ("" a
+    file)."""
     number = READERS.index(reader)
     rng = np.random.default_rng((seed, number, case))
     files = _example(number, seed, case % _EXAMPLES)

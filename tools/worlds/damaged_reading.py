@@ -1,6 +1,7 @@
 """Reads damaged files in a child process, which is started anew after it hung, died or took too much memory.
 
-As a program of its own this module is the child: it reads "reader seed case" lines and answers each with a line of JSON.
+As a program of its own this module is the child: it reads "reader seed case" lines and answers each with a line of
+JSON.
 """
 
 import json

@@ -1,7 +1,8 @@
-"""Simulated sets of flange scans, clean or with one cause; the arm and the scanner err in ways that the doctor's models do not hold.
+"""Simulated sets of flange scans, clean or with one cause; the arm and the scanner err in ways that the doctor's models
+do not hold.
 
-The arm has joint zeros, link lengths, sag and repeatability of its own; the scanner a polynomial warp to the third power, noise that
-grows with distance, and normals that bend at the rim.
+The arm has joint zeros, link lengths, sag and repeatability of its own; the scanner a polynomial warp to the third
+power, noise that grows with distance, and normals that bend at the rim.
 """
 
 from collections.abc import Callable
@@ -107,8 +108,8 @@ def _off(chain: Chain, rng: np.random.Generator, length: float) -> Chain:
 def observe(
     world: World, X_BF: Array, X_BC: Array | None = None, believed: Array | None = None, *, soft: float = 0.0
 ) -> Case:
-    """What the scanner sees of the true flange poses (n, 4, 4); ``believed`` is what the controller states, ``soft`` the distance (m) from
-    which on the image is out of focus (0: nowhere)."""
+    """What the scanner sees of the true flange poses (n, 4, 4); ``believed`` is what the controller states, ``soft``
+    the distance (m) from which on the image is out of focus (0: nowhere)."""
     rng, n = world.rng, len(X_BF)
     X_CF = inverse(np.broadcast_to(world.X_BC if X_BC is None else X_BC, (n, 4, 4))) @ X_BF
     c, m = X_CF[:, :3, 3], X_CF[:, :3, 2]
@@ -360,4 +361,7 @@ UNKNOWN: dict[str, Callable[[int], Case]] = {
     "scans of other poses": _shuffled,
     "rotations without meaning": _random_turns,
 }
-"""What each does to a set, by seed. Of the last three no model has the name: "unexplained", or a kinematics file, is right."""
+"""What each does to a set, by seed.
+
+Of the last three no model has the name: "unexplained", or a kinematics file, is right.
+"""

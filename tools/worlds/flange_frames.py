@@ -21,7 +21,8 @@ _SEGMENTS = 96  # of bodies that are no flange
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One scan (H, W, 3) m with NaN where nothing was measured, and the pose X_CR of the flange in it (None: no flange)."""
+    """One scan (H, W, 3) m with NaN where nothing was measured, and the pose X_CR of the flange in it (None: no
+    flange)."""
 
     points_C: Array
     X_CR: RigidTransform | None
@@ -75,7 +76,8 @@ def sphere_frame(
     p_FS: Array,
     radius_m: float,
 ) -> Array:
-    """A scan (H, W, 3) m of a flange at X_CF on its wrist that carries a ball of this radius at p_FS (3,) m, over a table."""
+    """A scan (H, W, 3) m of a flange at X_CF on its wrist that carries a ball of this radius at p_FS (3,) m, over a
+    table."""
     ball = _ball(radius_m, 121).transformed(X_CF @ RigidTransform(p_FS))
     bodies = [m.transformed(X_CF) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
     bodies += _surroundings(scanner, standard, rng, 0, clear_of=X_CF)
@@ -83,7 +85,8 @@ def sphere_frame(
 
 
 def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator) -> Frame:
-    """A frame without the flange: a table, things, and lookalikes (discs, rings and flanges of other sizes, tube ends)."""
+    """A frame without the flange: a table, things, and lookalikes (discs, rings and flanges of other sizes, tube
+    ends)."""
     bodies = _surroundings(scanner, standard, rng, 9, clear_of=None)
     for k in range(3):
         bodies.append(_lookalike(standard, rng, k).transformed(random_place(scanner, standard, rng)))
@@ -91,7 +94,8 @@ def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random
 
 
 class FrameFit(NamedTuple):
-    """The centre's error (m), its square per axis in units of the stated covariance, and the share of the edge that was seen."""
+    """The centre's error (m), its square per axis in units of the stated covariance, and the share of the edge that was
+    seen."""
 
     error_m: float
     normalised: float

@@ -42,8 +42,9 @@ class World:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the solver said of a world: "answer", "open" (a direction named), "warning", "refused", "named" (the mistake), or
-    "NAN" and "WRONG", which must not be; ``nees``: of the answer, in units of the region that holds the truth."""
+    """What the solver said of a world: "answer", "open" (a direction named), "warning", "refused", "named" (the
+    mistake), or "NAN" and "WRONG", which must not be; ``nees``: of the answer, in units of the region that holds the
+    truth."""
 
     said: str
     sentence: str
@@ -51,8 +52,8 @@ class Verdict:
 
 
 def random_world(rng: np.random.Generator, mistake: str | None = None) -> World:
-    """A world with any motion, mounting, noise (normal or heavy-tailed, about the middle of a board whose origin is a corner),
-    outliers, and one of the usual mistakes (``mistake``; else half of them without)."""
+    """A world with any motion, mounting, noise (normal or heavy-tailed, about the middle of a board whose origin is a
+    corner), outliers, and one of the usual mistakes (``mistake``; else half of them without)."""
     motion = str(rng.choice(MOTIONS))
     if mistake is None:
         mistake = "none" if rng.uniform() < 0.5 else str(rng.choice(MISTAKES[1:]))

@@ -1,4 +1,5 @@
-"""Writes and reads the weld log: a CSV with one row per servo tick and a JSON header with the meaning and unit of each column."""
+"""Writes and reads the weld log: a CSV with one row per servo tick and a JSON header with the meaning and unit of each
+column."""
 
 import csv
 import hashlib
@@ -49,7 +50,8 @@ COLUMNS: tuple[Column, ...] = (
         "phase",
         "",
         "",
-        "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT; HELD while a person holds the weld, BACK on the way back after that",
+        "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT; HELD while a person holds the weld, BACK on the way"
+        " back after that",
     ),
     Column("torch_on", "", "", "process output, 1 or 0: servo, job, robot, guard and person all agree"),
     Column("s_tip_m", "m", "planned seam", "arc length beside the tip"),
@@ -172,7 +174,8 @@ def load_weld_log(path: Path | str) -> WeldRecord:
     text = _text(csv_path)
     if hashlib.sha256(text.encode()).hexdigest() != header["sha256"]:
         raise WeldLogError(
-            f"{csv_path} is not the table that {header_path.name} describes: it was cut off or changed; use the original."
+            f"{csv_path} is not the table that {header_path.name} describes: it was cut off or changed; use the"
+            " original."
         )
     try:
         rows = list(csv.reader(io.StringIO(text)))

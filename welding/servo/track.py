@@ -91,7 +91,8 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
         on_path = plan.position + residual[0] * plan.normal + residual[1] * up
         step = s - state.s_torch
     else:
-        # The plan gives the surface better than a few points near a corner: the path leaves it by three degrees at most.
+        # The plan gives the surface better than a few points near a corner: the path leaves it by three degrees at
+        # most.
         rise = dot(fit.tangent, plan.up)
         t = unit(fit.tangent + (clip(rise, -_RISE, _RISE) - rise) * plan.up, fit.tangent)
         on_path = fit.point
@@ -101,8 +102,8 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     if fit is not None:
         bend = dot(fit.bend, n) / fit.speed**2
         if abs(plan.curvature) > _SHARP_PER_M:
-            # At a sharp corner the bend here does not describe the path a moment later, and turning the torch's path takes
-            # a ramp at the limit of the turning rate, of which half counts as lag.
+            # At a sharp corner the bend here does not describe the path a moment later, and turning the torch's path
+            # takes a ramp at the limit of the turning rate, of which half counts as lag.
             speed = config.weld_speed_m_s
             ramp = speed / (config.tool.torch_offset_m * config.limits.omega_acceleration_rad_s2)
             then = local_fit(

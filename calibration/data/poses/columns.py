@@ -4,21 +4,56 @@ import re
 from dataclasses import dataclass
 
 IDS = (
-    "id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no", "sample", "frame", "#", "point", "idx",
+    "id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no", "sample",
+    "frame", "#", "point", "idx",
 )  # fmt: skip
 TIMES = (
-    "time", "%time", "timestamp", "stamp", "t", "time_s", "header.stamp", "sec", "secs", "timestamp_s", "time_ns", "timestamp_ns",
-)  # fmt: skip
+    "time",
+    "%time",
+    "timestamp",
+    "stamp",
+    "t",
+    "time_s",
+    "header.stamp",
+    "sec",
+    "secs",
+    "timestamp_s",
+    "time_ns",
+    "timestamp_ns",
+)
 _POSITION = {
-    "position", "pos", "translation", "trans", "t", "p", "tvec", "xyz", "location", "origin", "linear", "coord",
-}  # fmt: skip
+    "position",
+    "pos",
+    "translation",
+    "trans",
+    "t",
+    "p",
+    "tvec",
+    "xyz",
+    "location",
+    "origin",
+    "linear",
+    "coord",
+}
 _ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad"}
 _VECTOR = {"rvec", "rotvec", "rv", "axisangle", "aa", "rodrigues"}
 _QUATERNION = {"quat", "quaternion", "q"}
 _FILLERS = {"field", "pose", "transform", "transforms0", "vector", "tcp", "data", "actual", "x1"}
 _OWNERS = (
-    "robot", "camera", "cam", "hand", "eye", "ee", "base", "flange", "target", "marker", "board", "gripper", "tool",
-)  # fmt: skip
+    "robot",
+    "camera",
+    "cam",
+    "hand",
+    "eye",
+    "ee",
+    "base",
+    "flange",
+    "target",
+    "marker",
+    "board",
+    "gripper",
+    "tool",
+)
 _WHOLE = {
     "qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o",
 }  # fmt: skip
@@ -43,7 +78,8 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Column:
-    """A column that is part of a pose: which list it belongs to, its role in a pose, its unit and its place in the table."""
+    """A column that is part of a pose: which list it belongs to, its role in a pose, its unit and its place in the
+    table."""
 
     prefix: str
     role: str
@@ -54,8 +90,9 @@ class Column:
 def columns_of(header: list[str]) -> tuple[list[Column], dict[str, int]]:
     """The columns of poses of a header, and the places of its ids and times.
 
-    Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector for sure); roll, pitch,
-    yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to m33.
+    Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector
+    for sure); roll, pitch, yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to
+    m33.
     """
     found: list[Column] = []
     other: dict[str, int] = {}
@@ -132,9 +169,11 @@ def _with_quaternions(columns: list[Column], names: list[tuple[str, str]]) -> li
     """Rotation columns x, y, z, w of one list are a quaternion."""
     four = {c.prefix for c in columns if c.role == "rw"}
     return [
-        Column(c.prefix, f"q{c.role[1]}", c.unit, c.index)
-        if c.prefix in four and re.fullmatch("r[wxyz]", c.role)
-        else c
+        (
+            Column(c.prefix, f"q{c.role[1]}", c.unit, c.index)
+            if c.prefix in four and re.fullmatch("r[wxyz]", c.role)
+            else c
+        )
         for c in columns
     ]
 

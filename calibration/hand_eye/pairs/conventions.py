@@ -22,7 +22,8 @@ _POSITION_FLOOR = 1e-6  # share of the positions: six printed digits
 _AGREE = 0.1  # of the motion: beyond it there is no agreement that deserves the name
 _SAME_SCALE = 0.02
 _NEAR_UNIT = 0.08  # of the logarithm of a factor: attenuation by noise of short motions
-_MOST = 160  # pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
+# Pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
+_MOST = 160
 _SURE_TURN = 2.8  # rad
 _ONE_AXIS = 0.1  # share of the turns off the main axis below which rotations do not determine X about it
 _STEPS = 6
@@ -104,10 +105,11 @@ def decide(
 ) -> Decision:
     """Compare all readings of two lists of n poses and keep those that the data do not reject.
 
-    With F = X_BF (eye in hand) or its inverse (eye on base) and G = X_CM, F X G = Y for one X and one Y. Pairs of poses give the angle of each
-    relative rotation, which is equal on both sides whatever X is: it selects the notations. A least-squares solution of those
-    that remain gives rotation and position residuals with 3 n - 6 degrees of freedom each. If reading r were right, its squared residuals
-    would exceed those of any other by more than the quantile of F(dof, dof) with probability CHANCE at most: readings beyond it are rejected.
+    With F = X_BF (eye in hand) or its inverse (eye on base) and G = X_CM, F X G = Y for one X and one Y. Pairs of poses
+    give the angle of each relative rotation, which is equal on both sides whatever X is: it selects the notations. A
+    least-squares solution of those that remain gives rotation and position residuals with 3 n - 6 degrees of freedom
+    each. If reading r were right, its squared residuals would exceed those of any other by more than the quantile of
+    F(dof, dof) with probability CHANCE at most: readings beyond it are rejected.
 
     Args:
         robot, camera: the candidates, usual ones first.
@@ -150,7 +152,8 @@ def _rejected(one: Agreement, best: Agreement, limit: float) -> bool:
 
 
 def _same(one: Agreement, other: Agreement) -> bool:
-    """Whether two readings have the same rotations, or lead to the same X and Y, within the residuals of the better one."""
+    """Whether two readings have the same rotations, or lead to the same X and Y, within the residuals of the better
+    one."""
     if abs(np.log(one.scale / other.scale)) > _SAME_SCALE:
         return False
     gaps = [
@@ -208,7 +211,8 @@ def agreements(
 ) -> list[Agreement]:
     """Solve F X G = Y for each pair of readings, all at once.
 
-    Without ``all_of_them``, readings that their rotations reject are left out, but the best of them and the best without a change.
+    Without ``all_of_them``, readings that their rotations reject are left out, but the best of them and the best
+    without a change.
     """
     tried, changes = [(a, b) for a, b, _ in variants], [c for _, _, c in variants]
     F = np.stack([one.X if eye_in_hand else inverse(one.X) for one, _ in tried])
@@ -280,8 +284,8 @@ def _weights(size: Array, kept: int) -> Array:
 
 
 def _rotation(F: Array, G: Array, kept: int) -> tuple[Array, Array, Array]:
-    """R_X and R_Y of F R_X G = R_Y and the residual angles (m, n) rad, for (m, n, 3, 3): the better of two linear starts, then alternating
-    robust means."""
+    """R_X and R_Y of F R_X G = R_Y and the residual angles (m, n) rad, for (m, n, 3, 3): the better of two linear
+    starts, then alternating robust means."""
     back = np.ascontiguousarray(np.swapaxes(F, 2, 3)), np.ascontiguousarray(np.swapaxes(G, 2, 3))
     one, other = (_alternate(R, F, G, back, kept, _TRIAL_STEPS) for R in _starts(F, G))
     better = _trimmed(other[2], kept) < _trimmed(one[2], kept)
@@ -326,9 +330,11 @@ def _starts(F: Array, G: Array) -> list[Array]:
 
 
 def _about_one_axis(F: Array, G: Array, RX: Array, RY: Array, kept: int) -> tuple[Array, Array]:
-    """R_X and R_Y turned about the robot's axis where it turns about one only: rotations leave that angle open, and positions fix it.
+    """R_X and R_Y turned about the robot's axis where it turns about one only: rotations leave that angle open, and
+    positions fix it.
 
-    F X G = Y is linear in t_X, t_Y and, with v = R_X t_G and the axis a, in the factors of v along a, of v across a, and of a x v.
+    F X G = Y is linear in t_X, t_Y and, with v = R_X t_G and the axis a, in the factors of v along a, of v across a,
+    and of a x v.
     """
     mean = nearest_rotation(F[..., :3, :3].sum(axis=1))
     turns = log_rotation((np.swapaxes(mean, 1, 2)[:, None] @ F[..., :3, :3]).reshape(-1, 3, 3)).reshape(*F.shape[:2], 3)
@@ -365,7 +371,8 @@ def _pairs(n: int, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _translation(F: Array, turned: Array, kept: int, scale: Array | None) -> tuple[Array, Array, Array, Array, Array]:
-    """t_X, t_Y (m, 3), the scale (m,) of the camera's positions, the residuals (m, n, 3) of F X G = Y, in F's unit, and the scale's sigma.
+    """t_X, t_Y (m, 3), the scale (m,) of the camera's positions, the residuals (m, n, 3) of F X G = Y, in F's unit, and
+    the scale's sigma.
 
     ``turned``: R_F R_X t_G (m, n, 3). ``scale``: fixed, or None to estimate it.
     """

@@ -1,7 +1,8 @@
 """The sphere problem: measurements, unknowns, and whitened residuals with derivatives.
 
 Every profile point lies on the sphere, and so does the tip at every touch. The error of the robot's position, which all
-points of a scan share, is taken out by whitening with it rather than by unknowns of its own; docs/profiler.md derives it.
+points of a scan share, is taken out by whitening with it rather than by unknowns of its own; docs/profiler.md derives
+it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ ROBUST: dict[str, Any] = {"loss": "soft_l1", "f_scale": 3.0, "max_nfev": 60}
 
 @dataclass(frozen=True, kw_only=True)
 class SphereSigmas:
-    """What is known before: of the sensor's points, the robot's position at a scan and at a touch (m), and the priors."""
+    """What is known before: of the sensor's points, the robot's position at a scan and at a touch (m), and the
+    priors."""
 
     sensor_m: float = 0.05e-3
     robot_m: float = 0.03e-3  # per axis: a repeatability of 0.05 mm by ISO 9283 is a radius
@@ -113,8 +115,9 @@ class Layout:
 class _Points(NamedTuple):
     """Where the unknowns `x`, with the turn `R0` before them, place everything.
 
-    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches; `rotation` (m, 3, 3):
-    of the flange at each point; `R`: of the sensor; `turned` (m, 3): the points about the sensor's origin, by F's axes.
+    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches; `rotation` (m,
+    3, 3): of the flange at each point; `R`: of the sensor; `turned` (m, 3): the points about the sensor's origin, by
+    F's axes.
     """
 
     x: Floats
@@ -188,7 +191,10 @@ class Problem:
         return points.at, points.felt, points.poses
 
     def _points(self, x: Floats) -> _Points:
-        """The points placed by x. The last answer is kept: a solver asks for residuals and derivatives at the same x."""
+        """The points placed by x.
+
+        The last answer is kept: a solver asks for residuals and derivatives at the same x.
+        """
         last = self._placed
         if last is not None and last.R0 is self._R0 and np.array_equal(last.x, x):
             return last
@@ -237,7 +243,8 @@ class Problem:
         return np.asarray(out)
 
     def shared(self, r: Floats) -> float:
-        """Sum of squares of what the whitened residuals (m,) of each scan share with an error of the robot's position."""
+        """Sum of squares of what the whitened residuals (m,) of each scan share with an error of the robot's
+        position."""
         ends = np.cumsum(self.count)
         parts = zip(self._whiten or [], ends - self.count, ends, strict=False)
         return float(sum(np.sum((U.T @ r[a:b]) ** 2) for (U, _), a, b in parts))

@@ -57,7 +57,8 @@ def free_radius(data: SphereData, start_m: float, sigmas: SphereSigmas) -> FreeR
 def check_radius(data: SphereData, sigmas: SphereSigmas, stated: SphereEstimate | None) -> None:
     """Refuse a stated radius that the profiles contradict; `stated`: the rigid fit with it, None where there is none.
 
-    A profiler's scale error shows as another radius: up to three sigmas of its prior is its error, more is another sphere.
+    A profiler's scale error shows as another radius: up to three sigmas of its prior is its error, more is another
+    sphere.
 
     Raises:
         RadiusError: the profiles determine the radius, and it is another one.
@@ -75,8 +76,8 @@ def check_radius(data: SphereData, sigmas: SphereSigmas, stated: SphereEstimate 
         if stated is None or near:
             return  # whatever the fit itself refuses for
         raise RadiusError(
-            f"The profiles contradict a sphere of {1e3 * R:.2f} mm radius and show no other one. Check the radius, the poses and that "
-            "only the sphere is in the profiles."
+            f"The profiles contradict a sphere of {1e3 * R:.2f} mm radius and show no other one. Check the radius, the"
+            " poses and that only the sphere is in the profiles."
         )
     worse = np.inf if stated is None else stated.reduced_chi2
     if abs(best.radius_m - R) <= allowed + NOISE_SIGMAS * best.sigma_m or best.reduced_chi2 > BETTER * worse:

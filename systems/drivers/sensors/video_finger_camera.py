@@ -95,7 +95,10 @@ class MjpegStream:
         self._boundary = b"--" + boundary.removeprefix("--").encode("latin-1")
 
     def next(self, timeout_s: float) -> Part | None:
-        """The next whole part; None where none came in time. Raises DeviceLost, and Garbage for a part that is no JPEG."""
+        """The next whole part; None where none came in time.
+
+        Raises DeviceLost, and Garbage for a part that is no JPEG.
+        """
         until = time.monotonic() + timeout_s
         while (found := self._part()) is None:
             left = until - time.monotonic()
@@ -178,9 +181,10 @@ UNDECODED = "it sent a picture that cannot be decoded"
 class VideoFingerCamera(WiredFingerCamera):
     """`!VideoFingerCamera`: where the pictures come from.
 
-    `source`: http://HOST:PORT/PATH (MJPEG), rtsp://..., the number or path of a video device (0, /dev/video0), or a video file.
-    `stamps` of an MJPEG stream's header X-Timestamp (s): host, of this computer's clock (Unix time); device, of a clock of its
-    own, whose offset is found from the earliest arrivals; none. Without stamps a picture was taken `latency_s` before it came.
+    `source`: http://HOST:PORT/PATH (MJPEG), rtsp://..., the number or path of a video device (0, /dev/video0), or a
+    video file. `stamps` of an MJPEG stream's header X-Timestamp (s): host, of this computer's clock (Unix time);
+    device, of a clock of its own, whose offset is found from the earliest arrivals; none. Without stamps a picture was
+    taken `latency_s` before it came.
     """
 
     source: str = ""
@@ -190,14 +194,16 @@ class VideoFingerCamera(WiredFingerCamera):
         """The source of pictures that `source` names. Raises InputError where it names none."""
         if not self.source:
             raise InputError(
-                "Write the camera's source in the scenario: finger_camera: !VideoFingerCamera {source: http://HOST:PORT/PATH}."
+                "Write the camera's source in the scenario: finger_camera: !VideoFingerCamera {source:"
+                " http://HOST:PORT/PATH}."
             )
         if self.stamps not in STAMPS:
             raise InputError(f"finger_camera.stamps must be {', '.join(STAMPS)}, not '{self.stamps}'.")
         if self.source.startswith("http://"):
             if self.exposure_ms is not None or self.gain is not None:
                 raise InputError(
-                    "The exposure of an MJPEG stream is set at its camera: leave finger_camera.exposure_ms and gain at null."
+                    "The exposure of an MJPEG stream is set at its camera: leave finger_camera.exposure_ms and gain at"
+                    " null."
                 )
             return MjpegSource(self)
         if self.stamps != "none":

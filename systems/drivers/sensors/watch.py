@@ -1,4 +1,5 @@
-"""DeviceWatch: a device's fault becomes the robot's: the arm stops, the process goes off, and the fault stays until the run ends."""
+"""DeviceWatch: a device's fault becomes the robot's: the arm stops, the process goes off, and the fault stays until the
+run ends."""
 
 import dataclasses as dc
 from collections.abc import Callable
@@ -42,8 +43,8 @@ class DeviceWatch(LeafSystem):
         output_ports:
         - status
 
-    Everything that stops for a robot's fault stops for a device's: the process first, then the arm, and the job holds by that
-    sentence. A device that works again changes nothing before the next run.
+    Everything that stops for a robot's fault stops for a device's: the process first, then the arm, and the job holds
+    by that sentence. A device that works again changes nothing before the next run.
     """
 
     def __init__(self, device: Watched, clock: Callable[[], float] | None = None) -> None:

@@ -1,4 +1,5 @@
-"""What all scanners by wire share: their configuration, the system that asks for scans, and the one that shows a stream."""
+"""What all scanners by wire share: their configuration, the system that asks for scans, and the one that shows a
+stream."""
 
 import dataclasses as dc
 import time
@@ -101,8 +102,8 @@ def checked_cloud(points: NDArray[Any], metres: float, far_m: float) -> Cloud:
     middle = float(np.median(z))
     if not 0.0 < middle <= FAR * far_m:
         raise Garbage(
-            f"the middle of the cloud is {middle:.3g} m away, and the scanner sees {far_m:.3g} m far: set scanner.unit to "
-            "the unit of its points, and let it send them in the frame of its camera"
+            f"the middle of the cloud is {middle:.3g} m away, and the scanner sees {far_m:.3g} m far: set scanner.unit"
+            " to the unit of its points, and let it send them in the frame of its camera"
         )
     return cloud
 
@@ -118,9 +119,9 @@ class WiredScanStream(LeafSystem):
         output_ports:
         - stream
 
-    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's own, less
-    what the Diagram had lost on its ``clock`` when the frame was taken: the two stay together while the computer is late. Where
-    the cell follows an emulated robot's time, a host that is late does not make a frame late.
+    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's
+    own, less what the Diagram had lost on its ``clock`` when the frame was taken: the two stay together while the
+    computer is late. Where the cell follows an emulated robot's time, a host that is late does not make a frame late.
     """
 
     def __init__(self, acquisition: Acquisition[Cloud], clock: WallClock | None = None) -> None:

@@ -22,10 +22,12 @@ OBEYING, STALE_REGISTER = 1, 2
 MADE_UP_FOR_S = 0.03  # of the cell's time
 # of the controller's time: the guard shows a pass in every frame
 GUARD_SILENT_S = 0.08
-# The guard writes its number and the output in the same frame. A terminal may follow 5 frames later, and number and output may
-# be of two packages, 2 frames apart: after 10 frames an output that is on without being asked for is somebody else's.
+# The guard writes its number and the output in the same frame. A terminal may follow 5 frames later, and number and
+# output may be of two packages, 2 frames apart: after 10 frames an output that is on without being asked for is
+# somebody else's.
 OUTPUT_ON_S = 0.020
-# The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after 25.
+# The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after
+# 25.
 OUTPUT_OFF_S = 0.050
 # The guard writes the analog outputs in every frame, too.
 SET_POINT_S = 0.050
@@ -71,8 +73,9 @@ class Limits:
     late_s: float = 0.050
     lost_s: float = 0.5  # the arm is at rest since late_s
     deaf_s: float = 0.200  # later than the guard, which latches after 150 ms without a number
-    # States that come so long after the commands that they answer, for so long: no gap shows that a connection has become slow. The guard
-    # waits 150 ms for a number, and one that reaches it 120 ms late is no fault: that is 40 ms above behind_s.
+    # States that come so long after the commands that they answer, for so long: no gap shows that a connection has
+    # become slow. The guard waits 150 ms for a number, and one that reaches it 120 ms late is no fault: that is 40 ms
+    # above behind_s.
     behind_s: float = 0.080
     behind_for_s: float = 0.100
     jump_s: float = 0.5
@@ -105,7 +108,8 @@ class Limits:
         )
 
     def in_lockstep(self, patience_s: float = PATIENCE_S, held_s: float = HELD_S) -> Limits:
-        """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no stop."""
+        """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no
+        stop."""
         return replace(
             self,
             stale_s=max(self.stale_s, patience_s),
@@ -304,7 +308,8 @@ class Supervisor:
         return Fault.NONE, 0.0
 
     def _set_points(self, robot: RobotSample) -> float | None:
-        """The share (%) that an analog output shows in place of what the guard gives it, of one package; None: as it should."""
+        """The share (%) that an analog output shows in place of what the guard gives it, of one package; None: as it
+        should."""
         wrong = [shown for asked, shown in robot.set_points if apart(asked, shown)]
         if not wrong:
             self._apart_since = None
@@ -313,7 +318,8 @@ class Supervisor:
         return 100.0 * wrong[0] if robot.robot_time - self._apart_since > SET_POINT_S else None
 
     def _arc_unasked(self, robot: RobotSample) -> bool:
-        """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the torch."""
+        """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the
+        torch."""
         if robot.arc is None or robot.process_on is None:
             return False
         if robot.process_asked or robot.process_on:
@@ -352,12 +358,14 @@ class Supervisor:
         if share.max() > 1.0 + 1e-9:
             return Fault.COMMAND_TOO_FAST, float(np.abs(command.qd)[int(np.argmax(share))])
         late = now - command.given_at
-        # a late command slows the arm to rest within late_s; a torch may not burn there, and may not come on again by itself
+        # a late command slows the arm to rest within late_s; a torch may not burn there, and may not come on again by
+        # itself
         longest = limits.late_s if command.process else limits.lost_s
         if (command.process or command.qd.any()) and late > longest and not (command.stop or command.orphaned):
             return Fault.COMMAND_LATE, 1e3 * late
         if command.number != self._command.number:
-            # a cell catches up after a delay of up to 20 ms and restarts its clock after a longer one; passes may skip commands
+            # a cell catches up after a delay of up to 20 ms and restarts its clock after a longer one; passes may skip
+            # commands
             passed = limits.pace * max(command.given_at - self._command.given_at, 0.0)
             if passed > MADE_UP_FOR_S:
                 passed = limits.pace * (now - self._stepped_at)

@@ -193,7 +193,8 @@ class Worker:
             self._gas_on = on
 
     def _scaled(self, command: Command, now: float, sample: RobotSample) -> Command:
-        """The command with the factor that slows the arm while command or state is late, but not under a burning torch, which goes out first."""
+        """The command with the factor that slows the arm while command or state is late, but not under a burning torch,
+        which goes out first."""
         factor = self._scale.step(now, now - min(command.given_at, sample.fresh_at))
         kept = command.process or self._config.limits.waits
         return command if kept else replace(command, scale=factor)
@@ -206,7 +207,8 @@ class Worker:
             if old and (command.qd.any() or waited_for):
                 return  # the controller waits for the cell's next command
             self._driven = command.number
-            # The supervisor ends a late command with the torch on. Set points that wait for the torch are no fault: they go to zero.
+            # The supervisor ends a late command with the torch on. Set points that wait for the torch are no fault:
+            # they go to zero.
             armed = command.armed and now - command.given_at <= self._config.limits.late_s
             if not robot.send(command.scaled_qd, ACCELERATION, command.process, armed):
                 self._phase = Phase.STOPPED  # the next sample shows the cause
@@ -228,7 +230,8 @@ class Worker:
             self._phase = Phase.STOPPED
 
     def _await_the_end(self, robot: Robot, period: float) -> None:
-        """Wait until the controller says that the program has ended, so that nothing of it runs on after this process."""
+        """Wait until the controller says that the program has ended, so that nothing of it runs on after this
+        process."""
         until = time.monotonic() + ENDS_S / self._config.limits.pace
         while (now := time.monotonic()) < until and robot.sample(now).runtime_state in (PLAYING, STOPPING):
             time.sleep(period)

@@ -1,4 +1,5 @@
-"""MountingCalibrator: estimates the unknown poses of any mounting from scans of a circle, and proposes the next pose."""
+"""MountingCalibrator: estimates the unknown poses of any mounting from scans of a circle, and proposes the next
+pose."""
 
 import dataclasses as dc
 from collections.abc import Sequence
@@ -41,7 +42,8 @@ class MountingFitConfig:
 
 
 class MountingCalibrator(BackgroundSystem):
-    """Fits the circle in each scan near its predicted position, and solves the mounting's equation with all observations.
+    """Fits the circle in each scan near its predicted position, and solves the mounting's equation with all
+    observations.
 
     .. pydrake_system::
 
@@ -129,8 +131,8 @@ def digest(
 def next_best(
     belief: MountingScene, result: MountingResult, seen: Sequence[SeenCircle], plan: Sequence[MountingPose]
 ) -> NextBest | None:
-    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work point most; None where
-    all were visited."""
+    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work
+    point most; None where all were visited."""
     left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
     if not left:
         return None

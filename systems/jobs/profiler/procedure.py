@@ -1,4 +1,5 @@
-"""ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along it."""
+"""ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along
+it."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -175,8 +176,8 @@ class ProfilerProcedure(Procedure[ProfilerState, ProfilerInputs]):
         - trigger
         - creep
 
-    `job` selects the FlangeMover between goals (mode move), or `creep` (6) rad/s (mode weld): the descent to a touch, the
-    profiler's pass and the torch's. `trigger` (1) is the number of the newest requested profile; `hold` (1) is the
+    `job` selects the FlangeMover between goals (mode move), or `creep` (6) rad/s (mode weld): the descent to a touch,
+    the profiler's pass and the torch's. `trigger` (1) is the number of the newest requested profile; `hold` (1) is the
     operator's stop request.
     """
 
@@ -276,8 +277,9 @@ class ProfilerProcedure(Procedure[ProfilerState, ProfilerInputs]):
         if now.time - s.since > (stage.gap_mm + stage.deepest_mm) / stage.descent_mm_s:
             number = len(s.touches) + 1
             reason = (
-                f"The torch did not touch the sphere at touch {number}, and stopped {stage.deepest_mm:g} mm below the surface expected: check "
-                "the sphere's position and radius, and the touch probe's cable and input. Jog the torch away from the sphere before the next start."
+                f"The torch did not touch the sphere at touch {number}, and stopped {stage.deepest_mm:g} mm below the"
+                " surface expected: check the sphere's position and radius, and the touch probe's cable and input. Jog"
+                " the torch away from the sphere before the next start."
             )
             return self.held(s, now, reason)
         return s

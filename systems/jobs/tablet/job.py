@@ -50,7 +50,8 @@ def camera_of(scenario: Scenario) -> RenderedWristCamera:
 
 
 def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
-    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included; raises InputError where out of reach."""
+    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included; raises InputError where out of
+    reach."""
     found = inverse_kinematics(arm, X_BF)
     if len(found) == 0:
         raise InputError("The arm cannot reach the tablet at its nominal pose; move it nearer in the scenario.")
@@ -113,8 +114,8 @@ def check_moves(scenario: Scenario, station: Station, plan: TabletPlan) -> None:
     for k in range(len(goals) - 1):
         if not clear_move(scenario, station, bodies, goals[k], goals[k + 1]):
             raise InputError(
-                f"The move from {names[k]} to {names[k + 1]} would touch the table, the surroundings or the arm itself: choose another home_deg, "
-                "a smaller tablet.turn_deg, or another place for the tablet."
+                f"The move from {names[k]} to {names[k + 1]} would touch the table, the surroundings or the arm itself:"
+                " choose another home_deg, a smaller tablet.turn_deg, or another place for the tablet."
             )
 
 

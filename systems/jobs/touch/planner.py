@@ -56,8 +56,8 @@ def check_touch(scenario: Scenario) -> None:
         return
     if scenario.job.calibrate or scenario.job.weld:
         raise InputError(
-            "The touch job neither calibrates nor welds: write job: {calibrate: false, weld: false}, or run it with weldcal verify RESULT "
-            "--scenario NAME."
+            "The touch job neither calibrates nor welds: write job: {calibrate: false, weld: false}, or run it with"
+            " weldcal verify RESULT --scenario NAME."
         )
     if not touch.result or not Path(touch.result).exists():
         raise InputError(f"touch.result must be a result of weldcal calibrate, and there is none at '{touch.result}'.")
@@ -83,7 +83,8 @@ Joints = Array
 
 @dc.dataclass(frozen=True, eq=False)
 class Place(Message):
-    """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal in the base."""
+    """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal
+    in the base."""
 
     q_above: Joints
     p_C: Array
@@ -104,7 +105,8 @@ class PlannedTouches(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class TouchPlanning:
-    """What touches are planned from: part, tool and arm as for a seam, the calibration to judge, and the job's numbers."""
+    """What touches are planned from: part, tool and arm as for a seam, the calibration to judge, and the job's
+    numbers."""
 
     seam: SeamPlanning
     X_BC: RigidTransform
@@ -187,7 +189,8 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
 
 
 def _face(raw: Array, points_B: Array, p_B: Array, up: Array) -> tuple[Array, Array, float]:
-    """Plane of the face on the line through p_B along ``up``: point and normal towards the scanner as scanned, and the sigma, m."""
+    """Plane of the face on the line through p_B along ``up``: point and normal towards the scanner as scanned, and the
+    sigma, m."""
     away = points_B - p_B
     height = away @ up
     column = (np.linalg.norm(away - height[:, None] * up, axis=1) < _COLUMN_M) & (np.abs(height) < 0.03)

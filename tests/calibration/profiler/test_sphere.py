@@ -1,4 +1,5 @@
-"""A profiler calibrated by a sphere and touches of it: the paper's method, the joint one, its sigma, and what is refused."""
+"""A profiler calibrated by a sphere and touches of it: the paper's method, the joint one, its sigma, and what is
+refused."""
 
 from __future__ import annotations
 
@@ -10,13 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.places import SHARED_DATA, needs
-from weldcal.calibration.errors import (
-    ArcNotFound,
-    DegenerateMotion,
-    InconsistentData,
-    RadiusError,
-    TooFewTranslations,
-)
+from weldcal.calibration.errors import ArcNotFound, DegenerateMotion, InconsistentData, RadiusError, TooFewTranslations
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses

@@ -38,7 +38,8 @@ def test_planned_scans_find_factory_size_errors_and_state_what_remains() -> None
 
 
 def test_offsets_alone_state_what_unfitted_links_do_to_them() -> None:
-    """An arm whose axes are off besides its zeros: without the prior of the links the offsets would be stated far too well."""
+    """An arm whose axes are off besides its zeros: without the prior of the links the offsets would be stated far too
+    well."""
     world = station(46)
     X_BC, plain = _near(world)
     sought = arm_errors(ARM, "joints")

@@ -44,7 +44,8 @@ VELOCITY = np.array([0.1, 0.0, -0.05, 0.0, 0.0, 0.1])
 
 
 class Rig:
-    """A supervisor at 250 Hz, an arm that follows its commands, a cell that gives one every 8 ms; `lag_s` is the arm's."""
+    """A supervisor at 250 Hz, an arm that follows its commands, a cell that gives one every 8 ms; `lag_s` is the
+    arm's."""
 
     def __init__(self, limits: Limits = LIMITS, velocity: np.ndarray = VELOCITY, *, process: bool = False) -> None:
         self.supervisor = Supervisor(limits)

@@ -1,4 +1,5 @@
-"""Scan by scan: the ring is found where the arm holds it, X_BC comes of it, and a scan that is no use is refused by name."""
+"""Scan by scan: the ring is found where the arm holds it, X_BC comes of it, and a scan that is no use is refused by
+name."""
 
 from __future__ import annotations
 

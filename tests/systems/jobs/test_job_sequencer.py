@@ -1,4 +1,5 @@
-"""The job goes through its phases in order, only when each is done; whatever goes wrong, it holds and says why, for good."""
+"""The job goes through its phases in order, only when each is done; whatever goes wrong, it holds and says why, for
+good."""
 
 from __future__ import annotations
 
@@ -291,7 +292,10 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         "scan_pose",
         0.1,
         {"calibration_status": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.023e-3)},
-        r"^Only 0 of 8 scans could be used, and the calibration needs 6 .*0\.023 mm at the work point, within the required 0\.100 mm",
+        (
+            r"^Only 0 of 8 scans could be used, and the calibration needs 6 .*0\.023 mm at the work point, within the"
+            r" required 0\.100 mm"
+        ),
     ),
     "no calibration at all": (
         "scan_pose",
@@ -416,11 +420,9 @@ def test_the_system_passes_its_command_on_to_everyone() -> None:
 def test_the_progress_told_of_a_run_never_falls_from_phase_to_phase() -> None:
     told = [SHARES[phase] for phase in PHASES if phase in SHARES]
     assert told == sorted(told)
-    assert set(PHASES) - set(SHARES) == {
-        "move_to_verification_cloud",
-        "scan_verification_cloud",
-        "scan_pose",
-    }, "these and move_to_pose are told by the number of scans"
+    assert set(PHASES) - set(SHARES) == {"move_to_verification_cloud", "scan_verification_cloud", "scan_pose"}, (
+        "these and move_to_pose are told by the number of scans"
+    )
 
 
 def test_a_scanner_that_moved_holds_the_job_before_the_weld_and_warns_during_it() -> None:

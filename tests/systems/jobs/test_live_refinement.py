@@ -1,4 +1,5 @@
-"""A live calibration is refined once its scans are enough, and the corrected arm is the one that the cell believes from then on."""
+"""A live calibration is refined once its scans are enough, and the corrected arm is the one that the cell believes from
+then on."""
 
 from __future__ import annotations
 
@@ -69,7 +70,8 @@ def test_the_arm_s_errors_are_found_and_its_new_poses_agree_with_new_scans() -> 
 
 
 def test_a_wrong_factory_file_is_found_out_and_what_cannot_be_refined_stays_plain(tmp_path: Path) -> None:
-    """The controller computes with another robot's file; the sentence says so, and the file written for it is the cell's afterwards."""
+    """The controller computes with another robot's file; the sentence says so, and the file written for it is the
+    cell's afterwards."""
     world = station(43, scans=14, links=False, size=20.0)
     arm = load_arm("ur10e")
     found = refined_status(status_of(world), "joints", arm, True).refinement
@@ -90,8 +92,8 @@ def test_a_wrong_factory_file_is_found_out_and_what_cannot_be_refined_stays_plai
 
 
 def _turned_away(arm: ArmModel, world: Station) -> float:
-    """Mean distance (m) of the flange's travel between new poses from the true arm's: the first joint's zero, which no scan shows, drops out
-    of lengths."""
+    """Mean distance (m) of the flange's travel between new poses from the true arm's: the first joint's zero, which no
+    scan shows, drops out of lengths."""
     true = flange_poses(load_chain("ur10e"), world.new_q, world.errors)[:, :3, 3]
     p = flange(arm, world.new_q)
     lengths = [np.linalg.norm(x[:, None] - x[None], axis=2) for x in (p, true)]

@@ -66,7 +66,8 @@ def test_the_places_are_on_the_flat_face_on_both_sides_and_the_tip_stands_above_
 
 
 def test_a_face_that_seems_tilted_by_three_degrees_does_not_refuse_a_place(planned: PlannedTouches) -> None:
-    """The torch hangs as low as the tip, 60 mm from it: a few points of noise in the scanned face must not bring it to the part."""
+    """The torch hangs as low as the tip, 60 mm from it: a few points of noise in the scanned face must not bring it to
+    the part."""
     told = scenario(SMALL_IDEAL_SCANNER, EXACT_PLATE)
     station = plain_station()
     seam = seam_planning(told, station, servo_config(told, station))

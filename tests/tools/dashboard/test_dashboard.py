@@ -1,4 +1,5 @@
-"""The dashboard in a real browser: state, hold, go on, end, plots; what it refuses; what a phone and the network see."""
+"""The dashboard in a real browser: state, hold, go on, end, plots; what it refuses; what a phone and the network
+see."""
 
 from __future__ import annotations
 
@@ -294,7 +295,10 @@ def test_the_page_keeps_result_report_and_replay_when_the_program_has_ended(
         assert words in text.lower(), words
     assert browser.run("return document.getElementById('state').textContent") == "DONE"
     assert not browser.run("return document.getElementById('live_view').offsetHeight"), "its server is gone"
-    bar = "const r = document.querySelector('.replay').getBoundingClientRect(); const f = loaded['recording.html'].getBoundingClientRect();"
+    bar = (
+        "const r = document.querySelector('.replay').getBoundingClientRect(); const f ="
+        " loaded['recording.html'].getBoundingClientRect();"
+    )
     assert browser.run(bar + "return r.bottom <= f.top + 1 && f.height > 200"), "nothing covers REPLAY"
     pixels = browser.screenshot(tmp_path / f"done_{size}.png", until=lambda picture: colours(picture) > 60)
     assert colours(pixels) > 60, "the replay is drawn"
@@ -366,7 +370,8 @@ def test_the_network_reads_with_a_token_and_cannot_act(
 def test_a_page_that_is_over_answers_nothing_on_connections_that_a_browser_keeps(
     source: DashboardSource, view: Meshcat
 ) -> None:
-    """The next run's page may have the same port: a request on such a connection would be answered by the page before it."""
+    """The next run's page may have the same port: a request on such a connection would be answered by the page before
+    it."""
     dashboard = Dashboard(source, view.web_url())
     address = dashboard.url.split("/")[2].split(":")
     with socket.create_connection((address[0], int(address[1])), timeout=5) as kept:

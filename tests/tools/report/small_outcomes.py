@@ -277,12 +277,7 @@ def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
     sequencer = SimpleNamespace(
         GetMyContextFromRoot=lambda root: root, state_in=lambda context: SimpleNamespace(warnings=("A remark.",))
     )
-    run = _run(
-        "calibrate_only",
-        sequencer=sequencer,
-        drift=lambda root: None,
-        planned_seam=lambda root: PlannedSeam(),
-    )
+    run = _run("calibrate_only", sequencer=sequencer, drift=lambda root: None, planned_seam=lambda root: PlannedSeam())
     if held:
         run.held, run.reason = True, "The tag was lost."
     if not begun:

@@ -1,4 +1,5 @@
-"""The first screen: which of three verdicts, at most three things that could be wrong, and the same lines on the terminal."""
+"""The first screen: which of three verdicts, at most three things that could be wrong, and the same lines on the
+terminal."""
 
 from __future__ import annotations
 

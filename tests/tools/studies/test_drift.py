@@ -65,7 +65,8 @@ def test_a_turn_about_the_line_of_sight_shows_least() -> None:
 
 
 def test_what_is_known_of_other_errors_bounds_what_a_test_that_is_told_all_else_finds() -> None:
-    """What the monitor does not know of arm and scanner can only hide a change; one that shows at four thresholds is never late."""
+    """What the monitor does not know of arm and scanner can only hide a change; one that shows at four thresholds is
+    never late."""
     sure = knock_trial(WorldConfig(), 2, turn=False)
     assert 1.0 < sure.told < sure.shown
     assert expected_late([sure]) < 1e-3

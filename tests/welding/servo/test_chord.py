@@ -1,4 +1,5 @@
-"""The rigid chord under the laws as they are shipped: Eq. 17's wrong sign, and a singularity of the law, not of the tool."""
+"""The rigid chord under the laws as they are shipped: Eq. 17's wrong sign, and a singularity of the law, not of the
+tool."""
 
 from __future__ import annotations
 

@@ -36,14 +36,15 @@ def lit_at(run: StudyRun) -> float:
 def test_the_arc_starts_where_the_groove_does_and_the_torch_is_on_it_there() -> None:
     run = simulate(straight(0.080), NOMINAL, CONFIG, 103)
     assert run.phase == Phase.DONE
-    # The plan is 2 mm off as a whole, along the seam too; a frame at 4 mm/s is 0.13 mm, what friction lets the tip lead 0.
+    # The plan is 2 mm off as a whole, along the seam too; a frame at 4 mm/s is 0.13 mm, what friction lets the tip lead
+    # 0.
     assert abs(float(run.planned.position(0.0)[0])) > 1.0 * MM
     assert lit_at(run) == pytest.approx(0.0, abs=0.4 * MM)
     on = run.column("torch_on") > 0.5
     error = path_error(run.points("torch")[on], run.torch_line)
     first = (error.s >= 0.0) & (error.s < 8.0 * MM)
-    # Without feeling it the plan's own noise leads here, 0.26 mm off with this seed; the tip's points leave three sigma of
-    # 0.015 mm and a zero and gain of 0.01 mm each.
+    # Without feeling it the plan's own noise leads here, 0.26 mm off with this seed; the tip's points leave three sigma
+    # of 0.015 mm and a zero and gain of 0.01 mm each.
     assert np.abs(error.lateral[first]).max() <= 0.1 * MM
 
 

@@ -1,4 +1,5 @@
-"""A weld that a person holds: the arc is off at once, the tool rests, goes back over its own path and welds the rest as well."""
+"""A weld that a person holds: the arc is off at once, the tool rests, goes back over its own path and welds the rest as
+well."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ MM = 1e-3
 
 
 class Held:
-    """The servo with a person beside it, who holds it for a second once the torch has come to each of these places (m)."""
+    """The servo with a person beside it, who holds it for a second once the torch has come to each of these places
+    (m)."""
 
     def __init__(self, *places: float, held_s: float = 1.0, moved: float = 0.0, phase: Phase | None = None) -> None:
         self.places, self.held_s, self.moved, self.phase = list(places), held_s, moved, phase

@@ -159,8 +159,8 @@ def test_a_corner_of_one_millimetre_neither_jams_the_tip_nor_throws_the_torch() 
     points = l_curve(0.001, side=1.0)
     run, error, _ = judged(weld(points, NOMINAL, CALIBRATED, 22), points)
     assert run.last.phase == Phase.DONE
-    # Target D4 asks for 1.3; the corner put back from its two sides does better. The repaired paper law turns at 891 rad/s
-    # here and throws the torch at 10 m/s.
+    # Target D4 asks for 1.3; the corner put back from its two sides does better. The repaired paper law turns at 891
+    # rad/s here and throws the torch at 10 m/s.
     assert error.max_m <= 0.5 * MM
     assert error.mean_m <= 0.05 * MM
     assert max(abs(c.diagnostics.omega) for c in run.commands) <= 0.8

@@ -1,4 +1,5 @@
-"""A seam that the tip does not feel: the torch follows the plan, the tip hangs above it, and no frame of the finger counts."""
+"""A seam that the tip does not feel: the torch follows the plan, the tip hangs above it, and no frame of the finger
+counts."""
 
 from __future__ import annotations
 

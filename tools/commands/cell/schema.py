@@ -25,8 +25,9 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _PLAIN = {float: "number", int: "integer", bool: "boolean", str: "string"}
 HEAD = """# Keys of a scenario
 
-Written by `weldcal schema --markdown`; do not edit. How to write a scenario: [scenarios.md](scenarios.md). Installed packages may add
-drivers. A key that is left out has its default. Units are in the names: m, mm, deg, s. Poses are in the robot's base.
+Written by `weldcal schema --markdown`; do not edit. How to write a scenario: [scenarios.md](scenarios.md).
+Installed packages may add drivers. A key that is left out has its default. Units are in the names: m, mm, deg, s. Poses
+are in the robot's base.
 """
 
 

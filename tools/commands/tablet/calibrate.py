@@ -96,8 +96,8 @@ class TabletInputs:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TabletCalibration:
-    """The result, the data of its report, the fit with full poses where it is one; else the rounding step of the hand and the
-    errors at the file's queries; and the duration."""
+    """The result, the data of its report, the fit with full poses where it is one; else the rounding step of the hand
+    and the errors at the file's queries; and the duration."""
 
     result: TabletResult
     shown: Shown
@@ -173,7 +173,8 @@ def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
     if len(visits) + len(read.refused) > 1:
         if inputs.two_stages:
             raise InputError(
-                f"'{inputs.file.name}' holds {len(visits) + len(read.refused)} visits. --two-stages needs a file with one."
+                f"'{inputs.file.name}' holds {len(visits) + len(read.refused)} visits. --two-stages needs a file with"
+                " one."
             )
         return fit_many(inputs.file, read, sign, step_m)
     found = fit_visit(visits[0], sign, step_m)

@@ -127,9 +127,11 @@ def narrowed(model: ArmModel, ranges: str) -> ArmModel:
 
 
 class Emulation:
-    """A controller's ports and its loop. `after_step` is called with the host's time (s) after every step of the controller,
-    before its frame is sent: what it does belongs to the same time, and the controller waits for it. `while_waiting` is called
-    while the controller's time waits for its client. `more_faults` are those of what stands around the controller.
+    """A controller's ports and its loop.
+
+    `after_step` is called with the host's time (s) after every step of the controller, before its frame is sent: what
+    it does belongs to the same time, and the controller waits for it. `while_waiting` is called while the controller's
+    time waits for its client. `more_faults` are those of what stands around the controller.
     """
 
     def __init__(

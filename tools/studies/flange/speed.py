@@ -30,7 +30,8 @@ _SEGMENTED = 13_000  # points, as the recorded clouds have
 
 
 Timing = dict[str, Any]
-"""One row: what ran on what, median and least milliseconds of processor time, and the centre's error, mm (None: it found nothing)."""
+"""One row: what ran on what, median and least milliseconds of processor time, and the centre's error, mm (None: it
+found nothing)."""
 
 
 def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress = no_progress) -> list[Timing]:
@@ -152,7 +153,8 @@ def _ransac(points: Array, seed: int) -> Array | None:
 
 
 def _open3d_chain(frame: Array, depth_m: float) -> Array | None:
-    """Gate about the known depth, statistical outlier removal, planes one after another, clusters, circle search: library calls all through."""
+    """Gate about the known depth, statistical outlier removal, planes one after another, clusters, circle search:
+    library calls all through."""
     p = frame.reshape(-1, 3)
     p = p[np.isfinite(p).all(axis=1)]
     p = p[np.abs(p[:, 2] - depth_m) < 0.04]
@@ -184,7 +186,9 @@ def _speed_rows(f: Figures) -> Iterable[Row]:
 
 SPEED = Study(
     name="flange",
-    what="Processor time to find the flange in a scan, beside the paper's loop, an Open3D chain and a PCL-style search.",
+    what=(
+        "Processor time to find the flange in a scan, beside the paper's loop, an Open3D chain and a PCL-style search."
+    ),
     figures=lambda results: results["all"],
     header=("method and scan", "median ms", "least ms", "", "centre off, mm"),
     rows=_speed_rows,
@@ -199,7 +203,8 @@ def speed(
         bool, switch("--loop/--no-loop", "Also run the paper's search as a Python loop; takes seconds.")
     ] = True,
 ) -> Outcome:
-    """Time the detection of the flange in a scan and compare with the paper's loop, an Open3D chain and a PCL-style search."""
+    """Time the detection of the flange in a scan and compare with the paper's loop, an Open3D chain and a PCL-style
+    search."""
     folder, rows = SPEED.folder(call), run_flange_benchmark(call.seed, loop=loop, progress=call.progress)
     return SPEED.measured({"all": {"rows": rows}}, folder).outcome()
 
@@ -221,5 +226,5 @@ def speed(
     arm=arm,
 )
 def flange(call: Call) -> None:
-    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden, holes), uncertainty (parts, honesty, stated,
-    imperfect, halves) and accuracy (live, few, arm)."""
+    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden, holes), uncertainty
+    (parts, honesty, stated, imperfect, halves) and accuracy (live, few, arm)."""

@@ -29,10 +29,11 @@ _CREEP_START_S = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was measured.
-    ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of the first WITHIN_S
-    say of it to a test that knows the noise and all other errors exactly, in units of the test's threshold; ``told`` what they say to one
-    that knows of these errors what the monitor knows, and is told when the change was, in the same units."""
+    """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was
+    measured. ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames
+    of the first WITHIN_S say of it to a test that knows the noise and all other errors exactly, in units of the test's
+    threshold; ``told`` what they say to one that knows of these errors what the monitor knows, and is told when the
+    change was, in the same units."""
 
     kind: str
     seed: int
@@ -54,15 +55,24 @@ def one_recording(kind: str, seed: int, stamps: str, hours: float = 0.0) -> Mapp
         return asdict(creep_trial(world, seed) if kind == "creep" else knock_trial(world, seed, turn=kind == "turn"))
     alarmed, largest, threshold = quiet_hours(world, hours, seed)
     return {
-        "kind": kind, "stamps": stamps, "hours": hours, "largest_statistic": largest, "threshold": threshold,
+        "kind": kind,
+        "stamps": stamps,
+        "hours": hours,
+        "largest_statistic": largest,
+        "threshold": threshold,
         "alarmed": [
             {
-                "kind": e.kind, "time_s": e.time_s, "found_s": e.found_s, "statistic": e.statistic, "model": e.model,
-                "translation_mm": (1e3 * e.translation_m).tolist(), "rotation_deg": np.degrees(e.rotation_rad).tolist(),
+                "kind": e.kind,
+                "time_s": e.time_s,
+                "found_s": e.found_s,
+                "statistic": e.statistic,
+                "model": e.model,
+                "translation_mm": (1e3 * e.translation_m).tolist(),
+                "rotation_deg": np.degrees(e.rotation_rad).tolist(),
             }
             for e in alarmed
         ],
-    }  # fmt: skip
+    }
 
 
 def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cases:
@@ -128,7 +138,10 @@ def _rows(figures: Figures) -> Iterable[Row]:
 
 STUDY = Study(
     name="drift",
-    what="How soon knocks of 0.2 mm or 0.03 degrees and creeps of the scanner are found, and false alarms in quiet hours.",
+    what=(
+        "How soon knocks of 0.2 mm or 0.03 degrees and creeps of the scanner are found, and false alarms in quiet"
+        " hours."
+    ),
     case=one_recording,
     figures=_figures,
     header=("turns about an axis so far from the view, deg", "turns", "found within 2 s, %", "shown, thresholds"),
@@ -195,8 +208,8 @@ def quiet_hours(world: WorldConfig, hours: float, seed: int) -> tuple[list[Drift
 def _watched(
     config: WorldConfig, duration_s: float, seed: int, change: tuple[float, Array, Array]
 ) -> tuple[list[DriftEvent], Array, float, float]:
-    """Events of a recording, the line of sight in the base, and what its frames show of a change (time s, shift m, rotation rad): to a
-    test that knows everything else, and to one that knows what the monitor does."""
+    """Events of a recording, the line of sight in the base, and what its frames show of a change (time s, shift m,
+    rotation rad): to a test that knows everything else, and to one that knows what the monitor does."""
     w = simulate(config, duration_s, seed)
     test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / config.frame_s)
     before: DriftFilter | None = None
@@ -210,7 +223,8 @@ def _watched(
 
 
 def expected_late(knocks: Sequence[Trial]) -> float:
-    """How many of the changes a test with three unknowns that is told their times does not find within WITHIN_S, by the noise alone."""
+    """How many of the changes a test with three unknowns that is told their times does not find within WITHIN_S, by the
+    noise alone."""
     threshold = DriftTest(RigidTransform(), np.eye(6), np.ones(3)).threshold_alone
     return float(sum(ncx2.cdf(threshold, 3, t.told * threshold) for t in knocks if np.isfinite(t.told)))
 
@@ -233,8 +247,8 @@ def _without_clock(information: Array) -> Array:
 
 
 def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> float:
-    """The expected statistic of a pure shift or turn by the frames of WITHIN_S after it, over its threshold, where noise and all other
-    errors are known exactly and the clock alone is not."""
+    """The expected statistic of a pure shift or turn by the frames of WITHIN_S after it, over its threshold, where
+    noise and all other errors are known exactly and the clock alone is not."""
     chosen = _within(w, change[0])
     if not len(chosen) or test.noise is None:
         return float("nan")
@@ -248,7 +262,8 @@ def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> flo
 
 
 def _told(w: World, test: DriftTest, before: DriftFilter, change: tuple[float, Array, Array]) -> float:
-    """The same, where all other errors are known as by the monitor's filter ``before`` the change, and its time exactly."""
+    """The same, where all other errors are known as by the monitor's filter ``before`` the change, and its time
+    exactly."""
     chosen = _within(w, change[0])
     if not len(chosen) or test.noise is None:
         return float("nan")
@@ -265,8 +280,8 @@ def _told(w: World, test: DriftTest, before: DriftFilter, change: tuple[float, A
 
 
 def found_by_angle(trials: Sequence[Trial]) -> list[dict[str, float]]:
-    """Of turns, by the angle between their axis and the line of sight: how many there were, the share found within WITHIN_S, and
-    the median of what the frames show."""
+    """Of turns, by the angle between their axis and the line of sight: how many there were, the share found within
+    WITHIN_S, and the median of what the frames show."""
     turns = [t for t in trials if t.kind == "turn"]
     angles = np.degrees(np.arccos(np.clip([t.along_view for t in turns], 0.0, 1.0)))
     rows = []
@@ -274,16 +289,30 @@ def found_by_angle(trials: Sequence[Trial]) -> list[dict[str, float]]:
         part = [t for t, a in zip(turns, angles, strict=True) if low <= a < high or a == high == 90.0]
         if part:
             found = np.array([t.found_after_s for t in part])
-            rows.append({
-                "from_deg": low, "to_deg": high, "turns": len(part), "found_within_2_s_percent": _percent(found <= WITHIN_S),
-                "shown_median": float(np.median([t.shown for t in part])), "shown_least": float(min(t.shown for t in part)),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "from_deg": low,
+                    "to_deg": high,
+                    "turns": len(part),
+                    "found_within_2_s_percent": _percent(found <= WITHIN_S),
+                    "shown_median": float(np.median([t.shown for t in part])),
+                    "shown_least": float(min(t.shown for t in part)),
+                }
+            )
     return rows
 
 
 def _trial(
-    kind: str, seed: int, events: list[DriftEvent], at: float, shift: Array, rotation: Array, view: float, shown: float, told: float
-) -> Trial:  # fmt: skip
+    kind: str,
+    seed: int,
+    events: list[DriftEvent],
+    at: float,
+    shift: Array,
+    rotation: Array,
+    view: float,
+    shown: float,
+    told: float,
+) -> Trial:
     early = sum(e.found_s < at for e in events)
     missed = Trial(kind=kind, seed=seed, along_view=view, false_alarms=early, shown=shown, told=told)
     for e in (e for e in events if e.found_s >= at):

@@ -1,4 +1,5 @@
-"""`weldcal benchmark whole-body`: the tracking error of the flange beside that of a wrist link, by its mesh and by a fused model."""
+"""`weldcal benchmark whole-body`: the tracking error of the flange beside that of a wrist link, by its mesh and by a
+fused model."""
 
 import tempfile
 from dataclasses import replace
@@ -76,9 +77,16 @@ def run_whole_body(
         known = replace(result, clock=None)
         for name, fused in (("mesh", False), ("fused", True)):
             frames, body_motion, X_LR, refused = see_link(
-                data, known, standard, link, fused=fused, seed=options.seed,
-                tell=lambda f, name=name: tell(f"{link}, {name}", 0.65 + 0.17 * f + 0.17 * (name == "fused")),  # type: ignore[misc]
-            )  # fmt: skip
+                data,
+                known,
+                standard,
+                link,
+                fused=fused,
+                seed=options.seed,
+                tell=lambda f, name=name, at=0.82 if fused else 0.65: tell(  # type: ignore[misc]
+                    f"{link}, {name}", at + 0.17 * f
+                ),
+            )
             found[name] = watch(known, frames, body_motion, X_FR=X_LR, dropped=refused)
     rows = {name: _row(w) for name, w in found.items()}
     limit = WITHIN * rows["flange"]["rms_mm"]

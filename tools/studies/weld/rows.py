@@ -109,10 +109,14 @@ ROWS: tuple[Row, ...] = (
         (Case("straight"), Case("arc_r60_end")),
         (Target("end_mm", 0.12), Target("end_step_mm_s", 0.5, unit="mm/s")),
     ),
-    Row("gap_10", "gap of 10 mm, straight and S", tuple(Case(s, gaps=_GAP_10) for s in _EASY[:2]), (Target("gap_mm", 0.12),)),
-    Row("gap_25", "gap of 25 mm, straight and S", tuple(Case(s, gaps=_GAP_25) for s in _EASY[:2]), (Target("gap_mm", 0.60),)),
-    Row("speed_16", "16 mm/s: S R60, L R20", tuple(Case(s, speed_m_s=0.016) for s in _EASY[1:]), (Target("max_mm", 0.20), *_BOUNDED)),
-    Row("speed_24", "24 mm/s: S R60, L R20", tuple(Case(s, speed_m_s=0.024) for s in _EASY[1:]), (Target("max_mm", 0.35), *_BOUNDED)),
+    Row("gap_10", "gap of 10 mm, straight and S", tuple(Case(s, gaps=_GAP_10) for s in _EASY[:2]), (Target("gap_mm",
+    0.12),)),
+    Row("gap_25", "gap of 25 mm, straight and S", tuple(Case(s, gaps=_GAP_25) for s in _EASY[:2]), (Target("gap_mm",
+    0.60),)),
+    Row("speed_16", "16 mm/s: S R60, L R20", tuple(Case(s, speed_m_s=0.016) for s in _EASY[1:]), (Target("max_mm",
+    0.20), *_BOUNDED)),
+    Row("speed_24", "24 mm/s: S R60, L R20", tuple(Case(s, speed_m_s=0.024) for s in _EASY[1:]), (Target("max_mm",
+    0.35), *_BOUNDED)),
     Row(
         "space",
         "on cylinders of R 150 and 300 mm, kinematic budget",
@@ -277,8 +281,8 @@ class TurnResult:
     Attributes:
         turn_deg, back_up_mm: by the true seam's chord map; possible: the map has no obstacle there.
         refused: before anything moved; phase, reason: how it ended; max_mm: error of what was welded in one go.
-        splits_mm: where the seam was split instead; pieces_done: how many of its pieces were welded; pieces_max_mm: their
-            largest error.
+        splits_mm: where the seam was split instead; pieces_done: how many of its pieces were welded; pieces_max_mm:
+            their largest error.
     """
 
     seam: str
@@ -316,7 +320,8 @@ class TurnResult:
 
 
 def run_turn(seam: str, chord_m: float, seed: int) -> TurnResult:
-    """Predict and then weld one seam with one chord, with the nominal budget's plan; what is refused is welded in pieces."""
+    """Predict and then weld one seam with one chord, with the nominal budget's plan; what is refused is welded in
+    pieces."""
     case = Case(seam, chord_m=chord_m)
     config = study_config(case)
     true = get_seam(seam)

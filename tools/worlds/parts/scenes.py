@@ -107,7 +107,8 @@ def without_spots(cloud_B: Floats, mesh_B: TriMesh, rng: np.random.Generator, co
 
 
 def clutter(mesh_B: TriMesh, rng: np.random.Generator, count: int) -> list[TriMesh]:
-    """Boxes, pipes and a fixture's clamps beside the part, none through it: each drawn anew until it is clear of its bounds."""
+    """Boxes, pipes and a fixture's clamps beside the part, none through it: each drawn anew until it is clear of its
+    bounds."""
     low, high = mesh_B.bounds
     found: list[TriMesh] = []
     for _ in range(200):

@@ -30,8 +30,11 @@ class Action:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A fault. `must` is STOP (at rest within `rest_s`, one of `faults` reported, nothing moves until a new start), GO, either,
-    or REFUSE: thrown in before the start, which must be refused. The arm begins with its last joint at `wrist_3` (rad)."""
+    """A fault.
+
+    `must` is STOP (at rest within `rest_s`, one of `faults` reported, nothing moves until a new start), GO, either, or
+    REFUSE: thrown in before the start, which must be refused. The arm begins with its last joint at `wrist_3` (rad).
+    """
 
     name: str
     throw: Callable[[Bench], float]
@@ -152,9 +155,16 @@ def _refused(name: str, throw: Callable[[Bench], float], says: str, *, short: bo
 
 
 REAL_OUTPUTS = (
-    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "speed_scaling", "target_speed_fraction",
-    "output_double_register_36", "output_double_register_37", "output_double_register_38",
-)  # fmt: skip
+    "timestamp",
+    "actual_q",
+    "actual_qd",
+    "actual_TCP_pose",
+    "speed_scaling",
+    "target_speed_fraction",
+    "output_double_register_36",
+    "output_double_register_37",
+    "output_double_register_38",
+)
 SHORT_NUMBERS = ("nan as actual_q", "inf as actual_TCP_pose", "nan as speed_scaling", "nan as timestamp")
 
 
@@ -213,7 +223,8 @@ RUNNING: tuple[Case, ...] = (
         "controller's clock jumps 10 s ahead", _fault("timestamp_jump", seconds=10.0), Fault.CLOCK_JUMPED, short=False
     ),
     _stops("controller's clock jumps 10 s back", _fault("timestamp_jump", seconds=-10.0), Fault.CLOCK_JUMPED),
-    # each output of real numbers that the driver reads; those of a register are the number, the time and the passes of the guard
+    # each output of real numbers that the driver reads; those of a register are the number, the time and the passes of
+    # the guard
     *(_no_number(output, value) for output in REAL_OUTPUTS for value in ("nan", "inf")),
     replace(_no_number("speed_scaling", "nan", process=True, burns_s=0.06, short=True), name="nan, process on"),
     # the robot
@@ -313,7 +324,8 @@ RUNNING: tuple[Case, ...] = (
         random=False,
         short=False,
     ),
-    # No process is left that could stop the paused program: old commands must have no effect when an operator presses Play.
+    # No process is left that could stop the paused program: old commands must have no effect when an operator presses
+    # Play.
     _paused("computer dies, pause, Play after 3 s", _dies_and_is_paused, 3.0),
     _paused("pause, computer dies, Play after 3 s", _is_paused_and_dies, 3.0),
     _paused("computer dies, pause, Play after 0.5 s", _dies_and_is_paused, 0.5, short=False),

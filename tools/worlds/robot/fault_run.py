@@ -1,4 +1,5 @@
-"""One fault of the robot link on the test bench: it is injected, observed, repaired, and held against what must follow."""
+"""One fault of the robot link on the test bench: it is injected, observed, repaired, and held against what must
+follow."""
 
 import time
 from collections.abc import Sequence

@@ -107,7 +107,8 @@ def _throw(bench: Bench, rng: np.random.Generator, done: Sequence, cases: list[C
 
 
 def _injected(bench: Bench, done: Sequence, case: Case) -> bool:
-    """Inject it; False where the robot is not ready for it: no program starts, for one, where a fault has just taken the power.
+    """Inject it; False where the robot is not ready for it: no program starts, for one, where a fault has just taken
+    the power.
 
     Raises:
         WeldcalError: the robot was ready, and the fault could not be injected.

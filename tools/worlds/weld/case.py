@@ -39,7 +39,8 @@ class Case:
 def study_config(case: Case) -> ServoConfig:
     """The servo's settings for a case: everything at its default but chord, speed, law and the touch-on calibration.
 
-    The paper's laws watch neither the torch's place nor its angles, so these are set wide open: they are to show what they do.
+    The paper's laws watch neither the torch's place nor its angles, so these are set wide open: they are to show what
+    they do.
     """
     config = ServoConfig(
         tool=ToolGeometry(torch_offset_m=case.chord_m),

@@ -1,4 +1,5 @@
-"""Lines in the plane of a face: arc length and lateral offset of points, smoothing, and sharp corners with their radius."""
+"""Lines in the plane of a face: arc length and lateral offset of points, smoothing, and sharp corners with their
+radius."""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ class Line:
         return np.asarray(np.sum(np.gradient(self.tangents, self.s, axis=0) * self.normals, axis=1))
 
     def tightest_bend(self, gap: tuple[float, float], over_m: float = 0.016) -> float:
-        """Largest curvature of the line's chords outside a gap, and of its turn from one side of the gap to the other."""
+        """Largest curvature of the line's chords outside a gap, and of its turn from one side of the gap to the
+        other."""
         step = max(1, round(over_m / (self.length / (len(self.points) - 1))))
         chords = self.points[step:] - self.points[:-step]
         heading = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
@@ -96,7 +98,8 @@ class Line:
         return Line(np.column_stack([np.interp(s, self.s, self.points[:, k]) for k in range(2)]))
 
     def coordinates(self, xy: Floats) -> tuple[Floats, Floats, Mask]:
-        """Arc length and offset (s, n) of points (M,2) by the nearest point on the line, and a mask of those within 30 mm."""
+        """Arc length and offset (s, n) of points (M,2) by the nearest point on the line, and a mask of those within 30
+        mm."""
         nearest = np.asarray(cKDTree(self.points).query(xy, distance_upper_bound=0.03)[1])
         far = nearest == len(self.points)
         nearest = np.where(far, 0, nearest)
@@ -199,8 +202,8 @@ def meeting_point(p: Floats, t: Floats, q: Floats, w: Floats) -> Floats:
 @dataclass(frozen=True, eq=False)
 class Corner:
     """A corner at arc length s m of the whole line, its apex (2,) m, its radius m, and how far to each side of s no
-    cross-section has points of its own, m; sigma: of the line sideways at s, m, as far as the radius is not known; wide: it is
-    certainly a bend."""
+    cross-section has points of its own, m; sigma: of the line sideways at s, m, as far as the radius is not known;
+    wide: it is certainly a bend."""
 
     s: float
     apex: Floats
@@ -290,7 +293,8 @@ def _radius(
         away = np.asarray(cKDTree(path.points).query(near[:, :2])[0])
         off = near[:, 2] - np.minimum(0.0, slope * away - profile.depth)
         costs.append(float(np.mean(np.square(off) / (np.square(off) + scale**2))))
-    # The cost is a share of c^2 = 2.5^2 sigma^2: where it is small, half the sum of squares over sigma^2 is 3.125 n of it.
+    # The cost is a share of c^2 = 2.5^2 sigma^2: where it is small, half the sum of squares over sigma^2 is 3.125 n of
+    # it.
     fine = np.arange(0.0, RADII_M[-1] + 1e-9, 0.00025)
     log_likelihood = -0.5 * 2.5**2 * len(near) / CROWD * np.interp(fine, RADII_M, costs)
     weight = np.exp(log_likelihood - log_likelihood.max())

@@ -59,7 +59,8 @@ def measure_groove(
     if groove.closed:
         line = Line(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
     else:
-        # The farthest cells of an opening are its corners: the ends of the coarse line lead there, not along the groove.
+        # The farthest cells of an opening are its corners: the ends of the coarse line lead there, not along the
+        # groove.
         trim = min(groove.width_m, 0.25 * line.length)
         inner = (line.s >= trim) & (line.s <= line.length - trim)
         line = Line(line.points[inner]).extended(trim + 0.006, trim + 0.006)
@@ -87,7 +88,8 @@ def _traced(
     config: GrooveConfig,
     wide: list[Floats],
 ) -> tuple[Line, list[Corner], Profile]:
-    """Move the coarse line onto the groove in legs between its corners; the joined line, the corners and the common profile."""
+    """Move the coarse line onto the groove in legs between its corners; the joined line, the corners and the common
+    profile."""
     pitch, sigma = groove.pitch_m, groove.sigma_m
     lines: list[Line] = [line]
     corners: list[Corner] = []
@@ -140,8 +142,8 @@ def _finish(
     gaps = [(a, b) for a, b in gaps if a >= first and b <= last]
     if longest > config.longest_gap_m or missing > config.most_missing * (last - first):
         raise GrooveUncertain(
-            f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan again "
-            "from elsewhere."
+            f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan"
+            " again from elsewhere."
         )
     at = np.linspace(first, last, max(8, round((last - first) / STATION_M) + 1))
     for corner in corners:
@@ -189,15 +191,15 @@ def _finish(
     for corner in corners:
         if first < corner.s < last and corner.sigma > config.most_bridge_sigma_m:
             raise GrooveUncertain(
-                f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f} mm from this "
-                f"scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart): use a finer scanner or move it "
-                "nearer."
+                f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f}"
+                f" mm from this scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart): use a"
+                " finer scanner or move it nearer."
             )
     if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
         raise GrooveUncertain(
-            f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan "
-            f"(noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and "
-            f"{1e3 * config.most_sigma_m:.2f} mm are required: use a finer scanner or move it nearer."
+            f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan"
+            f" (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and"
+            f" {1e3 * config.most_sigma_m:.2f} mm are required: use a finer scanner or move it nearer."
         )
     if np.max(sigma[~seen], initial=0.0) > config.most_bridge_sigma_m:
         raise GrooveUncertain(
@@ -311,7 +313,8 @@ def seen_extent(
 def ends_at_edges(
     f: Floats, ends: tuple[float, float], line: Line, profile: Profile, reach_m: float
 ) -> tuple[bool, bool]:
-    """Whether lower ground is seen within `reach_m` beyond each end, so that the plate ends there and not only the view."""
+    """Whether lower ground is seen within `reach_m` beyond each end, so that the plate ends there and not only the
+    view."""
     half_width = profile.depth / min(profile.slopes)
     tail = line.extended(reach_m + 0.001, reach_m + 0.001)
     s, n, beside = tail.coordinates(f[:, :2])

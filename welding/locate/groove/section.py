@@ -1,8 +1,8 @@
 """Fits V-shaped cross-sections to slices of a groove and moves a coarse line onto their centres.
 
 The profile is z(n) = min(face, root + slope_side |n - centre|), n to the left of the seam. The noise of a scanner that
-looks down is in z, so z is regressed on n and no point is selected by its depth: on walls this steep, selecting by depth
-would bias their slopes.
+looks down is in z, so z is regressed on n and no point is selected by its depth: on walls this steep, selecting by
+depth would bias their slopes.
 """
 
 import math
@@ -241,9 +241,9 @@ def common_profile(f: Floats, line: Line, slices: Slices, profile: Profile, sigm
 
 def _too_narrow(width: float, pitch: float, config: GrooveConfig) -> GrooveTooNarrow:
     return GrooveTooNarrow(
-        f"The groove is {1e3 * width:.1f} mm wide and the scan's points are {1e3 * pitch:.1f} mm apart: "
-        f"{width / pitch:.1f} of the {config.least_pitches:.0f} point distances it takes; move the scanner nearer or use "
-        "a finer one."
+        f"The groove is {1e3 * width:.1f} mm wide and the scan's points are {1e3 * pitch:.1f} mm apart:"
+        f" {width / pitch:.1f} of the {config.least_pitches:.0f} point distances it takes; move the scanner nearer or"
+        " use a finer one."
     )
 
 
@@ -315,7 +315,8 @@ def followed(
         weight = np.where(off > 4.0 * np.median(off) + 5e-5, 10.0, 1.0) * slices.sigma
     W = smoothing_weights(np.clip(at, slices.s[0], slices.s[-1]), slices.s, weight, width)
     moved = line.moved(at, W @ r)
-    # Where nothing was seen the coarse line is not reliable: it is replaced by a bridge between the sides that were seen.
+    # Where nothing was seen the coarse line is not reliable: it is replaced by a bridge between the sides that were
+    # seen.
     stretch = moved.length / line.length
     for k in np.flatnonzero(np.diff(slices.s) > 0.010)[::-1]:
         a, b = stretch * float(slices.s[k]), stretch * float(slices.s[k + 1])

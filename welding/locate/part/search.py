@@ -1,7 +1,8 @@
 """Finds rough poses of a part in a scan by its silhouettes from above and its heights.
 
-The part is turned into every direction in which it can rest and every angle about the vertical. Its silhouette is correlated with
-the cells in which the scan shows something above the ground; at the best shifts the heights are compared, up to a common lift.
+The part is turned into every direction in which it can rest and every angle about the vertical. Its silhouette is
+correlated with the cells in which the scan shows something above the ground; at the best shifts the heights are
+compared, up to a common lift.
 """
 
 from __future__ import annotations
@@ -222,7 +223,8 @@ def _places_for(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Scene:
-    """What the search compares: heights (H,W), NaN: none, their limits around a cell, and the transforms of the masks."""
+    """What the search compares: heights (H,W), NaN: none, their limits around a cell, and the transforms of the
+    masks."""
 
     top: npt.NDArray[np.floating]
     lowest: npt.NDArray[Any]

@@ -78,7 +78,8 @@ def cloud_of(parts: Sequence[Component]) -> NDArray[np.float32]:
 def profile_of(parts: Sequence[Component], scaling: Scaling = UNIT_SCALING) -> NDArray[np.float64]:
     """The last line of a frame as points (W, 2) [x, z] in the device's unit, NaN where nothing was measured.
 
-    Of Coord3D_AC32f, Coord3D_ABC32f or its planes as they are; of the range Coord3D_C16, whose x is the column, by `scaling`.
+    Of Coord3D_AC32f, Coord3D_ABC32f or its planes as they are; of the range Coord3D_C16, whose x is the column, by
+    `scaling`.
 
     Raises:
         Garbage: the frame has no such component.

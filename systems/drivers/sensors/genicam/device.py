@@ -64,7 +64,8 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """A frame: components copied out of the buffer, its number, its stamp (s of the device's clock; None: it has none)."""
+    """A frame: components copied out of the buffer, its number, its stamp (s of the device's clock; None: it has
+    none)."""
 
     components: tuple[Component, ...]
     number: int | None
@@ -75,7 +76,8 @@ class Taken:
 class GenicamDevice:
     """A device and its image acquirer. `wanted` is its serial number, model, name or id; empty where there is only one.
 
-    A process opens one device of a producer at a time: to look for devices harvesters closes the producer and opens it again.
+    A process opens one device of a producer at a time: to look for devices harvesters closes the producer and opens it
+    again.
     """
 
     def __init__(self, producer: str, wanted: str, features: Mapping[str, str], alive: str = "") -> None:
@@ -111,7 +113,10 @@ class GenicamDevice:
             raise
 
     def take(self, timeout_s: float) -> Taken | None:
-        """The oldest frame that waits; None where none came in time. Raises DeviceLost, and Garbage for an empty one."""
+        """The oldest frame that waits; None where none came in time.
+
+        Raises DeviceLost, and Garbage for an empty one.
+        """
         if self._acquirer is None:
             raise DeviceLost("it is not open")
         buffer = self._acquirer.try_fetch(timeout=timeout_s)

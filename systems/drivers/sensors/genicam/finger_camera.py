@@ -20,7 +20,8 @@ from weldcal.systems.drivers.station_build import StationBuild
 
 @dc.dataclass(kw_only=True)
 class GenicamFingerCamera(WiredFingerCamera):
-    """`!GenicamFingerCamera`: the maker's GenTL producer, the device, and its features; `exposure_ms` sets ExposureTime."""
+    """`!GenicamFingerCamera`: the maker's GenTL producer, the device, and its features; `exposure_ms` sets
+    ExposureTime."""
 
     producer: str = ""
     device: str = ""

@@ -25,8 +25,8 @@ _METRES = {"m": 1.0, "mm": 1e-3}
 class GenicamProfiler(WiredProfiler):
     """`!GenicamProfiler`: the maker's GenTL producer, the device, and its features.
 
-    The last line of a frame is the profile. A range picture (Coord3D_C16) is scaled by the device's Scan3dCoordinateScale and
-    Scan3dCoordinateOffset of its coordinates A and C.
+    The last line of a frame is the profile. A range picture (Coord3D_C16) is scaled by the device's
+    Scan3dCoordinateScale and Scan3dCoordinateOffset of its coordinates A and C.
     """
 
     producer: str = ""

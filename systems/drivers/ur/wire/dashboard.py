@@ -30,8 +30,8 @@ def ask(host: str, command: str, timeout_s: float = 2.0, port: int = DASHBOARD_P
 def stop_program(host: str, timeout_s: float = 2.0) -> str:
     """Stop the running or paused program; returns "Stopped", the controller's refusal, or an empty text.
 
-    After a fault only a stop is safe: `play` would continue with the velocity that the registers still hold. Where there
-    is no dashboard (PolyScope X), the command goes to the script port, which does not answer.
+    After a fault only a stop is safe: `play` would continue with the velocity that the registers still hold. Where
+    there is no dashboard (PolyScope X), the command goes to the script port, which does not answer.
 
     Raises:
         RobotUnreachable: neither port answers in time.

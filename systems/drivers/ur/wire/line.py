@@ -110,8 +110,8 @@ class Line:
 
     def _lost(self, what: str) -> RobotUnreachable:
         return RobotUnreachable(
-            f"{self._host} accepts a connection on its {self._service} port {self._port} but {what}: check that this is "
-            "the robot's address, and restart the control box if it is."
+            f"{self._host} accepts a connection on its {self._service} port {self._port} but {what}: check that this is"
+            " the robot's address, and restart the control box if it is."
         )
 
     def close(self) -> None:

@@ -167,7 +167,8 @@ class ControlServer(Server):
             if request.get(kind) in questions:
                 return questions[request[kind]](request)
         raise InputError(
-            "Send fault, do, check (at_rest_after, output_after, output_on_after, summary) or ask (state, log, program, connections)."
+            "Send fault, do, check (at_rest_after, output_after, output_on_after, summary) or ask (state, log, program,"
+            " connections)."
         )
 
     def _links(self, request: Request) -> list[Connection]:

@@ -143,4 +143,5 @@ def pictures(study: Found) -> dict[str, Callable[[Results], bytes]]:
         drawn[f"fig11_{c.name}"] = partial(plots.fig11_rerun, c)
         drawn[f"held_out_{c.name}"] = partial(plots.held_out, c)
         drawn[f"circles_{c.name}"] = partial(plots.circles, c)
-    return {f"figures/{name}.svg": lambda results, draw=draw: draw() for name, draw in drawn.items()}  # type: ignore[misc]
+    figures = {f"figures/{name}.svg": draw for name, draw in drawn.items()}
+    return {path: lambda results, draw=draw: draw() for path, draw in figures.items()}  # type: ignore[misc]
