@@ -148,7 +148,7 @@ def _too_much(name: str) -> InputError:
 
 
 @dataclass(frozen=True)
-class Section:
+class DocumentSection:
     """A mapping of a document; its getters raise InputError naming ``file`` and key where a value is missing or
     wrong."""
 
@@ -157,25 +157,25 @@ class Section:
     place: str = field(default="")
 
     @staticmethod
-    def of(file: str, value: Any, place: str = "") -> "Section":
+    def of(file: str, value: Any, place: str = "") -> "DocumentSection":
         """The mapping as a section. Raises InputError where it is none."""
         if not isinstance(value, Mapping):
             raise InputError(
                 f"'{file}': {place or 'the file'} must be a mapping of keys to values, not {shown(value)}."
             )
-        return Section(file, value, place)
+        return DocumentSection(file, value, place)
 
     def has(self, key: str) -> bool:
         """Whether the key stands there with a value."""
         return self.values.get(key) is not None
 
-    def section(self, key: str) -> "Section":
+    def section(self, key: str) -> "DocumentSection":
         """The mapping under a key; empty where there is none."""
-        return Section.of(self.file, self.values[key] if self.has(key) else {}, self._at(key))
+        return DocumentSection.of(self.file, self.values[key] if self.has(key) else {}, self._at(key))
 
-    def sections(self, key: str) -> tuple["Section", ...]:
+    def sections(self, key: str) -> tuple["DocumentSection", ...]:
         """The mappings of the list under a key; none where there is none."""
-        return tuple(Section.of(self.file, v, f"{self._at(key)}[{k}]") for k, v in enumerate(self.items(key)))
+        return tuple(DocumentSection.of(self.file, v, f"{self._at(key)}[{k}]") for k, v in enumerate(self.items(key)))
 
     def items(self, key: str) -> list[Any]:
         """The list under a key; empty where there is none."""

@@ -15,7 +15,7 @@ from weldcal.calibration.data.scanner_clock import ScannerClock, clock_from_docu
 from weldcal.calibration.data.scanner_correction import TERMS, correction_from_document
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
-from weldcal.models.documents import Section, read_document, shown
+from weldcal.models.documents import DocumentSection, read_document, shown
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import require_whole, write_atomic
 
@@ -215,7 +215,7 @@ def load_result(path: Path) -> CalibrationResult:
         )
     if not isinstance(document, dict) or not {"schema", "X_BC", "covariance"} <= set(document):
         raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.")
-    d = Section.of(path.name, document)
+    d = DocumentSection.of(path.name, document)
     if d.values["schema"] != 1:
         raise InputError(f"'{path.name}' is not a calibration result of schema 1; run 'weldcal calibrate' again.")
     M = d.section("X_BC").array("matrix", 4, 4)
@@ -264,7 +264,7 @@ def load_result(path: Path) -> CalibrationResult:
     )
 
 
-def _covariance(d: Section, key: str, size: int) -> Array:
+def _covariance(d: DocumentSection, key: str, size: int) -> Array:
     """The matrix (size, size) of a covariance.
 
     Raises InputError where it is not symmetric or has a negative variance.
@@ -280,7 +280,7 @@ def _covariance(d: Section, key: str, size: int) -> Array:
     return C
 
 
-def _pose_record(r: Section) -> PoseRecord:
+def _pose_record(r: DocumentSection) -> PoseRecord:
     _only(r, PoseRecord)
     return PoseRecord(
         id=r.text("id"),
@@ -293,7 +293,7 @@ def _pose_record(r: Section) -> PoseRecord:
     )
 
 
-def _icp_record(r: Section) -> IcpRecord:
+def _icp_record(r: DocumentSection) -> IcpRecord:
     _only(r, IcpRecord)
     rotation, translation = (tuple(float(v) for v in r.array(key, 3)) for key in ("rotation_deg", "translation_mm"))
     return IcpRecord(
@@ -307,7 +307,7 @@ def _icp_record(r: Section) -> IcpRecord:
     )
 
 
-def _only(r: Section, kind: type) -> None:
+def _only(r: DocumentSection, kind: type) -> None:
     """Refuses keys that a record does not have."""
     known = {f.name for f in fields(kind)}
     surplus = next((k for k in r.values if k not in known), None)

@@ -13,7 +13,7 @@ Which = NDArray[np.bool_] | NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class ArmErrors:
+class ArmDerivatives:
     """What joint zeros and link lengths of p numbers do: change D (n, 3, p) of p_CR's place in the base, change T (n,
     3, p) of the normals, and one sigma (p,) of the numbers for an arm as it leaves the factory."""
 
@@ -23,7 +23,7 @@ class ArmErrors:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Case:
+class DoctorCase:
     """n scans of a flange: X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and
     outward normals m (n, 3) in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise``
     (n,) m rms of each face about its plane (NaN: unknown), ``coverage`` (n,) share of the edge that was seen.
@@ -50,7 +50,7 @@ class Case:
     refused: tuple[tuple[str, str], ...] = ()
     near_far: tuple[float, float] | None = None
     oriented: bool = True
-    arm: ArmErrors | None = None
+    arm: ArmDerivatives | None = None
 
     @property
     def n(self) -> int:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.calibration.doctor.case import Case
-from weldcal.calibration.doctor.fit import NU, Fit, fit
+from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.fit import NU, CauseFit, fit
 from weldcal.calibration.doctor.models import Explained, explanations, with_arm_errors
 from weldcal.calibration.doctor.readings import (
     FEWEST,
@@ -36,7 +36,7 @@ _NOISE_CHANCE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class DirectCause:
     """A cause that shows without a model of the residuals: its name, its weight (twice a log-likelihood ratio) and its
     numbers."""
 
@@ -46,7 +46,7 @@ class Finding:
     where: tuple[str, ...] = ()
 
 
-def outliers(case: Case, null: Fit) -> Explained | None:
+def outliers(case: DoctorCase, null: CauseFit) -> Explained | None:
     """Single scans that disagree with all others, each of them anywhere (uniform in the ball that holds their
     errors)."""
     r = np.linalg.norm(null.e, axis=1)
@@ -73,7 +73,7 @@ def outliers(case: Case, null: Fit) -> Explained | None:
     )
 
 
-def sure_outliers(case: Case, null: Fit) -> Finding | None:
+def sure_outliers(case: DoctorCase, null: CauseFit) -> DirectCause | None:
     """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the
     residuals."""
     r = np.linalg.norm(null.e, axis=1)
@@ -84,22 +84,22 @@ def sure_outliers(case: Case, null: Fit) -> Finding | None:
         return None
     numbers = {"worst_mm": 1e3 * float(r[bad].max()), "others_mm": 1e3 * float(np.median(r[~bad]))}
     score = float(-2.0 * np.log(chance[bad] * case.n).sum())
-    return Finding("outlier scans or partial views", score, numbers, tuple(np.array(case.ids)[bad]))
+    return DirectCause("outlier scans or partial views", score, numbers, tuple(np.array(case.ids)[bad]))
 
 
-def _centre_errors(case: Case, one: Fit) -> Array:
+def _centre_errors(case: DoctorCase, one: CauseFit) -> Array:
     q = case.c @ one.R[0].T + one.p[0] - case.b
     return np.asarray(np.linalg.norm(q, axis=1))
 
 
-def partial_views(case: Case) -> Finding | None:
+def partial_views(case: DoctorCase) -> DirectCause | None:
     """Scans that show little of the flange's edge, or none of it."""
     few = np.zeros(case.n, dtype=bool) if case.coverage is None else np.nan_to_num(case.coverage, nan=1.0) < _LEAST_SEEN
     lost = [i for i, _ in case.refused]
     share = (int(few.sum()) + len(lost)) / max(case.n + len(lost), 1)
     if share < _REFUSED or int(few.sum()) + len(lost) < 2:
         return None
-    return Finding(
+    return DirectCause(
         "outlier scans or partial views",
         40.0 * share + 12.0,
         {"share": share, "refused": float(len(lost))},
@@ -107,7 +107,7 @@ def partial_views(case: Case) -> Finding | None:
     )
 
 
-def noise_growth(case: Case) -> Finding | None:
+def noise_growth(case: DoctorCase) -> DirectCause | None:
     """Noise of the faces that grows away from a distance faster than triangulation's square law."""
     z = np.linalg.norm(case.c, axis=1)
     if case.noise is None or case.n < 8:
@@ -136,10 +136,10 @@ def noise_growth(case: Case) -> Finding | None:
     numbers = {"factor": factor, "at_mm": 1e3 * at, "chance": chance}
     if case.near_far is not None:
         numbers |= {"near_mm": 1e3 * case.near_far[0], "far_mm": 1e3 * case.near_far[1]}
-    return Finding("scanner out of focus or range", float(score), numbers, tuple(worst))
+    return DirectCause("scanner out of focus or range", float(score), numbers, tuple(worst))
 
 
-def too_alike(case: Case) -> Finding | None:
+def too_alike(case: DoctorCase) -> DirectCause | None:
     """Poses that differ too little to fix the camera.
 
     One orientation alone is no fault where the places differ enough.
@@ -152,10 +152,10 @@ def too_alike(case: Case) -> Finding | None:
     if width[1] >= _FLAT_M:
         return None
     numbers = {"spread_mm": 1e3 * float(width[0]), "second_mm": 1e3 * float(width[1]), "turn_deg": middle}
-    return Finding("poses too alike", 60.0, numbers)
+    return DirectCause("poses too alike", 60.0, numbers)
 
 
-def installation(case: Case, one: Fit) -> Finding | None:
+def installation(case: DoctorCase, one: CauseFit) -> DirectCause | None:
     """The camera is elsewhere than somebody measured it, by more than the measurement's stated error, while all scans
     agree."""
     if case.guess is None:
@@ -175,7 +175,9 @@ def installation(case: Case, one: Fit) -> Finding | None:
         "shift_mm": 1e3 * float(np.linalg.norm(shift)),
         "stated_mm": 1e3 * case.guess_radius,
     }
-    return Finding("robot in another installation", float(min(10.0 * (off / case.guess_radius) ** 2, 400.0)), numbers)
+    return DirectCause(
+        "robot in another installation", float(min(10.0 * (off / case.guess_radius) ** 2, 400.0)), numbers
+    )
 
 
 _WRONG_RAD = 0.05  # normals disagree with the poses as they are
@@ -186,7 +188,7 @@ def _off(u: Array, z: Array) -> float:
     return float(np.median(np.arctan2(np.linalg.norm(np.cross(u, z), axis=1), (u * z).sum(axis=1))))
 
 
-def rotations_disagree(case: Case) -> dict[str, float] | None:
+def rotations_disagree(case: DoctorCase) -> dict[str, float] | None:
     """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind; None where both
     agree."""
     seen = np.asarray(np.isfinite(case.m).all(axis=1))
@@ -250,7 +252,7 @@ class Diagnosis:
     spread_m: float
 
 
-def diagnose(case: Case) -> Diagnosis:
+def diagnose(case: DoctorCase) -> Diagnosis:
     """The causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
     causes: list[Cause] = []
     if case.fits_flange and case.fits_flange != case.flange:
@@ -310,18 +312,18 @@ def diagnose(case: Case) -> Diagnosis:
     return Diagnosis(tuple(causes), case.n, float(np.median(np.linalg.norm(best.e, axis=1))))
 
 
-def _ranked(case: Case, null: Fit) -> list[Explained]:
+def _ranked(case: DoctorCase, null: CauseFit) -> list[Explained]:
     found = [*explanations(case, null)]
     single = outliers(case, null)
     return sorted([*found, *([] if single is None else [single])], key=lambda m: m.bic)
 
 
-def _named(m: Explained, null: Fit) -> bool:
+def _named(m: Explained, null: CauseFit) -> bool:
     shows = m.cause.startswith("outlier") or null.rms > CLEAR * m.fit.rms
     return shows and null.bic - m.bic > THRESHOLDS[m.cause] and m.effect_m > LEAST_EFFECT_M[m.cause]
 
 
-def _unexplained(case: Case, best: Fit) -> Cause | None:
+def _unexplained(case: DoctorCase, best: CauseFit) -> Cause | None:
     """What remains after the best model and is too large for any arm and scanner; None where nothing does."""
     turned = rotations_disagree(case)
     tilt = float(np.degrees(np.nanmedian(best.tilt))) if np.isfinite(best.tilt).any() else 0.0
@@ -335,13 +337,13 @@ def _unexplained(case: Case, best: Fit) -> Cause | None:
     return None
 
 
-def _weight(winner: Explained, models: list[Explained], null: Fit) -> float:
+def _weight(winner: Explained, models: list[Explained], null: CauseFit) -> float:
     """Share of the winner in the weights of all models, exp(-bic / 2)."""
     lead = [0.5 * (winner.bic - m.bic) for m in models] + [0.5 * (winner.bic - null.bic)]
     return float(1.0 / np.exp(np.minimum(lead, 0.0)).sum())
 
 
-def _residuals(null: Fit, best: Fit) -> dict[str, float]:
+def _residuals(null: CauseFit, best: CauseFit) -> dict[str, float]:
     """Medians of centres (mm) and, where normals were seen, of their angles (deg), without and with the cause."""
     out = {"without_mm": 1e3 * null.rms, "with_mm": 1e3 * best.rms}
     if np.isfinite(null.tilt).any() and np.isfinite(best.tilt).any():

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.geometry.rigid import drawn_triples, fit_rigid, fit_rigid_sets
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arrays import Array
@@ -27,7 +27,7 @@ _BEST = 0.6  # share of the scans that the start must explain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fit:
+class CauseFit:
     """A fitted model: camera poses R (G, 3, 3), p (G, 3); scanner terms; the cause's numbers a (p,); residuals of
     centres e (n, 3) m and of normals (n,) rad; spreads per axis; log-likelihood.
 
@@ -84,15 +84,15 @@ def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
 
 
 def fit(
-    case: Case,
+    case: DoctorCase,
     *,
     groups: NDArray[np.int64] | None = None,
     columns: Array | None = None,
-    start: Fit | None = None,
+    start: CauseFit | None = None,
     normals: bool = True,
     turning: Array | None = None,
     prior: Array | None = None,
-) -> Fit:
+) -> CauseFit:
     """The best numbers of a model; ``columns`` (n, 3, p) of the cause, ``groups`` (n,) the camera pose of each scan.
 
     ``turning`` (n, 3, p) is what the cause does to the normals z; ``prior`` (p,) one sigma of its numbers about zero.
@@ -185,7 +185,7 @@ def fit(
     occam = (
         _narrowed(rows, np.concatenate([np.zeros(6 * G + 4, dtype=bool), held]), sigmas[held]) if held.any() else 0.0
     )
-    return Fit(
+    return CauseFit(
         R=R,
         p=t,
         scanner=s,

@@ -46,7 +46,7 @@ class FlangeFitConfig:
 
 
 @dataclass
-class Refusal:
+class FaceRefusal:
     """The reason of the candidate that passed most tests before it failed."""
 
     stage: int = -1
@@ -59,7 +59,7 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Face:
+class FlangeFace:
     """A flange face: its plane, its edges (centres (2,) in the plane's axes), share of the outer edge seen, and its
     quality."""
 
@@ -72,7 +72,7 @@ class Face:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Measured:
+class FaceMeasurements:
     """Measurements that the tests of a flange use: its plane and edges, the pitch between points m, the share of the
     outer edge seen, the points on the face, and the shares of the bore's core and of the ring between the edges that
     are face."""
@@ -94,8 +94,13 @@ def thickness(plane: PlaneFit) -> float:
 
 
 def faces_on_plane(
-    points: Array, seed_point: Array, normal: Array, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal
-) -> list[Face]:
+    points: Array,
+    seed_point: Array,
+    normal: Array,
+    standard: FlangeStandard,
+    config: FlangeFitConfig,
+    refusal: FaceRefusal,
+) -> list[FlangeFace]:
     """Find flange faces on one plane (point and normal (3,)), among its connected parts of about the flange's size."""
     d = points - seed_point
     around = np.einsum("nk,nk->n", d, d) < (1.2 * standard.outer_m) ** 2
@@ -134,7 +139,7 @@ def edge_bounds(pitch: float, standard: FlangeStandard, config: FlangeFitConfig)
 
 
 def _first_circle(
-    part: Array, pitch: float, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal
+    part: Array, pitch: float, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> CircleFit | None:
     """The outer edge of a connected part (N, 2), roughly."""
     bounds = edge_bounds(pitch, standard, config)
@@ -165,8 +170,8 @@ def _measure(
     pitch: float,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
-) -> Face | None:
+    refusal: FaceRefusal,
+) -> FlangeFace | None:
     """Plane and edges in turn, twice; then the tests."""
     bounds = edge_bounds(pitch, standard, config)
     slack = bounds[1] - standard.outer_radius_m
@@ -207,7 +212,7 @@ def _measure(
     span = (standard.face_inner_radius_m + 0.5 * pitch, outer.radius - 0.5 * pitch)
     middle = (span[0] + 0.75 * (span[1] - span[0]), span[1])  # where every ring of the size has its face
     full = np.count_nonzero((rho > middle[0]) & (rho < middle[1])) / (middle[1] ** 2 - middle[0] ** 2)
-    measured = Measured(
+    measured = FaceMeasurements(
         plane=plane,
         outer=outer,
         bore=bore,
@@ -300,7 +305,9 @@ def _parts(points: Array, plane: PlaneFit, center: Array, reach: float) -> tuple
     return xy, pitch, connected_parts(xy, 2.5 * pitch)
 
 
-def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> Face | None:
+def judge(
+    m: FaceMeasurements, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal
+) -> FlangeFace | None:
     """Test size, edge and bore; return the face, or None with the reason noted."""
     bounds = edge_bounds(m.pitch, standard, config)
     rough = max(config.max_rim_rms_m, 0.7 * m.pitch)
@@ -342,11 +349,11 @@ def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusa
         )
     else:
         quality = m.coverage + (1.0 if m.bore is not None else 0.0) - m.outer.rms / rough
-        return Face(m.plane, m.outer, m.bore, m.coverage, m.count, quality)
+        return FlangeFace(m.plane, m.outer, m.bore, m.coverage, m.count, quality)
     return None
 
 
-def _least_ring(m: Measured) -> float:
+def _least_ring(m: FaceMeasurements) -> float:
     """The share of the ring between the edges that must be face."""
     if m.bore is None:
         return _FULL

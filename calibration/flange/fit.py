@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange.face import Face, FlangeFitConfig, Refusal, faces_on_plane, near
+from weldcal.calibration.flange.face import FaceRefusal, FlangeFace, FlangeFitConfig, faces_on_plane, near
 from weldcal.calibration.flange.lattice import interpolated, is_thinned, rebuild_grid
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.flange.search import search_frame, typical_pitches, window_about
@@ -98,7 +98,7 @@ def fit_flange(
         raise FlangeNotFound(f"A cloud must be (N, 3) or (H, W, 3); this one has the shape {cloud.shape}.")
     if isinstance(guess, FlangeFit):
         guess = FlangeGuess(guess.center_C, _TRACKED_RADIUS * standard.outer_m, guess.normal_C)
-    refusal = Refusal()
+    refusal = FaceRefusal()
     find = _organised if cloud.ndim == 3 else _unordered
     found = find(cloud, standard, guess, config, refusal)
     if found is None and (cloud.ndim == 3 or guess is None):
@@ -109,13 +109,13 @@ def fit_flange(
 
 
 def _unordered(
-    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
     """A list of points: on its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then
     searched."""
     grid = rebuild_grid(cloud)
     if grid is not None:
-        on_grid = Refusal()
+        on_grid = FaceRefusal()
         found = _organised(grid, standard, guess, config, on_grid)
         if found is not None:
             return found
@@ -134,7 +134,7 @@ def _unordered(
 
 
 def _organised(
-    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
     """A scan with its pixel grid: the whole of it, or the window about a guess."""
     measured = None
@@ -174,7 +174,7 @@ def _where_it_was(
     pitch: float,
     config: FlangeFitConfig,
     measured: NDArray[np.bool_] | None,
-) -> Face | None:
+) -> FlangeFace | None:
     """The flange within a few millimetres of a guessed pose, as when it is tracked; None where it must be searched."""
     assert guess.normal_C is not None
     reach = 0.5 * standard.outer_m + 2.0 * pitch + 0.003
@@ -184,12 +184,12 @@ def _where_it_was(
     center, normal = np.asarray(guess.center_C, dtype=float), np.asarray(guess.normal_C, dtype=float)
     known = None if measured is None else measured[window]
     face = measure_window(
-        cloud[window], center, normal, standard.face_outer_radius_m, standard, config, Refusal(), known
+        cloud[window], center, normal, standard.face_outer_radius_m, standard, config, FaceRefusal(), known
     )
     return face if face is not None and face.coverage > _GOOD_COVERAGE and face.bore is not None else None
 
 
-def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> FlangeFit | None:
+def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal) -> FlangeFit | None:
     """A cloud that shows little more than a flange as it is; a larger scene body by body."""
     if len(points) == 0:
         refusal.note(0, "The cloud holds no valid point.")
@@ -240,21 +240,21 @@ def _explain_unit(cloud: Array, standard: FlangeStandard, config: FlangeFitConfi
         (1e3, "small", "metres, read as millimetres"),
     ):
         find = _organised if cloud.ndim == 3 else _unordered
-        if find(cloud * factor, standard, None, config, Refusal()) is not None:
+        if find(cloud * factor, standard, None, config, FaceRefusal()) is not None:
             raise FlangeNotFound(
                 f"The flange in the cloud is 1000 times too {size}: the coordinates are {unit}; correct the unit."
             )
 
 
 def _find(
-    points: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+    points: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
     if len(points) < config.min_points:
         where = "in the cloud" if guess is None else f"within {1e3 * guess.radius_m:.0f} mm of the expected flange"
         refusal.note(0, f"Only {len(points)} valid points lie {where}; the flange needs {config.min_points}.")
         return None
     refusal.note(0, "No plane was found in the cloud.")
-    best: Face | None = None
+    best: FlangeFace | None = None
     for p, n, support in local_planes(
         points, reach=0.9 * standard.outer_m, tolerance=config.hypothesis_tolerance_m, seed=config.seed
     ):
@@ -274,7 +274,7 @@ def _find(
     return None if best is None else _result(best)
 
 
-def _result(face: Face) -> FlangeFit:
+def _result(face: FlangeFace) -> FlangeFit:
     axes = np.column_stack(plane_axes(face.plane.normal))
     circles = [face.outer] + ([face.bore] if face.bore is not None else [])
     center, cov = fuse([c.center for c in circles], [c.covariance[:2, :2] for c in circles])

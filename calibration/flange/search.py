@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.flange.face import Face, FlangeFitConfig, Refusal
+from weldcal.calibration.flange.face import FaceRefusal, FlangeFace, FlangeFitConfig
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.flange.window import measure_window
 from weldcal.models.arrays import Array
@@ -29,7 +29,7 @@ _MOST = 60  # parts that are looked at closely
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class FlatPart:
     """A flat part of about the flange's size: where its outer edge seems to be (centre (3,) m, radius m), the outward
     normal (3,), and how little its outline differs from that circle."""
 
@@ -43,9 +43,9 @@ def search_frame(
     cloud: Array,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
+    refusal: FaceRefusal,
     measured: NDArray[np.bool_] | None = None,
-) -> Face | None:
+) -> FlangeFace | None:
     """The best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted.
 
     Of a thinned scan, whose missing pixels are interpolated, ``measured`` (H, W) says which were not.
@@ -66,7 +66,7 @@ def search_frame(
     scales += [(w, _BEND_SIGMAS[0], "smoothed") for w in sizes]
     tried: list[tuple[Array, float]] = []
     for wide, sigmas, noise in scales:
-        best: Face | None = None
+        best: FlangeFace | None = None
         step = (round(wide / along), round(wide / across))
         for part in flat_parts(cloud[:: step[0], :: step[1]], standard, config, sigmas, noise):
             if any(
@@ -131,7 +131,7 @@ def flat_parts(
     config: FlangeFitConfig,
     sigmas: float = _BEND_SIGMAS[0],
     noise: _Noise = "of all",
-) -> Iterator[Part]:
+) -> Iterator[FlatPart]:
     """Connected flat parts of a thinned scan (h, w, 3) whose size and outline could be the flange's, most likely first.
 
     A plane seen in perspective has an inverse depth that is linear over the image: where its second differences
@@ -151,7 +151,7 @@ def flat_parts(
     with np.errstate(invalid="ignore"):
         flat = (bend < np.maximum(_BEND_M * np.square(inverse[1:-1, 1:-1]), sigmas * sigma)).astype(np.uint8)
     _count, labels, stats, _centroids = cv2.connectedComponentsWithStats(flat, connectivity=4, ltype=cv2.CV_32S)
-    parts: list[Part] = []
+    parts: list[FlatPart] = []
     for k in _likeliest(labels, stats, z, grid, standard):
         x, y, w, h = stats[k, :4].tolist()
         inside = labels[y : y + h, x : x + w] == k
@@ -212,7 +212,7 @@ def _likeliest(
     return [int(k) for k in ks[np.argsort(np.abs(np.log(diagonal[ks] / (0.9 * expected))), kind="stable")][:_MOST]]
 
 
-def _parts(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> list[Part]:
+def _parts(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> list[FlatPart]:
     """The part as it is, or the planes it consists of where it leaked over a shallow step onto another."""
     extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
     if not 0.55 * standard.outer_m < extent < _WIDEST * standard.outer_m:
@@ -246,7 +246,7 @@ def _draws(seed: int) -> Array:
     return np.random.default_rng(seed).random((3, _TRIPLES))
 
 
-def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[Part | None, float]:
+def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[FlatPart | None, float]:
     """Plane and outline of points (N, 3), None where they could not be a flange's, and the rms from the plane, m."""
     middle = points.mean(axis=0)
     d = points - middle
@@ -265,7 +265,7 @@ def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> t
     if found is None or found[2] > _ROUND * standard.outer_m:
         return None, rms
     center, radius, misfit = found
-    return Part(middle + axes @ center, normal, radius + pitch, misfit / standard.outer_m), rms
+    return FlatPart(middle + axes @ center, normal, radius + pitch, misfit / standard.outer_m), rms
 
 
 def _hull_circle(hull: Array, bounds: tuple[float, float]) -> tuple[Array, float, float] | None:

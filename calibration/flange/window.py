@@ -10,10 +10,10 @@ from scipy import ndimage
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
 from weldcal.calibration.flange.edge_labels import refine_circle
 from weldcal.calibration.flange.face import (
-    Face,
+    FaceMeasurements,
+    FaceRefusal,
+    FlangeFace,
     FlangeFitConfig,
-    Measured,
-    Refusal,
     clear_band,
     judge,
     lowered_by,
@@ -62,9 +62,9 @@ def measure_window(
     radius: float,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
+    refusal: FaceRefusal,
     measured: Mask | None = None,
-) -> Face | None:
+) -> FlangeFace | None:
     """Fit the face with an outer edge near ``center`` (3,) m and ``radius`` m in a part (h, w, 3) of a scan.
 
     ``normal`` (3,) outward, within a few degrees. ``measured`` (h, w) of a thinned scan with interpolated pixels: only
@@ -325,10 +325,10 @@ def _face(
     pitch: float,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
+    refusal: FaceRefusal,
     grid: Array,
     axes: Array,
-) -> Face | None:
+) -> FlangeFace | None:
     """The tests, then the plane once more, of all that proved to be the face."""
     low, high = standard.face_inner_radius_m + 0.5 * pitch, outer.radius - 0.5 * pitch
     ring = (rho2 > low**2) & (rho2 < high**2)
@@ -342,7 +342,7 @@ def _face(
     spacing = pitch
     if w.measured is not None:
         spacing *= float(np.sqrt(count / max(int(np.count_nonzero(ring & w.face & w.measured)), 1)))
-    measured = Measured(
+    measured = FaceMeasurements(
         plane=plane,
         outer=outer,
         bore=bore,

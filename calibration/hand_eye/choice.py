@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.hand_eye.fit import Fit, descend, fit, noise_of
+from weldcal.calibration.hand_eye.fit import EquationFit, descend, fit, noise_of
 from weldcal.calibration.hand_eye.linearisation import Loss
 from weldcal.calibration.hand_eye.problem import Problem, State, residuals
 from weldcal.calibration.hand_eye.starts import closed_forms, grid
@@ -37,7 +37,7 @@ class Choice:
 
     state: State
     covariance: Array
-    fit: Fit
+    fit: EquationFit
     method: str
     start: str
 
@@ -61,7 +61,7 @@ def solve(
     state = _concentrated(problem, state)
     w, d = residuals(problem, state)
     keep = _gate(problem, w, d)
-    base: Fit | None = None
+    base: EquationFit | None = None
     tried_sets: set[bytes] = set()
     for _ in range(10):
         noise = noise_of(problem, w, d, keep) if base is None else base.noise
@@ -145,7 +145,7 @@ def _gate(problem: Problem, w: Array, d: Array) -> Flags:
     return _inside(problem, w, d, noise.rotation, noise.translation)
 
 
-def _within(problem: Problem, base: Fit) -> Flags:
+def _within(problem: Problem, base: EquationFit) -> Flags:
     if len(problem) <= 4:
         return np.ones(len(problem), dtype=bool)
     return _inside(problem, base.w, base.d, base.noise.rotation, base.noise.translation)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.poses.readings import PoseReading, apply_change
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
 from weldcal.calibration.hand_eye.linearisation import inverse_information
-from weldcal.calibration.hand_eye.pairs.conventions import Agreement
+from weldcal.calibration.hand_eye.pairs.conventions import ReadingAgreement
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import LEAST_SCALE, SCALE_SIGMA, decided
 from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, residuals
@@ -57,7 +57,7 @@ def likely_mistake(pairs: PosePairs) -> str | None:
     )
 
 
-def _solvable(one: Agreement, mode: str) -> bool:
+def _solvable(one: ReadingAgreement, mode: str) -> bool:
     """Whether the solver finds a result, where a quarter of outliers or more hides from the comparison that a reading
     agrees."""
     F = one.robot.X if mode == "eye_in_hand" else inverse(one.robot.X)
@@ -79,7 +79,7 @@ def _orders(X: Array) -> list[PoseReading]:
     return some
 
 
-def _words(one: Agreement, mode: str) -> list[str]:
+def _words(one: ReadingAgreement, mode: str) -> list[str]:
     """What must be corrected for an agreement."""
     other = "eye_on_base" if mode == "eye_in_hand" else "eye_in_hand"
     said, forms = [], {"robot": one.robot.form.split(","), "camera": one.camera.form.split(",")}

@@ -27,7 +27,7 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.variances import (
     FREE_S2,
-    Linearised,
+    LinearisedStream,
     Variances,
     frame_weights,
     new_variances,
@@ -321,7 +321,7 @@ def _polished_capture(
 
 def linearised(
     problem: MotionProblem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, edge: float, pivot: Array
-) -> Linearised:
+) -> LinearisedStream:
     """The model at capture times (N,) s: residuals extrapolated to the nominal times, and their derivatives by all
     unknowns. ``rolling`` s, ``edge`` in noises of the face, rotations about ``pivot`` (3,) m."""
     f = problem.frames
@@ -351,11 +351,11 @@ def linearised(
     bad = ~np.isfinite(y).all(axis=1)
     for array in (y, J, g):
         array[bad] = np.nan
-    return Linearised(y, J, g, own, own_lean)
+    return LinearisedStream(y, J, g, own, own_lean)
 
 
 def _sorted_frames(
-    linear: Linearised, variances: Variances, W: Array, allowed: Flags, kept: Flags, late: Flags, step: int
+    linear: LinearisedStream, variances: Variances, W: Array, allowed: Flags, kept: Flags, late: Flags, step: int
 ) -> tuple[Flags, Flags, bool]:
     """Frames to use and frames whose time is grossly late, from the present residuals; whether both sets stayed."""
     if step < 2 or step > 25:

@@ -67,7 +67,7 @@ class PoseStreams:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Synchronised:
+class ClockOffset:
     """``offset_s``: time of the eye's stamps less the hand's time of the same instant, ``sigma_s`` its standard
     deviation; ``X`` eye in the hand, ``Y`` world in the base, 4 x 4; ``rms_deg`` and ``rms_m`` of the frames; ``pairs``
     for the solvers; ``before_m`` the rms at offset zero with the same poses."""
@@ -135,7 +135,7 @@ def are_trajectories(robot: Listing, camera: Listing) -> bool:
 
 def synchronise_lists(
     robot: Listing, camera: Listing, *, mounting: str = "eye_in_hand", source: str = "trajectories"
-) -> Synchronised:
+) -> ClockOffset:
     """Clock offset, both poses and pairs of two trajectories, the camera's as X_CM or as the camera in the target's or
     the world's frame.
 
@@ -152,7 +152,7 @@ def synchronise_lists(
             f"The rotations of '{(robot if who == 'robot' else camera).name}' can be read in {max(len(a), len(b))}"
             f" ways. State how they are written, for example --{who}-form {(a if who == 'robot' else b)[0].form}."
         )
-    tried: list[tuple[float, Synchronised, str, str]] = []
+    tried: list[tuple[float, ClockOffset, str, str]] = []
     problem: WeldcalError | None = None
     for one, other in itertools.product(a, b):
         for inverted in (False, True):
@@ -212,7 +212,7 @@ def _metres(X: Array, unit: str) -> Array:
     return out
 
 
-def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: str = "streams") -> Synchronised:
+def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: str = "streams") -> ClockOffset:
     """Clock offset and both poses from two streams, and pairs at the offset for the solvers of hand-eye calibration.
 
     The eye's stamps are used as they are; X and Y are those of the mounting. The standard deviation of the offset
@@ -275,7 +275,7 @@ def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: 
     known = hand.known(t)
     before = residuals(none)[:, 3:] * scales[1]
     pairs = PosePairs(source=source, robot=hand.poses(t[chosen] - offset), camera=inverse(E[chosen]), mode=mounting)
-    return Synchronised(
+    return ClockOffset(
         offset_s=offset,
         sigma_s=sigma,
         X=A,

@@ -33,7 +33,7 @@ class Variances:
 
 
 @dataclass(eq=False)
-class Linearised:
+class LinearisedStream:
     """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5),
     Jacobians J (N, 5, 15), rates g (N, 5) and the unit covariances of the three kinds of noise in 5 x 5."""
 
@@ -44,7 +44,7 @@ class Linearised:
     own_lean: Array
 
 
-def total_variances(linear: Linearised, variances: Variances, keep: Flags) -> Array:
+def total_variances(linear: LinearisedStream, variances: Variances, keep: Flags) -> Array:
     """Mean variances of a centre and a normal, an axis, and of the time: what the weights follow from.
 
     The share of the fits' own noise in them converges slowly, and matters little.
@@ -56,7 +56,7 @@ def total_variances(linear: Linearised, variances: Variances, keep: Flags) -> Ar
     )
 
 
-def noise_covariances(linear: Linearised, variances: Variances) -> Array:
+def noise_covariances(linear: LinearisedStream, variances: Variances) -> Array:
     """Covariances (N, 5, 5) without the jitter."""
     P = variances.factor * (linear.own + linear.own_lean)
     P[:, range(3), range(3)] += variances.spread
@@ -64,7 +64,7 @@ def noise_covariances(linear: Linearised, variances: Variances) -> Array:
     return P
 
 
-def frame_weights(linear: Linearised, variances: Variances, late: Flags) -> Array:
+def frame_weights(linear: LinearisedStream, variances: Variances, late: Flags) -> Array:
     """Inverse covariances (N, 5, 5) with the jitter."""
     j = np.where(late, FREE_S2, variances.jitter)
     V = noise_covariances(linear, variances) + j[:, None, None] * linear.g[:, :, None] * linear.g[:, None, :]
@@ -73,7 +73,7 @@ def frame_weights(linear: Linearised, variances: Variances, late: Flags) -> Arra
 
 
 def new_variances(
-    linear: Linearised,
+    linear: LinearisedStream,
     variances: Variances,
     W: Array,
     information: Array,

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
-from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes, self_distance
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, lowest_point, occludes, self_distance
 from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
@@ -190,7 +190,7 @@ def _refuse(
     X_BC: RigidTransform,
     X_BR: RigidTransform,
     ring_R: Array,
-    bodies: list[Body],
+    bodies: list[LinkCapsule],
     q_start: Array,
     config: PlannerConfig,
 ) -> str | None:

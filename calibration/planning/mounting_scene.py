@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from weldcal.calibration.geometry.se3 import IDENTITY
 from weldcal.calibration.hand_eye.mountings import Mounting, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import Problem, State
-from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, lowest_point, occludes
 from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
@@ -178,7 +178,7 @@ class Bodies:
         half, radius, z = SCANNER_BODY
         ends = [np.asarray(scene.X_LC @ np.array([side * half, 0.0, z])) for side in (-1.0, 1.0)]
         carried = scene.link != BASE
-        self.scanner = [Body(scene.link, scene.link, ends[0], ends[1], radius)] if carried else []
+        self.scanner = [LinkCapsule(scene.link, scene.link, ends[0], ends[1], radius)] if carried else []
         first = [*self.arm, *self.scanner]
         self._first, self._second = _stack(first), _stack(self.arm_2)
         link = np.array([b.link for b in first])
@@ -246,7 +246,7 @@ Stacked = tuple[NDArray[np.intp], Array]
 """Frames (n,) and points in them (n, 9, 3) of n capsules."""
 
 
-def _stack(bodies: Sequence[Body]) -> Stacked:
+def _stack(bodies: Sequence[LinkCapsule]) -> Stacked:
     points = [b.p_start + _ALONG * (b.p_end - b.p_start) for b in bodies]
     return np.array([b.frame for b in bodies], dtype=np.intp), np.array(points).reshape(-1, len(_ALONG), 3)
 

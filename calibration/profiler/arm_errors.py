@@ -19,7 +19,7 @@ ARM_ERRORS = len(OFFSET_JOINTS) + len(SAG_JOINTS) + 6 * len(TABLE)
 
 
 @dataclass(frozen=True, eq=False)
-class ArmErrors:
+class ProfilerArmErrors:
     """Offsets (4,) rad of joints 2 to 5, sag (2,) rad/m of joints 2 and 3, and the table's errors (6, 3): a m, alpha
     rad, d m."""
 
@@ -28,11 +28,11 @@ class ArmErrors:
     table: Floats
 
     @staticmethod
-    def of(values: Floats) -> ArmErrors:
+    def of(values: Floats) -> ProfilerArmErrors:
         """From a vector (24,) in this order."""
         k = len(OFFSET_JOINTS)
         m = k + len(SAG_JOINTS)
-        return ArmErrors(values[:k], values[k:m], values[m:].reshape(6, 3))
+        return ProfilerArmErrors(values[:k], values[k:m], values[m:].reshape(6, 3))
 
     @property
     def values(self) -> Floats:
@@ -40,9 +40,9 @@ class ArmErrors:
         return np.concatenate([self.offsets, self.sag, self.table.ravel()])
 
     @staticmethod
-    def none() -> ArmErrors:
+    def none() -> ProfilerArmErrors:
         """An arm as drawn."""
-        return ArmErrors.of(np.zeros(ARM_ERRORS))
+        return ProfilerArmErrors.of(np.zeros(ARM_ERRORS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +114,11 @@ class DhArm:
         rows[:, TABLE] += table
         return DhArm(rows)
 
-    def with_errors(self, q: Floats, errors: ArmErrors, loads: Floats) -> FlangePoses:
+    def with_errors(self, q: Floats, errors: ProfilerArmErrors, loads: Floats) -> FlangePoses:
         """Flange poses of the arm with its errors."""
         return self.changed(errors.table).poses(q, errors.offsets, errors.sag, loads)
 
-    def twists(self, q: Floats, errors: ArmErrors, loads: Floats) -> tuple[Floats, Floats]:
+    def twists(self, q: Floats, errors: ProfilerArmErrors, loads: Floats) -> tuple[Floats, Floats]:
         """How the flange moves with each error: turns w (n, 24, 3) and shifts v (n, 24, 3) with dp = w x p + v for p in
         B.
 

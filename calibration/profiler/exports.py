@@ -17,7 +17,7 @@ from weldcal.calibration.data.poses.text import table_lists
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.profiler.gocator import gocator_profiles, is_gocator
 from weldcal.calibration.profiler.motion import Floats
-from weldcal.calibration.profiler.text_blocks import Block, blocks_of
+from weldcal.calibration.profiler.text_blocks import NumberRows, blocks_of
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, MOST_COLUMNS, read_text, require_short_numbers
 
@@ -118,7 +118,7 @@ def _check(profiles: Profiles) -> None:
             )
 
 
-def _with_header(blocks: list[Block], name: str) -> Profiles:
+def _with_header(blocks: list[NumberRows], name: str) -> Profiles:
     """Tables with named columns: x and z of each point, with the scan's number, or a block for each profile."""
     header = blocks[0].header
     if any(b.header != header for b in blocks):
@@ -239,7 +239,7 @@ def _runs(poses: Floats) -> np.ndarray[Any, Any]:
     return np.arange(len(poses))
 
 
-def _captions(blocks: list[Block]) -> tuple[str, ...]:
+def _captions(blocks: list[NumberRows]) -> tuple[str, ...]:
     """Names of profiles by the captions of their blocks, such as "Profile 3"; empty where they have no numbers of their
     own."""
     numbers = [number_of(b.caption) for b in blocks]
@@ -265,7 +265,7 @@ def _empty(z: Floats) -> np.ndarray[Any, Any]:
     return marks | (z < -2.1e9)
 
 
-def _columns_of_heights(blocks: list[Block], header: tuple[str, ...], name: str) -> Profiles:
+def _columns_of_heights(blocks: list[NumberRows], header: tuple[str, ...], name: str) -> Profiles:
     """A column of x and one column of heights for each profile."""
     names = [_split(h) for h in header]
     x = [k for k, (n, _) in enumerate(names) if n in ("x", "x coordinate", "x coordinates", "x position")]
@@ -295,7 +295,7 @@ def listed_columns(profiles: Profiles) -> str:
     return _listed(profiles.columns)
 
 
-def _bare(blocks: list[Block], name: str, pitch_mm: float | None) -> Profiles:
+def _bare(blocks: list[NumberRows], name: str, pitch_mm: float | None) -> Profiles:
     """Numbers without names: x z, x z intensity or x y z a row; a grid with a row or a column of x; heights alone."""
     width = blocks[0].table.shape[1]
     if any(b.table.shape[1] != width for b in blocks):

@@ -17,7 +17,7 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate
 from weldcal.calibration.profiler.sphere.model import corrected
-from weldcal.models.documents import Section, read_document
+from weldcal.models.documents import DocumentSection, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import require_whole, write_atomic
 
@@ -147,7 +147,7 @@ def load_record(path: Path) -> ProfilerRecord:
     document = read_document(path)
     if not isinstance(document, dict) or document.get("schema") != 1 or "X_FS" not in document:
         raise InputError(f"'{path.name}' is no profiler's calibration: run 'weldcal profiler edge' or 'sphere' again.")
-    d = Section.of(path.name, document)
+    d = DocumentSection.of(path.name, document)
     M = d.section("X_FS").array("matrix", 4, 4)
     if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
         raise InputError(f"'{path.name}' was changed by hand: run 'weldcal profiler edge' or 'sphere' again.")

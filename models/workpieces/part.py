@@ -17,12 +17,12 @@ from weldcal.models.workpieces.drawing import goes_on
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.models.workpieces.seat import (
-    Entry,
     JointNotWeldable,
     JointSection,
     Press,
     Seated,
-    Tip,
+    SeatedTip,
+    TipApproach,
     check_weldable,
     hard_height,
     press_for,
@@ -154,13 +154,13 @@ class WeldPart(Protocol):
     def end_window_m(self) -> float:
         """How far from the drawn end the seam may end."""
 
-    def seated(self, tip: Tip, press: Press) -> Seated:
+    def seated(self, tip: SeatedTip, press: Press) -> Seated:
         """Where the centre of the loaded tip rests, from the root."""
 
-    def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
+    def press(self, tip: SeatedTip, axial_m: float | None, lateral_m: float | None) -> Press:
         """How hard the tip is pressed; a value that is given is kept."""
 
-    def entry(self, tip: Tip, seated: Seated) -> Entry:
+    def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
         """How the tip is brought into the joint in which it then rests."""
 
 
@@ -246,21 +246,21 @@ class Part:
         felt."""
         return CHOSEN_END_M if goes_on(self.mesh, self.seam) else FELT_END_M
 
-    def felt_by(self, tip: Tip) -> bool:
+    def felt_by(self, tip: SeatedTip) -> bool:
         """Whether the tip is used on this seam: as the seam's `feel` says, else not where level plates leave too narrow
         a gap."""
         if self.seam.feel is not None or self.seam.joint != "butt" or self.seam.gap_m > UNFELT_GAP_M:
             return self.seam.feel is not False
         return feels(self.section, tip)
 
-    def seated(self, tip: Tip, press: Press) -> Seated:
+    def seated(self, tip: SeatedTip, press: Press) -> Seated:
         """See WeldPart; a tip that is not used hangs HOVER_M clear of the walls."""
         if not self.felt_by(tip):
             clear = tip.tip_radius_m + HOVER_M
             return Seated(0.0, clear if self.section.gap_m > 0.0 else hard_height(self.section, clear))
         return seat(self.section, tip, press)
 
-    def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
+    def press(self, tip: SeatedTip, axial_m: float | None, lateral_m: float | None) -> Press:
         """See WeldPart: of the first of its seams that is felt; raises JointNotWeldable."""
         felt = next((p for k in range(seam_count(self)) if is_felt(p := numbered(self, k), tip)), None)
         if not isinstance(felt, Part):
@@ -272,19 +272,19 @@ class Part:
             advice = "Or write feel: false with the seam: it is then followed from the scan and the drawing."
             raise JointNotWeldable(f"{error} {advice}") from error
 
-    def entry(self, tip: Tip, seated: Seated) -> Entry:
+    def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
         """See WeldPart: a wide joint guides the tip in from above; beside a narrow one it lands on the face and
         searches."""
         section = self.section
         if not self.felt_by(tip):
-            return Entry(0.0, GUIDED_DROP_M)
+            return TipApproach(0.0, GUIDED_DROP_M)
         if section.gap_m == 0.0 and section.half_angle_rad >= SELF_GUIDING_RAD:
-            return Entry(0.0, GUIDED_DROP_M)
+            return TipApproach(0.0, GUIDED_DROP_M)
         mouth = 0.5 * section.gap_m if section.gap_m else section.right_m * math.sin(section.half_angle_rad)
-        return Entry(-(mouth + BESIDE_M), self.depth_m + tip.tip_radius_m - seated.above_m)
+        return TipApproach(-(mouth + BESIDE_M), self.depth_m + tip.tip_radius_m - seated.above_m)
 
 
-def feels(section: JointSection, tip: Tip) -> bool:
+def feels(section: JointSection, tip: SeatedTip) -> bool:
     """Whether a ball can feel a joint."""
     try:
         check_weldable(section, tip.tip_radius_m)
@@ -294,7 +294,7 @@ def feels(section: JointSection, tip: Tip) -> bool:
     return True
 
 
-def is_felt(part: WeldPart, tip: Tip) -> bool:
+def is_felt(part: WeldPart, tip: SeatedTip) -> bool:
     """Whether the tip is used on the part's seam; on a grooved plate it is."""
     return not isinstance(part, Part) or part.felt_by(tip)
 

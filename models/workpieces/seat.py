@@ -26,7 +26,7 @@ HELD_SHARE = 0.5  # of the sideways force that would lift the ball off its other
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
 
-class Tip(Protocol):
+class SeatedTip(Protocol):
     """The numbers of the soft tip that its seat depends on; weldcal.models.tool.WeldingTool has them."""
 
     @property
@@ -53,7 +53,7 @@ class Press(NamedTuple):
     lateral_m: float
 
 
-class Entry(NamedTuple):
+class TipApproach(NamedTuple):
     """How the tip is brought into a joint, m: how far to the left of the root it comes down (negative: to the right),
     and how much lower it then rests in the joint than where it lands."""
 
@@ -153,7 +153,9 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
             )
 
 
-def press_for(section: JointSection, tip: Tip, axial_m: float | None = None, lateral_m: float | None = None) -> Press:
+def press_for(
+    section: JointSection, tip: SeatedTip, axial_m: float | None = None, lateral_m: float | None = None
+) -> Press:
     """How hard the tip is pressed into this joint, m; a value that is given is kept.
 
     Pressed sideways by more than cot(half angle) of the downward force the ball would climb its wall; half of that is
@@ -186,7 +188,7 @@ def press_for(section: JointSection, tip: Tip, axial_m: float | None = None, lat
     return Press(axial, lateral)
 
 
-def seat(section: JointSection, tip: Tip, press: Press) -> Seated:
+def seat(section: JointSection, tip: SeatedTip, press: Press) -> Seated:
     """Where the ball of the tip rests, pressed left and down by its springs.
 
     The pressure in the soft ball grows linearly from its surface to the modulus at its centre (Elandt et al., IROS

@@ -50,7 +50,7 @@ _LEAN = 0.05  # off a vertical axis, which a viewer cannot look along
 _PLACES = 40  # remembered: a browser answers late
 
 
-class Place(NamedTuple):
+class CameraPlace(NamedTuple):
     """From `time` s on camera `view` stands at `eye` and looks at `target`, (3,) m in the world."""
 
     time: float
@@ -69,7 +69,7 @@ class Views:
         self.wanted = FOLLOW
         self.showing = CELL
         self.known: tuple[str, ...] = (CELL,)
-        self.places: list[Place] = []
+        self.places: list[CameraPlace] = []
 
     def pick(self, name: str) -> bool:
         """Pick a camera, or FOLLOW; False where there is none of that name."""
@@ -171,7 +171,7 @@ class CameraDirector(LeafSystem):
         """Keep the followed camera for the recording."""
         places = self._views.places
         if not places or places[-1].view != view or np.linalg.norm(target - np.array(places[-1].target)) > 5 * STEP_M:
-            places.append(Place(time, view, tuple(eye.round(4).tolist()), tuple(target.round(4).tolist())))
+            places.append(CameraPlace(time, view, tuple(eye.round(4).tolist()), tuple(target.round(4).tolist())))
 
     def _place(self, view: str, shown: Mapping[str, Any]) -> tuple[Array, Array]:
         """Eye and target (3,) m of a camera in the world."""

@@ -14,8 +14,8 @@ from tests.places import ROOT
 # A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
 BOUNDS = {
     "modules": 655,  # files with code in the five folders
-    "code lines": 96_800,  # without blank lines, comments and docstrings
-    "lines of studies": 10_800,  # in tools/studies, all lines
+    "code lines": 96_890,  # without blank lines, comments and docstrings
+    "lines of studies": 10_830,  # in tools/studies, all lines
     "tests that import studies": 2,  # outside tests/tools/studies
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only
@@ -23,9 +23,9 @@ BOUNDS = {
     "import cycles": 0,  # modules that import themselves through others, imports under TYPE_CHECKING included
     "full folders": 0,  # outside tools/, with more than FULLEST_FOLDER modules
     "long lines": 0,  # in the five folders, over LONGEST_LINE characters
-    "layout by hand": 20,  # statements in the five folders that ruff does not format
+    "layout by hand": 19,  # statements in the five folders that ruff does not format
     "bare constants": 220,  # float constants of the mathematics and the systems without a comment
-    "shared class names": 55,  # public class names that occur in more than one module
+    "shared class names": 0,  # public class names that occur in more than one module
 }
 LONGEST_CALL = 6
 LONGEST_LINE = 120

@@ -26,7 +26,7 @@ from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.servo.guards import GUARD, SPEED_SHARE, SlewLimits, guarded_joint_velocity, slew_limit
-from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchOnConfig
 from weldcal.welding.servo.state import Phase
 
 ARMS = ("ur3e", "ur5e", "ur7e", "ur10e", "ur12e", "ur16e", "ur20")
@@ -103,7 +103,7 @@ def draw(seed: int) -> Placement:
     seam = TrueSeam("placed", points @ R.T + p, R[:, 2])
     config = ServoConfig(
         tool=ToolGeometry(torch_offset_m=chord_m, torch_height_m=tool.torch_height_m),
-        touch=TouchConfig(zero_frames=10),
+        touch=TouchOnConfig(zero_frames=10),
         weld_speed_m_s=float(rng.uniform(0.010, 0.020)),
     )
     pan = (angle + rng.uniform(-0.8, 0.8) + math.pi) % (2.0 * math.pi) - math.pi

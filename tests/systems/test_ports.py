@@ -79,7 +79,7 @@ from weldcal.systems.jobs.weld.iterative_calibrator import (
     CalibrationPosePlanner,
     CalibratorConfig,
     IterativeCalibrator,
-    NextPose,
+    PoseRequest,
 )
 from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobPlan, JobSequencer, JobState
@@ -374,7 +374,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "history": PoseHistory,
         "calibration_status": CalibrationStatus,
     },
-    CalibrationPosePlanner: {"calibration_status": CalibrationStatus, "next_pose": NextPose},
+    CalibrationPosePlanner: {"calibration_status": CalibrationStatus, "next_pose": PoseRequest},
     SeamPlanner: {
         "scan": Scan,
         "job": JobCommand,
@@ -444,7 +444,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "robot_status": UrStatus,
         "settled_goal": 1,
         "position_measured": 6,
-        "next_pose": NextPose,
+        "next_pose": PoseRequest,
         "calibration_status": CalibrationStatus,
         "planned_seam": PlannedSeam,
         "servo_report": ServoReport,

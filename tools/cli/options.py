@@ -199,7 +199,7 @@ class Call:
 
 
 @dataclass(frozen=True)
-class Command:
+class CliCommand:
     """A command: its full name ("benchmark cell"), the function as Typer takes it, and its body.
 
     Attributes:
@@ -237,7 +237,7 @@ def command(
     options: tuple[str, ...] = (),
     common: tuple[str, ...] = RESULT,
     defaults: Mapping[str, object] | None = None,
-) -> Callable[[Body], Command]:
+) -> Callable[[Body], CliCommand]:
     """Makes a command of a function body(call, own parameters ...) that returns an Outcome, a summary or None.
 
     The body gets the common options ``options`` and ``common`` through its Call. It runs inside console.boundary, with
@@ -248,7 +248,7 @@ def command(
     names = (*options, *common)
     preset = {name: (defaults or {}).get(name, COMMON[name][1]) for name in names}
 
-    def decorate(body: Body) -> Command:
+    def decorate(body: Body) -> CliCommand:
         def run(**given: Any) -> None:
             _check_numbers(given)
             shared = {name: given.pop(name) for name in names}
@@ -271,7 +271,7 @@ def command(
         parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + shared
         run.__doc__ = body.__doc__
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        return Command(title, run, body)
+        return CliCommand(title, run, body)
 
     return decorate
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.calibration.doctor.readings import FEWEST
 from weldcal.calibration.doctor.record import NAME, case_of, case_text
@@ -24,7 +24,7 @@ _NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "
 """Causes that the solver names itself, or that are none."""
 
 
-def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> Case:
+def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> DoctorCase:
     """What a dataset shows of the flange, as the doctor examines it."""
     X_BC, guess = data.X_BC_guess, data.header.scanner_guess
     try:
@@ -47,7 +47,7 @@ def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard
     )
 
 
-def write_case(folder: Path, case: Case) -> None:
+def write_case(folder: Path, case: DoctorCase) -> None:
     """Write what was seen of the flange beside a result, for `weldcal doctor`."""
     write_apart(folder / NAME, case_text(case))
 
@@ -75,7 +75,7 @@ def examined_where_refused(
         raise
 
 
-def _name_cause(problem: WeldcalError, case: Case) -> None:
+def _name_cause(problem: WeldcalError, case: DoctorCase) -> None:
     """Adds the doctor's first cause to the sentence, with its evidence and remedy, unless the sentence names it."""
     causes = worded("", diagnose(case), most=1).causes
     if not causes or causes[0].name in _NAMED_ALREADY:

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.doctor.diagnose import Cause, Diagnosis, diagnose
 from weldcal.calibration.doctor.record import NAME, read_case
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
@@ -133,7 +133,7 @@ def _found_in(data: Dataset, ids: Sequence[str], standard: FlangeStandard) -> li
 
 def _recorded(path: Path, progress: Progress) -> Diagnosis:
     """Replay a recording, and examine what its calibration saw and its weld felt."""
-    cases: list[Case] = []
+    cases: list[DoctorCase] = []
     reasons: list[str] = []
 
     def look(cell: Cell[Any], root: Context) -> None:

@@ -15,7 +15,7 @@ from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.first_screen import CARE
-from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Cell, Checked, FleetReport, fleet_report, held_out_mm
+from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, FleetCell, FleetReport, fleet_report, held_out_mm
 from weldcal.tools.report.render import write_atomic
 
 HEADER = "dataset.yaml"
@@ -173,7 +173,7 @@ def judge_fleet(cells: Mapping[str, Sequence[Checked]], out: Path) -> FleetRepor
     return FleetReport(tuple(judged), out)
 
 
-def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> Cell:
+def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> FleetCell:
     """Judge a cell by its newest dataset, its history, and the fleet's usual held-out error (mm)."""
     newest = datasets[-1]
     since = _refuted_since(datasets)
@@ -200,7 +200,7 @@ def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> Cel
     else:
         reason, then = _smaller_signs(newest, usual_mm)
         state = LOOK if reason else FINE
-    return Cell(name=name, datasets=datasets, state=state, reason=reason, next=then, since=since, trend=trend)
+    return FleetCell(name=name, datasets=datasets, state=state, reason=reason, next=then, since=since, trend=trend)
 
 
 def _smaller_signs(newest: Checked, usual_mm: float) -> tuple[str, str]:

@@ -30,8 +30,8 @@ from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult, solve_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.motion.pose_streams import Synchronised, are_trajectories, is_stream_file, synchronise_lists
-from weldcal.calibration.planning.next_pose import View, next_pose, view_of
+from weldcal.calibration.motion.pose_streams import ClockOffset, are_trajectories, is_stream_file, synchronise_lists
+from weldcal.calibration.planning.next_pose import VisibleVolume, next_pose, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
@@ -344,7 +344,7 @@ def run_hand_eye(
     return report
 
 
-def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Synchronised | None:
+def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> ClockOffset | None:
     """The pairs of two recordings in motion of a folder; None where it holds none."""
     if not path.is_dir() or (path / "pairs.npz").exists():
         return None
@@ -384,7 +384,7 @@ def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, option
     return refined
 
 
-def _no_advice(view: View, arm: Chain | None) -> str:
+def _no_advice(view: VisibleVolume, arm: Chain | None) -> str:
     reach = "" if arm is None else f" and within reach of {arm.name}"
     return (
         f"No further pose near those so far is visible{reach} (view: {view.source}). Move to a region with a better"

@@ -18,7 +18,7 @@ from weldcal.calibration.data.results import CalibrationResult, export_all, load
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.motion.drift.background import background_move
 from weldcal.calibration.motion.drift.sequential import MOVED, DriftConfig, DriftEvent
-from weldcal.calibration.motion.drift.watch import Watched, watch
+from weldcal.calibration.motion.drift.watch import DriftHistory, watch
 from weldcal.calibration.motion.frames import observed_frames, see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
@@ -35,7 +35,7 @@ from weldcal.tools.cli.options import LIVE, Call, FlangeOption, Outcome, command
 from weldcal.tools.commands.monitor_body import see_link
 from weldcal.tools.commands.run import JobRun, run_job, run_options
 from weldcal.tools.console import Progress
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 from weldcal.tools.report.monitor import MonitorReport, drift_document, monitor_page
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
@@ -229,7 +229,7 @@ def rate_checked(false_alarms_per_hour: float) -> None:
 
 
 def recalibrated_result(
-    result: CalibrationResult, watched: Watched, hashes: dict[str, str], flange: str, seed: int
+    result: CalibrationResult, watched: DriftHistory, hashes: dict[str, str], flange: str, seed: int
 ) -> CalibrationResult:
     """The calibration as it is at the end of a watch, from all frames since the last change and the calibration before
     it."""
@@ -252,7 +252,7 @@ def recalibrated_result(
     )
 
 
-def told_apart(e: DriftEvent, watched: Watched, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
+def told_apart(e: DriftEvent, watched: DriftHistory, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
     """The event with its cause, where what stands still in the scans before and after it tells."""
     if e.kind != MOVED or e.since_start:
         return e
@@ -273,12 +273,14 @@ def told_apart(e: DriftEvent, watched: Watched, data: MotionDataset, result: Cal
     return e if found is None or found.cause is None else replace(e, cause=found.cause)
 
 
-def causes(watched: Watched) -> str:
+def causes(watched: DriftHistory) -> str:
     """What the data tell of the cause, over all events."""
     return "; ".join(dict.fromkeys(e.cause for e in watched.events))
 
 
-def _warnings(result: CalibrationResult, data: MotionDataset, watched: Watched, refused: int, flange: str) -> list[str]:
+def _warnings(
+    result: CalibrationResult, data: MotionDataset, watched: DriftHistory, refused: int, flange: str
+) -> list[str]:
     h, out = data.header, []
     for what, was, now in (
         ("robot", result.robot, h.robot),
@@ -327,7 +329,7 @@ class LiveMonitor:
             found = Findings(against=held or ["No frame showed the flange."], unseen=0)
             after = Next("See that the scanner streams and sees the flange, then watch again.")
             return FirstScreen(
-                found, Expected("error of the tracked flange, 95 %", "not known", "no frame showed it"), after
+                found, ExpectedError("error of the tracked flange, 95 %", "not known", "no frame showed it"), after
             )
         first = self.report.first
         if not held:
@@ -453,7 +455,9 @@ def monitor_live(
     return outcome
 
 
-def watched_record(result: CalibrationResult, record: MotionRecord, finished: JobRun, config: DriftConfig) -> Watched:
+def watched_record(
+    result: CalibrationResult, record: MotionRecord, finished: JobRun, config: DriftConfig
+) -> DriftHistory:
     """What all frames of a run say together."""
     cell, root = finished.cell, finished.run.root
     added: AddedMotion = cell.job

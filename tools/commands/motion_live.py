@@ -19,7 +19,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.calibration import error_summary
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, after_hold
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import motion_screen
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
@@ -69,7 +69,7 @@ class MotionOutcome:
         e, run = self.estimate, self.run
         against = [run.reason or "The job was held."] if run.held else []
         if e is None:
-            expected = Expected("error in the middle of the frames, 95 %", "not known", "there is no calibration")
+            expected = ExpectedError("error in the middle of the frames, 95 %", "not known", "there is no calibration")
             found = Findings(against=against or ["There is no calibration."], unseen=0)
             return FirstScreen(found, expected, after_hold(run.ended_by_operator), more={"pose": "none was found"})
         seen = self.record.seen

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.data.results import load_result
-from weldcal.calibration.motion.expected import Expected, expected_of_motion
+from weldcal.calibration.motion.expected import PredictedSigma, expected_of_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import closed_moves, recorded_stream
 from weldcal.models.arrays import Array
@@ -162,7 +162,7 @@ def _of_cubes(
     return found
 
 
-def _planned(name: str, told: Expected, corners: tuple[tuple[float, ...], ...] = ()) -> Planned:
+def _planned(name: str, told: PredictedSigma, corners: tuple[tuple[float, ...], ...] = ()) -> Planned:
     cost = float(np.hypot(told.work_m, _SPEED_M_S * told.offset_s))
     return Planned(
         name=name,

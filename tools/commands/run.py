@@ -32,7 +32,7 @@ from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.person import Person, person_at
 from weldcal.systems.recording.port_recorder import ENTERED, LEFT
 from weldcal.systems.recording.scenario_files import packed
-from weldcal.systems.recording.tap import Layout, OpenSink
+from weldcal.systems.recording.tap import OpenSink, PortLayout
 from weldcal.systems.recording.values import encode
 from weldcal.systems.recording.writer import RecordingWriter
 from weldcal.systems.runner import Progress, Run, run_cell
@@ -362,7 +362,7 @@ class RunRecorder:
         """See build_cell."""
         return self._open
 
-    def _open(self, station: Station, layout: Layout) -> RecordingWriter:
+    def _open(self, station: Station, layout: PortLayout) -> RecordingWriter:
         sizes = {ENTERED: layout.entered, LEFT: layout.left}
         about = {
             "sizes": json.dumps(sizes),

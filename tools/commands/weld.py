@@ -10,7 +10,7 @@ from weldcal.calibration.calibrate import KINEMATICS_FILE
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.doctor.record import case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.stated_error import orientations_of
@@ -233,7 +233,7 @@ def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robo
     return folder
 
 
-def live_case(cell: Cell[Any], root: Context) -> Case | None:
+def live_case(cell: Cell[Any], root: Context) -> DoctorCase | None:
     """What a live calibration has seen of its feature, as the doctor examines it; None where the job does not calibrate
     by it."""
     status = getattr(cell.job, "calibration_status", None)

@@ -20,7 +20,7 @@ from weldcal.tools.report import plots_weld
 from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.first_screen import (
     SCANNER,
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -107,7 +107,7 @@ class DemoResult:
             more["pose"] = (
                 "none was computed: X_BC is the scenario's" if not scenario.job.calibrate else "none was found"
             )
-            none = Expected("error at the work point, 95 %", "not known", "there is no calibration")
+            none = ExpectedError("error at the work point, 95 %", "not known", "there is no calibration")
             return FirstScreen(
                 found, none if scenario.job.calibrate else self._torch(), self._next(), (), more, self._lead()
             )
@@ -116,7 +116,7 @@ class DemoResult:
         for v in status.verifications:
             limit = f"limit {c.verification_limit_mm:g} mm, calibration.verification_limit_mm"
             backing = f"{expected.backing}; at '{v.label}', held out by the job: {1e3 * v.error_m:.3f} mm ({limit})"
-            expected = Expected(expected.what, expected.figure, backing)
+            expected = ExpectedError(expected.what, expected.figure, backing)
         tolerance = Tolerance(
             "the expected error at the work point, one sigma,",
             1e3 * status.predicted_error_m,
@@ -164,15 +164,15 @@ class DemoResult:
         torch = self._torch()
         return {"torch": f"{torch.figure} ({torch.backing})"} if self.status.estimate is not None else {}
 
-    def _torch(self) -> Expected:
+    def _torch(self) -> ExpectedError:
         """The torch's distance from the true seam."""
         if self.weld is None or self.weld.error is None:
-            return Expected("torch off the seam", "not known", "the true seam is known in simulation only")
+            return ExpectedError("torch off the seam", "not known", "the true seam is known in simulation only")
         distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
         backing = (
             f"95 % of the weld; mean {distance.mean():.3f}, at most {distance.max():.3f} mm; known in simulation only"
         )
-        return Expected("torch off the seam", f"{np.percentile(distance, 95):.3f} mm", backing)
+        return ExpectedError("torch off the seam", f"{np.percentile(distance, 95):.3f} mm", backing)
 
     def _next(self) -> Next:
         folder, robot = self.folder, self.robot != "simulated"

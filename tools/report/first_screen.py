@@ -118,7 +118,7 @@ class Tolerance:
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedError:
     """The error to expect: `what` is measured, the figure with its unit, and what backs it, in words."""
 
     what: str
@@ -229,7 +229,7 @@ class FirstScreen:
     """
 
     found: Findings
-    expected: Expected
+    expected: ExpectedError
     next: Next
     poses: tuple[ShownPose, ...] = ()
     more: Mapping[str, str] = field(default_factory=dict)
@@ -318,7 +318,7 @@ def point_covariance(X: RigidTransform, covariance: Array, p: Array) -> Array:
 
 def expected_error(
     what: str, own_mm: float | None, held_95_mm: float | None, n: int, of: str, place: str = ""
-) -> tuple[Expected, float]:
+) -> tuple[ExpectedError, float]:
     """The error at 95 % in words, and in mm (NaN: not known): the larger of the result's own and that of what it had
     not seen.
 
@@ -334,23 +334,23 @@ def expected_error(
         else f"within which 95 % of {n} {of} were, each unseen by its calibration"
     )
     if own is None and held is None:
-        return Expected(
+        return ExpectedError(
             what, "not known", f"the method states no uncertainty, and none of the {of} was left out"
         ), float("nan")
     if held is None:
-        return Expected(what, f"{own:.3f} mm", f"{itself}; no unseen {of.removesuffix('s')} backs it"), float(
+        return ExpectedError(what, f"{own:.3f} mm", f"{itself}; no unseen {of.removesuffix('s')} backs it"), float(
             own or 0.0
         )
     if own is None:
-        return Expected(what, f"{held:.3f} mm", f"{seen}; the method states no uncertainty of its own"), held
+        return ExpectedError(what, f"{held:.3f} mm", f"{seen}; the method states no uncertainty of its own"), held
     larger = max(own, held)
     return (
-        Expected(what, f"{larger:.3f} mm", f"the larger of two: {own:.3f} mm {itself}, and {held:.3f} mm {seen}"),
+        ExpectedError(what, f"{larger:.3f} mm", f"the larger of two: {own:.3f} mm {itself}, and {held:.3f} mm {seen}"),
         larger,
     )
 
 
-def work_point_expected(work: WorkPoint) -> tuple[Expected, float]:
+def work_point_expected(work: WorkPoint) -> tuple[ExpectedError, float]:
     """The error at the work point in words, and in mm."""
     x, y, z = work.p_B_mm
     place = f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the base"

@@ -46,7 +46,7 @@ class Checked:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
+class FleetCell:
     """A cell with its datasets in order, oldest first, and what follows from them: VISIT, LOOK or FINE, why, and what
     to do."""
 
@@ -101,7 +101,7 @@ class Cell:
 class FleetReport:
     """All cells, those that need a visit first, and where the page is."""
 
-    cells: tuple[Cell, ...]
+    cells: tuple[FleetCell, ...]
     out: Path
 
     def named(self, state: str) -> list[str]:
@@ -180,7 +180,7 @@ def _headline(visit: list[str], look: list[str], cells: int) -> str:
     return f"All {cells} cells are fine" if cells > 1 else "The cell is fine"
 
 
-def _row(cell: Cell) -> dict[str, object]:
+def _row(cell: FleetCell) -> dict[str, object]:
     newest = cell.datasets[-1]
     return {
         "name": cell.name,

@@ -12,10 +12,10 @@ from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
-from weldcal.calibration.motion.pose_streams import Synchronised
+from weldcal.calibration.motion.pose_streams import ClockOffset
 from weldcal.calibration.planning.next_pose import NextPose
 from weldcal.models.arrays import Array
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, ShownPose, Tolerance
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 
@@ -45,7 +45,7 @@ class HandEyeReport:
     seconds: float
     corners: str = ""
     advice: str = ""
-    streams: Synchronised | None = None
+    streams: ClockOffset | None = None
     limit_mm: float | None = None
     folder: Path | None = None
     reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
@@ -215,7 +215,7 @@ def undetermined(r: HandEyeResult, *, everything: bool = False) -> list[str]:
     return [f"Not observable: {text}. Add poses that turn the hand about other axes." for text in r.unobservable]
 
 
-def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
+def held_out_error(r: HandEyeResult) -> tuple[ExpectedError, float, int]:
     """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and the number of
     poses."""
     used = held_out_used(r)
@@ -224,7 +224,7 @@ def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
     what = "held-out error at the target, 95 %"
     if not len(held):
         return (
-            Expected(what, "not known", "too few poses to leave any out; it takes the place of a work point"),
+            ExpectedError(what, "not known", "too few poses to leave any out; it takes the place of a work point"),
             float("nan"),
             0,
         )
@@ -233,7 +233,7 @@ def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
         f"of {held_out_set(r)}, each unseen by its calibration; rms {used.rms_deg:.3f} degrees; in place of a work"
         " point"
     )
-    return Expected(what, f"{p95:.3f} mm", backing), p95, len(np.unique(r.observation[r.inliers][seen]))
+    return ExpectedError(what, f"{p95:.3f} mm", backing), p95, len(np.unique(r.observation[r.inliers][seen]))
 
 
 def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:

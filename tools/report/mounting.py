@@ -33,7 +33,7 @@ from weldcal.systems.jobs.mounting.job import AddedMounting
 from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -140,14 +140,14 @@ class MountingReport:
         what = f"error of a scanned point {1e3 * self.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
         if result is None:
             found = Findings(against=against or ["There is no result."], unseen=0)
-            none = Expected(what, "not known", "there is no calibration")
+            none = ExpectedError(what, "not known", "there is no calibration")
             held = after_hold(self.run is not None and self.run.ended_by_operator)
             return FirstScreen(found, none, held, more={"pose": "none was found"})
         _, p95, n = held_out_error(result)
         expected, figure = expected_error(what, 1e3 * status.error_95_m, p95, n, "poses")
         if aside:
             more = f"{expected.backing}; {len(aside)} held out by the job: at most {max(aside):.3f} mm"
-            expected = Expected(what, expected.figure, more)
+            expected = ExpectedError(what, expected.figure, more)
         limit, source = self.tolerance
         tolerance = None if limit is None else Tolerance("the expected error, 95 %,", figure, limit, source)
         open_directions = undetermined(result)

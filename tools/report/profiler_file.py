@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.models.arrays import Array
 from weldcal.tools.report.first_screen import (
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -141,9 +141,9 @@ class ProfilerSeam:
         fit = f"{n} profiles fit their groove with {self.found['rms_mm']:.3f} mm rms (median)"
         what = "error of a mapped point, 95 %"
         if own is None:
-            expected = Expected(what, "not known", f"the calibration states no uncertainty; {fit}")
+            expected = ExpectedError(what, "not known", f"the calibration states no uncertainty; {fit}")
         else:
-            expected = Expected(
+            expected = ExpectedError(
                 what,
                 f"{own:.3f} mm",
                 f"of the profiler's calibration; {fit}; no point of the groove was measured otherwise",

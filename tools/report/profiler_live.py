@@ -17,7 +17,7 @@ from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -214,7 +214,7 @@ class ProfilerLive:
                 )
         figure = " and ".join(f"{v:.3f} mm" for v in errors) or "not known"
         said = "; ".join(backing) or "no scan was held out"
-        expected = Expected(
+        expected = ExpectedError(
             "error in the middle of the profiles, 95 %", figure, f"of the calibration itself, by each target; {said}"
         )
         o, tolerance = self.outcome, None

@@ -15,7 +15,15 @@ from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance, after_hold
+from weldcal.tools.report.first_screen import (
+    ExpectedError,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    after_hold,
+)
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 from weldcal.tools.report.run import robot_timing
@@ -32,7 +40,7 @@ _UNITS = {"phi": ("deg", 180.0 / np.pi), "scale": ("", 1.0), "roll": ("deg", 180
 
 WORDS = "pose of the camera C in the robot's flange F"
 NO_KEY = "No scenario key states how exact a touch must be: compare the error with what your job allows."
-NOTHING = Expected("error of a touch, 95 %", "not known", "there is no calibration")
+NOTHING = ExpectedError("error of a touch, 95 %", "not known", "there is no calibration")
 
 
 def tablet_screen(result: TabletResult, queries_mm: Array, limit_mm: float | None, no_tolerance: str) -> FirstScreen:
@@ -90,15 +98,17 @@ def run_screen(first: FirstScreen | None, reason: str, found: Mapping[str, objec
     return FirstScreen(first.found, first.expected, first.next, first.poses, {**first.more, "truth": truth})
 
 
-def _touch(held_mm: Array, what: str, limit_mm: float | None) -> tuple[Expected, Tolerance | None]:
+def _touch(held_mm: Array, what: str, limit_mm: float | None) -> tuple[ExpectedError, Tolerance | None]:
     held = held_mm[np.isfinite(held_mm)]
     p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
     name = "error of a touch, 95 %"
     tolerance = None if limit_mm is None else Tolerance(f"the {name},", p95, limit_mm, "--limit-mm")
     if not len(held):
-        return Expected(name, "not known", "no landmark could be left out"), tolerance
+        return ExpectedError(name, "not known", "no landmark could be left out"), tolerance
     return (
-        Expected(name, f"{p95:.3f} mm", f"of {len(held)} {what} that the fit did not use; mean {held.mean():.3f} mm"),
+        ExpectedError(
+            name, f"{p95:.3f} mm", f"of {len(held)} {what} that the fit did not use; mean {held.mean():.3f} mm"
+        ),
         tolerance,
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.touch.judge import LEVEL, TouchErrors
 from weldcal.tools.report.calibration import error_summary, scanner_pose
-from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, Expected, Findings, FirstScreen, Next, Tolerance
+from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, ExpectedError, Findings, FirstScreen, Next, Tolerance
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.verify import Verdict
@@ -34,7 +34,7 @@ class TouchReport:
             "touches outside their region", float(f.outside), float(f.most_outside), "99 % of good cells", ""
         )
         found = Findings(tolerance=tolerance, unseen=len(f.ids), settled=(v.verdict, v.reason))
-        expected = Expected(
+        expected = ExpectedError(
             "touched less scanned, 95 %",
             f"{np.percentile(errors, 95):.3f} mm",
             f"of {len(errors)} touches, which the calibration did not use; median {np.median(errors):.3f} mm",

@@ -16,7 +16,7 @@ from weldcal.tools.report.first_screen import (
     DO_NOT,
     ENOUGH_UNSEEN,
     USE,
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -91,13 +91,15 @@ class VerifyReport:
         )
         if len(new):
             what = f"{len(new)} new scan{'' if len(new) == 1 else 's'}, which the calibration did not use"
-            expected = Expected(
+            expected = ExpectedError(
                 "error at the flange, 95 %",
                 f"{np.percentile(new, 95):.3f} mm",
                 f"of {what}; median {np.median(new):.3f} mm",
             )
         else:
-            expected = Expected("error at the flange, 95 %", "not known", "every scan here was used in the calibration")
+            expected = ExpectedError(
+                "error at the flange, 95 %", "not known", "every scan here was used in the calibration"
+            )
         return FirstScreen(found, expected, self._next(), (scanner_pose(r),))
 
     def _next(self) -> Next:

@@ -9,7 +9,7 @@ import numpy as np
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.pairs.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL, Judgement
 from weldcal.calibration.hand_eye.solve import as_transform
-from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, Expected, Findings, FirstScreen, Next, ShownPose
+from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, ExpectedError, Findings, FirstScreen, Next, ShownPose
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.verify import NONE, Verdict
@@ -110,7 +110,7 @@ class PairsReport:
         v, j = self.verdict, self.judgement
         lead = {NONE: "This is no verification. ", CANNOT_TELL: "These pairs cannot tell. "}.get(v.verdict, "")
         settled = (v.verdict if v.verdict in (USE, CARE, DO_NOT) else CARE, lead + v.reason)
-        expected = Expected(
+        expected = ExpectedError(
             "held-out error at the target, 95 %",
             f"{1e3 * np.percentile(j.held_translation_m[j.used], 95):.3f} mm",
             f"of {int(j.used.sum())} pairs, with RESULT's pose and the target's pose from the other pairs",

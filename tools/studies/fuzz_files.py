@@ -35,7 +35,7 @@ def benchmark_fuzz_files(
 
 
 @dataclass(frozen=True)
-class Finding:
+class FuzzFailure:
     """A case that was neither accepted nor refused; ``folder`` holds its files."""
 
     reader: str
@@ -50,7 +50,7 @@ class FuzzResult:
     """Verdicts by reader, what must not be, the slowest case of each reader (s), and some refusals of each."""
 
     counts: dict[str, Counter[str]]
-    findings: tuple[Finding, ...]
+    findings: tuple[FuzzFailure, ...]
     slowest_s: dict[str, float]
     seed: int
 
@@ -96,7 +96,7 @@ def fuzz_files(
     """
     counts = {reader.name: Counter[str]() for reader in readers}
     slowest = dict.fromkeys(counts, 0.0)
-    findings: list[Finding] = []
+    findings: list[FuzzFailure] = []
     with TemporaryDirectory() as place, Child(Path(place)) as child:
         for n, reader in enumerate(readers):
             for case in range(cases):
@@ -106,7 +106,7 @@ def fuzz_files(
                 if verdict.said not in GOOD:
                     kept = counts[reader.name][verdict.said] <= _KEPT
                     folder = _keep(reader, seed, case, out) if kept else ""
-                    findings.append(Finding(reader.name, case, verdict.said, verdict.detail, folder))
+                    findings.append(FuzzFailure(reader.name, case, verdict.said, verdict.detail, folder))
                 if case % 50 == 0:
                     progress(reader.name, (n + case / cases) / len(readers))
             # after each reader, since thousands of cases take a while

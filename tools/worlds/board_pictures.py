@@ -59,7 +59,7 @@ class Drawing:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class BoardWorld:
     """Robot poses (n, 4, 4) as the robot states them, poses of the board in the camera, and the truth."""
 
     robot: Array
@@ -121,7 +121,9 @@ def render(drawing: Drawing, C: Array, rng: np.random.Generator) -> NDArray[np.u
     return np.asarray(np.clip(np.rint(value), 0, 255), dtype=np.uint8)
 
 
-def views(drawing: Drawing, rng: np.random.Generator, n: int, *, eye_in_hand: bool, deg: float, mm: float) -> World:
+def views(
+    drawing: Drawing, rng: np.random.Generator, n: int, *, eye_in_hand: bool, deg: float, mm: float
+) -> BoardWorld:
     """``n`` views of the whole board, and the robot's poses with normal errors of ``deg`` and ``mm`` per axis."""
     X = pose(exp_rotation(np.array([0.1, -0.2, 1.5])), np.array([0.03, -0.05, 0.10]))
     turn, shift = ([0.2, 0.1, 0.5], [0.5, 0.1, 0.05]) if eye_in_hand else ([0.1, 2.9, 0.3], [0.01, 0.02, 0.05])
@@ -142,7 +144,7 @@ def views(drawing: Drawing, rng: np.random.Generator, n: int, *, eye_in_hand: bo
         noise = pose(exp_rotation(rng.normal(0.0, np.radians(deg), 3)), rng.normal(0.0, 1e-3 * mm, 3))
         robot.append((F if eye_in_hand else inverse(F)) @ noise)
         camera.append(C)
-    return World(np.array(robot), np.array(camera), X, Y)
+    return BoardWorld(np.array(robot), np.array(camera), X, Y)
 
 
 def calibrated(kind: str, board: str, seed: int) -> Mapping[str, object]:

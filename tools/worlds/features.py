@@ -59,7 +59,7 @@ class WorldConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class FeatureWorld:
     """A calibration and the residuals of the frames against it. Truth stays in ``config``."""
 
     X_BC: RigidTransform
@@ -68,7 +68,7 @@ class World:
     rows: Rows
 
 
-def simulate(config: WorldConfig, duration_s: float, seed: int) -> World:
+def simulate(config: WorldConfig, duration_s: float, seed: int) -> FeatureWorld:
     """Residuals of a recording.
 
     The arm moves by joint-space moves between the corners of random tasks, each repeated for ``task_s``; its poses are
@@ -128,7 +128,7 @@ def simulate(config: WorldConfig, duration_s: float, seed: int) -> World:
     rows = rows_of(
         X_BC, _CENTER, stamps, p, nrm, V[:, 3:], np.cross(V[:, :3], nrm), p_C, n_C, config.stated**2 * S, stated
     )
-    return World(X_BC, C, _CENTER, rows.part(np.argsort(stamps, kind="stable")))
+    return FeatureWorld(X_BC, C, _CENTER, rows.part(np.argsort(stamps, kind="stable")))
 
 
 def _best_move(p_C: Array, p_B: Array, R: Array, p: Array, which: Array) -> Array:

@@ -23,7 +23,7 @@ _LEAST = 6  # corners in an image that is kept
 
 
 @dataclass(frozen=True)
-class Cell:
+class PairedPoses:
     """Pairs of one cell: ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as
     estimated, ``X`` (4, 4) and ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this
     ``kind``."""
@@ -35,7 +35,7 @@ class Cell:
     Y: Array
 
 
-def imperfect_cell(kind: str, seed: int) -> Cell:
+def imperfect_cell(kind: str, seed: int) -> PairedPoses:
     """One cell with a wrist camera and a board; numbers are drawn from ranges that cells have (metres, rad, pixels).
 
     8 to 60 poses about a work point, scattered or on a path, with turns of 6 to 35 degrees; a board of 0.1 to 0.3 m,
@@ -93,7 +93,7 @@ def imperfect_cell(kind: str, seed: int) -> Cell:
             G.append(found)
         if len(F) == n:
             break
-    return Cell(kind, np.array(F), np.array(G), X, Y)
+    return PairedPoses(kind, np.array(F), np.array(G), X, Y)
 
 
 def _read(

@@ -27,7 +27,7 @@ from weldcal.models.scanners import ScannerPreset, depth_to_points, get_scanner
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.worlds.disturbance import Disturbance
-from weldcal.tools.worlds.moving_scene import Body, MovingScene, arm_bodies
+from weldcal.tools.worlds.moving_scene import MovingScene, RigidBody, arm_bodies
 from weldcal.tools.worlds.robot_path import RobotPath, cube_poses, path_through, reachable_start
 
 _DEPTH_STEP_M = 1e-5  # of the stored depths: a tenth of the smallest noise
@@ -80,7 +80,7 @@ class MotionOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class StreamedFrame:
     """A streamed frame: depth (H, W) m, and the truth behind it: the capture on the robot's clock and both poses
     then."""
 
@@ -132,7 +132,7 @@ class MotionWorld:
         """The scanner's true pose in the robot's base at ``t`` s after the start."""
         return self.options.disturbance.scanner_pose(self.X_BC, t)
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Iterator[StreamedFrame]:
         """Every frame that arrives, rendered one after the other."""
         o = self.options
         for k, t in enumerate(self.captures):
@@ -148,7 +148,7 @@ class MotionWorld:
                 scanner=device,
                 X_BW=o.disturbance.world_in_base(capture),
             )
-            yield Frame(
+            yield StreamedFrame(
                 f"{k:05d}",
                 depth,
                 o.robot_start_s + capture,
@@ -262,14 +262,14 @@ def facing(centre: Array, X_BC: RigidTransform) -> RotationMatrix:
     return RotationMatrix(np.column_stack([x, np.cross(z, x), z]))
 
 
-def surroundings(centre: Array) -> list[Body]:
+def surroundings(centre: Array) -> list[RigidBody]:
     """The table and blocks on it in the scanner's view: by them a moved scanner is told from a moved robot."""
     blocks = []
     for x, y, top in ((-0.16, 0.22, 0.24), (0.10, 0.24, 0.18), (0.16, -0.25, 0.22), (-0.10, -0.26, 0.14)):
         place = centre + np.array([x, y, 0.0])
         size = np.array([[-0.03, -0.04], [0.03, -0.04], [0.03, 0.04], [-0.03, 0.04]]) + place[:2]
-        blocks.append(Body(None, extrude(size, 0.0, top)))
-    return [*blocks, Body(None, _table())]
+        blocks.append(RigidBody(None, extrude(size, 0.0, top)))
+    return [*blocks, RigidBody(None, _table())]
 
 
 def _table() -> TriMesh:

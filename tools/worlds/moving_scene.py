@@ -39,7 +39,7 @@ _DARK = {"charcoal": 0.7, "blue_grey": 0.0, "light_grey": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class RigidBody:
     """A rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None stands in the base; ``dark`` 0 to
     1."""
 
@@ -51,7 +51,7 @@ class Body:
 class _Cast:
     """The bodies of one link as a scene of its own."""
 
-    def __init__(self, bodies: list[Body]) -> None:
+    def __init__(self, bodies: list[RigidBody]) -> None:
         self.link = bodies[0].link
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         for body in bodies:
@@ -69,10 +69,10 @@ class _Cast:
         return hit["t_hit"].numpy(), self.dark[ids]
 
 
-def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[Body]:
+def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[RigidBody]:
     """The drawn solids of an arm and the mesh of its flange, in their links' frames."""
     root = ET.fromstring(arm_urdf(arm))
-    bodies = [Body(6, flange_mesh(flange, _THICK_M))]
+    bodies = [RigidBody(6, flange_mesh(flange, _THICK_M))]
     for link in root.iter("link"):
         for visual in link.iter("visual"):
             origin, geometry, material = (visual.find(tag) for tag in ("origin", "geometry", "material"))
@@ -82,7 +82,7 @@ def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[Body]:
             xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
             mesh = _solid(geometry[0]).transformed(RigidTransform(RollPitchYaw(rpy), xyz))
             bodies.append(
-                Body(arm.link_names.index(link.get("name", "")), mesh, _DARK.get(material.get("name", ""), 0.0))
+                RigidBody(arm.link_names.index(link.get("name", "")), mesh, _DARK.get(material.get("name", ""), 0.0))
             )
     return bodies
 
@@ -101,12 +101,12 @@ def _solid(shape: ET.Element) -> TriMesh:
 class MovingScene:
     """Renders what a streaming scanner returns of bodies on a moving arm and of bodies that stand in the base."""
 
-    def __init__(self, arm: ArmModel, bodies: list[Body], scanner: ScannerPreset, stream: ScannerStream) -> None:
+    def __init__(self, arm: ArmModel, bodies: list[RigidBody], scanner: ScannerPreset, stream: ScannerStream) -> None:
         self.arm, self.scanner, self.stream = arm, scanner, stream
         links = sorted({b.link for b in bodies if b.link is not None})
         self._moving = [_Cast([b for b in bodies if b.link == k]) for k in links]
         fixed = [b for b in bodies if b.link is None]
-        self._fixed = [_Cast([Body(None, merge(*(b.mesh for b in fixed)))])] if fixed else []
+        self._fixed = [_Cast([RigidBody(None, merge(*(b.mesh for b in fixed)))])] if fixed else []
         self._X_WC = RigidTransform()
         self._background: tuple[Array, Depth] | None = None  # camera pose and its depth map
         u = (np.arange(scanner.width) - scanner.cx) / scanner.fx

@@ -43,7 +43,7 @@ CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, twist_rad=0.0, sag_rad_m=0.0, a
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cell:
+class ProfilerCell:
     """Where a world's arm stands: its table, joints at which the tool points downwards, the sphere's centre (3,) m, and
     where the groove's and the frustum's frames lie, the groove turned about z."""
 
@@ -56,13 +56,13 @@ class Cell:
     boss_yaw_deg: float
 
 
-def files_cell() -> Cell:
+def files_cell() -> ProfilerCell:
     """Of the fixed files: an arm of 1.4 m reach with a torch of 342 mm."""
     rows = np.array(
         [[180, -90, 400, 0], [600, 0, 0, -90], [120, -90, 0, 0], [0, 90, 620, 0], [0, -90, 0, 0], [0, 0, 115, 0]], float
     ) * [1e-3, np.radians(1.0), 1e-3, np.radians(1.0)]
     center = np.array([0.93, 0.06, 0.26])
-    return Cell(
+    return ProfilerCell(
         arm=DhArm(rows),
         home=np.array([0.0, 0.35, 0.25, 0.0, 0.95, 0.0]),
         center=center,
@@ -73,11 +73,11 @@ def files_cell() -> Cell:
     )
 
 
-def ur10e_cell() -> Cell:
+def ur10e_cell() -> ProfilerCell:
     """A UR10e."""
     center = np.array([-0.75, 0.12, 0.18])
     home = np.radians([0.0, -110.0, 120.0, -100.0, -90.0, 0.0])
-    return Cell(
+    return ProfilerCell(
         arm=DhArm.of(load_arm("ur10e")),
         home=home,
         center=center,
@@ -103,7 +103,7 @@ class SphereTests:
 class SphereWorld:
     """One robot with one profiler and one torch: `nominal` is what is believed, the rest is how it is."""
 
-    cell: Cell
+    cell: ProfilerCell
     real: DhArm
     sag: Floats
     rotation: Floats

@@ -15,7 +15,7 @@ from weldcal.tools.report.weld import calibration_error
 
 
 @dataclass(frozen=True, eq=False)
-class Station:
+class RedrawnStation:
     """What made the observations: arm (its joints (n, 6) rad at each of them), how well the flange repeats (m, rms),
     the true X_BC, and the work point (3,) m in B."""
 
@@ -53,7 +53,7 @@ def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Arra
     return np.array(out)
 
 
-def redraw(observations: tuple[Observation, ...], station: Station, count: int, seed: int = 0) -> Redrawn:
+def redraw(observations: tuple[Observation, ...], station: RedrawnStation, count: int, seed: int = 0) -> Redrawn:
     """``count`` calibrations from the poses of these observations, each with noise of its own: joint offsets that
     displace the flange by the repeatability, and fits that err as they state. Deterministic for ``seed``."""
     rng = np.random.default_rng(seed)
@@ -74,7 +74,7 @@ def joined(parts: list[Redrawn]) -> Redrawn:
     return Redrawn(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
-def bound_covariance(observations: tuple[Observation, ...], station: Station) -> Array:
+def bound_covariance(observations: tuple[Observation, ...], station: RedrawnStation) -> Array:
     """Cramer-Rao: the least covariance (6, 6) [rotation rad; displacement of the work point m] that an unbiased
     calibration from these observations of a bare flange can have.
 
@@ -97,12 +97,12 @@ def bound_covariance(observations: tuple[Observation, ...], station: Station) ->
     return np.asarray(np.linalg.inv(information))
 
 
-def _joint_sigma(station: Station, J: Array) -> float:
+def _joint_sigma(station: RedrawnStation, J: Array) -> float:
     """Standard deviation (rad) of each joint's offset, as the simulated arm draws it."""
     return station.repeatability_m / float(np.linalg.norm(J[3:]))
 
 
-def _redrawn(o: Observation, q: Array, station: Station, rng: np.random.Generator) -> Observation:
+def _redrawn(o: Observation, q: Array, station: RedrawnStation, rng: np.random.Generator) -> Observation:
     """The observation with noise of its own; the robot's reported pose stays."""
     offset = _joint_sigma(station, jacobian(station.arm, q)) * rng.standard_normal(6)
     X_CR = station.X_BC.inverse() @ forward_kinematics(station.arm, q + offset)

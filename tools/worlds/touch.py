@@ -37,14 +37,14 @@ _TAUGHT_M, _BALL_M, _CONTACT_M = 5e-5, 2e-5, 2e-5  # tip as taught, per axis; it
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class TouchWorld:
     """What calibration and judge are given: the result, and the touches."""
 
     result: CalibrationResult
     touches: tuple[Touch, ...]
 
 
-def touch_world(seed: int, scans: int = SCANS) -> World:
+def touch_world(seed: int, scans: int = SCANS) -> TouchWorld:
     """The cell of this seed. What no estimate is given, and no model of the estimator has:
 
     an arm with zeros off by 0.02 to 0.05 degrees and axes by 0.1 to 0.3 mm and 0.02 degrees, that repeats to 0.035 mm;
@@ -64,7 +64,7 @@ def touch_world(seed: int, scans: int = SCANS) -> World:
     touches = tuple(
         _touch(f"{kind}{k}", kind, nominal, true, scanner, tip, ball, rng) for k, kind in enumerate(FEATURES)
     )
-    return World(_calibrated(observations), touches)
+    return TouchWorld(_calibrated(observations), touches)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ _CANDIDATES = 250
 
 
 @dataclass(frozen=True)
-class Station:
+class WrongArmStation:
     """One world: stated observations at joint angles q with their hole circles, and the errors (n, 6) of the arm that
     no estimate is given."""
 
@@ -48,7 +48,7 @@ class Station:
 
 def station(
     seed: int, scans: int = SCANS, new: int = NEW, *, planned: bool = True, links: bool = True, size: float = 1.0
-) -> Station:
+) -> WrongArmStation:
     """A UR10e with offsets of 0.02 to 0.05 degrees and axes off by 0.1 to 0.3 mm and 0.02 degrees, and a scanner 0.65 m
     from its flange with a scale error of 0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion that the
     correction's polynomial has only in part.
@@ -75,7 +75,7 @@ def station(
     bend = (1e-3 * rng.normal(), 5e-3 * rng.normal(size=2), 3e-3 * rng.normal())
     one, other = q[chosen], q[_CANDIDATES:]
     seen, patterns = _seen(arm, one, errors, X_BC, bend, rng, "p")
-    return Station(seen, one, _seen(arm, other, errors, X_BC, bend, rng, "n")[0], other, errors, patterns)
+    return WrongArmStation(seen, one, _seen(arm, other, errors, X_BC, bend, rng, "n")[0], other, errors, patterns)
 
 
 def _visible(arm: Chain, X_BC: Array, rng: np.random.Generator, n: int) -> Array:
@@ -142,7 +142,7 @@ class Found:
     offsets_sigma: Array
 
 
-def study_station(world: Station, kind: str = "links", prior: FactoryPrior | None = None) -> Found:
+def study_station(world: WrongArmStation, kind: str = "links", prior: FactoryPrior | None = None) -> Found:
     """Calibrate one world plain, with the choice of the scanner's correction, and refined, and judge both on its new
     scans."""
     arm = load_chain("ur10e")

@@ -22,7 +22,7 @@ AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Intrinsics:
+class FingerIntrinsics:
     """A camera: K (3, 3) px, OpenCV's five distortion coefficients, picture size, rms reprojection in px of the
     pictures that were used and of those that were not, their numbers, and the standard deviation of the focal length in
     px."""
@@ -69,7 +69,7 @@ def find_board(picture: NDArray[np.uint8], board: cv2.aruco.CharucoBoard) -> tup
     )
 
 
-def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, int]) -> Intrinsics:
+def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, int]) -> FingerIntrinsics:
     """The camera from points on a board (n, 3) m and their pixels (n, 2) in each picture; every fourth picture is held
     out.
 
@@ -110,7 +110,7 @@ def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, i
     errors = [_reprojection(np.asarray(p), np.asarray(u), K, distortion) for p, u in judges]
     held_out = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     focal_sigma = float(np.ravel(sigmas)[0])
-    return Intrinsics(
+    return FingerIntrinsics(
         K=np.asarray(K),
         distortion=np.ravel(distortion),
         width=size[0],

@@ -41,7 +41,7 @@ class CornerConfig:
 
 
 @dataclass(frozen=True)
-class Corner:
+class RoundedCorner:
     """The points (n,3) m to put between the two sides, the path's length m from the last felt point to each, and the
     whole length m from side to side; `middle`: the length m to the corner's middle."""
 
@@ -59,7 +59,7 @@ def is_jump(last: Array, point: Array, config: CornerConfig) -> bool:
     return config.jump_m < step < config.reach_m and step > config.jump_steps * norm(last[-1] - last[-4]) / 3.0
 
 
-def fill_corner(before: Array, after: Array, config: CornerConfig) -> Corner | None:
+def fill_corner(before: Array, after: Array, config: CornerConfig) -> RoundedCorner | None:
     """Compute the corner between two sides, each (n,3) m in order of travel; None where there is none.
 
     The lines through the sides are met where they pass closest in space.
@@ -96,7 +96,7 @@ def fill_corner(before: Array, after: Array, config: CornerConfig) -> Corner | N
             rows.append(start + radius * (math.sin(a) * t + (1.0 - math.cos(a)) * inward))
         else:
             rows.append(apex + (tangent + x - first - arc) * w)
-    return Corner(np.array(rows).reshape(-1, 3), along, length, first + 0.5 * arc)
+    return RoundedCorner(np.array(rows).reshape(-1, 3), along, length, first + 0.5 * arc)
 
 
 def _line(points: Array) -> tuple[Array, Array]:

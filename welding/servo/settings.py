@@ -121,7 +121,7 @@ class ToolGeometry:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TouchConfig:
+class TouchOnConfig:
     """The touch-on: descent, search for the groove, gain calibration and zero.
 
     Attributes:
@@ -371,7 +371,7 @@ class ServoConfig:
     """
 
     tool: ToolGeometry = field(default_factory=ToolGeometry)
-    touch: TouchConfig = field(default_factory=TouchConfig)
+    touch: TouchOnConfig = field(default_factory=TouchOnConfig)
     contact: ContactConfig = field(default_factory=ContactConfig)
     gap: GapConfig = field(default_factory=GapConfig)
     faults: FaultLimits = field(default_factory=FaultLimits)

@@ -113,7 +113,7 @@ class GainFit(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TouchState:
+class TouchOnState:
     """State of the touch search: its step, the step's start, heights and lateral place; `free`: deflections of the free
     tip; `felt`: points measured on the way back to the start, each with how far ahead of its rest point friction held
     the tip.
@@ -140,7 +140,7 @@ class WeldingState:
     started: float = 0.0
     plan_fit: PlanFit | None = None
     refined: RefinedSeam = field(default_factory=RefinedSeam.empty)
-    touch: TouchState = field(default_factory=TouchState)
+    touch: TouchOnState = field(default_factory=TouchOnState)
     gain: float = 1.0
     zero: Array | None = None
     measurement: Measurement | None = None

@@ -42,7 +42,7 @@ class TorchTarget(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Motion:
+class TickMotion:
     """The motion of one tick: V_BT (6,), tip and torch speed m/s, rate about the tool's up rad/s, conditioning."""
 
     V_BT: Array
@@ -194,7 +194,7 @@ def guarded_motion(
     servo: tuple[float, float],
     config: ServoConfig,
     dt: float,
-) -> Motion:
+) -> TickMotion:
     """One tick of the guarded law in space (docs/weld_law.md, sections 3 and 4).
 
     Unknown are the tip's speed along the seam and the rate about the tool's up; pitch is eliminated by the torch's
@@ -263,4 +263,4 @@ def guarded_motion(
     level = unit(u - dot(u, up) * up, u)
     w_r = clip((roll_rate(axes, b, config) - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
     V = np.concatenate([w * a + w_p * m + w_r * u, v * tb + base])
-    return Motion(V, v, v * t_v + w * t_w + t_0, w, seam_conditioning(u, tb, t))
+    return TickMotion(V, v, v * t_v + w * t_w + t_0, w, seam_conditioning(u, tb, t))

@@ -30,7 +30,7 @@ _ADVICE = "write 'intrinsics: {fx: ..., fy: ..., cx: ..., cy: ...}' (pixels) int
 
 
 @dataclass(frozen=True, kw_only=True)
-class Intrinsics:
+class DepthIntrinsics:
     """A camera as its file states it.
 
     Attributes:
@@ -51,7 +51,7 @@ def is_camera_file(path: Path) -> bool:
     return path.stem.lower() in _STEMS and path.suffix.lower() in (*_TREES, *_TEXTS)
 
 
-def find_intrinsics(*folders: Path) -> Intrinsics | None:
+def find_intrinsics(*folders: Path) -> DepthIntrinsics | None:
     """The camera of the first of these folders that holds a file of one; None where none does.
 
     Raises:
@@ -78,7 +78,9 @@ def checked_intrinsics(values: tuple[float, ...], source: str) -> tuple[float, f
     return fx, fy, cx, cy
 
 
-def intrinsics_of(found: Intrinsics | None, shape: tuple[int, int], name: str) -> tuple[float, float, float, float]:
+def intrinsics_of(
+    found: DepthIntrinsics | None, shape: tuple[int, int], name: str
+) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy for a depth image (height, width).
 
     Raises:
@@ -104,7 +106,7 @@ def intrinsics_of(found: Intrinsics | None, shape: tuple[int, int], name: str) -
     return found.values
 
 
-def _stated(path: Path) -> Intrinsics | None:
+def _stated(path: Path) -> DepthIntrinsics | None:
     """The camera in a file; None where it holds none."""
     try:
         found = find_camera(path)
@@ -114,7 +116,7 @@ def _stated(path: Path) -> Intrinsics | None:
         return None
     K, straight = found.K, not found.distortion.any()
     values = checked_intrinsics((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), path.name)
-    return Intrinsics(values=values, source=path, size=found.size or (0, 0), straight=straight)
+    return DepthIntrinsics(values=values, source=path, size=found.size or (0, 0), straight=straight)
 
 
 def may_be_depth(path: Path) -> bool:
@@ -133,13 +135,13 @@ def is_depth(path: Path) -> bool:
         return False
 
 
-def camera_of(path: Path, form: CloudForm) -> Intrinsics | None:
+def camera_of(path: Path, form: CloudForm) -> DepthIntrinsics | None:
     """The camera of a depth image: as stated, else of a file beside it or in the dataset's folder.
 
     Raises CloudError.
     """
     if form.intrinsics is not None:
-        return Intrinsics(values=checked_intrinsics(form.intrinsics, "dataset.yaml"), source=Path("dataset.yaml"))
+        return DepthIntrinsics(values=checked_intrinsics(form.intrinsics, "dataset.yaml"), source=Path("dataset.yaml"))
     return find_intrinsics(path.parent, *(() if form.folder is None else (form.folder,)))
 
 

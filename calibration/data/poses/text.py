@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.columns import Column, columns_of
+from weldcal.calibration.data.poses.columns import PoseColumn, columns_of
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
 from weldcal.calibration.data.poses.names import whose
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
@@ -355,7 +355,7 @@ def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...]
     return found
 
 
-def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...], times: Array | None) -> Listing:
+def _columns(name: str, columns: list[PoseColumn], table: Array, ids: tuple[str, ...], times: Array | None) -> Listing:
     at = {c.role: c.index for c in columns}
     units = {c.role: c.unit for c in columns if c.unit}
     length = units.get("x", "")

@@ -31,7 +31,7 @@ _TRIAL_STEPS = 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Agreement:
+class ReadingAgreement:
     """How well two lists agree under one reading of each.
 
     Attributes:
@@ -79,7 +79,7 @@ class Agreement:
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
+class ReadingDecision:
     """The readings of two lists that the data select.
 
     Attributes:
@@ -89,10 +89,10 @@ class Decision:
         next: the best of the rejected readings; None where there is no other.
     """
 
-    best: Agreement
-    rivals: tuple[Agreement, ...]
-    same: tuple[Agreement, ...]
-    next: Agreement | None
+    best: ReadingAgreement
+    rivals: tuple[ReadingAgreement, ...]
+    same: tuple[ReadingAgreement, ...]
+    next: ReadingAgreement | None
 
     @property
     def determined(self) -> bool:
@@ -102,7 +102,7 @@ class Decision:
 
 def decide(
     robot: Sequence[PoseReading], camera: Sequence[PoseReading], *, eye_in_hand: bool, changes: bool = True
-) -> Decision:
+) -> ReadingDecision:
     """Compare all readings of two lists of n poses and keep those that the data do not reject.
 
     With F = X_BF (eye in hand) or its inverse (eye on base) and G = X_CM, F X G = Y for one X and one Y. Pairs of poses
@@ -121,7 +121,7 @@ def decide(
     return _judge(agreements(tried, eye_in_hand=eye_in_hand, all_of_them=False), len(tried))
 
 
-def _judge(tried: list[Agreement], count: int) -> Decision:
+def _judge(tried: list[ReadingAgreement], count: int) -> ReadingDecision:
     best = min(tried, key=lambda t: t.cost)
     if best.changed:
         # a list that need not be changed is not changed
@@ -130,8 +130,8 @@ def _judge(tried: list[Agreement], count: int) -> Decision:
         if not _rejected(first, best, _limit(best.dof, count)):
             best, tried = first, plain
     limit = _limit(best.dof, count)
-    alive: list[Agreement] = []
-    dead: list[Agreement] = []
+    alive: list[ReadingAgreement] = []
+    dead: list[ReadingAgreement] = []
     for one in tried:
         if one is not best and (best.changed or not one.changed or one.cost < best.cost):
             (dead if _rejected(one, best, limit) else alive).append(one)
@@ -139,7 +139,7 @@ def _judge(tried: list[Agreement], count: int) -> Decision:
     dead.sort(key=lambda t: t.cost)
     same = [one for one in alive if _same(one, best)]
     rivals = [one for one in alive if not _same(one, best)]
-    return Decision(best, tuple(rivals), tuple(same), dead[0] if dead else None)
+    return ReadingDecision(best, tuple(rivals), tuple(same), dead[0] if dead else None)
 
 
 def _limit(dof: int, tried: int) -> float:
@@ -147,11 +147,11 @@ def _limit(dof: int, tried: int) -> float:
     return float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * max(tried - 1, 1)), dof, dof)))
 
 
-def _rejected(one: Agreement, best: Agreement, limit: float) -> bool:
+def _rejected(one: ReadingAgreement, best: ReadingAgreement, limit: float) -> bool:
     return one.rotation / one.turn * best.turn > limit * best.rotation or one.position > limit * best.position
 
 
-def _same(one: Agreement, other: Agreement) -> bool:
+def _same(one: ReadingAgreement, other: ReadingAgreement) -> bool:
     """Whether two readings have the same rotations, or lead to the same X and Y, within the residuals of the better
     one."""
     if abs(np.log(one.scale / other.scale)) > _SAME_SCALE:
@@ -208,7 +208,7 @@ def _relative_angles(R: Array, i: NDArray[np.intp], j: NDArray[np.intp]) -> Arra
 
 def agreements(
     variants: list[tuple[PoseReading, PoseReading, int]], *, eye_in_hand: bool, all_of_them: bool = True
-) -> list[Agreement]:
+) -> list[ReadingAgreement]:
     """Solve F X G = Y for each pair of readings, all at once.
 
     Without ``all_of_them``, readings that their rotations reject are left out, but the best of them and the best
@@ -242,7 +242,7 @@ def agreements(
     for k, (one, other) in enumerate(tried):
         X, Y = np.eye(4), np.eye(4)
         X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3] = RX[k], tX[k], RY[k], tY[k]
-        agreement = Agreement(
+        agreement = ReadingAgreement(
             robot=one,
             camera=other,
             scale=float(scale[k]),

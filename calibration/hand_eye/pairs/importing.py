@@ -11,7 +11,7 @@ from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.hand_eye.pairs.conventions import UNITS, Agreement, Decision, decide
+from weldcal.calibration.hand_eye.pairs.conventions import UNITS, ReadingAgreement, ReadingDecision, decide
 from weldcal.models.arrays import Array
 
 _MOST_COMPARED = 60  # poses that decide the reading: more do not make it surer
@@ -197,7 +197,9 @@ def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
         )
 
 
-def decided(a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int) -> tuple[Decision | None, int]:
+def decided(
+    a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int
+) -> tuple[ReadingDecision | None, int]:
     """The decision, and by how many rows the camera's list is shifted; None where the data decide nothing."""
     if n < _FEWEST:
         return None, 0
@@ -216,7 +218,7 @@ def decided(a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: in
     return (best, by) if best.best.agrees or len(a) > 1 or len(b) > 1 else (None, 0)
 
 
-def _require_one(decision: Decision, source: str, mounting: str, camera_known: bool) -> None:
+def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_known: bool) -> None:
     """Refuses readings that agree equally and differ in the result. Raises InconsistentPoses."""
     best = decision.best
     other = "eye_on_base" if mounting == "eye_in_hand" else "eye_in_hand"
@@ -257,20 +259,20 @@ def _option(reading: PoseReading, change: str) -> str:
     return f"{plain},{change}"
 
 
-def _options(one: Agreement) -> str:
+def _options(one: ReadingAgreement) -> str:
     return f"--robot-form {one.robot.form} --camera-form {one.camera.form}"
 
 
-def _pair_words(one: Agreement) -> str:
+def _pair_words(one: ReadingAgreement) -> str:
     return f"robot as {one.robot.words}, camera as {one.camera.words}"
 
 
-def _residual(one: Agreement) -> str:
+def _residual(one: ReadingAgreement) -> str:
     share = 100.0 * one.position / max(one.extent, 1e-12)
     return f"residuals {np.degrees(one.rotation):.3g} degrees and {share:.2g} % of the motion"
 
 
-def _sentences(decision: Decision, robot: Listing, camera: Listing, shift: int) -> list[str]:
+def _sentences(decision: ReadingDecision, robot: Listing, camera: Listing, shift: int) -> list[str]:
     """What was chosen where there was a choice."""
     best, found = decision.best, []
     chosen = [
@@ -300,7 +302,7 @@ def _units(
     B: PoseReading,
     robot: Listing,
     camera: Listing,
-    best: Agreement | None,
+    best: ReadingAgreement | None,
     stated: StatedForms,
     source: str,
 ) -> tuple[tuple[float, str], tuple[float, str]]:

@@ -29,7 +29,7 @@ _ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show i
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Watched:
+class DriftHistory:
     """What a recording says of a calibration, for its N tracked frames in the order of their times.
 
     ``rows`` are the residuals against the calibration at the nominal capture times; ``residuals`` (N, 3) m and
@@ -77,7 +77,7 @@ def watch(
     X_FR: RigidTransform | None = None,
     dropped: Sequence[tuple[str, str]] = (),
     config: DriftConfig | None = None,
-) -> Watched:
+) -> DriftHistory:
     """Watch a calibration over the frames of a recording.
 
     Raises InputError where no frame lies within the robot's stream.
@@ -117,7 +117,7 @@ def _tested(
     X_FR: RigidTransform | None,
     dropped: Sequence[tuple[str, str]],
     config: DriftConfig | None,
-) -> Watched:
+) -> DriftHistory:
     at = motion.feature(clock.times, X_FR)
     inside = np.isfinite(at.p).all(axis=1) & np.isfinite(at.v).all(axis=1)
     order = np.flatnonzero(inside)[np.argsort(clock.times[inside], kind="stable")]
@@ -179,7 +179,7 @@ def _tested(
     at_arrival = motion.feature(clock.clock.base[order], X_FR).p
     before = rows.residuals[:, :3] + at.p[order] - at_arrival
     after = held.residuals[:, :3] - moved[:, :3]
-    return Watched(
+    return DriftHistory(
         ids=tuple(frames.ids[k] for k in order),
         rows=rows,
         residuals=residuals,

@@ -13,10 +13,16 @@ from scipy.optimize import OptimizeResult
 
 from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
+from weldcal.calibration.profiler.arm_errors import DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
-from weldcal.calibration.profiler.sphere.model import Layout, Problem, SphereData, SphereSigmas, corrected
+from weldcal.calibration.profiler.sphere.model import (
+    ParameterLayout,
+    SphereData,
+    SphereProblem,
+    SphereSigmas,
+    corrected,
+)
 from weldcal.calibration.profiler.sphere.start import sphere_starts
 from weldcal.models.errors import InputError
 
@@ -45,7 +51,7 @@ class SphereEstimate(ProfilerEstimate):
     tip: Floats | None = None
     affine: Floats = field(default_factory=lambda: np.zeros(3))
     origin: Floats = field(default_factory=lambda: np.zeros(2))
-    arm_errors: ArmErrors = field(default_factory=ArmErrors.none)
+    arm_errors: ProfilerArmErrors = field(default_factory=ProfilerArmErrors.none)
     wrong_poses: tuple[int, ...] = ()
     radius_change_m: float = 0.0
     radius_sigma_m: float = float("nan")
@@ -85,8 +91,8 @@ def sphere_joint(
     """
     s = sigmas or SphereSigmas()
     _check(data, model)
-    layout = Layout(tip=data.touches is not None, affine=model != "rigid", joints=model == "affine+joints")
-    problem = Problem(data, layout, s)
+    layout = ParameterLayout(tip=data.touches is not None, affine=model != "rigid", joints=model == "affine+joints")
+    problem = SphereProblem(data, layout, s)
     rivals: list[Floats] = []
     if init is not None:
         R, result = problem.solved(init.rotation, init.translation, _started(init, data, layout))
@@ -121,14 +127,14 @@ def sphere_optima(data: SphereData, sigmas: SphereSigmas) -> list[tuple[Floats, 
         InputError, TooFewTranslations: as sphere_joint.
     """
     _check(data, "rigid")
-    layout = Layout(tip=data.touches is not None, affine=False, joints=False)
-    problem = Problem(data, layout, sigmas)
+    layout = ParameterLayout(tip=data.touches is not None, affine=False, joints=False)
+    problem = SphereProblem(data, layout, sigmas)
     starts = sphere_starts(data.poses, problem.profiles, data.radius_m)
     found = [problem.solved(R, t, np.concatenate([np.zeros(6), c, np.zeros(3 * layout.tip)])) for R, t, c in starts]
     return sorted(found, key=lambda one: float(one[1].cost))
 
 
-def _started(init: SphereEstimate, data: SphereData, layout: Layout) -> Floats:
+def _started(init: SphereEstimate, data: SphereData, layout: ParameterLayout) -> Floats:
     """The unknowns of an estimate, but for its pose."""
     parts = [np.zeros(6), init.center]
     if layout.tip:
@@ -233,7 +239,7 @@ def _check(data: SphereData, model: Model) -> None:
             raise InputError(f"Profile {k} has fewer than five points of the sphere: exclude that scan.")
 
 
-def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
+def _estimate(problem: SphereProblem, R0: Floats, x: Floats) -> SphereEstimate:
     """The result with its covariance, and whether it may be believed."""
     # linearised about itself: a large rotation vector's own covariance is not that of a turn in F
     R = exp_rotation(x[:3]) @ R0
@@ -289,7 +295,7 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
         tip=None if problem.data.tip is None else problem.data.tip + tip,
         affine=np.asarray(affine),
         origin=problem.origin,
-        arm_errors=ArmErrors.of(arm),
+        arm_errors=ProfilerArmErrors.of(arm),
         wrong_poses=wrong,
         radius_change_m=step,
         radius_sigma_m=sigma * float(np.sqrt(max(1.0, float(r @ r) / freedom))),

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, OFFSET_JOINTS, SAG_JOINTS, ArmErrors, DhArm
+from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, OFFSET_JOINTS, SAG_JOINTS, DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, left_jacobian
 
 POINTS_PER_POSE = 120
@@ -85,7 +85,7 @@ def corrected(p: Floats, affine: Floats, origin: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ParameterLayout:
     """Where each unknown stands in the vector: pose, centre, tip, affine, joints."""
 
     tip: bool
@@ -131,10 +131,10 @@ class _Points(NamedTuple):
     turned: Floats
 
 
-class Problem:
+class SphereProblem:
     """The whitened residuals of one model on one set of measurements."""
 
-    def __init__(self, data: SphereData, layout: Layout, sigmas: SphereSigmas) -> None:
+    def __init__(self, data: SphereData, layout: ParameterLayout, sigmas: SphereSigmas) -> None:
         self.data, self.layout, self.sigmas = data, layout, sigmas
         self.profiles = [_thinned(p[np.isfinite(p).all(axis=1)]) for p in data.profiles]
         self.count = np.array([len(p) for p in self.profiles])
@@ -180,7 +180,7 @@ class Problem:
         assert data.arm is not None
         assert data.q is not None
         assert self._loads is not None
-        errors, touches = ArmErrors.of(values), None
+        errors, touches = ProfilerArmErrors.of(values), None
         if data.touch_q is not None and self._touch_loads is not None:
             touches = data.arm.with_errors(data.touch_q, errors, self._touch_loads)
         return data.arm.with_errors(data.q, errors, self._loads), touches
@@ -271,7 +271,7 @@ class Problem:
             touch.append(np.zeros((m, 3)))
         if self.layout.joints:
             assert self.data.arm is not None
-            errors = ArmErrors.of(arm)
+            errors = ProfilerArmErrors.of(arm)
             for q, loads, p_B, normal, of, columns in (
                 (self.data.q, self._loads, at + c, n_B, self.of, scan),
                 (self.data.touch_q, self._touch_loads, felt + c, m_B, np.arange(m), touch),

@@ -6,7 +6,7 @@ import numpy as np
 
 from weldcal.calibration.errors import RadiusError
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, last_step
-from weldcal.calibration.profiler.sphere.model import Layout, Problem, SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.model import ParameterLayout, SphereData, SphereProblem, SphereSigmas
 from weldcal.calibration.profiler.sphere.start import sphere_starts
 
 SCALE_SIGMAS = 3.0  # of the prior of the profiler's scale: what a sensor may be off, its radius may be
@@ -35,14 +35,14 @@ def free_radius(data: SphereData, start_m: float, sigmas: SphereSigmas) -> FreeR
     Gauss-Newton in the radius, all other unknowns solved at each step.
     """
     scans, radius = SphereData(poses=data.poses, profiles=data.profiles, radius_m=start_m), start_m
-    layout = Layout(tip=False, affine=False, joints=False)
-    problem = Problem(scans, layout, sigmas)
+    layout = ParameterLayout(tip=False, affine=False, joints=False)
+    problem = SphereProblem(scans, layout, sigmas)
     starts = sphere_starts(data.poses, problem.profiles, start_m)
     if not starts:
         return None
     R, x = starts[0][0], np.concatenate([np.zeros(3), starts[0][1], starts[0][2]])
     for _ in range(ROUNDS):
-        problem = Problem(replace(scans, radius_m=radius), layout, sigmas)
+        problem = SphereProblem(replace(scans, radius_m=radius), layout, sigmas)
         _, found = problem.solved(R, np.zeros(3), x)
         x = np.asarray(found.x)
         r = problem.residual(x)

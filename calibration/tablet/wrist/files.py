@@ -112,7 +112,7 @@ _MATRIX, _DISTORTION = ("camera_matrix", "K", "k", "M"), ("distortion_coefficien
 
 
 @dataclass(frozen=True)
-class Intrinsics:
+class WristIntrinsics:
     """Pinhole camera: focal lengths and principal point (px, centre of the first pixel at (0, 0)), OpenCV
     distortion."""
 
@@ -126,7 +126,7 @@ class Intrinsics:
         return np.asarray(cv2.undistortPoints(uv_px[:, None], K, self.distortion)[:, 0], dtype=float)
 
 
-def load_intrinsics(path: Path) -> Intrinsics:
+def load_intrinsics(path: Path) -> WristIntrinsics:
     """Intrinsics from a YAML file: fx, fy, cx, cy and optionally distortion (OpenCV's order), or camera_matrix (K) and
     distortion_coefficients (D) as lists or with their `data`. Raises TabletDataError."""
     try:
@@ -151,7 +151,7 @@ def load_intrinsics(path: Path) -> Intrinsics:
         raise TabletDataError(
             f"'{path.name}' holds a focal length that is not positive, or a value that is not a number."
         )
-    return Intrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion if distortion.size else np.zeros(5))
+    return WristIntrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion if distortion.size else np.zeros(5))
 
 
 def _document(path: Path, text: str) -> dict[str, Any]:
@@ -297,7 +297,7 @@ def _warnings(
     rows: Mapping[int, Row],
     used: list[int],
     poses: Path,
-    intrinsics: Intrinsics,
+    intrinsics: WristIntrinsics,
     picture: NDArray[np.uint8] | None,
     camera: Path,
 ) -> tuple[str, ...]:

@@ -81,7 +81,7 @@ class Source(Protocol[Datum]):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Frame(Generic[Datum]):
+class AcquiredFrame(Generic[Datum]):
     """A frame with its own number (from 1, gaps where frames were lost) and its stamp; `arrived` s (host,
     monotonic)."""
 
@@ -158,7 +158,7 @@ class Acquisition(Generic[Datum]):
         self._kept, self._latency_s, self._prepare = kept, latency_s, prepare
         self.clock = DeviceClock(latency_s, rules.late_s)
         self._unix = UnixClock()
-        self._frames: tuple[Frame[Datum], ...] = ()
+        self._frames: tuple[AcquiredFrame[Datum], ...] = ()
         self._seen = _Seen()
         self._read = self._wanted = self._number = 0
         self._wanted_at = 0.0
@@ -217,22 +217,22 @@ class Acquisition(Generic[Datum]):
             self._wanted_at = self.time.now()
             self._wanted = number
 
-    def frames(self) -> tuple[Frame[Datum], ...]:
+    def frames(self) -> tuple[AcquiredFrame[Datum], ...]:
         """The newest frames, oldest first. Never waits."""
         found = self._frames
         if found:
             self._read = max(self._read, found[-1].number)
         return found
 
-    def answer(self, number: int) -> Frame[Datum] | None:
+    def answer(self, number: int) -> AcquiredFrame[Datum] | None:
         """The frame that answers a request; None where there is none yet. Never waits."""
         self.frames()
         return self._find(number)
 
-    def _find(self, number: int) -> Frame[Datum] | None:
+    def _find(self, number: int) -> AcquiredFrame[Datum] | None:
         return next((f for f in reversed(self._frames) if f.request == number), None)
 
-    def wait_for_answer(self, number: int) -> Frame[Datum] | None:
+    def wait_for_answer(self, number: int) -> AcquiredFrame[Datum] | None:
         """The frame that answers a request, waited for until the device is at fault: only where the Diagram may
         wait."""
         while (found := self.answer(number)) is None and self.fault(self.time.now()) is None:
@@ -354,7 +354,7 @@ class Acquisition(Generic[Datum]):
             gap = max(gap, d.number - self._device_number - 1)
         self._device_number = d.number
         self._number += 1 + gap
-        frame = Frame(
+        frame = AcquiredFrame(
             number=self._number,
             datum=d.datum,
             arrived=d.arrived,

@@ -18,7 +18,7 @@ OPEN_S = 30.0  # the process imports its libraries first
 END_S = 1.0
 
 
-class OwnProcess(Source[Datum]):
+class SourceProcess(Source[Datum]):
     """What `make(*arguments)` returns, used from a spawned process; frames come through a pipe.
 
     The process stays over a lost device and opens it again. One that has ended is started again.

@@ -32,7 +32,7 @@ _START, _END = b"\xff\xd8", b"\xff\xd9"
 
 
 @dataclass(frozen=True)
-class Part:
+class StreamedPicture:
     """One picture, as JPEG, with its headers (names in lower case) and its arrival (s, host monotonic)."""
 
     jpeg: bytes
@@ -94,7 +94,7 @@ class MjpegStream:
         boundary = kind.split("boundary=", 1)[1].split(";")[0].strip().strip('"')
         self._boundary = b"--" + boundary.removeprefix("--").encode("latin-1")
 
-    def next(self, timeout_s: float) -> Part | None:
+    def next(self, timeout_s: float) -> StreamedPicture | None:
         """The next whole part; None where none came in time.
 
         Raises DeviceLost, and Garbage for a part that is no JPEG.
@@ -128,7 +128,7 @@ class MjpegStream:
         self._unread += found
         return True
 
-    def _part(self) -> Part | None:
+    def _part(self) -> StreamedPicture | None:
         """The first whole part of what is unread."""
         start = self._unread.find(self._boundary)
         if start < 0:
@@ -157,7 +157,7 @@ class MjpegStream:
         del self._unread[:stop]
         if not jpeg.startswith(_START) or not jpeg.rstrip(b"\x00\r\n").endswith(_END):
             raise Garbage("it sent a picture that is not a whole JPEG")
-        return Part(jpeg, headers, time.monotonic())
+        return StreamedPicture(jpeg, headers, time.monotonic())
 
     def _shorten(self) -> None:
         """Refuse a stream that never comes to a part's end."""

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig
-from weldcal.systems.drivers.sensors.acquisition import Acquisition, Frame, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.acquisition import AcquiredFrame, Acquisition, Garbage, Rules, Source
 from weldcal.systems.drivers.sensors.cell_time import cell_time
 from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
@@ -145,7 +145,7 @@ class WiredScanStream(LeafSystem):
                 newest = new[-1].number
         discrete.set_value([float(newest)])
 
-    def _streamed(self, frame: Frame[Cloud], now: float) -> StreamedScan:
+    def _streamed(self, frame: AcquiredFrame[Cloud], now: float) -> StreamedScan:
         device = frame.device_time
         if device is not None and self._clock is not None:
             device -= self._clock.lost_by(self.acquisition.time.at(frame.stamp.captured))

@@ -25,7 +25,7 @@ from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, S
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
 from weldcal.systems.drivers.ur.wire.dashboard import stop_program
-from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
+from weldcal.systems.drivers.ur.worker import WorkerConfig, WorkerPhase
 from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus
 
@@ -142,7 +142,7 @@ class UrLink:
         while time.monotonic() < until:
             found = link._memory.state.read()
             if found is not None:
-                if found.phase == Phase.OBEYING:
+                if found.phase == WorkerPhase.OBEYING:
                     return link
                 if found.fault:
                     fault = Fault(found.fault)
@@ -199,7 +199,7 @@ class UrLink:
             raise RuntimeError("the link has not started")
         now = time.monotonic()
         fault, detail, fault_time = Fault(found.fault), found.detail, found.fault_time
-        if fault is Fault.NONE and self._died is None and found.phase != Phase.ENDED:
+        if fault is Fault.NONE and self._died is None and found.phase != WorkerPhase.ENDED:
             limits = self._config.limits
             quiet = now - found.heartbeat > max(HEARTBEAT_LIMIT_S / limits.pace, limits.stale_s)
             if quiet or self._process.poll() is not None:

@@ -150,7 +150,7 @@ def _without(text: str, mark: str) -> str:
     return "".join(line for line in text.splitlines(keepends=True) if mark not in line)
 
 
-class Robot:
+class ControllerStream:
     """The stream to and from the controller, the clock map and the newest complete package."""
 
     def __init__(

@@ -160,7 +160,7 @@ class RobotSample:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Command:
+class VelocityCommand:
     """The newest velocity command of the cell; `given_at` is host time."""
 
     number: int = 0
@@ -193,7 +193,7 @@ class Supervisor:
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._last: RobotSample | None = None
-        self._command = Command()
+        self._command = VelocityCommand()
         self._stepped_at = 0.0
         self._reference: Array | None = None
         self._referred_at = 0.0
@@ -208,7 +208,7 @@ class Supervisor:
         self._seen_time, self._seen_number = -np.inf, 0
         self.latched = Decision(Action.SEND)
 
-    def step(self, now: float, robot: RobotSample, command: Command) -> Decision:
+    def step(self, now: float, robot: RobotSample, command: VelocityCommand) -> Decision:
         """Compute the decision of this pass. `now` is host time, s."""
         if robot.robot_time != self._seen_time:
             self._seen_time, self._seen_number = robot.robot_time, command.number
@@ -230,7 +230,7 @@ class Supervisor:
         """Forget where the commands lead: for some time none was sent, and the guard has slowed the arm."""
         self._reference = None
 
-    def _look(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+    def _look(self, now: float, robot: RobotSample, command: VelocityCommand) -> tuple[Fault, float]:
         for look in (self._link(now, robot, command), self._safety(robot), self._program(robot), self._output(robot)):
             if look[0] is not Fault.NONE:
                 return look
@@ -242,7 +242,7 @@ class Supervisor:
             return Fault.ARC_INPUT, 0.0
         return self._motion(now, robot, command)
 
-    def _link(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+    def _link(self, now: float, robot: RobotSample, command: VelocityCommand) -> tuple[Fault, float]:
         limits, last = self._limits, self._last
         if not robot.connected:
             return Fault.LINK_CLOSED, 0.0
@@ -331,7 +331,7 @@ class Supervisor:
         self._arc_since = min(self._arc_since, robot.robot_time)
         return robot.robot_time > self._arc_ends_at and robot.robot_time - self._arc_since >= ARC_ON_S
 
-    def _motion(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+    def _motion(self, now: float, robot: RobotSample, command: VelocityCommand) -> tuple[Fault, float]:
         limits = self._limits
         if robot.unheard_s > limits.deaf_s:
             return Fault.CONTROLLER_DEAF, 1e3 * robot.unheard_s
@@ -380,7 +380,7 @@ class Supervisor:
             return Fault.JOINT_LIMIT, float(np.argmax(outside) + 1)
         return self._tracking(now, robot, command)
 
-    def _tracking(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+    def _tracking(self, now: float, robot: RobotSample, command: VelocityCommand) -> tuple[Fault, float]:
         """Check the arm's position against the integral of the recent commands, which decays in half a second."""
         limits = self._limits
         if self._reference is None:

@@ -129,7 +129,7 @@ def _stream_delay_s(scenario: Scenario) -> float | None:
     return None if scanner is None else scanner.stream_delay_s()
 
 
-class Motion(Job[MotionPlanned]):
+class MotionCalibrationJob(Job[MotionPlanned]):
     """The job of a scenario with a `motion` part."""
 
     key = "motion"
@@ -298,4 +298,4 @@ def joint_speed(arm: ArmModel, corners: tuple[Array, ...], speed_m_s: float) -> 
     return float(slowest)
 
 
-JOB = Motion()
+JOB = MotionCalibrationJob()

@@ -27,7 +27,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.mounting.procedure import HeldOut, MountingState, MountingStatus, NextBest
+from weldcal.systems.jobs.mounting.procedure import HeldOutScan, MountingState, MountingStatus, NextBest
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
@@ -108,7 +108,7 @@ def digest(
         return dc.replace(status, refused=(*status.refused, (job.label, str(error))), message=str(error))
     if job.purpose == "verify":
         off = off_prediction(belief, seen, None if status.result is None else status.result.correction)
-        return dc.replace(status, held_out=(*status.held_out, HeldOut(job.label, *off)))
+        return dc.replace(status, held_out=(*status.held_out, HeldOutScan(job.label, *off)))
     status = dc.replace(status, seen=(*status.seen, seen), message="")
     if len(status.seen) < fewest(scene):
         return status

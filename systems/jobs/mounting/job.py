@@ -68,7 +68,7 @@ class AddedMounting(AddedJob):
         )
 
 
-class Mounting(Job[MountingPlanned]):
+class MountingCalibrationJob(Job[MountingPlanned]):
     """The job of a scenario with a `mounting` part."""
 
     key = "mounting"
@@ -201,4 +201,4 @@ def true_poses(scene: MountingScene, station: Station) -> dict[str, RigidTransfo
     return found
 
 
-JOB = Mounting()
+JOB = MountingCalibrationJob()

@@ -33,7 +33,7 @@ class MountingState(ProcedureState):
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutScan:
     """Errors of the calibration's prediction of the circle in a held-out scan."""
 
     label: str
@@ -75,7 +75,7 @@ class MountingStatus(Message):
     sigma_work_m: float = np.inf  # expected error (3-D, rms) of a point at the scanner's best distance
     error_95_m: float = np.inf  # and the bound that it keeps with 95 %
     history: tuple[tuple[int, float], ...] = ()  # of that bound, by the number of scans
-    held_out: tuple[HeldOut, ...] = ()
+    held_out: tuple[HeldOutScan, ...] = ()
     next_best: NextBest | None = None
     done: bool = False
     message: str = ""

@@ -34,7 +34,7 @@ WIDER_M = 0.5e-3  # noise may make a circle larger than the sphere
 
 
 @dataclass(frozen=True, eq=False)
-class Taken(Message):
+class TakenProfile(Message):
     """One profile with the joints (6,) rad that the controller reported at its capture time."""
 
     kind: str
@@ -102,7 +102,7 @@ def sphere_sigmas(p: RenderedProfiler, job: ProfilerJob) -> SphereSigmas:
     )
 
 
-def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple[Taken, ...]) -> EdgeFound:
+def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple[TakenProfile, ...]) -> EdgeFound:
     """Estimate X_FS from the scans of kind `scan`, and its errors at those of kind `held_out`.
 
     Raises:
@@ -135,7 +135,7 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
     return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1), r)
 
 
-def _enough(found: int, taken: tuple[Taken, ...], what: str) -> None:
+def _enough(found: int, taken: tuple[TakenProfile, ...], what: str) -> None:
     wanted = sum(one.kind == "scan" for one in taken)
     if found < 0.5 * wanted:
         raise FeatureNotFound(
@@ -163,7 +163,7 @@ def find_sphere(
     arm: ArmModel,
     p: RenderedProfiler,
     job: ProfilerJob,
-    taken: tuple[Taken, ...],
+    taken: tuple[TakenProfile, ...],
     touches: tuple[Array, ...] = (),
     tip: Array | None = None,
     first: SphereEstimate | None = None,
@@ -228,7 +228,7 @@ def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate)
 
 
 def find_seam(
-    arm: ArmModel, estimate: SphereEstimate, drawn: SeamCurve, taken: tuple[Taken, ...], every_m: float
+    arm: ArmModel, estimate: SphereEstimate, drawn: SeamCurve, taken: tuple[TakenProfile, ...], every_m: float
 ) -> SeamFound:
     """Measure the groove's root in B with the calibration: points of all passes, merged along the nominal seam and
     smoothed.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.interpolate import CubicSpline
 
-from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, path_clearance
 from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses
@@ -66,7 +66,7 @@ class PlanningContext:
         """The depth range of the calibration."""
         return Field(1e-3 * self.job.half_width_mm, 1e-3 * self.job.near_mm, 1e-3 * self.job.far_mm)
 
-    def bodies(self) -> list[Body]:
+    def bodies(self) -> list[LinkCapsule]:
         """The arm with the rig on its flange."""
         at = np.array(self.X_FS.translation())
         capsules = [

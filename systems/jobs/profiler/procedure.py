@@ -16,7 +16,7 @@ from weldcal.systems.jobs.profiler.estimates import (
     EdgeFound,
     SeamFound,
     SphereFound,
-    Taken,
+    TakenProfile,
     feature_sigmas,
     find_edge,
     find_seam,
@@ -53,14 +53,14 @@ class ProfilerState(ProcedureState):
     seen: int = 0  # number of the newest received profile
     before: int = 0  # number of profiles at the start of the pass
     felt: int = 0  # number of touches at the start of the descent
-    taken: tuple[Taken, ...] = ()
+    taken: tuple[TakenProfile, ...] = ()
     touches: tuple[Array, ...] = ()
     edge: EdgeFound | None = None
     sphere: SphereFound | None = None
     seam: SeamFound | None = None
-    edge_scans: tuple[Taken, ...] = ()
-    sphere_scans: tuple[Taken, ...] = ()
-    seam_scans: tuple[Taken, ...] = ()
+    edge_scans: tuple[TakenProfile, ...] = ()
+    sphere_scans: tuple[TakenProfile, ...] = ()
+    seam_scans: tuple[TakenProfile, ...] = ()
     torch_from_s: float = np.inf
     torch_until_s: float = np.inf
     planning: PlanningContext | None = None
@@ -267,7 +267,7 @@ class ProfilerProcedure(Procedure[ProfilerState, ProfilerInputs]):
         q = now.history.joints_at(scan.capture_time) if scan.sequence > s.seen else None
         if q is None:
             return s
-        return replace(s, seen=scan.sequence, taken=(*s.taken, Taken(s.goals[0].kind, q, scan.points)))
+        return replace(s, seen=scan.sequence, taken=(*s.taken, TakenProfile(s.goals[0].kind, q, scan.points)))
 
     def _descend(self, s: ProfilerState, now: ProfilerInputs) -> ProfilerState:
         touch, stage = now.touch, self._planning.job.sphere

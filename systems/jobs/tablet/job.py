@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.planning.clearance import Body, arm_bodies
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
@@ -108,7 +108,7 @@ def check_moves(scenario: Scenario, station: Station, plan: TabletPlan) -> None:
         InputError: one does not; nothing has moved.
     """
     pen = Capsule(6, np.zeros(3), plan.p_FP, PEN_BODY_M)
-    bodies: list[Body] = arm_bodies(station.arm, (pen,))
+    bodies: list[LinkCapsule] = arm_bodies(station.arm, (pen,))
     goals = [plan.q_home, plan.q_look, *plan.q_above, plan.q_home]
     names = ["home", "the look", *(f"landmark {k + 1}" for k in range(len(plan.q_above))), "home"]
     for k in range(len(goals) - 1):

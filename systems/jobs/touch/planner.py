@@ -82,7 +82,7 @@ Joints = Array
 
 
 @dc.dataclass(frozen=True, eq=False)
-class Place(Message):
+class TouchPlace(Message):
     """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal
     in the base."""
 
@@ -99,7 +99,7 @@ class PlannedTouches(Message):
     """The places of a scan, or the reason why there are none."""
 
     sequence: int = 0
-    places: tuple[Place, ...] = ()
+    places: tuple[TouchPlace, ...] = ()
     reason: str | None = None
 
 
@@ -153,7 +153,7 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
             points_B, seam.workpiece, seam.X_BP_guess, seam.method, X_BC.translation(), seam.arm.up
         )
         root = SeamCurve.from_points(found.root, up=np.broadcast_to(found.up, found.root.shape))
-        places: list[Place] = []
+        places: list[TouchPlace] = []
         for k in range(config.points):
             frame = root.frame(root.length * (k + 0.5) / config.points)
             side = 1.0 if k % 2 == 0 else -1.0
@@ -180,7 +180,7 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
                 seam.tool.X_FT,
             )
             check_path(seam.arm, q, [descent])
-            places.append(Place(q, face[0], face[1], face[2], np.asarray(p_B), np.asarray(n_B)))
+            places.append(TouchPlace(q, face[0], face[1], face[2], np.asarray(p_B), np.asarray(n_B)))
         if found.X_BP is not None:
             _check_moves(planning, found.X_BP, [seam.q_near, *(p.q_above for p in places), seam.q_near])
     except WeldcalError as error:

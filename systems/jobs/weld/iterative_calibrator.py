@@ -77,7 +77,7 @@ def _message(kind: str, found: Refined, arm: ArmModel) -> Refinement:
 
 
 @dc.dataclass(frozen=True, eq=False)
-class NextPose(Message):
+class PoseRequest(Message):
     """The pose to visit after the calibration status with this sequence number; q (6,) rad, None when none is left."""
 
     after_sequence: int = -1
@@ -106,19 +106,19 @@ class CalibrationPosePlanner(LeafSystem):
         self._plan = plan
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(
-            AbstractValue.Make(NextPose(-1, 0, "pose01", plan[0].q if plan else None))
+            AbstractValue.Make(PoseRequest(-1, 0, "pose01", plan[0].q if plan else None))
         )
         self.DeclareStateOutputPort("next_pose", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
         status: CalibrationStatus = self._status.Eval(context)
-        newest: NextPose = context.get_abstract_state(self._state).get_value()
+        newest: PoseRequest = context.get_abstract_state(self._state).get_value()
         if status.sequence <= newest.after_sequence:
             return
         index = status.sequence  # one pose per scan
         q = self._plan[index].q if index < len(self._plan) else None
-        new = NextPose(status.sequence, index, f"pose{index + 1:02d}", q)
+        new = PoseRequest(status.sequence, index, f"pose{index + 1:02d}", q)
         state.get_mutable_abstract_state(self._state).set_value(new)
 
 

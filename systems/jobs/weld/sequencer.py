@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
-from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import PoseRequest
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
 from weldcal.systems.motion.clear_moves import stands_at
@@ -71,7 +71,7 @@ class JobState(ProcedureState):
 class JobInputs(Inputs):
     """Inputs of the sequencer at one tick."""
 
-    next_pose: NextPose
+    next_pose: PoseRequest
     calibration_status: CalibrationStatus
     planned_seam: PlannedSeam
     servo_report: ServoReport
@@ -166,7 +166,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         self._plan = plan
         self.read(
             "drift",
-            next_pose=NextPose(),
+            next_pose=PoseRequest(),
             calibration_status=CalibrationStatus(),
             planned_seam=PlannedSeam(),
             servo_report=ServoReport(),

@@ -35,7 +35,7 @@ from weldcal.welding.servo.settings import (
     ServoConfig,
     ToolGeometry,
     TorchControl,
-    TouchConfig,
+    TouchOnConfig,
 )
 
 _POOL = (3, 2)
@@ -82,7 +82,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
     )
     return ServoConfig(
         tool=geometry,
-        touch=TouchConfig(zero_frames=ZERO_FRAMES, offset_m=entry.aside_m),
+        touch=TouchOnConfig(zero_frames=ZERO_FRAMES, offset_m=entry.aside_m),
         gap=GapConfig(end_window_m=cad.end_window_m),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),

@@ -15,7 +15,7 @@ from pydrake.systems.analysis import Simulator
 
 from tests.systems.cells import Q_HOME
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, HeldOut
-from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import PoseRequest
 from weldcal.systems.jobs.weld.job import SHARES
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobInputs, JobPlan, JobSequencer, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
@@ -70,7 +70,7 @@ class World:
             robot=UrStatus(),
             settled_goal=0,
             q=Q_HOME,
-            next_pose=NextPose(0, 0, "pose01", Q_HOME),
+            next_pose=PoseRequest(0, 0, "pose01", Q_HOME),
             calibration_status=CalibrationStatus(),
             planned_seam=PlannedSeam(),
             servo_report=ServoReport(),
@@ -102,7 +102,7 @@ class World:
         counts = self.now.calibration_status.calibration_scans + int(self.command.scan_purpose == "calibrate")
         status = dc.replace(self.now.calibration_status, sequence=n, calibration_scans=counts, **changes)
         return self.look(
-            0.3, calibration_status=status, next_pose=NextPose(n, n, f"pose{n + 1:02d}", np.full(6, 0.01 * n))
+            0.3, calibration_status=status, next_pose=PoseRequest(n, n, f"pose{n + 1:02d}", np.full(6, 0.01 * n))
         )
 
 
@@ -235,9 +235,9 @@ def test_it_waits_for_the_arm_to_have_been_still_for_its_dwell_time() -> None:
 
 def test_it_does_not_go_to_a_pose_that_was_chosen_before_the_newest_scan() -> None:
     world = in_phase("scan_pose", purpose="calibrate")
-    old = NextPose(3, 3, "pose04", Q_HOME)
+    old = PoseRequest(3, 3, "pose04", Q_HOME)
     assert world.look(0.1, calibration_status=CalibrationStatus(sequence=4), next_pose=old) == "scan_pose"
-    assert world.look(0.1, next_pose=NextPose(4, 4, "pose05", Q_HOME)) == "move_to_pose"
+    assert world.look(0.1, next_pose=PoseRequest(4, 4, "pose05", Q_HOME)) == "move_to_pose"
 
 
 def test_the_camera_streams_before_the_tip_touches() -> None:
@@ -251,7 +251,7 @@ def status(**changes: Any) -> CalibrationStatus:
     return CalibrationStatus(sequence=4, **changes)
 
 
-NO_POSE = NextPose(4, 14, "pose15", None)
+NO_POSE = PoseRequest(4, 14, "pose15", None)
 HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
     "protective stop": (
         "weld",
@@ -390,7 +390,7 @@ def test_the_system_passes_its_command_on_to_everyone() -> None:
     context = simulator.get_mutable_context()
     for name, value in {
         "robot_status": UrStatus(),
-        "next_pose": NextPose(),
+        "next_pose": PoseRequest(),
         "calibration_status": CalibrationStatus(),
         "planned_seam": PlannedSeam(),
         "servo_report": ServoReport(),

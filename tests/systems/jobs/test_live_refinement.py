@@ -28,10 +28,10 @@ from weldcal.systems.scenario.arm import corrected_arm
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.wrong_arm import Station, station
+from weldcal.tools.worlds.wrong_arm import WrongArmStation, station
 
 
-def status_of(world: Station) -> CalibrationStatus:
+def status_of(world: WrongArmStation) -> CalibrationStatus:
     """The live calibration of a light world, before it is refined."""
     seen = tuple(world.observations)
     return CalibrationStatus(observations=seen, joints=tuple(world.q), estimate=estimate_jointly(seen)[0], done=True)
@@ -41,7 +41,7 @@ def flange(arm: ArmModel, q: Array) -> Array:
     return np.array([forward_kinematics(arm, each).translation() for each in q])
 
 
-def new_errors(status: CalibrationStatus, world: Station) -> Array:
+def new_errors(status: CalibrationStatus, world: WrongArmStation) -> Array:
     """Errors at new scans, m, where the arm that the cell believes says that it is."""
     arm, X_BC = status.arm_or(load_arm("ur10e")), status.X_BC
     assert X_BC is not None
@@ -91,7 +91,7 @@ def test_a_wrong_factory_file_is_found_out_and_what_cannot_be_refined_stays_plai
     assert "need 12 usable poses, and there are 8" in kept.refinement.sentence
 
 
-def _turned_away(arm: ArmModel, world: Station) -> float:
+def _turned_away(arm: ArmModel, world: WrongArmStation) -> float:
     """Mean distance (m) of the flange's travel between new poses from the true arm's: the first joint's zero, which no
     scan shows, drops out of lengths."""
     true = flange_poses(load_chain("ur10e"), world.new_q, world.errors)[:, :3, 3]

@@ -400,9 +400,9 @@ def tablet() -> Made:
 def finger() -> Made:
     """`finger calibrate` with touches."""
     from weldcal.tools.commands.cell.finger import FingerReport, finger_page
-    from weldcal.welding.finger.calibration import Intrinsics, TipCalibration
+    from weldcal.welding.finger.calibration import FingerIntrinsics, TipCalibration
 
-    camera = Intrinsics(
+    camera = FingerIntrinsics(
         K=np.diag([900.0, 900.0, 1.0]),
         distortion=np.zeros(5),
         width=640,

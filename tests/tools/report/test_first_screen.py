@@ -18,7 +18,7 @@ from weldcal.tools.report.first_screen import (
     CARE,
     DO_NOT,
     USE,
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -38,7 +38,7 @@ X = RigidTransform(RollPitchYaw(0.3, -0.7, 2.0), [0.65, -0.02, 0.94])
 
 def screen(found: Findings) -> FirstScreen:
     """A first screen of these findings."""
-    expected = Expected("error at the work point, 95 %", "0.213 mm", "8 unseen poses")
+    expected = ExpectedError("error at the work point, 95 %", "0.213 mm", "8 unseen poses")
     after = Next("Verify it.", "weldcal verify out NEW_SCANS")
     return FirstScreen(found, expected, after, (ShownPose("X_BC", "pose of the scanner C in the robot's base B", X),))
 

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.motion.drift import Trial, _watched, expected_late, found_by_angle, knock_trial
+from weldcal.tools.studies.motion.drift import DriftTrial, _watched, expected_late, found_by_angle, knock_trial
 from weldcal.tools.worlds.features import Change, WorldConfig
 
 
@@ -34,7 +34,7 @@ def test_a_trial_says_what_the_change_was() -> None:
 
 def test_a_turn_about_the_line_of_sight_shows_least() -> None:
     trials = [
-        Trial(
+        DriftTrial(
             kind="turn",
             seed=k,
             along_view=view,

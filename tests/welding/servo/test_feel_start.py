@@ -15,12 +15,12 @@ from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit
 from weldcal.welding.servo.feel_start import feel_start_step, with_touch_place
-from weldcal.welding.servo.settings import ServoConfig, TouchConfig
-from weldcal.welding.servo.state import Measurement, Phase, ServoSample, TouchState, WeldingState
+from weldcal.welding.servo.settings import ServoConfig, TouchOnConfig
+from weldcal.welding.servo.state import Measurement, Phase, ServoSample, TouchOnState, WeldingState
 
 MM = 1e-3
 UP = np.array([0.0, 0.0, 1.0])
-CONFIG = ServoConfig(touch=TouchConfig(calibrate_gain=True, zero_frames=30, feel_start=True))
+CONFIG = ServoConfig(touch=TouchOnConfig(calibrate_gain=True, zero_frames=30, feel_start=True))
 
 
 def straight(length: float) -> TrueSeam:
@@ -62,7 +62,7 @@ def test_a_groove_that_is_not_found_again_is_said_not_to_be() -> None:
     p = np.array([0.012, 0.0, -0.5 * MM])
     state = WeldingState(
         plan_fit=PlanFit.start(plan),
-        touch=TouchState(step="enter"),
+        touch=TouchOnState(step="enter"),
         measurement=Measurement(0.0, p, np.zeros(3), p),
         s_tip=0.012,
         lost_at=-1.0 * MM,

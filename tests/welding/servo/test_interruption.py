@@ -16,10 +16,10 @@ from weldcal.tools.worlds.weld.groove import SEAT_M
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.interruption import RAMP_S, Interruption, interruptible_step
-from weldcal.welding.servo.settings import ServoConfig, TouchConfig
+from weldcal.welding.servo.settings import ServoConfig, TouchOnConfig
 from weldcal.welding.servo.state import Phase, ServoSample, WeldingCommand, WeldingState
 
-CONFIG = ServoConfig(touch=TouchConfig(calibrate_gain=True))
+CONFIG = ServoConfig(touch=TouchOnConfig(calibrate_gain=True))
 SEAMS = {"straight": straight(0.1), "l": l_curve()}
 MM = 1e-3
 

@@ -31,13 +31,13 @@ from weldcal.welding.servo.settings import (
     SteeringConfig,
     ToolGeometry,
     TorchControl,
-    TouchConfig,
+    TouchOnConfig,
 )
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
 
-CALIBRATED = ServoConfig(touch=TouchConfig(calibrate_gain=True))
+CALIBRATED = ServoConfig(touch=TouchOnConfig(calibrate_gain=True))
 SPEED = CALIBRATED.weld_speed_m_s
 MM = 1e-3
 
@@ -295,7 +295,7 @@ def test_every_command_is_finite_wherever_the_tool_stands() -> None:
 
 
 GROUPS = (
-    *(ToolGeometry, TouchConfig, ContactConfig, GapConfig, FaultLimits, DeflectionControl, TorchControl),
+    *(ToolGeometry, TouchOnConfig, ContactConfig, GapConfig, FaultLimits, DeflectionControl, TorchControl),
     *(MotionLimits, LawWeights, SteeringConfig, FeltPathConfig, ServoConfig),
 )
 SIGNED = {"torch_height_m", "side_offset_m", "offset_m", "work_angle_rad"}  # a side, or a direction
@@ -335,4 +335,4 @@ def test_a_chord_too_short_to_trail_and_a_press_that_does_not_press_are_refused(
     with pytest.raises(ServoConfigError, match="trail"):
         ServoConfig(tool=ToolGeometry(torch_offset_m=0.0))
     with pytest.raises(ServoConfigError, match="press_ratio"):
-        TouchConfig(press_ratio=1.0)
+        TouchOnConfig(press_ratio=1.0)

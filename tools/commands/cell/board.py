@@ -54,7 +54,7 @@ def print_board(
         sheet = described_sheet(parse_board(kind), paper)
         kind = kind.partition(":")[0]
     elif kind == "charuco":
-        board = Board(columns, rows, square_mm, marker_mm, dictionary)
+        board = CharucoBoard(columns, rows, square_mm, marker_mm, dictionary)
         sheet = board_sheet(board, paper)
     elif kind == "tags":
         words = ids.split(",")
@@ -157,7 +157,7 @@ class Sheet:
 
 
 @dataclass(frozen=True)
-class Board:
+class CharucoBoard:
     """A ChArUco board: squares, their side and that of the markers in mm, and the markers' dictionary."""
 
     columns: int = 8
@@ -181,7 +181,7 @@ class Board:
         return cv2.aruco.CharucoBoard((self.columns, self.rows), *sides, dictionary_named(self.dictionary))
 
 
-def board_sheet(board: Board, paper: str) -> Sheet:
+def board_sheet(board: CharucoBoard, paper: str) -> Sheet:
     """The board in the middle of a page. Raises InputError where it does not fit."""
     sizes = f"{board.square_mm:.12g}:{board.marker_mm:.12g}:{board.dictionary}"
     return described_sheet(parse_board(f"charuco:{board.columns}x{board.rows}:{sizes}"), paper)
@@ -264,7 +264,7 @@ def tag_sheet(tags: Iterable[TagModel], paper: str) -> Sheet:
     return sheet
 
 
-def write_board(folder: Path, sheet: Sheet, board: Board | None) -> dict[str, str]:
+def write_board(folder: Path, sheet: Sheet, board: CharucoBoard | None) -> dict[str, str]:
     """Write board.pdf, and board.yaml where it is a board, into a folder; returns their paths by kind."""
     folder.mkdir(parents=True, exist_ok=True)
     written = {"pdf": str(folder / "board.pdf")}

@@ -18,11 +18,11 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.cell.board import Board
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, Tolerance, check_limit
+from weldcal.tools.commands.cell.board import CharucoBoard
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, Tolerance, check_limit
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.welding.finger.calibration import (
-    Intrinsics,
+    FingerIntrinsics,
     TipCalibration,
     calibrate_intrinsics,
     calibrate_tip,
@@ -81,7 +81,7 @@ class FingerReport:
     """The camera, the tip (None without touches), pictures in which the board was not found, and the tag's pose at
     rest."""
 
-    camera: Intrinsics
+    camera: FingerIntrinsics
     tip: TipCalibration | None
     without_board: tuple[str, ...]
     tag_size_mm: float | None = None
@@ -116,7 +116,7 @@ class FingerReport:
             )
             return FirstScreen(
                 found,
-                Expected("reprojection of pictures left out", f"{c.held_out_px:.3f} px", pictures),
+                ExpectedError("reprojection of pictures left out", f"{c.held_out_px:.3f} px", pictures),
                 after,
                 (),
                 more,
@@ -124,7 +124,7 @@ class FingerReport:
         error, what = 1e3 * tip.held_out_m, "error of a touch, median"
         tolerance = None if self.limit_mm is None else Tolerance(f"the {what},", error, self.limit_mm, "--limit-mm")
         found = Findings(tolerance=tolerance, unseen=self.touches, concerns=concerns, notes=notes)
-        expected = Expected(
+        expected = ExpectedError(
             what,
             f"{error:.3f} mm",
             f"of {self.touches} touches, each left out of the fit; too few for a 95 % figure. {pictures}",
@@ -236,11 +236,11 @@ def finger_page(report: FingerReport, folder: Path) -> str:
     )
 
 
-def read_board(path: Path) -> Board:
+def read_board(path: Path) -> CharucoBoard:
     """The board that `weldcal print-board` described. Raises InputError where the file is no such description."""
     try:
         keys = dict(read_document(path)["board"])
-        board = Board(**keys)
+        board = CharucoBoard(**keys)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"'{path}' describes no board: give the board.yaml that weldcal print-board wrote.") from error
     return board

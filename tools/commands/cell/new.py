@@ -39,7 +39,7 @@ from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
 from weldcal.tools.commands.cell.scan_poses import add_scan_poses
-from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
+from weldcal.tools.commands.cell.schema import SchemaKey, json_schema, keys_of, yaml_of
 from weldcal.tools.commands.cell.screen import least_pipe, ranked, unit_hint
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
@@ -307,7 +307,7 @@ def _below(config: Any, indent: str) -> Iterator[str]:
         yield _line(key, getattr(config, key.name), indent, written=k == 0 and not changed)
 
 
-def _line(key: Key, value: Any, indent: str, written: bool = False) -> str:
+def _line(key: SchemaKey, value: Any, indent: str, written: bool = False) -> str:
     """The key with its value, behind a comment sign where that is the default, and what it means."""
     meaning = key.meaning
     mark = "# " if value == key.default and not written and key.name != "description" else ""

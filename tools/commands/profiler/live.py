@@ -12,7 +12,7 @@ import numpy as np
 from weldcal.calibration.profiler.record import ProfilerRecord, save_record
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.profiler.estimates import Taken
+from weldcal.systems.jobs.profiler.estimates import TakenProfile
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -109,7 +109,7 @@ def write_live(live: ProfilerLive, finished: JobRun) -> None:
     )
 
 
-def _npz(arm: ArmModel, taken: Sequence[Taken], more: Mapping[str, Any]) -> bytes:
+def _npz(arm: ArmModel, taken: Sequence[TakenProfile], more: Mapping[str, Any]) -> bytes:
     """The bytes of an npz file with flange poses, joints and raw profiles."""
     T = np.array([forward_kinematics(arm, t.q).GetAsMatrix4() for t in taken])
     out = io.BytesIO()

@@ -19,7 +19,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, ScenarioOption, command
 from weldcal.tools.commands.run import run_job, run_options
-from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
+from weldcal.tools.commands.tablet.calibrate import TabletCalibration, VisitFiles, calibrate_tablet
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
@@ -104,7 +104,7 @@ def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCa
     folder, tablet = options.out, run.cell.job.tablet
     write_visit(run, folder)
     done = calibrate_tablet(
-        TabletInputs(
+        VisitFiles(
             file=folder / "touches.csv",
             poses=folder / "poses.csv",
             camera=folder / "camera.yaml",

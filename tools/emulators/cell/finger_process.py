@@ -34,7 +34,7 @@ class FingerSetup:
     port: int
 
 
-class Stream:
+class PictureStream:
     """The newest part of the stream, for any number of clients."""
 
     def __init__(self) -> None:
@@ -81,7 +81,7 @@ class _Server(Limited, socketserver.ThreadingTCPServer):
     allow_reuse_address = True
 
 
-def _handler(stream: Stream) -> type[BaseHTTPRequestHandler]:
+def _handler(stream: PictureStream) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_response(200)
@@ -115,7 +115,7 @@ def run_finger_camera(setup: FingerSetup, world: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     cv2.setNumThreads(1)
-    view, stream, rng = TagView(setup.tool, setup.camera), Stream(), np.random.default_rng([setup.seed, 3])
+    view, stream, rng = TagView(setup.tool, setup.camera), PictureStream(), np.random.default_rng([setup.seed, 3])
     with _Server((setup.host, setup.port), _handler(stream)) as server, contextlib.suppress(EOFError, OSError):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         world.send("ready")

@@ -23,7 +23,7 @@ from weldcal.tools.report.weld import calibration_error
 from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.studies.targets import Target
 from weldcal.tools.worlds.perfect_world import perfect
-from weldcal.tools.worlds.redrawn import Redrawn, Station, bound_covariance, joined, joints_of, redraw
+from weldcal.tools.worlds.redrawn import Redrawn, RedrawnStation, bound_covariance, joined, joints_of, redraw
 
 SCENARIO = "calibrate_only"
 TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
@@ -86,7 +86,7 @@ def study_live(
         error = calibration_error(status.estimate.X_BC, truth, work)
         found = status.observations
         joints = joints_of(found, cell.station.arm, np.deg2rad(scenario.home_deg))
-        station = Station(cell.station.arm, joints, 1e-3 * repeatability_mm, truth, np.asarray(work))
+        station = RedrawnStation(cell.station.arm, joints, 1e-3 * repeatability_mm, truth, np.asarray(work))
         least = np.diag(bound_covariance(found, station))
         rows.append(
             LiveRow(

@@ -21,7 +21,7 @@ from weldcal.tools.studies.flange.live import live
 from weldcal.tools.studies.flange.recorded import few, halves, parts
 from weldcal.tools.studies.flange.scans import frames, hidden, holes
 from weldcal.tools.studies.harness import Figures, Row, Study
-from weldcal.tools.worlds.flange_frames import Frame, facing, flange_frame
+from weldcal.tools.worlds.flange_frames import FlangeScan, facing, flange_frame
 
 FLANGE = "iso9409-1-50-4-m6"
 _E_D, _E_R, _K_MAX = 0.0003, 0.001, 10_000  # paper, section 3.2.2
@@ -40,7 +40,7 @@ def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress
     ``loop`` includes the paper's search as a Python loop (its 10 000 draws take seconds).
     """
     standard = get_flange(FLANGE)
-    frames: dict[str, Frame] = {}
+    frames: dict[str, FlangeScan] = {}
     for name, width in (("0.5", 824), ("3.2", 2064)):
         progress("ray-casting the scans", 0.05 * len(frames))
         X_CR = facing(np.array([0.04, -0.03, 0.62]), np.radians(12.0), 0.7, 0.3)
@@ -95,7 +95,7 @@ def _time(
     }
 
 
-def _segmented(frame: Frame, outer_m: float) -> tuple[Array, Array]:
+def _segmented(frame: FlangeScan, outer_m: float) -> tuple[Array, Array]:
     """The flange's own points of a frame, thinned to a recorded cloud's number, and the true centre."""
     assert frame.X_CR is not None
     p = frame.points_C.reshape(-1, 3)

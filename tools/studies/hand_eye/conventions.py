@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.poses.readings import PoseReading, readings
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import inverse, pose
-from weldcal.calibration.hand_eye.pairs.conventions import Decision, agreements, decide
+from weldcal.calibration.hand_eye.pairs.conventions import ReadingDecision, agreements, decide
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, Table
 from weldcal.tools.worlds.written_poses import WrittenSet, written_set
@@ -49,13 +49,13 @@ def _chosen(case: WrittenSet) -> Mapping[str, object]:
     }
 
 
-def _determined(clean: Decision, case: WrittenSet) -> bool:
+def _determined(clean: ReadingDecision, case: WrittenSet) -> bool:
     """Whether the next reading that leads to another result leaves residuals over SIGMAS of the noise."""
     others = [one for one in (*clean.rivals, clean.next) if one is not None]
     return all(max(one.rotation / case.rotation, one.position / case.position) > SIGMAS for one in others)
 
 
-def _near(found: Decision, case: WrittenSet) -> bool:
+def _near(found: ReadingDecision, case: WrittenSet) -> bool:
     """Whether X is within the errors that the noise causes."""
     n, best = len(case.robot.p), found.best
     turn = Rotation.from_matrix(best.X[:3, :3].T @ case.X[:3, :3]).magnitude()

@@ -18,7 +18,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
 from weldcal.tools.studies.targets import Target, all_met
-from weldcal.tools.worlds.features import Change, World, WorldConfig, simulate
+from weldcal.tools.worlds.features import Change, FeatureWorld, WorldConfig, simulate
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
 WITHIN_S = 2.0
@@ -28,7 +28,7 @@ _CREEP_START_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class DriftTrial:
     """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was
     measured. ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames
     of the first WITHIN_S say of it to a test that knows the noise and all other errors exactly, in units of the test's
@@ -85,7 +85,7 @@ def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cas
 
 def _figures(results: Results) -> Figures:
     quiet = whole(results)["quiet"]
-    trials = [Trial(**_numbers(r)) for r in results.values() if r["kind"] != "quiet"]
+    trials = [DriftTrial(**_numbers(r)) for r in results.values() if r["kind"] != "quiet"]
     knocks = [t for t in trials if t.kind != "creep"]
     found = np.array([t.found_after_s for t in knocks])
     creeps = np.array([t.found_after_s for t in trials if t.kind == "creep"])
@@ -167,7 +167,7 @@ def benchmark_drift(
     return STUDY.outcome(call, cases(*size, stamps, call.seed))
 
 
-def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> Trial:
+def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> DriftTrial:
     """A recording of some 40 s with a knock of 0.2 mm, or 0.03 degrees, along or about a random axis."""
     rng = np.random.default_rng([seed, 3])
     axis = rng.standard_normal(3)
@@ -179,7 +179,7 @@ def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> Trial:
     return _trial("turn" if turn else "shift", seed, events, at, shift, rotation, float(abs(axis @ view)), *said)
 
 
-def creep_trial(world: WorldConfig, seed: int) -> Trial:
+def creep_trial(world: WorldConfig, seed: int) -> DriftTrial:
     """A recording with a creep of 0.02 mm/min in a random direction."""
     rng = np.random.default_rng([seed, 4])
     axis = rng.standard_normal(3)
@@ -222,20 +222,20 @@ def _watched(
     return test.events, np.asarray(w.X_BC.rotation().matrix()[:, 2]), _shown(w, test, change), told
 
 
-def expected_late(knocks: Sequence[Trial]) -> float:
+def expected_late(knocks: Sequence[DriftTrial]) -> float:
     """How many of the changes a test with three unknowns that is told their times does not find within WITHIN_S, by the
     noise alone."""
     threshold = DriftTest(RigidTransform(), np.eye(6), np.ones(3)).threshold_alone
     return float(sum(ncx2.cdf(threshold, 3, t.told * threshold) for t in knocks if np.isfinite(t.told)))
 
 
-def _moved(w: World, change: tuple[float, Array, Array]) -> Array:
+def _moved(w: FeatureWorld, change: tuple[float, Array, Array]) -> Array:
     """A change [rotation; translation] (6,) about the pivot."""
     _, shift, rotation = change
     return np.concatenate([rotation, shift + np.cross(rotation, w.pivot - np.asarray(w.X_BC.translation()))])
 
 
-def _within(w: World, at: float) -> NDArray[np.intp]:
+def _within(w: FeatureWorld, at: float) -> NDArray[np.intp]:
     """The frames of WITHIN_S after a time."""
     return np.flatnonzero((w.rows.times >= at) & (w.rows.times <= at + WITHIN_S))
 
@@ -246,7 +246,7 @@ def _without_clock(information: Array) -> Array:
     return np.asarray(N[:c, :c] - np.outer(N[:c, c], N[c, :c]) / N[c, c])
 
 
-def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> float:
+def _shown(w: FeatureWorld, test: DriftTest, change: tuple[float, Array, Array]) -> float:
     """The expected statistic of a pure shift or turn by the frames of WITHIN_S after it, over its threshold, where
     noise and all other errors are known exactly and the clock alone is not."""
     chosen = _within(w, change[0])
@@ -261,7 +261,7 @@ def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> flo
     return float(move @ _without_clock(N) @ move) / test.threshold_alone
 
 
-def _told(w: World, test: DriftTest, before: DriftFilter, change: tuple[float, Array, Array]) -> float:
+def _told(w: FeatureWorld, test: DriftTest, before: DriftFilter, change: tuple[float, Array, Array]) -> float:
     """The same, where all other errors are known as by the monitor's filter ``before`` the change, and its time
     exactly."""
     chosen = _within(w, change[0])
@@ -279,7 +279,7 @@ def _told(w: World, test: DriftTest, before: DriftFilter, change: tuple[float, A
     return 1.0 / (1.0 / known + 1.0 / float(move @ (move / floor))) / test.threshold_alone
 
 
-def found_by_angle(trials: Sequence[Trial]) -> list[dict[str, float]]:
+def found_by_angle(trials: Sequence[DriftTrial]) -> list[dict[str, float]]:
     """Of turns, by the angle between their axis and the line of sight: how many there were, the share found within
     WITHIN_S, and the median of what the frames show."""
     turns = [t for t in trials if t.kind == "turn"]
@@ -312,9 +312,9 @@ def _trial(
     view: float,
     shown: float,
     told: float,
-) -> Trial:
+) -> DriftTrial:
     early = sum(e.found_s < at for e in events)
-    missed = Trial(kind=kind, seed=seed, along_view=view, false_alarms=early, shown=shown, told=told)
+    missed = DriftTrial(kind=kind, seed=seed, along_view=view, false_alarms=early, shown=shown, told=told)
     for e in (e for e in events if e.found_s >= at):
         return replace(
             missed,

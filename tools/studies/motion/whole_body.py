@@ -10,7 +10,7 @@ import numpy as np
 
 from weldcal.calibration.data.motion_dataset import load_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.motion.drift.watch import Watched, watch
+from weldcal.calibration.motion.drift.watch import DriftHistory, watch
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.kinematics import load_arm
@@ -65,7 +65,7 @@ def run_whole_body(
         robot=options.robot,
         flange=world.flange.designation,
     )
-    found: dict[str, Watched] = {}
+    found: dict[str, DriftHistory] = {}
     with tempfile.TemporaryDirectory() as folder:
         data_folder = Path(folder) / "recording"
         write_motion_dataset(world, data_folder, Path(folder) / "truth.json", lambda s, f: tell(s, 0.5 * f))
@@ -102,7 +102,7 @@ def run_whole_body(
     return summary, targets
 
 
-def _row(w: Watched) -> dict[str, float]:
+def _row(w: DriftHistory) -> dict[str, float]:
     used = ~w.gross
     e = w.residuals[used]
     return {

@@ -17,7 +17,7 @@ from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.parts.planning import planning
 from weldcal.tools.studies.parts.registration import registration
-from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
 
 COLUMNS = (
@@ -39,7 +39,11 @@ MEAN_TARGET_MM, MAX_TARGET_MM = 0.10, 0.40
 
 
 def run_part_welds(
-    out: Path, names: Sequence[str] | None, seeds: range, trial: Trial | None = None, progress: Progress = no_progress
+    out: Path,
+    names: Sequence[str] | None,
+    seeds: range,
+    trial: PartTrial | None = None,
+    progress: Progress = no_progress,
 ) -> Mapping[str, object]:
     """Weld each part once per seed; parts.csv grows row by row.
 
@@ -53,7 +57,7 @@ def run_part_welds(
     if unknown:
         listed = f"choose from {', '.join(PARTS)}."
         raise InputError(f"There is no part '{unknown[0]}': {did_you_mean(unknown[0], PARTS, listed)}")
-    trial = trial or Trial()
+    trial = trial or PartTrial()
     rows: list[dict[str, object]] = []
     runs = [(name, seed) for name in chosen for seed in seeds]
     for k, (name, seed) in enumerate(runs):
@@ -118,7 +122,7 @@ def welds(
 ) -> Outcome:
     """Weld twelve parts in four joints in the simulated cell, each from its STEP file, and measure the torch's
     error."""
-    trial = Trial.of(located_by, seam_mm, refine, arm_mm)
+    trial = PartTrial.of(located_by, seam_mm, refine, arm_mm)
     folder = call.folder("benchmark", "part-welds")
     return Outcome(run_part_welds(folder, part, range(call.seed, call.seed + runs), trial, call.progress))
 

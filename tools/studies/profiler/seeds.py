@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
+from weldcal.calibration.profiler.arm_errors import DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.features.frustum import fit_frustum
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
@@ -240,14 +240,14 @@ DRAWS, BOSS_DRAWS = 300, 6
 def changed(e: SphereEstimate, x: Floats) -> SphereEstimate:
     """The estimate with all its unknowns (39,) moved."""
     assert e.tip is not None
-    errors = ArmErrors.of(x[15:])
+    errors = ProfilerArmErrors.of(x[15:])
     return replace(
         e,
         rotation=Rotation.from_rotvec(x[:3]).as_matrix() @ e.rotation,
         translation=e.translation + x[3:6],
         tip=e.tip + x[9:12],
         affine=e.affine + x[12:15],
-        arm_errors=ArmErrors(
+        arm_errors=ProfilerArmErrors(
             e.arm_errors.offsets + errors.offsets, e.arm_errors.sag + errors.sag, e.arm_errors.table + errors.table
         ),
     )

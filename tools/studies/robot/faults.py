@@ -21,7 +21,7 @@ from weldcal.tools.studies.robot.stream import TRANSPORT, one_transport, stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING
-from weldcal.tools.worlds.robot.fault_run import Outcome, run_case
+from weldcal.tools.worlds.robot.fault_run import FaultOutcome, run_case
 from weldcal.tools.worlds.robot.sequences import Sequence, run_sequence
 
 OUTCOME_COLUMNS = (
@@ -56,7 +56,7 @@ SEQUENCE_COLUMNS = (
 class FaultReport:
     """All outcomes and all sequences."""
 
-    outcomes: list[Outcome]
+    outcomes: list[FaultOutcome]
     sequences: list[Sequence]
 
     def summary(self) -> dict[str, object]:

@@ -28,7 +28,7 @@ from weldcal.tools.studies.weld.rows import (
     run_cases,
     run_turn,
 )
-from weldcal.tools.worlds.weld.case import Case, study_config
+from weldcal.tools.worlds.weld.case import WeldCase, study_config
 from weldcal.tools.worlds.weld.metrics import RunMetrics
 from weldcal.tools.worlds.weld.plant import COLUMNS, PHASES, StudyRun
 from weldcal.welding.record.process import path_error, speed_along
@@ -64,9 +64,9 @@ def run_study(
     rows = get_rows(names)
     wanted = [case for row in rows for case in row.cases]
     seeds = tuple(range(first, first + count))
-    pictured: dict[str, tuple[Case, StudyRun]] = {}
+    pictured: dict[str, tuple[WeldCase, StudyRun]] = {}
 
-    def keep(case: Case, seed: int, run: StudyRun, figures: RunMetrics) -> None:
+    def keep(case: WeldCase, seed: int, run: StudyRun, figures: RunMetrics) -> None:
         # One run of each seam is drawn: the first seed, ours, nominal, as far as there is one.
         if seed == first and case.law == "guarded" and case.seam not in pictured:
             pictured[case.seam] = (case, run)
@@ -79,7 +79,7 @@ def run_study(
         for k, (name, chord) in enumerate(pairs):
             progress(name, 0.7 + 0.05 * k / len(pairs))
             turns.append(run_turn(name, chord, first))
-    compared: dict[Case, CaseResult] = {}
+    compared: dict[WeldCase, CaseResult] = {}
     if everything or "laws" in names:
         few = seeds[: 1 if quick else COMPARED_SEEDS]
         compared = run_cases(COMPARED, few, keep, lambda name, share: progress(name, 0.75 + 0.25 * share), results)

@@ -42,7 +42,7 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class PartTrial:
     """How the parts lie and are found: deviations of the true part, and the source of its pose; and what is known of
     the arm.
 
@@ -60,7 +60,7 @@ class Trial:
     arm_mm: float = 0.4
 
     @classmethod
-    def of(cls, located_by: str, seam_mm: float | None = None, refine: str = PLAIN, arm_mm: float = 0.4) -> Trial:
+    def of(cls, located_by: str, seam_mm: float | None = None, refine: str = PLAIN, arm_mm: float = 0.4) -> PartTrial:
         """The trial by the source of the pose: a pose from the drawing must be nearer to the truth.
 
         Raises InputError: an unknown refinement.
@@ -97,7 +97,7 @@ class Trial:
         return known_camera(str(cell)) if self.refine == PLAIN else load_scenario(str(cell))
 
 
-def write_cell(part: MadePart, folder: Path, trial: Trial) -> Path:
+def write_cell(part: MadePart, folder: Path, trial: PartTrial) -> Path:
     """Write the part, its seam and a scenario that welds it; the scenario's path."""
     folder.mkdir(parents=True, exist_ok=True)
     part.write(folder)

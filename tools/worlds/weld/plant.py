@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.tools.worlds.weld.budgets import Budget, planned_seam, roughness
-from weldcal.tools.worlds.weld.groove import DROP_M, SEAT_M, Groove, Tip
+from weldcal.tools.worlds.weld.groove import DROP_M, SEAT_M, Groove, TipPlace
 from weldcal.tools.worlds.weld.seams import TrueSeam
-from weldcal.tools.worlds.weld.unknowns import World, draw_world
+from weldcal.tools.worlds.weld.unknowns import WeldUnknowns, draw_world
 from weldcal.welding.numerics import Array, norm
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.feel_start import with_touch_place
@@ -25,8 +25,7 @@ from weldcal.welding.servo.touch import touch_start_pose
 FRAME_PERIOD_S = 1.0 / 30.0
 COLUMNS = (
     "time_s", "phase", "torch_on", "torch_x", "torch_y", "torch_z", "robot_x", "robot_y", "robot_z", "tip_x", "tip_y",
-    "tip_z",
-    "v_x", "v_y", "v_z", "omega_rad_s", "n_d_dot_n_t", "delta_n_m", "delta_axial_m", "e_t_m", "s_torch_m", "s_tip_m",
+    "tip_z", "v_x", "v_y", "v_z", "omega_rad_s", "n_d_dot_n_t", "delta_n_m", "delta_axial_m", "e_t_m", "s_torch_m", "s_tip_m",
     "tip_speed_m_s", "ahead_x", "ahead_y", "ahead_z", "left_x", "left_y", "left_z",
 )  # fmt: skip
 PHASES = tuple(Phase)
@@ -36,7 +35,7 @@ _KEPT = 64  # poses: half a second
 class Stamps:
     """Stamps poses and pictures as a world does; the servo's clock is the stamp of the newest pose."""
 
-    def __init__(self, world: World, seed: int) -> None:
+    def __init__(self, world: WeldUnknowns, seed: int) -> None:
         self._world = world
         self._exact = not any((world.image_bias_s, world.image_jitter_s, world.pose_bias_s, world.pose_jitter_s))
         self._rng = np.random.default_rng((seed, 2))
@@ -163,7 +162,7 @@ def simulate(
     dt, p_TW = settings.period_s, settings.p_TW
     X_BT = touch_start_pose(plan, settings)
     R, p = np.array(X_BT.rotation().matrix()), np.array(X_BT.translation())
-    tip, state, V = Tip(p, groove), WeldingState(), np.zeros(6)
+    tip, state, V = TipPlace(p, groove), WeldingState(), np.zeros(6)
     yaw = RotationMatrix.MakeZRotation(budget.tag_yaw_rad).matrix() * budget.tag_gain
     bias = np.array((0.0, 0.0, budget.tag_bias_m))
     queue: list[DeflectionSample] = []
@@ -188,10 +187,8 @@ def simulate(
         d = command.diagnostics
         rows.append(
             (t, PHASES.index(command.phase), float(command.torch_on), *(p + R @ p_TW).tolist(), *p.tolist(),
-            *centre.tolist(),
-             *command.V_BT[3:].tolist(), d.omega, d.n_d_dot_n_t, d.delta_n, d.delta_axial, d.e_t, d.s_torch, d.s_tip,
-             d.tip_speed,
-             *R[:, 0].tolist(), *R[:, 1].tolist())
+             *centre.tolist(), *command.V_BT[3:].tolist(), d.omega, d.n_d_dot_n_t, d.delta_n, d.delta_axial, d.e_t, d.s_torch, d.s_tip,
+             d.tip_speed, *R[:, 0].tolist(), *R[:, 1].tolist())
         )  # fmt: skip
         stopped = stopped + 1 if command.phase in (Phase.DONE, Phase.FAULT) else 0
         if stopped > 30:

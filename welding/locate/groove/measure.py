@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from weldcal.welding.locate.groove.line import Corner, Line, round_corners, smoothing_weights, split_legs
+from weldcal.welding.locate.groove.line import Corner, SmoothLine, round_corners, smoothing_weights, split_legs
 from weldcal.welding.locate.groove.seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain, Profile
 from weldcal.welding.locate.groove.search import CoarseGroove
 from weldcal.welding.locate.groove.section import (
@@ -55,15 +55,15 @@ def measure_groove(
     fine = point_pitch(f[np.abs(f[:, 2]) < 0.003][:, :2])
     groove = replace(groove, pitch_m=fine) if fine < THINNED * groove.pitch_m else groove
     pitch, sigma = groove.pitch_m, groove.sigma_m
-    line = Line(groove.line_Q).even()
+    line = SmoothLine(groove.line_Q).even()
     if groove.closed:
-        line = Line(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
+        line = SmoothLine(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
     else:
         # The farthest cells of an opening are its corners: the ends of the coarse line lead there, not along the
         # groove.
         trim = min(groove.width_m, 0.25 * line.length)
         inner = (line.s >= trim) & (line.s <= line.length - trim)
-        line = Line(line.points[inner]).extended(trim + 0.006, trim + 0.006)
+        line = SmoothLine(line.points[inner]).extended(trim + 0.006, trim + 0.006)
     first_profile = measured_profile(f, line, groove, config)
     half_slice = max(0.0015, 1.5 * pitch, 0.003 * min(1.0, sigma / 0.0008))
     wide: list[Floats] = []
@@ -81,17 +81,17 @@ def measure_groove(
 
 def _traced(
     f: Floats,
-    line: Line,
+    line: SmoothLine,
     profile: Profile,
     groove: CoarseGroove,
     half_slice: float,
     config: GrooveConfig,
     wide: list[Floats],
-) -> tuple[Line, list[Corner], Profile]:
+) -> tuple[SmoothLine, list[Corner], Profile]:
     """Move the coarse line onto the groove in legs between its corners; the joined line, the corners and the common
     profile."""
     pitch, sigma = groove.pitch_m, groove.sigma_m
-    lines: list[Line] = [line]
+    lines: list[SmoothLine] = [line]
     corners: list[Corner] = []
     for step in range(4):
         lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
@@ -114,7 +114,7 @@ def _traced(
 def _finish(
     f: Floats,
     around: Floats,
-    line: Line,
+    line: SmoothLine,
     slices: Slices,
     corners: list[Corner],
     groove: CoarseGroove,
@@ -283,7 +283,7 @@ def _close(line: Floats, over: int = 8) -> None:
 
 
 def seen_extent(
-    f: Floats, line: Line, profile: Profile, slices: Slices, groove: CoarseGroove
+    f: Floats, line: SmoothLine, profile: Profile, slices: Slices, groove: CoarseGroove
 ) -> tuple[float, float, list[tuple[float, float]]]:
     """Arc lengths where the groove begins and ends, and the gaps in between that were not seen."""
     half_width = profile.depth / min(profile.slopes)
@@ -311,7 +311,7 @@ def seen_extent(
 
 
 def ends_at_edges(
-    f: Floats, ends: tuple[float, float], line: Line, profile: Profile, reach_m: float
+    f: Floats, ends: tuple[float, float], line: SmoothLine, profile: Profile, reach_m: float
 ) -> tuple[bool, bool]:
     """Whether lower ground is seen within `reach_m` beyond each end, so that the plate ends there and not only the
     view."""
@@ -329,7 +329,7 @@ def ends_at_edges(
     return seen[0], seen[1]
 
 
-def refuse_gap(f: Floats, line: Line, slices: Slices, profile: Profile, steepest_rad: float) -> None:
+def refuse_gap(f: Floats, line: SmoothLine, slices: Slices, profile: Profile, steepest_rad: float) -> None:
     """Raise GrooveNotFound for a flat floor (as deep half-way to the shoulders as in the middle) or vertical walls."""
     if max(profile.slopes) > math.tan(steepest_rad):
         raise GrooveNotFound(

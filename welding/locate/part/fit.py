@@ -55,7 +55,7 @@ class Equations:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class PartFit:
     """A pose with its covariance (6,6), of the motion in P; rms_m of the surface."""
 
     X_BP: RigidTransform
@@ -256,7 +256,7 @@ def coarse_fit(
     return X
 
 
-def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> Fit | None:
+def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> PartFit | None:
     """Fit surface and rims from a pose good to the gate, with its covariance; None where too few points are near."""
     pitch, gate = scan.pitch_m, max(FINE_GATE_M, FINE_GATE * model.radius)
     middle, around = X.multiply(model.center), model.radius + 0.02
@@ -295,7 +295,7 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> Fit | N
             if math.hypot(model.radius * float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))) < STILL_M:
                 break
     assert surface is not None
-    return Fit(
+    return PartFit(
         X,
         covariance(surface, rims, sigma, pitch),
         float(np.sqrt(np.mean(np.square(surface.residual[np.abs(surface.residual) < max(4.0 * sigma, 0.0004)])))),

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.mesh import TriMesh
 from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near, views_off
-from weldcal.welding.locate.part.fit import Fit, coarse_fit, fine_fit
+from weldcal.welding.locate.part.fit import PartFit, coarse_fit, fine_fit
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.result import AmbiguousPart, PartConfig, PartNotFound, PartRegistration
 from weldcal.welding.locate.part.rivals import (
@@ -52,7 +52,7 @@ ELSEWHERE = 0.85  # of the best score: a rival at another place with less is wor
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    fit: Fit
+    fit: PartFit
     agreement: Agreement
 
     @property

@@ -63,7 +63,7 @@ class Component:
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
+class CopiedFrame:
     """A frame: components copied out of the buffer, its number, its stamp (s of the device's clock; None: it has
     none)."""
 
@@ -112,7 +112,7 @@ class GenicamDevice:
             self.close()
             raise
 
-    def take(self, timeout_s: float) -> Taken | None:
+    def take(self, timeout_s: float) -> CopiedFrame | None:
         """The oldest frame that waits; None where none came in time.
 
         Raises DeviceLost, and Garbage for an empty one.
@@ -136,7 +136,7 @@ class GenicamDevice:
             buffer.queue()
         if not parts:
             raise Garbage("it sent a frame without components")
-        return Taken(tuple(parts), number, stamp, arrived)
+        return CopiedFrame(tuple(parts), number, stamp, arrived)
 
     def execute(self, command: str) -> None:
         """Run a command of the device. Raises DeviceLost."""

@@ -6,7 +6,7 @@ from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.components import get_profile, picture_of
 from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
-from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_camera
 from weldcal.systems.drivers.sensors.wired_camera import (
     Picture,
@@ -36,7 +36,7 @@ class GenicamFingerCamera(WiredFingerCamera):
     def source(self) -> Source[Picture]:
         """The device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamPictures(self)  # the keys are checked here, not in the process
-        return OwnProcess(self.title, GenicamPictures, self)
+        return SourceProcess(self.title, GenicamPictures, self)
 
 
 class GenicamPictures(GenicamSource[Picture]):

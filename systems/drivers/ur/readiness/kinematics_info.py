@@ -16,7 +16,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.systems.drivers.ur.faults import RobotRefused
 from weldcal.systems.drivers.ur.readiness import operator_actions as actions
-from weldcal.systems.drivers.ur.wire.line import Line
+from weldcal.systems.drivers.ur.wire.line import SocketLine
 
 PRIMARY_PORT = 30001
 # With the right calibration FK agrees with the controller to 10-20 um; without it, to millimetres.
@@ -75,7 +75,7 @@ def read_kinematics(
         RobotUnreachable: nothing answers in time, or what answers is not the primary interface.
         RobotRefused: the controller does not report its arm yet, because the arm has no power.
     """
-    with Line(host, port, "Primary Client Interface", timeout_s) as line:
+    with SocketLine(host, port, "Primary Client Interface", timeout_s) as line:
         until = line.deadline()
         while True:
             size, kind = _HEADER.unpack(line.read(_HEADER.size, until))
@@ -88,7 +88,7 @@ def read_kinematics(
                 return _parse(body), _limits(_part(package, _CONFIGURATION, line))
 
 
-def _part(package: bytes, wanted: int, line: Line) -> bytes | None:
+def _part(package: bytes, wanted: int, line: SocketLine) -> bytes | None:
     """The body of one sub-package of a robot state; None where the state does not contain it."""
     at = 0
     while at + _PART.size <= len(package):

@@ -9,7 +9,7 @@ from typing import Protocol
 from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET
 from weldcal.systems.drivers.ur.torch.set_points import ANALOG, MASK, VALUE, Level, OffSwitch
 from weldcal.systems.drivers.ur.wire.dashboard import SCRIPT_PORT
-from weldcal.systems.drivers.ur.wire.line import Line
+from weldcal.systems.drivers.ur.wire.line import SocketLine
 from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, RtdeProbe
 from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream
 
@@ -88,7 +88,7 @@ class NativeTransport(RtdeStream):
 
     def upload(self, script: str, started: Callable[[], bool], until: float) -> bool:
         """See Transport."""
-        with Line(self._host, SCRIPT_PORT, "Script", LINE_LIMIT_S) as line:
+        with SocketLine(self._host, SCRIPT_PORT, "Script", LINE_LIMIT_S) as line:
             line.send(script.encode())
             # the connection stays open until the program runs: to close one with unread data would reset it
             while time.monotonic() < until:

@@ -119,7 +119,7 @@ def _axes(task: Task, p: Array, v: Array) -> Array:
 
 
 @dataclass
-class Surroundings:
+class ElasticContact:
     """An elastic half-space and a hand; wrenches are [f; t] on the tool centre point in base axes (N, N m)."""
 
     point: Array = field(default_factory=lambda: np.zeros(3))

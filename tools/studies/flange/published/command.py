@@ -21,7 +21,7 @@ from weldcal.tools.studies.flange.published.pairs import (
     study_pairs,
 )
 from weldcal.tools.studies.flange.published.report import COST_HEADER, cost_rows, pictures, tables
-from weldcal.tools.studies.flange.published.results import Found
+from weldcal.tools.studies.flange.published.results import PublishedResults
 from weldcal.tools.studies.flange.published.simulation import simulate
 from weldcal.tools.studies.flange.published.sphere import run_sphere_study, sphere_rows
 from weldcal.tools.studies.harness import Study
@@ -35,7 +35,7 @@ _LEAST_CLOUDS = 10
 _USUAL_CLOUDS = 18  # more scans make each run of Algorithm 1 longer: fewer runs then, and the same time
 
 
-def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> Found:
+def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> PublishedResults:
     """Everything, or the simulated parts where no folder of datasets is given.
 
     Raises:
@@ -81,7 +81,7 @@ def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> Fo
                 progress=lambda what, done, a=begin, b=width: progress(what, a + b * done),  # type: ignore[misc]
             )
             clouds.append(outcome)
-    return Found(
+    return PublishedResults(
         simulation=simulation, pairs=tuple(pairs), clouds=tuple(clouds), kinect=tuple(kinect), notes=tuple(notes)
     )
 
