@@ -25,8 +25,8 @@ from weldcal.welding.servo.touch import touch_start_pose
 FRAME_PERIOD_S = 1.0 / 30.0
 COLUMNS = (
     "time_s", "phase", "torch_on", "torch_x", "torch_y", "torch_z", "robot_x", "robot_y", "robot_z", "tip_x", "tip_y",
-    "tip_z", "v_x", "v_y", "v_z", "omega_rad_s", "n_d_dot_n_t", "delta_n_m", "delta_axial_m", "e_t_m", "s_torch_m", "s_tip_m",
-    "tip_speed_m_s", "ahead_x", "ahead_y", "ahead_z", "left_x", "left_y", "left_z",
+    "tip_z", "v_x", "v_y", "v_z", "omega_rad_s", "n_d_dot_n_t", "delta_n_m", "delta_axial_m", "e_t_m", "s_torch_m",
+    "s_tip_m", "tip_speed_m_s", "ahead_x", "ahead_y", "ahead_z", "left_x", "left_y", "left_z",
 )  # fmt: skip
 PHASES = tuple(Phase)
 _KEPT = 64  # poses: half a second
@@ -187,8 +187,8 @@ def simulate(
         d = command.diagnostics
         rows.append(
             (t, PHASES.index(command.phase), float(command.torch_on), *(p + R @ p_TW).tolist(), *p.tolist(),
-             *centre.tolist(), *command.V_BT[3:].tolist(), d.omega, d.n_d_dot_n_t, d.delta_n, d.delta_axial, d.e_t, d.s_torch, d.s_tip,
-             d.tip_speed, *R[:, 0].tolist(), *R[:, 1].tolist())
+             *centre.tolist(), *command.V_BT[3:].tolist(), d.omega, d.n_d_dot_n_t, d.delta_n, d.delta_axial, d.e_t,
+             d.s_torch, d.s_tip, d.tip_speed, *R[:, 0].tolist(), *R[:, 1].tolist())
         )  # fmt: skip
         stopped = stopped + 1 if command.phase in (Phase.DONE, Phase.FAULT) else 0
         if stopped > 30:
