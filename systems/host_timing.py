@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.pacing import real_time_priority
 
-TICK_S = 0.002
-MEASURED_S = 0.5
-LATE_MS = 4.0
+TICK_S = 0.002  # one frame of an e-Series controller, 500 Hz
+MEASURED_S = 0.5  # a choice: 250 wake-ups, of which MOST_LATE_PERCENT are 25; half of it lets one burst decide
+LATE_MS = 4.0  # as wall_clock.ON_TIME_MS: a later velocity is replaced by the next one
 # A computer that is busy beside has some late wake-ups, for which the path is slowed. With one in ten the arm would
 # hardly move, and the guard on the controller stops an arm that gets no number for 150 ms.
 MOST_LATE_PERCENT = 10.0
-LONGEST_MS = 100.0
+LONGEST_MS = 100.0  # two thirds of the 150 ms after which the guard stops the arm
 TRIES = 3  # a single long pause, as of a disk, says nothing about the run
 
 

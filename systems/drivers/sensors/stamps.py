@@ -7,12 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 KEPT = 4096  # pairs of host and Diagram time: 32 s at 125 Hz
+# a choice: 15 frames at 30 Hz, of which the earliest is rarely late; twice of it doubles the time to a drift
 BIN_S = 0.5
 BINS = 120
 DRIFT_LIMIT = 5e-4  # the drift of two quartz clocks is below 1e-4
 BINS_FOR_DRIFT = 8
 SET_S = 0.02  # by which the host's clock is set and not only disciplined, between two frames
-SET_KEPT_S = 10.0
+SET_KEPT_S = 10.0  # a choice: longer than a frame is under way; half of it suits frames that are at most 5 s late
 READINGS, QUICK_S = 5, 1e-4  # of two clocks one after the other, between which this process may have to wait
 RELEARN_S = 3.0  # frames that stay late for so long belong to another offset: the device's clock was set back
 

@@ -13,7 +13,7 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import UrStatus
 
-PERIOD_S = 0.008
+PERIOD_S = 0.008  # two periods of the commands: a tenth of the shortest time after which a device is silent
 STOOD_S = 0.1  # a longer time between two looks: the Diagram computed, with the arm at rest
 
 

@@ -24,7 +24,7 @@ from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Image
 
 Picture = NDArray[np.uint8]
-PERIOD_S = 0.004
+PERIOD_S = 0.004  # the period of the robot's commands; a picture is delayed by at most this
 
 
 @dc.dataclass(kw_only=True)

@@ -15,8 +15,8 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import ProfileScan
 
 Profile = NDArray[np.float64]
-PERIOD_S = 0.008
-FAR = 1.5
+PERIOD_S = 0.008  # two periods of the commands: a profile is delayed by at most this
+FAR = 1.5  # a choice: allows a mount that is half farther off than planned; a wrong unit is a factor of 10 or more
 FEWEST_POINTS = 10
 
 

@@ -16,7 +16,7 @@ SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7
 RUNNING = 7
 STOPPING, STOPPED, PLAYING, PAUSING, PAUSED = range(5)
 MODES = range(-1, 100)  # of robot, safety and program; PolyScope has some fifteen of each, from -1 on
-POSE_M = 5e-5
+POSE_M = 5e-5  # what the pre-flight demands at rest (docs/hardware.md, flange pose)
 # states that the guard script writes into its output register
 OBEYING, STALE_REGISTER = 1, 2
 MADE_UP_FOR_S = 0.03  # of the cell's time

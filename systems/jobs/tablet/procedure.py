@@ -13,7 +13,7 @@ from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
 from weldcal.systems.messages import Message
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
-PICTURE_TIMEOUT_S = 8.0
+PICTURE_TIMEOUT_S = 8.0  # a choice: a busy computer renders a picture in seconds; twice as much only delays the report
 # added to a descent's longest time, so that a touch at its end can still be reported
 LATE_TOUCH_S = 0.2
 

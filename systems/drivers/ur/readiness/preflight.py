@@ -70,11 +70,11 @@ WAITS_FOR = {
 
 
 RUNNING, NORMAL, REDUCED, STOPPED = 7, 1, 2, 1
-FULL_SPEED = 0.99
-TCP_ZERO = 1e-6
+FULL_SPEED = 0.99  # a choice: full but for rounding; a slider at 98 % is reported
+TCP_ZERO = 1e-6  # m or rad: rounding; a pendant sets steps of 0.01 mm
 LOCAL = "LOCAL"
 LIMIT_MARGIN_RAD = float(np.deg2rad(5.0))
-REST_RAD_S = 0.005
+REST_RAD_S = 0.005  # a choice: 0.3 deg/s; a jogged arm turns at some deg/s, and twice as much would still find it
 
 CHECKS = (
     "answer",

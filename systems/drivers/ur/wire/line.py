@@ -11,7 +11,7 @@ from types import TracebackType
 from weldcal.systems.addresses import controller_address
 from weldcal.systems.drivers.ur.faults import RobotUnreachable
 
-RELEASE_WAIT_S = 0.3
+RELEASE_WAIT_S = 0.3  # a choice: a controller closes in some frames; one that does not delays every command by this
 
 
 class SocketLine:

@@ -16,8 +16,8 @@ from weldcal.systems.drivers.ur.wire.line import SocketLine
 
 RTDE_PORT = 30004
 IN_USE, NOT_FOUND = "IN_USE", "NOT_FOUND"
-FREQUENCY_HZ = 125.0
-SLOWEST_HZ = 1.0
+FREQUENCY_HZ = 125.0  # the rate of CB3, which every controller has; values are read once
+SLOWEST_HZ = 1.0  # a choice: the slowest whole rate; nothing reads these packages
 PROTOCOL_VERSION = 2
 MAX_NAMES_BYTES = 2048
 
