@@ -15,10 +15,16 @@ from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.drivers.simulated.second_arm import FIRST
-from weldcal.systems.host_timing import HostTiming, measure_host, require_timely_host
 from weldcal.systems.interrupts import SIGTERM, deferred
 from weldcal.systems.messages import JobCommand, Scan
-from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
+from weldcal.systems.pacing import (
+    HostTiming,
+    measure_host,
+    no_long_garbage_collections,
+    real_time_priority,
+    require_timely_host,
+    short_turns,
+)
 from weldcal.systems.person import KEYS
 from weldcal.systems.wall_clock import PictureWait, WallClock
 

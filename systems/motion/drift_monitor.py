@@ -20,7 +20,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, believed_arm
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 
 SEARCHED_S = 0.3  # by which a frame may come later or earlier than usual
 _APART_S = 0.5  # a frame that is this early is of a clock that was set anew; one this late may be late

@@ -13,8 +13,8 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, UrStatus
+from weldcal.systems.motion.buffers import PoseRecorder
 from weldcal.systems.motion.flange_mover import FlangeMover
-from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.person import FASTEST, Person
 from weldcal.systems.viewer.kept import keep
 from weldcal.systems.wiring import Wiring

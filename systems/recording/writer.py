@@ -20,9 +20,8 @@ from pydrake.math import RigidTransform
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.messages import CalibrationStatus, Image, Scan
-from weldcal.systems.recording.cdr import IMAGE, POINT_CLOUD, SCHEMAS, write_cloud, write_image
 from weldcal.systems.recording.port_recorder import BEFORE, BOTH, ENTERED, LEFT, PERIOD_S, STAGES, UPDATED
-from weldcal.systems.recording.values import encode
+from weldcal.systems.recording.values import IMAGE, POINT_CLOUD, SCHEMAS, encode, write_cloud, write_image
 
 _Row = tuple[int, np.ndarray]  # key, values
 

@@ -16,9 +16,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.models.workpieces.reading import LARGEST_SIZE_M
 from weldcal.systems.drivers.config import NoDevice
-from weldcal.systems.jobs.discovery import job_of, jobs
+from weldcal.systems.jobs.job import job_of, jobs
+from weldcal.systems.scenario.parts import check_workpiece
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
-from weldcal.systems.scenario.workpiece import check_workpiece
 from weldcal.welding.servo.laws import get_law
 
 POSITIVE = {

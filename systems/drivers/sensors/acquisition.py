@@ -13,8 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
-from weldcal.systems.drivers.sensors.cell_time import CellTime, HostTime
-from weldcal.systems.drivers.sensors.stamps import DeviceClock, Stamp, UnixClock
+from weldcal.systems.drivers.sensors.stamps import CellTime, DeviceClock, HostTime, Stamp, UnixClock
 
 Datum = TypeVar("Datum")
 POLL_S = 0.02  # longest time that a source is waited for before requests are looked at

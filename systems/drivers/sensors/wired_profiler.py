@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.cell_time import cell_time
-from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
-from weldcal.systems.drivers.sensors.watch import watch
+from weldcal.systems.drivers.sensors.stamps import cell_time
+from weldcal.systems.drivers.sensors.watch import OnTrigger, watch
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import ProfileScan

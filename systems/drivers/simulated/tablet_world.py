@@ -36,7 +36,6 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context, State
 
-from weldcal.systems.bodies.textured_board import textured_board
 from weldcal.systems.bodies.tool import DARK, STEEL
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
@@ -45,6 +44,7 @@ from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.tablet.config import TabletConfig, TabletTouch, TabletTruth
 from weldcal.systems.leaf_system import LeafSystem
+from weldcal.systems.viewer.scene import textured_board
 
 GLASS, NIB = "tablet_glass", "pen_nib"  # names of the two contact geometries
 

@@ -24,7 +24,7 @@ from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
-from weldcal.systems.drivers.ur.wire.dashboard import stop_program
+from weldcal.systems.drivers.ur.wire.line import stop_program
 from weldcal.systems.drivers.ur.worker import WorkerConfig, WorkerPhase
 from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus

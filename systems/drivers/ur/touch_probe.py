@@ -12,8 +12,8 @@ from pydrake.systems.framework import Context, DiscreteValues
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig
-from weldcal.systems.drivers.sensors.cell_time import CellTime, cell_time
 from weldcal.systems.drivers.sensors.preflight import Sensed
+from weldcal.systems.drivers.sensors.stamps import CellTime, cell_time
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.drivers.ur.faults import Fault, reported_as, sentence

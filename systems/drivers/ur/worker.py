@@ -18,7 +18,6 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur.precedence import take_priority
 from weldcal.systems.drivers.ur.robot import ControllerStream, Refused
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import (
@@ -33,6 +32,7 @@ from weldcal.systems.drivers.ur.supervisor import (
 )
 from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas, Level, SetPoints, apart
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
+from weldcal.systems.pacing import take_priority
 
 FRESH_S = 0.012  # of robot time; three periods of the commands
 ZERO_S = 0.050  # as Limits.late_s: the arm is at rest before the silence is a fault

@@ -33,9 +33,9 @@ from weldcal.systems.jobs.weld.settings import (
 )
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
+from weldcal.systems.motion.buffers import FrameQueue
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
-from weldcal.systems.motion.frame_queue import FrameQueue
-from weldcal.systems.motion.singularity_guard import SingularityGuard
+from weldcal.systems.motion.guarded_path import SingularityGuard
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario

@@ -33,9 +33,19 @@ from weldcal.systems.drivers.ur.readiness.load import (
     mounting_finding,
     payload_finding,
 )
-from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, SET_POINTS, UPPER_OFFSET, ranges, register_names
-from weldcal.systems.drivers.ur.wire.dashboard import ask
-from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
+from weldcal.systems.drivers.ur.wire.line import ask
+from weldcal.systems.drivers.ur.wire.rtde_client import (
+    DOUBLES,
+    IN_USE,
+    NOT_FOUND,
+    RTDE_PORT,
+    SET_POINTS,
+    UPPER_OFFSET,
+    RtdeProbe,
+    Value,
+    ranges,
+    register_names,
+)
 
 POLYSCOPE_X = 10
 OLDEST_5, OLDEST_X = (5, 12), (10, 10)
