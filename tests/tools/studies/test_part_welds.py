@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -15,10 +16,11 @@ from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam, Refinement
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.report.demo import DemoResult
-from weldcal.tools.studies.parts.welds import run_part_welds
+from weldcal.tools.report.demo import DemoResult, seam_document
+from weldcal.tools.studies.parts.welds import COLUMNS, run_part_welds
 from weldcal.tools.worlds.parts.cells import Trial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
+from weldcal.welding.record.process import PathError
 
 
 def test_a_refined_cell_calibrates_scanner_and_arm_before_it_welds(tmp_path: Path) -> None:
@@ -72,3 +74,15 @@ def test_an_unknown_refinement_is_refused_before_anything_is_written(tmp_path: P
     assert found.exit_code == 1
     assert "--refine must be none, joints or links, not 'all'." in " ".join(found.output.split())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_seams_figures_name_its_ends() -> None:
+    """3-4-5 at the start, 5-12-13 at the end, 0.1 mm between."""
+    s = np.arange(0.0, 0.051, 0.001)
+    lateral, height = np.full(len(s), 1e-4), np.zeros(len(s))
+    lateral[2], height[2], lateral[-3], height[-3] = 3e-4, 4e-4, -5e-5, 1.2e-4
+    found = seam_document(PathError(s, lateral, height))
+    ends = {"torch_first_max_mm": 0.5, "torch_last_max_mm": 0.13, "torch_middle_max_mm": 0.1}
+    assert {key: found[key] for key in ends} == pytest.approx(ends)
+    assert found["torch_max_mm"] == pytest.approx(0.5)
+    assert set(ends) - {"torch_middle_max_mm"} <= set(COLUMNS)

@@ -21,8 +21,8 @@ from weldcal.tools.worlds.parts.cells import Trial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
 
 COLUMNS = (
-    "part", "joint", "seed", "state", "torch_mean_mm", "torch_max_mm", "plan_mean_mm", "plan_max_mm", "welded_mm", "refined",
-    "plan_arm_sigma_mm", "plan_arm_turn_deg", "reason",
+    "part", "joint", "seed", "state", "torch_mean_mm", "torch_max_mm", "torch_first_max_mm", "torch_last_max_mm",
+    "plan_mean_mm", "plan_max_mm", "welded_mm", "refined", "plan_arm_sigma_mm", "plan_arm_turn_deg", "reason",
 )  # fmt: skip
 MEAN_TARGET_MM, MAX_TARGET_MM = 0.10, 0.40
 
@@ -79,13 +79,18 @@ def _summed(rows: list[dict[str, object]]) -> dict[str, object]:
         and of(row, "torch_max_mm") <= MAX_TARGET_MM
         for row in rows
     ]
-    means, most = ([of(row, key) for row in rows] for key in ("torch_mean_mm", "torch_max_mm"))
+
+    def worst(*keys: str) -> float | None:
+        values = [of(row, key) for row in rows for key in keys]
+        return float(np.nanmax(values)) if np.isfinite(values).any() else None
+
     return {
         "state": "done" if all(row["state"] == "done" for row in rows) else "held",
         "welds": len(rows),
         "within_targets": int(sum(good)),
-        "worst_torch_mean_mm": float(np.nanmax(means)) if np.isfinite(means).any() else None,
-        "worst_torch_max_mm": float(np.nanmax(most)) if np.isfinite(most).any() else None,
+        "worst_torch_mean_mm": worst("torch_mean_mm"),
+        "worst_torch_max_mm": worst("torch_max_mm"),
+        "worst_ends_mm": worst("torch_first_max_mm", "torch_last_max_mm"),
         "parts": [{key: row.get(key) for key in COLUMNS if key in row} for row in rows],
     }
 
