@@ -17,7 +17,7 @@ from weldcal.systems.messages import CalibrationStatus, PlannedSeam, Refinement
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.report.demo import DemoResult, seam_document
-from weldcal.tools.studies.parts.welds import COLUMNS, run_part_welds
+from weldcal.tools.studies.parts.welds import COLUMNS, _summed, run_part_welds
 from weldcal.tools.worlds.parts.cells import Trial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.record.process import PathError
@@ -86,3 +86,19 @@ def test_a_seams_figures_name_its_ends() -> None:
     assert {key: found[key] for key in ends} == pytest.approx(ends)
     assert found["torch_max_mm"] == pytest.approx(0.5)
     assert set(ends) - {"torch_middle_max_mm"} <= set(COLUMNS)
+
+
+def test_the_worst_end_of_all_welds_is_given() -> None:
+    """Of three welds: one good, one with a bad last stretch, one that was held before the arc."""
+    good = {
+        "state": "done",
+        "torch_mean_mm": 0.05,
+        "torch_max_mm": 0.12,
+        "torch_first_max_mm": 0.12,
+        "torch_last_max_mm": 0.03,
+    }
+    bad = {**good, "torch_last_max_mm": 0.45, "torch_max_mm": 0.45}
+    found = _summed([good, bad, {"state": "held", "reason": "no room"}])
+    assert (found["state"], found["welds"], found["within_targets"]) == ("held", 3, 1)
+    assert (found["worst_ends_mm"], found["worst_torch_max_mm"], found["worst_torch_mean_mm"]) == (0.45, 0.45, 0.05)
+    assert _summed([{"state": "held"}])["worst_ends_mm"] is None
