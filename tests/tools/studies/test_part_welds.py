@@ -13,8 +13,12 @@ from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
+from weldcal.systems.jobs.weld.job import seam_planning
+from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
+from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam, Refinement
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
 from weldcal.tools.report.demo import DemoResult, seam_document
 from weldcal.tools.studies.parts.welds import COLUMNS, _summed, run_part_welds
@@ -102,3 +106,13 @@ def test_the_worst_end_of_all_welds_is_given() -> None:
     assert (found["state"], found["welds"], found["within_targets"]) == ("held", 3, 1)
     assert (found["worst_ends_mm"], found["worst_torch_max_mm"], found["worst_torch_mean_mm"]) == (0.45, 0.45, 0.05)
     assert _summed([{"state": "held"}])["worst_ends_mm"] is None
+
+
+def test_the_arm_of_the_cell_follows_the_bent_web_without_meeting_itself(tmp_path: Path) -> None:
+    """On the branch of home the tool's ring would meet the forearm at its end."""
+    scenario = load_scenario(str(write_cell(PARTS["curved_web"](), tmp_path, Trial())))
+    station = make_station(scenario, 0)
+    try:
+        assert plan_drawn_seam(seam_planning(scenario, station, servo_config(scenario, station)), 1).reason is None
+    finally:
+        station.close()
