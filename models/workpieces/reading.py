@@ -23,7 +23,8 @@ def read_shape(path: Path, units: str | None = None) -> PartShape:
         units: mm, m or inch. A STEP file states its own, which must agree; a mesh has none, and without this it is mm.
 
     Raises:
-        InputError: a file that is missing, empty, malformed or no solid; an unknown unit; a size that no weld cell holds.
+        InputError: a file that is missing, empty, malformed or no solid; an unknown unit; a size that no weld cell
+            holds.
     """
     if units is not None and units not in UNITS_M:
         raise InputError(f"units must be {', '.join(UNITS_M)}, not '{units}'.")
@@ -38,7 +39,8 @@ def _stamp(file: Path) -> tuple[Path, int, int]:
 
 @lru_cache(maxsize=1)
 def _read(path: Path, units: str | None, written: tuple[tuple[Path, int, int], ...]) -> PartShape:
-    """Read a part once while its files, with their times and sizes, stay as they are: each seam that is planned asks for it."""
+    """Read a part once while its files, with their times and sizes, stay as they are: each seam that is planned asks
+    for it."""
     suffix = path.suffix.lower()
     if suffix in STEP_SUFFIXES:
         shape = read_step(path, units)

@@ -114,7 +114,7 @@ class PathError:
         return np.hypot(self.lateral, self.height)
 
     def ends_m(self, length_m: float = END_M) -> tuple[float, float, float]:
-        """Largest distance in space over the first and the last stretch of a length, and between them, m; NaN without samples."""
+        """Largest distance in space over the first and the last stretch, and between them, m; NaN without samples."""
         first, last = self.s <= self.s[0] + length_m, self.s >= self.s[-1] - length_m
         most = (np.max(self.distance_m, where=part, initial=-np.inf) for part in (first, last, ~(first | last)))
         first_m, last_m, between_m = (float(v) if v >= 0.0 else math.nan for v in most)

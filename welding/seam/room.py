@@ -37,7 +37,8 @@ WIRE_M = 0.001  # radius of the wire with its play
 
 
 class NoRoom(WeldcalError):
-    """The tool's body would touch the part while the tip is in the joint; `short_m`: by how much its clearance is too small."""
+    """The tool's body would touch the part while the tip is in the joint; `short_m`: by how much its clearance is too
+    small."""
 
     def __init__(self, sentence: str, short_m: float) -> None:
         super().__init__(sentence)
@@ -55,8 +56,8 @@ def check_room(
 ) -> None:
     """Check the distance between the tool's capsules (in the flange frame) and the part's surface along the seam.
 
-    The tool stands as the servo holds it: its axis along the mean of the bisectors at tip and torch, and leaning from it across the chord by
-    `lean_rad`.
+    The tool stands as the servo holds it: its axis along the mean of the bisectors at tip and torch, and leaning from
+    it across the chord by `lean_rad`.
 
     Raises:
         NoRoom: less than 1 mm, with the place.
@@ -72,8 +73,9 @@ def check_room(
             near = float(_distances(points_T, a, b).min()) - radius
             if near < CLEARANCE_M:
                 raise NoRoom(
-                    f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body would come within "
-                    f"{1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer finger or weld the joint from elsewhere.",
+                    f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body"
+                    f" would come within {1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer"
+                    " finger or weld the joint from elsewhere.",
                     CLEARANCE_M - near,
                 )
 
@@ -89,10 +91,12 @@ def check_beside(
     stops: list[float] | None = None,
     from_m: float = 0.0,
 ) -> None:
-    """Check that nothing that a scan (N,3) shows and the drawing does not, as a clamp or a tack, is in the way of the tool.
+    """Check that nothing that a scan (N,3) shows and the drawing does not, as a clamp or a tack, is in the way of the
+    tool.
 
-    Tip, finger, torch and the tool's body along the seam from `from_m` on, and lifted off at both of its ends; below `table_z_m` it is the
-    table. Where `stops` is given, the places of the tip at which something is in the way are added to it instead.
+    Tip, finger, torch and the tool's body along the seam from `from_m` on, and lifted off at both of its ends; below
+    `table_z_m` it is the table. Where `stops` is given, the places of the tip at which something is in the way are
+    added to it instead.
 
     Raises:
         NoRoom: with the place.
@@ -132,7 +136,10 @@ def check_beside(
                 stops.append(s)
             elif len(met) and len(both) >= least:
                 x, y, z = np.median(other[both], axis=0)
-                there = f"near ({1e3 * x:.0f}, {1e3 * y:.0f}, {1e3 * z:.0f}) mm in the base, at {1e3 * s:.0f} mm of the seam"
+                there = (
+                    f"near ({1e3 * x:.0f}, {1e3 * y:.0f}, {1e3 * z:.0f}) mm in the base, at {1e3 * s:.0f} mm of the"
+                    " seam"
+                )
                 if z < table_z_m + OTHER_M:
                     what, change = f"The tool would touch the table {there}", "raise the part"
                 else:
@@ -143,10 +150,11 @@ def check_beside(
 def clear_pieces(
     seam: SeamCurve, stops: Sequence[float], chord_m: float, run_up_m: float
 ) -> list[tuple[float, float, float]]:
-    """Split a seam where something is in the way of the tool: for each piece its start and end and the place where the tip comes down, m.
+    """Split a seam where something is in the way of the tool: for each piece its start and end and the place where the
+    tip comes down, m.
 
-    The tip is a chord ahead of the torch. A piece ends where the tip would meet a thing. The next one begins where the torch has passed it, and
-    `run_up_m` later, when the torch is on the seam.
+    The tip is a chord ahead of the torch. A piece ends where the tip would meet a thing. The next one begins where the
+    torch has passed it, and `run_up_m` later, when the torch is on the seam.
     """
     found = []
     edges = [-math.inf, *sorted(stops), math.inf]
@@ -160,11 +168,12 @@ def clear_pieces(
 
 
 def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:
-    """Check that nothing of the part stands in the way of the tip beyond the seam's end and of the torch before its start.
+    """Check that nothing of the part stands in the way of the tip beyond the seam's end and of the torch before its
+    start.
 
-    The tip runs `chord_m` ahead of the torch, straight on where the groove is drawn no further; the torch comes from as far behind its
-    start. A wall met at a slant, as that of a curved joint cut short, leads the tip aside, or up and out of the groove. Where it is too
-    high for that, as a web that the seam follows on its hollow side, it stops the tip.
+    The tip runs `chord_m` ahead of the torch, straight on where the groove is drawn no further; the torch comes from as
+    far behind its start. A wall met at a slant, as that of a curved joint cut short, leads the tip aside, or up and out
+    of the groove. Where it is too high for that, as a web that the seam follows on its hollow side, it stops the tip.
 
     Raises:
         NoRoom: with how much of the seam to cut off.
@@ -181,8 +190,8 @@ def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: fl
             by_length = name == "end" and seam.end is not None
             change = f"welding.seam_length_mm {off} smaller" if by_length else f"{name}_mm of the seam {off} larger"
             raise NoRoom(
-                f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs {1e3 * needed:.0f} mm there: "
-                f"set {change}, or weld it from elsewhere.",
+                f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs"
+                f" {1e3 * needed:.0f} mm there: set {change}, or weld it from elsewhere.",
                 needed - free,
             )
 
@@ -223,7 +232,8 @@ def _yields(
 
 
 def _crossings(triangles: NDArray[np.float64], origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Distances (K,) m along a unit vector at which its line crosses triangles (M,3,3), and its cosines with their inward normals.
+    """Distances (K,) m along a unit vector at which its line crosses triangles (M,3,3), and its cosines with their
+    inward normals.
 
     Source: Moeller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997.
     """

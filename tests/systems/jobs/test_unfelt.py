@@ -1,4 +1,4 @@
-"""What a plan states across a seam: as large as errors of arms, scanners and calibrations are; refused where too large and not felt."""
+"""What a plan states across a seam: as large as errors of arms, scanners and calibrations; refused where too large."""
 
 from __future__ import annotations
 
@@ -118,7 +118,8 @@ def root_at(point: Array, along: Array, part_m: float) -> RootPlan:
 
 
 def squared(widened: float, worlds: int = 16) -> float:
-    """Mean square of the error across a seam in units of its stated sigma (times `widened`), over calibrations of wrong arms and scanners.
+    """Mean square of the error across a seam in units of its stated sigma (times `widened`), over calibrations of wrong
+    arms and scanners.
 
     The truth is where the arm itself says that the flange is at new postures, and where the calibrated scanner puts it.
     """
@@ -223,13 +224,13 @@ def drawn_arm(rng: np.random.Generator, q: Array) -> Array:
 
 
 def drawn_scanner(rng: np.random.Generator, p_C: Array) -> Array:
-    """Where a scanner as bought, 0.2 % off in scale and 1.5 % per metre in gradient (one sigma), measures points (..., 3) m."""
+    """Where a scanner as bought measures points (..., 3) m: 0.2 % off in scale, 1.5 % per metre in gradient."""
     scale, gx, gy = np.array([2e-3, 1.5e-2, 1.5e-2]) * rng.standard_normal(3)
     return np.asarray(p_C * (1.0 + scale + gx * p_C[..., :1] + gy * p_C[..., 1:2]))
 
 
 def test_a_fresh_cell_states_what_its_scanner_and_arm_err() -> None:
-    """From both sides, over 200 cells that nobody has calibrated: a sigma four times too wide or too narrow is out of the bounds."""
+    """Over 200 cells that nobody has calibrated; a sigma four times too wide or too narrow is out of the bounds."""
     rng, z = np.random.default_rng(61), []
     path = tool_path(STRAIGHT, ServoConfig())
     q = nearest_solution(ARM, path.X_BT[0] @ TOOL.X_FT.inverse(), Q_HOME)
@@ -250,7 +251,7 @@ def test_a_fresh_cell_states_what_its_scanner_and_arm_err() -> None:
 
 
 def test_a_fresh_cells_first_plan_lies_within_its_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fillet, scanned by a ray caster of its own with a scanner that nobody has corrected; uncertain by 8 mm along itself, as a ring is."""
+    """A fillet, scanned by a ray caster of its own with a scanner as bought; uncertain along itself, as a ring is."""
 
     def along_itself(*given: Any) -> RootPlan:
         return replace(plan_root_anyhow(*given), sigma_m=8e-3)

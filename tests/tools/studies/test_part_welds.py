@@ -22,13 +22,13 @@ from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
 from weldcal.tools.report.demo import DemoResult, seam_document
 from weldcal.tools.studies.parts.welds import COLUMNS, _summed, run_part_welds
-from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.record.process import PathError
 
 
 def test_a_refined_cell_calibrates_scanner_and_arm_before_it_welds(tmp_path: Path) -> None:
-    trial = Trial.of("scan", refine="links", arm_mm=0.7)
+    trial = PartTrial.of("scan", refine="links", arm_mm=0.7)
     scenario = trial.scenario(write_cell(PARTS["straight_web"](), tmp_path, trial))
     assert scenario.job.calibrate
     assert scenario.job.weld
@@ -39,7 +39,7 @@ def test_a_refined_cell_calibrates_scanner_and_arm_before_it_welds(tmp_path: Pat
 
 
 def test_without_it_the_scanners_pose_is_given(tmp_path: Path) -> None:
-    trial = Trial()
+    trial = PartTrial()
     scenario = trial.scenario(write_cell(PARTS["straight_web"](), tmp_path, trial))
     assert not scenario.job.calibrate
     assert scenario.job.X_BC is not None
@@ -49,7 +49,7 @@ def test_without_it_the_scanners_pose_is_given(tmp_path: Path) -> None:
 
 def test_another_refinement_is_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"calibration.refine must be .*, not 'wrists'"):
-        run_part_welds(tmp_path, ["straight_web"], range(1), Trial(refine="wrists"))
+        run_part_welds(tmp_path, ["straight_web"], range(1), PartTrial(refine="wrists"))
 
 
 def of_plan(sigma_m: float, refinement: Refinement | None = None) -> DemoResult:
@@ -110,7 +110,7 @@ def test_the_worst_end_of_all_welds_is_given() -> None:
 
 def test_the_arm_of_the_cell_follows_the_bent_web_without_meeting_itself(tmp_path: Path) -> None:
     """On the branch of home the tool's ring would meet the forearm at its end."""
-    scenario = load_scenario(str(write_cell(PARTS["curved_web"](), tmp_path, Trial())))
+    scenario = load_scenario(str(write_cell(PARTS["curved_web"](), tmp_path, PartTrial())))
     station = make_station(scenario, 0)
     try:
         assert plan_drawn_seam(seam_planning(scenario, station, servo_config(scenario, station)), 1).reason is None
