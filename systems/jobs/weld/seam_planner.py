@@ -68,7 +68,7 @@ def plan_root_anyhow(
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
-OVERLAP_M = 5e-3
+OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
 RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
 UNFELT = "followed from the scan and the drawing; not felt"
 
