@@ -1,6 +1,7 @@
 """Which joints of a part a tool fits, and why not the others; the arm is not asked."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,10 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import load_tool, tool_file
 from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
+from weldcal.models.workpieces.seam_input import chained
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
-from weldcal.models.workpieces.shape import UNITS_M, PartJoint, PartShape
+from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
+from weldcal.systems.scenario.schema import SeamConfig
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam
 from weldcal.welding.seam.room import NoRoom, check_room
@@ -22,6 +25,9 @@ from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
 
 PIPE_TOOL = "pipe"
 SMALL_M = 0.012  # a part this small may be drawn in inches
+LAP_MM = 5.0  # by which the pieces of a ring overlap
+CORNER_COS = math.cos(math.radians(35.0))  # between two steps of a seam's line: a sharper turn is a corner
+NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,7 @@ class Seam:
 
     short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
     felt: by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was asked, too.
+    pieces: in which pieces that arm welds it; "" for one.
     """
 
     joint: PartJoint
@@ -38,6 +45,7 @@ class Seam:
     short_m: float = 0.0
     felt: bool = True
     planned: bool = False
+    pieces: str = ""
 
     @property
     def verdict(self) -> str:
@@ -45,6 +53,7 @@ class Seam:
         if self.reason:
             return f"no: {self.reason}"
         yes = "yes" if self.planned else "fits the tool, not planned"
+        yes = f"{yes}. {self.pieces}".removesuffix(". ")
         return yes if self.felt else f"{yes}; by the scan, not felt (its sigma comes with the scan)"
 
     def as_row(self) -> dict[str, Any]:
@@ -62,6 +71,7 @@ class Seam:
             "weldable": not self.reason,
             "reason": self.reason,
             "planned": self.planned,
+            "pieces": self.pieces,
             "felt": self.felt,
         }
 
@@ -139,3 +149,42 @@ def unit_hint(shape: PartShape) -> str:
     if max(size) >= SMALL_M or shape.unit_m != UNITS_M["mm"]:
         return ""
     return "The part is only {:.1f} x {:.1f} x {:.1f} mm: its unit may be inch; check the file.".format(*(1e3 * size))
+
+
+def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], str]]:
+    """A seam along edges as a whole, and what it may be welded in: a ring in pieces that overlap, another edge by edge.
+
+    Each with a note of the pieces, "" for the whole.
+    """
+    found = [([SeamConfig(edges=list(ids))], "")]
+    line, closed = chained(shape, ids)
+    steps = np.diff(line[np.linalg.norm(np.diff(line, axis=0, prepend=np.nan), axis=1) != 0.0], axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    t = steps / length[:, None]
+    if closed and (np.vecdot(t, np.roll(t, 1, axis=0)) > CORNER_COS).all():
+        whole = 1e3 * float(length.sum())
+        ends = [round(share * whole, 1) for share in (0.25, 0.5)]
+        edges, rest = list(ids), round(whole - ends[0] - LAP_MM, 1)
+        # Both halves begin at one place: there the arm turns one way for the one and back for the other.
+        halves = [
+            SeamConfig(edges=edges, direction="reverse", start_mm=round(whole - ends[1] - LAP_MM, 1)),
+            SeamConfig(edges=edges, start_mm=ends[1], end_mm=-LAP_MM),
+        ]
+        found.append((halves, f"The ring {_listed(ids)} in two halves that overlap by {LAP_MM:g} mm."))
+        following = f"start_mm: {ends[0]:g}, end_mm: {round(rest - ends[0], 1):g}"
+        quarter = f"For the next, subtract 90 from the last of pose_guess.rpy_deg and write {following}; and so on."
+        found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {_listed(ids)}. {quarter}"))
+        return found
+    alone = sorted(ids, key=lambda id: -shape.edge(id).length_m) if len(ids) > 1 else []
+    return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {_listed(ids)}.") for id in alone]
+
+
+def _listed(ids: Sequence[int]) -> str:
+    return ", ".join(map(str, ids))
+
+
+def joint_of(edge: PartEdge) -> str:
+    """The kind of joint at an edge, by its angle."""
+    if edge.kind == "flush":
+        return "butt"
+    return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"
