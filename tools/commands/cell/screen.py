@@ -27,6 +27,7 @@ PIPE_TOOL = "pipe"
 SMALL_M = 0.012  # a part this small may be drawn in inches
 LAP_MM = 5.0  # by which the pieces of a ring overlap
 CORNER_COS = math.cos(math.radians(35.0))  # between two steps of a seam's line: a sharper turn is a corner
+SHORT_M = 0.02  # the end of a sheet is such an edge: too short for the tip to come down and for the torch to follow
 NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 
@@ -175,8 +176,12 @@ def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], s
         quarter = f"For the next, subtract 90 from the last of pose_guess.rpy_deg and write {following}; and so on."
         found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {_listed(ids)}. {quarter}"))
         return found
-    alone = sorted(ids, key=lambda id: -shape.edge(id).length_m) if len(ids) > 1 else []
-    return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {_listed(ids)}.") for id in alone]
+    by_length = sorted(ids, key=lambda id: -shape.edge(id).length_m) if len(ids) > 1 else []
+    long = [id for id in ids if shape.edge(id).length_m > SHORT_M]
+    if 1 < len(long) < len(ids):
+        without = f"Without the short edges {_listed([id for id in ids if id not in long])}."
+        found.append(([SeamConfig(edges=[id]) for id in long], without))
+    return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {_listed(ids)}.") for id in by_length]
 
 
 def _listed(ids: Sequence[int]) -> str:
