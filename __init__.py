@@ -1,6 +1,7 @@
 """weldcal: calibrate a 3D scanner to a robot by the robot's own flange, then weld along a seam that is felt by touch.
 
-The functions are those of `weldcal.tools.api`. They are imported when they are first used: importing weldcal stays fast.
+The functions are those of `weldcal.tools.api`. They are imported when they are first used: importing weldcal stays
+fast.
 """
 
 from typing import TYPE_CHECKING

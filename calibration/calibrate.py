@@ -1,4 +1,5 @@
-"""Calibrates a scanner beside the robot from flange observations, step by step: for `weldcal calibrate` and the live job."""
+"""Calibrates a scanner beside the robot from flange observations, step by step: for `weldcal calibrate` and the live
+job."""
 
 from __future__ import annotations
 
@@ -39,11 +40,11 @@ KINEMATICS_FILE = "kinematics.yaml"
 class Steps:
     """What `calibrate` does with n observations.
 
-    ``patterns``: hole patterns by id. ``correct_scanner``: a correction is applied where the scans show one. ``axis_turn_rad``: known
-    rotation of the hole pattern, for one to three scans. ``feature_m``: radius of the flange, and ``X_FR``: the feature on it (None: not
-    known), which say how far a TCP that was set shifts the poses. ``coplanar``: flange centres in one plane are enough, as where normals
-    were measured. ``refine``: "none", "local", or "joints" or "links" of ``arm`` at ``joints`` (n, joints) rad; ``note`` is the first line
-    of its kinematics file.
+    ``patterns``: hole patterns by id. ``correct_scanner``: a correction is applied where the scans show one.
+    ``axis_turn_rad``: known rotation of the hole pattern, for one to three scans. ``feature_m``: radius of the flange,
+    and ``X_FR``: the feature on it (None: not known), which say how far a TCP that was set shifts the poses.
+    ``coplanar``: flange centres in one plane are enough, as where normals were measured. ``refine``: "none", "local",
+    or "joints" or "links" of ``arm`` at ``joints`` (n, joints) rad; ``note`` is the first line of its kinematics file.
     """
 
     patterns: Mapping[str, HolePattern] = field(default_factory=dict)
@@ -61,8 +62,8 @@ class Steps:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration:
-    """The estimate and the n ``observations`` with all corrections applied; the verdict on the scanner (None: not asked, or too few
-    scans), the refinement (None: not asked), and ``warnings``, such as of a TCP that seems to be set.
+    """The estimate and the n ``observations`` with all corrections applied; the verdict on the scanner (None: not
+    asked, or too few scans), the refinement (None: not asked), and ``warnings``, such as of a TCP that seems to be set.
     ``X_rigid``: X_BC from the scans as they are."""
 
     estimate: CalibrationEstimate
@@ -85,17 +86,19 @@ class Calibration:
 
 
 def calibrate(
-    observations: Sequence[Observation],
-    steps: Steps | None = None,
-    tell: Callable[[str], None] = lambda step: None,
+    observations: Sequence[Observation], steps: Steps | None = None, tell: Callable[[str], None] = lambda step: None
 ) -> Calibration:
-    """X_BC from n >= 1 observations: estimate, scanner correction, and the refinement that is asked for. ``tell`` gets each step's name.
+    """X_BC from n >= 1 observations: estimate, scanner correction, and the refinement that is asked for.
 
-    Below four observations the usual errors of robot and scanner stand for what the scans cannot show (calibrate_from_few). Deterministic.
+    ``tell`` gets each step's name.
+
+    Below four observations the usual errors of robot and scanner stand for what the scans cannot show
+    (calibrate_from_few). Deterministic.
 
     Raises:
         TooFewPoses, RepeatedPoses, CoplanarPoses: the poses do not determine X_BC, or are too few for the refinement.
-        InconsistentPoses: they contradict each other, as where a TCP longer than the flange's radius is set at the robot.
+        InconsistentPoses: they contradict each other, as where a TCP longer than the flange's radius is set at the
+            robot.
         ScannerMoved: the scanner or the base moved during the recording.
         InputError: the refinement cannot be made from such poses.
     """
@@ -119,9 +122,11 @@ def calibrate(
 
 
 def refine(plain: Calibration, observations: Sequence[Observation], steps: Steps) -> Calibration:
-    """A calibration without a refinement, refined as ``steps`` say; ``observations`` (n) are those it was made from, as measured.
+    """A calibration without a refinement, refined as ``steps`` say; ``observations`` (n) are those it was made from, as
+    measured.
 
-    It stays as it is, but for nested held-out errors, where that does not help. Raises TooFewPoses and InputError as `calibrate` does.
+    It stays as it is, but for nested held-out errors, where that does not help. Raises TooFewPoses and InputError as
+    `calibrate` does.
     """
     way = _refine_locally if steps.refine == "local" else _refine_arm
     refined = way(plain, observations, steps)
@@ -131,7 +136,8 @@ def refine(plain: Calibration, observations: Sequence[Observation], steps: Steps
 def _estimate_consistent(
     observations: tuple[Observation, ...], steps: Steps
 ) -> tuple[CalibrationEstimate, ScannerVerdict | None, RigidTransform, tuple[str, ...]]:
-    """The estimate, the verdict on the scanner, X_BC from the scans as they are, and a sentence where the poses look as if a TCP were set."""
+    """The estimate, the verdict on the scanner, X_BC from the scans as they are, and a sentence where the poses look as
+    if a TCP were set."""
     config = SolveConfig(seed=steps.seed, allow_coplanar=steps.coplanar)
     change = find_change(observations)
     try:
@@ -169,9 +175,10 @@ def _refuse_change(change: ChangePoint | None, tcp: TcpOffset | None, observatio
         parts.append({"poses": option, "n": len(part), **_part(part)})
         offers.append(f"--poses {option} ({len(part)} scans)")
     raise ScannerMoved(
-        f"The scanner or the robot's base moved between '{change.before}' and '{change.after}': the poses before and after it agree on "
-        f"two camera positions, which differ by {1e3 * change.shift_m:.2f} mm at the flange and {np.degrees(change.rotation_rad):.3f} "
-        f"degrees. Calibrate one part: {' or '.join(offers)}; only the later one holds where the scanner has stayed since.",
+        f"The scanner or the robot's base moved between '{change.before}' and '{change.after}': the poses before and"
+        f" after it agree on two camera positions, which differ by {1e3 * change.shift_m:.2f} mm at the flange and"
+        f" {np.degrees(change.rotation_rad):.3f} degrees. Calibrate one part: {' or '.join(offers)}; only the later one"
+        " holds where the scanner has stayed since.",
         {
             "change_point": {
                 "before": change.before,
@@ -199,9 +206,9 @@ def _part(observations: tuple[Observation, ...]) -> dict[str, object]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Refined:
-    """What became of it: estimate and observations; the field, or the text of the kinematics file, the link transforms (n, 4, 4) in it, the
-    scanner correction that goes with them and the document of the errors, where one was accepted; the sentence that says so or why not;
-    ``numbers`` for the JSON object."""
+    """What became of it: estimate and observations; the field, or the text of the kinematics file, the link transforms
+    (n, 4, 4) in it, the scanner correction that goes with them and the document of the errors, where one was accepted;
+    the sentence that says so or why not; ``numbers`` for the JSON object."""
 
     estimate: CalibrationEstimate
     observations: tuple[Observation, ...]

@@ -31,7 +31,10 @@ def read_grey_image(path: Path) -> NDArray[np.uint8]:
 
 
 def read_raw_image(path: Path) -> NDArray[Any]:
-    """The pixels (height, width) or (height, width, channels) of a file as they are stored. Raises InputError as read_grey_image."""
+    """The pixels (height, width) or (height, width, channels) of a file as they are stored.
+
+    Raises InputError as read_grey_image.
+    """
     return _decoded(path, grey=False)
 
 
@@ -60,7 +63,8 @@ def _decoded(path: Path, *, grey: bool) -> NDArray[Any]:
         max(width, 1) * max(height, 1) > _DEFLATED * len(content) or not _whole_png(content)
     ):
         raise InputError(
-            f"'{path.name}' is damaged: it promises {width} by {height} pixels, more than {len(content)} bytes can hold, or is cut off."
+            f"'{path.name}' is damaged: it promises {width} by {height} pixels, more than {len(content)} bytes can"
+            " hold, or is cut off."
         )
     flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_UNCHANGED
     try:
@@ -122,9 +126,19 @@ _KINDS = "biufSU"
 _LONGEST_HEADER = 10_000
 # what zipfile, zlib and NumPy raise for damaged files
 _DAMAGED = (
-    zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, TypeError, NotImplementedError, RuntimeError, struct.error,
-    SyntaxError, tokenize.TokenError, OverflowError,
-)  # fmt: skip
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    NotImplementedError,
+    RuntimeError,
+    struct.error,
+    SyntaxError,
+    tokenize.TokenError,
+    OverflowError,
+)
 
 AnyArray = NDArray[Any]
 
@@ -226,7 +240,8 @@ def _header(what: str, stream: Any, size: int) -> tuple[tuple[int, ...], bool, i
     there = size - stream.tell()
     if count * dtype.itemsize != there:
         raise InputError(
-            f"{what} is damaged: its header promises {count * dtype.itemsize} bytes and {there} are there; save it again."
+            f"{what} is damaged: its header promises {count * dtype.itemsize} bytes and {there} are there; save it"
+            " again."
         )
     return shape, order, max(count, count * dtype.itemsize // 8), dtype
 
@@ -252,6 +267,6 @@ def _check_expansion(path: Path, numbers: int, stream: BinaryIO) -> None:
     stream.seek(here)
     if 8 * numbers > expansion_limit(size):
         raise InputError(
-            f"The file {path.name} would expand to {8e-6 * numbers:.0f} MB, more than the {1e-6 * expansion_limit(size):.0f} MB that "
-            "are read of a file of its size."
+            f"The file {path.name} would expand to {8e-6 * numbers:.0f} MB, more than the"
+            f" {1e-6 * expansion_limit(size):.0f} MB that are read of a file of its size."
         )

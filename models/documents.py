@@ -32,7 +32,10 @@ def read_document(path: Path) -> Any:
 
 
 def parse_document(name: str, text: str, kind: str = "YAML") -> Any:
-    """The contents of a text of YAML or JSON, ``name`` of which appears in messages. Raises InputError as read_document."""
+    """The contents of a text of YAML or JSON, ``name`` of which appears in messages.
+
+    Raises InputError as read_document.
+    """
     if not text.strip():
         raise InputError(f"'{name}' is empty.")
     try:
@@ -145,33 +148,34 @@ def _too_much(name: str) -> InputError:
 
 
 @dataclass(frozen=True)
-class Section:
-    """A mapping of a document; its getters raise InputError naming ``file`` and key where a value is missing or wrong."""
+class DocumentSection:
+    """A mapping of a document; its getters raise InputError naming ``file`` and key where a value is missing or
+    wrong."""
 
     file: str
     values: Mapping[Any, Any]
     place: str = field(default="")
 
     @staticmethod
-    def of(file: str, value: Any, place: str = "") -> "Section":
+    def of(file: str, value: Any, place: str = "") -> "DocumentSection":
         """The mapping as a section. Raises InputError where it is none."""
         if not isinstance(value, Mapping):
             raise InputError(
                 f"'{file}': {place or 'the file'} must be a mapping of keys to values, not {shown(value)}."
             )
-        return Section(file, value, place)
+        return DocumentSection(file, value, place)
 
     def has(self, key: str) -> bool:
         """Whether the key stands there with a value."""
         return self.values.get(key) is not None
 
-    def section(self, key: str) -> "Section":
+    def section(self, key: str) -> "DocumentSection":
         """The mapping under a key; empty where there is none."""
-        return Section.of(self.file, self.values[key] if self.has(key) else {}, self._at(key))
+        return DocumentSection.of(self.file, self.values[key] if self.has(key) else {}, self._at(key))
 
-    def sections(self, key: str) -> tuple["Section", ...]:
+    def sections(self, key: str) -> tuple["DocumentSection", ...]:
         """The mappings of the list under a key; none where there is none."""
-        return tuple(Section.of(self.file, v, f"{self._at(key)}[{k}]") for k, v in enumerate(self.items(key)))
+        return tuple(DocumentSection.of(self.file, v, f"{self._at(key)}[{k}]") for k, v in enumerate(self.items(key)))
 
     def items(self, key: str) -> list[Any]:
         """The list under a key; empty where there is none."""
@@ -248,7 +252,8 @@ class Section:
 
 
 def as_number(value: Any) -> float:
-    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text); NaN for anything else, true and false included."""
+    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text); NaN for anything else, true and false
+    included."""
     try:
         return math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):

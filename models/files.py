@@ -1,4 +1,5 @@
-"""Opens a file that a person hands in: a regular file of bounded size, text in UTF-8; anything else is refused by a sentence."""
+"""Opens a file that a person hands in: a regular file of bounded size, text in UTF-8; anything else is refused by a
+sentence."""
 
 import hashlib
 import os
@@ -36,7 +37,8 @@ LARGEST_IMAGE = 128 * 1024**2
 MOST_PIXELS = 100_000_000
 """Pixels of an image."""
 MOST_POSES = 100_000
-"""Poses of one list, and lines of a text that holds them: more take minutes to read, and no set of scans has so many."""
+"""Poses of one list, and lines of a text that holds them: more take minutes to read, and no set of scans has so
+many."""
 LARGEST_NUMBER = 1e9
 """Size of any coordinate, in the unit of its file: squares and cubes of it are still far from overflow."""
 
@@ -45,9 +47,11 @@ _TIMES = 10
 
 
 def expansion_limit(size: int) -> int:
-    """Bytes to which a file of this size (bytes) may expand as double-precision numbers: 256 MiB, or ten times its size.
+    """Bytes to which a file of this size (bytes) may expand as double-precision numbers: 256 MiB, or ten times its
+    size.
 
-    The largest of today's area scanners (8 megapixels) takes 190 MB; a file that is not compressed never exceeds ten times.
+    The largest of today's area scanners (8 megapixels) takes 190 MB; a file that is not compressed never exceeds ten
+    times.
     """
     return max(_EXPANDED, _TIMES * size)
 
@@ -55,9 +59,12 @@ def expansion_limit(size: int) -> int:
 _BLOCK = 1024**2
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _KINDS = (
-    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"),
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
     (stat.S_ISSOCK, "a socket"),
-)  # fmt: skip
+)
 
 
 def file_size(path: Path, limit: int = LARGEST_BYTES) -> int:
@@ -85,7 +92,8 @@ def require_few_lines(path: Path, most: int = MOST_POSES) -> None:
         lines = sum(block.count(b"\n") for block in iter(lambda: file.read(_BLOCK), b""))
     if lines > most + 1:
         raise InputError(
-            f"'{path.name}' holds {lines:,} lines, and at most {most:,} poses are read. Keep one row for each scan or picture: the pose at its time."
+            f"'{path.name}' holds {lines:,} lines, and at most {most:,} poses are read. Keep one row for each scan or"
+            " picture: the pose at its time."
         )
 
 
@@ -187,5 +195,6 @@ def require_short_numbers(text: str, name: str) -> None:
     found = re.search(rf"\d{{{_MOST_DIGITS},}}", text)
     if found is not None:
         raise InputError(
-            f"'{name}' holds a number of {len(found[0])} digits ({found[0][:6]} ...): the file is damaged. Export it again."
+            f"'{name}' holds a number of {len(found[0])} digits ({found[0][:6]} ...): the file is damaged. Export it"
+            " again."
         )

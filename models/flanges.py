@@ -178,7 +178,8 @@ def get_flange(name: str, *, pin_angle_rad: float | None = None) -> FlangeStanda
     if flange is None:
         if not name:
             raise InputError(
-                f"No flange is named: write 'flange:' in dataset.yaml, or add --flange; known are {', '.join(STANDARDS)}."
+                "No flange is named: write 'flange:' in dataset.yaml, or add --flange; known are"
+                f" {', '.join(STANDARDS)}."
             )
         listed = f"use one of {', '.join(STANDARDS)}."
         raise InputError(f"Flange '{name}' is not known: {did_you_mean(name, STANDARDS, listed)}")

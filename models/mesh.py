@@ -62,8 +62,8 @@ def _imported() -> Any:
 o3d = _imported()
 
 
-# pydrake.geometry and scipy.spatial are imported where they are used: they take half of the time in which a process starts
-# that only asks for a robot's name.
+# pydrake.geometry and scipy.spatial are imported where they are used: they take half of the time in which a process
+# starts that only asks for a robot's name.
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -256,7 +256,7 @@ def grid(points: Floats, *, close_rows: bool = False, close_columns: bool = Fals
 
 def extrude(outline: Floats, z_low_m: float, z_high_m: float, holes: list[Floats] | None = None) -> TriMesh:
     """A prism between two heights over a polygon (N,2) with through holes; loops in any direction; watertight."""
-    loops = [_turned(outline, left=True), *[_turned(h, left=False) for h in (holes or [])]]
+    loops = [_turned(outline, left=True), *[_turned(h, left=False) for h in holes or []]]
     triangles = triangulate_polygon(loops[0], loops[1:])
     points = np.concatenate(loops)
     caps = [plane_mesh(points, triangles, z_high_m, up=True), plane_mesh(points, triangles, z_low_m, up=False)]

@@ -1,6 +1,7 @@
 """Simulates a laser profiler: rays of one plane cast onto meshes, with noise, rounding, spikes and missing returns.
 
-Frame S: x along the laser line, z away from the sensor, y across the plane of light; a profile point [x, z] is (x, 0, z).
+Frame S: x along the laser line, z away from the sensor, y across the plane of light; a profile point [x, z] is (x, 0,
+z).
 """
 
 from dataclasses import dataclass
@@ -56,7 +57,8 @@ def make_scene(mesh: TriMesh) -> Any:
 
 
 def cast_profiles(scene: Any, rotation: Floats, translation: Floats, preset: ProfilerPreset) -> Floats:
-    """What a perfect profiler sees (n, samples, 2) [x, z] m from poses R_WS (n, 3, 3), p_WS (n, 3) m; NaN: nothing in range."""
+    """What a perfect profiler sees (n, samples, 2) [x, z] m from poses R_WS (n, 3, 3), p_WS (n, 3) m; NaN: nothing in
+    range."""
     from weldcal.models.mesh import o3d  # slow to import
 
     x = preset.x_m

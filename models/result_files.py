@@ -33,7 +33,8 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def write_apart(path: Path, content: str | bytes) -> None:
-    """Write a file that is whole by itself, as ``write_atomic`` does: it does not make its folder an unfinished result."""
+    """Write a file that is whole by itself, as ``write_atomic`` does: it does not make its folder an unfinished
+    result."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _replace(path, content.encode() if isinstance(content, str) else content)
 
@@ -55,8 +56,9 @@ def write_npz(path: Path, **arrays: Any) -> None:
 def whole_result(folder: Path) -> Iterator[None]:
     """Make one result of all that is written into ``folder`` within the block.
 
-    The first file marks the folder as unfinished, and the end of the block removes the mark. An exception or the death of the
-    process leaves it, so that ``require_whole`` refuses the folder. Blocks may be nested: each folder has its own mark.
+    The first file marks the folder as unfinished, and the end of the block removes the mark. An exception or the death
+    of the process leaves it, so that ``require_whole`` refuses the folder. Blocks may be nested: each folder has its
+    own mark.
     """
     folder = folder.absolute()
     before = _RESULTS.set((*_RESULTS.get(), folder))
@@ -83,7 +85,8 @@ def require_whole(path: Path) -> None:
     folder = path if path.is_dir() else path.parent
     if (folder / UNFINISHED).exists():
         raise InputError(
-            f"The result in '{folder}' is not complete: weldcal was ended while it wrote it. Run the command again, or give another folder."
+            f"The result in '{folder}' is not complete: weldcal was ended while it wrote it. Run the command again, or"
+            " give another folder."
         )
 
 

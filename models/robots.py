@@ -13,20 +13,24 @@ from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange
 
 @dataclass(frozen=True)
 class BaseCircle:
-    """The upper face of the foot: ``standard`` says its outer and inner edge, ``X_BR`` (frame R as a flange's: origin at the
-    circle's centre in the face, z out of it) where the drawing puts it in the base."""
+    """The upper face of the foot: ``standard`` says its outer and inner edge, ``X_BR`` (frame R as a flange's: origin
+    at the circle's centre in the face, z out of it) where the drawing puts it in the base."""
 
     standard: FlangeStandard
     X_BR: RigidTransform
 
 
-# Outer diameter (m): base footprint in Universal Robots' user manuals (UR10e 190 mm, as UR5e 149 mm). Inner edge, where the
-# column rises out of the foot, and height of the face: as the arm is drawn here (arms/urdf.py); measure them on another arm.
+# Outer diameter (m): base footprint in Universal Robots' user manuals (UR10e 190 mm, as UR5e 149 mm). Inner edge, where
+# the column rises out of the foot, and height of the face: as the arm is drawn here (arms/urdf.py); measure them on
+# another arm.
 _FEET = {"ur10e": (0.190, 0.166, 0.014)}
 
 
 def base_circle(arm: str) -> BaseCircle:
-    """The base-mounting circle of that arm (flange paper, Fig. 14a). Raises InputError naming the arms whose foot is known."""
+    """The base-mounting circle of that arm (flange paper, Fig. 14a).
+
+    Raises InputError naming the arms whose foot is known.
+    """
     if arm not in _FEET:
         raise InputError(f"The base circle of arm '{arm}' is not known: use one of {', '.join(_FEET)}.")
     outer, inner, height = _FEET[arm]
@@ -44,10 +48,13 @@ CATALOGUE = ("flange", "payload", "reach", "repeatability", "joint limits")
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """One robot. ``flange`` is its ISO 9409-1 designation, the dowel at ``pin_angle_rad``; payload kg, reach m (the maker's
-    working radius), repeatability m; ``inverse`` says how its joint angles are found; ``source`` where the numbers are from.
-    Joint limits and kinematics are the arm's own files (`chain`). ``confirmed`` holds which of CATALOGUE a public source bears out,
-    and that source; what is not there is written from memory of the maker's data sheet."""
+    """One robot.
+
+    ``flange`` is its ISO 9409-1 designation, the dowel at ``pin_angle_rad``; payload kg, reach m (the maker's working
+    radius), repeatability m; ``inverse`` says how its joint angles are found; ``source`` where the numbers are from.
+    Joint limits and kinematics are the arm's own files (`chain`). ``confirmed`` holds which of CATALOGUE a public
+    source bears out, and that source; what is not there is written from memory of the maker's data sheet.
+    """
 
     name: str
     title: str
@@ -83,7 +90,10 @@ _UR_CB3 = "user manual, CB3, technical specifications; kinematics: Universal Rob
 _UR_TWIN = (
     "technical specifications; kinematics: Universal Robots, ROS 2 description, as the predecessor of the same build"
 )
-_UR_LARGE = "technical specifications (UR20, UR30: the smaller of two published payloads); kinematics: Universal Robots, DH parameters"
+_UR_LARGE = (
+    "technical specifications (UR20, UR30: the smaller of two published payloads); kinematics: Universal Robots, DH"
+    " parameters"
+)
 _RIGHT_ANGLE = math.pi / 2
 
 
@@ -173,7 +183,10 @@ ROBOTS: dict[str, Robot] = {
             reach_m=0.855,
             repeatability_m=1e-4,
             inverse=NUMERIC,
-            source="Franka Emika data sheet; limits: FCI documentation; kinematics: franka_description; dowel: the recorded scans' CAD",
+            source=(
+                "Franka Emika data sheet; limits: FCI documentation; kinematics: franka_description; dowel: the"
+                " recorded scans' CAD"
+            ),
             confirmed=CONFIRMED["franka_panda"],
         ),
         Robot(
@@ -218,9 +231,9 @@ CONTROLLER_MODELS: dict[str, tuple[str, int]] = {
     "ur20": ("UR20", 7),
     "ur30": ("UR30", 8),
 }
-"""What a Universal Robots controller calls its arm: `get robot model` of the dashboard, and robot_type of the primary interface
-(numbers: RobotType of UniversalRobots/Universal_Robots_Client_Library). UR7e and UR12e are assumed to answer as the UR5e and UR10e,
-or with their own names."""
+"""What a Universal Robots controller calls its arm: `get robot model` of the dashboard, and robot_type of the primary
+interface (numbers: RobotType of UniversalRobots/Universal_Robots_Client_Library). UR7e and UR12e are assumed to answer
+as the UR5e and UR10e, or with their own names."""
 
 ALIASES = {"franka": "franka_panda", "panda": "franka_panda", "fr3": "franka_fr3", "aubo": "aubo_i5"}
 """Shorter names that datasets use."""

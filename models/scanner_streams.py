@@ -1,7 +1,8 @@
 """Timing of a scanner that streams: frame rate, exposure, readout, transport delay and the device's own clock.
 
-MotionCam-3D: 20 frames per second and about 140 ms between capture and arrival (the second flange paper, sections 2.3 and
-3.3). Exposure, readout, jitter and the clock's drift are not published there; they are typical values of such devices.
+MotionCam-3D: 20 frames per second and about 140 ms between capture and arrival (the second flange paper, sections 2.3
+and 3.3). Exposure, readout, jitter and the clock's drift are not published there; they are typical values of such
+devices.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from weldcal.models.errors import InputError
 
 
 def mixed_exposure(stack: Depth, edge_step_m: float, flying: float, rng: np.random.Generator) -> Depth:
-    """The depth map (H, W) m of an exposure of which ``stack`` (n, H, W) holds the instants, infinite or 0 where nothing is.
+    """The depth map (H, W) m of an exposure of which ``stack`` (n, H, W) holds the instants, infinite or 0 where
+    nothing is.
 
-    Depths further apart than ``edge_step_m`` are two surfaces; such a pixel reads one of them, by its share of the exposure, or
-    with chance ``flying`` the mean. 0 marks "no reading".
+    Depths further apart than ``edge_step_m`` are two surfaces; such a pixel reads one of them, by its share of the
+    exposure, or with chance ``flying`` the mean. 0 marks "no reading".
     """
     stack = np.where(np.isfinite(stack) & (stack > 0.0), stack, np.float32(np.inf))
     low, high = stack.min(axis=0), stack.max(axis=0)

@@ -63,7 +63,10 @@ class DistortionPart:
 
 @dataclass(kw_only=True)
 class ScannerPart:
-    """A scanner file. Pixels as in OpenCV: the centre of the first pixel is (0, 0). fx, fy, cx, cy, or field_of_view_deg."""
+    """A scanner file.
+
+    Pixels as in OpenCV: the centre of the first pixel is (0, 0). fx, fy, cx, cy, or field_of_view_deg.
+    """
 
     name: str = ""
     width: int = 0  # px
@@ -131,7 +134,8 @@ def _read(path: Path, changed: int) -> ReadScanner:
         raise InputError(f"'{file}': the principal point ({cx:g}, {cy:g}) lies outside the picture.")
     if not 0.0 < part.near_mm < part.far_mm <= 20_000.0:
         raise InputError(
-            f"'{file}': near_mm must be positive and below far_mm (at most 20 m), not {part.near_mm:g} to {part.far_mm:g}."
+            f"'{file}': near_mm must be positive and below far_mm (at most 20 m), not {part.near_mm:g} to"
+            f" {part.far_mm:g}."
         )
     optimum = part.optimum_mm or 0.5 * (part.near_mm + part.far_mm)
     if not part.near_mm <= optimum <= part.far_mm:
@@ -290,7 +294,8 @@ SCANNERS: dict[str, ScannerPreset] = {
         _by_area(
             "motioncam_3d_motion", 1120, 800, 0.497, 0.650, 0.939, 0.590, _structured_light(2.5e-4, 0.650, 1.2, 0.15)
         ),
-        # streaming: the largest image of the second paper (section 2.3), and the same view with half a million pixels; 0.5 mm
+        # streaming: the largest image of the second paper (section 2.3), and the same view with half a million pixels;
+        # 0.5 mm
         _by_area("motioncam_3d_stream", 1068, 800, 0.497, 0.650, 0.939, 0.590, _STREAMED),
         _by_area("motioncam_3d_stream_half", 816, 612, 0.497, 0.650, 0.939, 0.590, _STREAMED),
         ScannerPreset(
@@ -328,8 +333,8 @@ def is_scanner_file(name: str) -> bool:
 
 
 def get_scanner(name: str, width: int | None = None, height: int | None = None) -> ScannerPreset:
-    """The named scanner, or that of a file (.yaml), resized when a width (and height) is given; raises InputError naming the
-    known ones, or what is wrong in the file."""
+    """The named scanner, or that of a file (.yaml), resized when a width (and height) is given; raises InputError
+    naming the known ones, or what is wrong in the file."""
     if is_scanner_file(name):
         preset: ScannerPreset | None = ScannerPreset(**vars(read_scanner_file(Path(name))))
     else:
@@ -345,10 +350,7 @@ def get_scanner(name: str, width: int | None = None, height: int | None = None) 
 
 
 def apply_noise(
-    depth: Depth,
-    preset: ScannerPreset,
-    rng: np.random.Generator,
-    dark: npt.NDArray[np.floating] | None = None,
+    depth: Depth, preset: ScannerPreset, rng: np.random.Generator, dark: npt.NDArray[np.floating] | None = None
 ) -> Depth:
     """What the scanner returns for a perfect depth map (H,W) in metres: float32, 0 where it measured nothing.
 

@@ -17,7 +17,8 @@ from weldcal.models.flanges import FlangeStandard, get_flange
 RING = get_flange("tool-ring-63")
 LAST_LINK = len(LINKS)  # the flange's link, counted as in kinematics.link_frames (0 is the base)
 
-# z_F points out of the flange (down while welding); the ring, the tip frame and the torch all have their z up, against z_F.
+# z_F points out of the flange (down while welding); the ring, the tip frame and the torch all have their z up, against
+# z_F.
 R_FLIPPED = RollPitchYaw(np.pi, 0.0, 0.0).ToRotationMatrix()
 
 
@@ -36,8 +37,8 @@ class Placed:
 
 @dataclass(frozen=True, kw_only=True)
 class ToolShape:
-    """A drawn body of a tool, on the flange: ``size`` m of a box (x, y, z), cylinder (radius, length along z), capsule (likewise),
-    sphere (radius) or mesh (none: vertices and triangles are those of the file)."""
+    """A drawn body of a tool, on the flange: ``size`` m of a box (x, y, z), cylinder (radius, length along z), capsule
+    (likewise), sphere (radius) or mesh (none: vertices and triangles are those of the file)."""
 
     name: str
     kind: str
@@ -49,7 +50,8 @@ class ToolShape:
 
 
 class Seat(NamedTuple):
-    """A loaded tip against a hard ball in the same groove, m: how far towards the wall it leans on, and how far below."""
+    """A loaded tip against a hard ball in the same groove, m: how far towards the wall it leans on, and how far
+    below."""
 
     aside_m: float
     below_m: float
@@ -63,11 +65,13 @@ def flipped_where_it_is(X: RigidTransform) -> RigidTransform:
 
 @dataclass(frozen=True, kw_only=True)
 class WeldingTool:
-    """Numbers of a tool, all in the flange frame F (m, rad, N, kg). The defaults are the welding tool of the paper's figure; a tool
-    file gives the fields at the end, which replace what follows from the others (models/tools).
+    """Numbers of a tool, all in the flange frame F (m, rad, N, kg).
 
-    The soft tip is a sphere on three springs (omni-directional, as the metamaterial finger of the paper); the tag rides on
-    it and the finger camera looks at the tag along +z_F. The torch trails the tip by `chord_m` along -x_T.
+    The defaults are the welding tool of the paper's figure; a tool file gives the fields at the end, which replace what
+    follows from the others (models/tools).
+
+    The soft tip is a sphere on three springs (omni-directional, as the metamaterial finger of the paper); the tag rides
+    on it and the finger camera looks at the tag along +z_F. The torch trails the tip by `chord_m` along -x_T.
     """
 
     plate_thickness_m: float = 0.012
@@ -107,10 +111,10 @@ class WeldingTool:
     def wall_force(self, depth_m: float) -> float:
         """Force in N of a flat rigid wall that is pressed `depth_m` into the ball.
 
-        The pressure in the soft ball grows linearly from nothing at its surface to the modulus at its centre (hydroelastic
-        contact: Elandt et al., A pressure field model for fast, robust approximation of net contact force and moment
-        between nominally rigid objects, IROS 2019). Its integral over the disc that the wall cuts out is
-        2 pi E (d^2 / 2 - d^3 / (3 r)).
+        The pressure in the soft ball grows linearly from nothing at its surface to the modulus at its centre
+        (hydroelastic contact: Elandt et al., A pressure field model for fast, robust approximation of net contact force
+        and moment between nominally rigid objects, IROS 2019). Its integral over the disc that the wall cuts out is 2
+        pi E (d^2 / 2 - d^3 / (3 r)).
         """
         return 2.0 * np.pi * self.tip_modulus_Pa * (depth_m**2 / 2.0 - depth_m**3 / (3.0 * self.tip_radius_m))
 
@@ -124,8 +128,8 @@ class WeldingTool:
     def seat(self) -> Seat:
         """Where the loaded tip rests in its V, against a hard ball in the same groove.
 
-        The springs press it down and to the left; each wall answers along its own normal, for in a weld friction points along
-        the groove. A soft ball gives way to each wall by its `indentation`.
+        The springs press it down and to the left; each wall answers along its own normal, for in a weld friction points
+        along the groove. A soft ball gives way to each wall by its `indentation`.
 
         Raises:
             InputError: pressed aside so hard that the other wall holds nothing: it would climb out.
@@ -136,8 +140,8 @@ class WeldingTool:
         on_left, on_right = 0.5 * (down / s + left / c), 0.5 * (down / s - left / c)
         if on_right <= 0.0:
             raise InputError(
-                f"A tip pressed {1e3 * self.press_lateral_m:.1f} mm aside and {1e3 * self.press_axial_m:.1f} mm down climbs out "
-                "of its groove: take less welding.deflection_mm or more welding.axial_deflection_mm."
+                f"A tip pressed {1e3 * self.press_lateral_m:.1f} mm aside and {1e3 * self.press_axial_m:.1f} mm down"
+                " climbs out of its groove: take less welding.deflection_mm or more welding.axial_deflection_mm."
             )
         into_left, into_right = self.indentation(on_left), self.indentation(on_right)
         return Seat((into_left - into_right) / (2.0 * c), (into_left + into_right) / (2.0 * s))
@@ -215,7 +219,8 @@ class WeldingTool:
         return straight if X_TM.IsNearlyEqualTo(straight, 1e-12) else X_TM
 
     def drawn(self) -> tuple[ToolShape, ...]:
-        """The bodies on the flange, besides ring, finger and tag: those of the tool's file, or those of the welding tool."""
+        """The bodies on the flange, besides ring, finger and tag: those of the tool's file, or those of the welding
+        tool."""
         return self.shapes if self.shapes is not None else self._own_shapes()
 
     def _own_shapes(self) -> tuple[ToolShape, ...]:

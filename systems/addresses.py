@@ -61,7 +61,8 @@ def own_address(text: str) -> str:
         return str(ipaddress.ip_address(text))
     except ValueError:
         raise AddressError(
-            f"'{text[:60]}' is not an IP address: give --host as an address of this machine, such as 127.0.0.1, or 0.0.0.0."
+            f"'{text[:60]}' is not an IP address: give --host as an address of this machine, such as 127.0.0.1, or"
+            " 0.0.0.0."
         ) from None
 
 

@@ -71,8 +71,10 @@ class Background(Protocol):
 
 
 class Inline:
-    """Computes at once, in the caller's thread. The Diagram's time does not pass meanwhile, so the same seed gives the same run
-    on any computer."""
+    """Computes at once, in the caller's thread.
+
+    The Diagram's time does not pass meanwhile, so the same seed gives the same run on any computer.
+    """
 
     waiting_since: float | None = None
 
@@ -100,8 +102,8 @@ class Inline:
 class OwnProcess:
     """Computes in one process without real-time priority, beside a Diagram that keeps the pace of a robot.
 
-    A thread would share the interpreter's lock with the Diagram: each tick would wait for it. The process is spawned, not
-    forked, because a fork copies the locks of the link's and the renderer's threads.
+    A thread would share the interpreter's lock with the Diagram: each tick would wait for it. The process is spawned,
+    not forked, because a fork copies the locks of the link's and the renderer's threads.
     """
 
     _pool: ProcessPoolExecutor = field(
@@ -153,8 +155,8 @@ def import_module(name: str) -> None:
 def _begin_process() -> None:
     """Prepare the process: before other programs, and with one thread for linear algebra.
 
-    The fits' matrices are small. On a loaded computer two threads wait busily for each other: a fit of 3 s took 40 s, longer than an
-    emulated robot waits for its cell.
+    The fits' matrices are small. On a loaded computer two threads wait busily for each other: a fit of 3 s took 40 s,
+    longer than an emulated robot waits for its cell.
     """
     importlib.import_module("scipy.linalg")  # its linear algebra is not NumPy's, and only what is loaded can be limited
     importlib.import_module("threadpoolctl").threadpool_limits(1, user_api="blas")
@@ -162,6 +164,7 @@ def _begin_process() -> None:
 
 
 def before_other_programs(thread: int = 0) -> None:
-    """Give a thread (0: the caller's) a larger share of the processor than other programs have, where the system allows it."""
+    """Give a thread (0: the caller's) a larger share of the processor than other programs have, where the system allows
+    it."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, thread, NICE)

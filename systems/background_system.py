@@ -36,7 +36,10 @@ class BackgroundSystem(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def ask(self, context: Context, newest: Any) -> Answer[Any] | None:
-        """Start the computation that the inputs call for; None where they call for none. `newest` is the present output."""
+        """Start the computation that the inputs call for; None where they call for none.
+
+        `newest` is the present output.
+        """
         raise NotImplementedError
 
     def newest(self, context: Context) -> Any:

@@ -32,7 +32,9 @@ JobOf = TypeVar("JobOf", bound=AddedJob, covariant=True)
 
 @dataclass(frozen=True, eq=False)
 class Cell(Generic[JobOf]):
-    """The Diagram and its named parts; `person` may hold and end its run. The caller that builds a cell must close its station.
+    """The Diagram and its named parts; `person` may hold and end its run.
+
+    The caller that builds a cell must close its station.
 
     `logs`: the sinks of the logged values by name; in the Diagram the sink of NAME is called `log_NAME`.
     """
@@ -105,12 +107,7 @@ def build_cell(
 
 
 def _build(
-    job: Job[Any],
-    plan: Any,
-    wiring: Wiring,
-    noted: NotedBackground,
-    open_sink: OpenSink | None,
-    live: LiveView | None,
+    job: Job[Any], plan: Any, wiring: Wiring, noted: NotedBackground, open_sink: OpenSink | None, live: LiveView | None
 ) -> Cell[Any]:
     builder, station, scenario = wiring.builder, wiring.station, wiring.scenario
     builder.AddSystem(station.diagram)

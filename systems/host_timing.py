@@ -1,4 +1,5 @@
-"""Measures whether this computer can keep a robot's rate: how late a thread wakes up that asks for a wake-up every tick."""
+"""Measures whether this computer can keep a robot's rate: how late a thread wakes up that asks for a wake-up every
+tick."""
 
 import time
 from collections.abc import Callable
@@ -10,8 +11,8 @@ from weldcal.systems.pacing import real_time_priority
 TICK_S = 0.002
 MEASURED_S = 0.5
 LATE_MS = 4.0
-# A computer that is busy beside has some late wake-ups, for which the path is slowed. With one in ten the arm would hardly
-# move, and the guard on the controller stops an arm that gets no number for 150 ms.
+# A computer that is busy beside has some late wake-ups, for which the path is slowed. With one in ten the arm would
+# hardly move, and the guard on the controller stops an arm that gets no number for 150 ms.
 MOST_LATE_PERCENT = 10.0
 LONGEST_MS = 100.0
 TRIES = 3  # a single long pause, as of a disk, says nothing about the run
@@ -23,7 +24,8 @@ class HostTooLate(WeldcalError):
 
 @dataclass(frozen=True)
 class HostTiming:
-    """Wake-ups that were asked for every TICK_S: how many, the share that came LATE_MS late or later, and the latest."""
+    """Wake-ups that were asked for every TICK_S: how many, the share that came LATE_MS late or later, and the
+    latest."""
 
     wake_ups: int
     late_percent: float

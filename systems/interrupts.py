@@ -1,4 +1,5 @@
-"""Answers Ctrl-C and SIGTERM from the start of the program to its end: one sentence, one exit code, no traceback, no process left."""
+"""Answers Ctrl-C and SIGTERM from the start of the program to its end: one sentence, one exit code, no traceback, no
+process left."""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ def received() -> bool:
 
 @contextmanager
 def work() -> Iterator[None]:
-    """The work of a command: a signal raises KeyboardInterrupt within the block; after it, the outcome is printed first."""
+    """The work of a command: a signal raises KeyboardInterrupt within the block; after it, the outcome is printed
+    first."""
     _Now.time = _WORK
     try:
         yield
@@ -64,7 +66,10 @@ def work() -> Iterator[None]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Let signals wait until the end of the block. A process that is started within it never gets a Ctrl-C of the terminal."""
+    """Let signals wait until the end of the block.
+
+    A process that is started within it never gets a Ctrl-C of the terminal.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a started process inherits this
     _Now.deferred += 1
     try:

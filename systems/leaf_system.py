@@ -30,7 +30,8 @@ DECLARATIONS = (
 
 
 def without_owner(callback: Any) -> Any:
-    """The callback with a weak reference to the object whose method it is (a `partial` of a method too); any other as it is."""
+    """The callback with a weak reference to the object whose method it is (a `partial` of a method too); any other as
+    it is."""
     if isinstance(callback, MethodType):
         return _of_a_reference(callback.__func__, ref(callback.__self__))
     if isinstance(callback, partial):
@@ -54,14 +55,18 @@ class _OfCpp(type(DrakeLeafSystem)):  # type: ignore[misc]
 
 
 class LeafSystem(DrakeLeafSystem, metaclass=_OfCpp):
-    """A Drake LeafSystem that is freed with its Diagram. Two things keep others in memory for ever, with plants and renderers:
+    """A Drake LeafSystem that is freed with its Diagram.
 
-    - pydrake 1.51 stores a declared method in C++. It keeps the Python system alive, which keeps the C++ system alive, which keeps the
-      method (Drake issues 22515, 23930 and 24162). Here C++ gets a function that knows its system by a weak reference; the Diagram
-      keeps the system alive. A callback must be a method or a `functools.partial` of one: what a lambda captures stays captured.
-    - With CPython 3.11 the attributes of a Python class that derives from one of pybind11 are counted twice by the garbage collector,
-      which then never frees a cycle (pybind11 issue 4092), and each port is in a cycle with its system. The metaclass leaves them to
-      pybind11: every derived class has empty `__slots__`, and takes attributes all the same.
+    Two things keep others in memory for ever, with plants and renderers:
+
+    - pydrake 1.51 stores a declared method in C++. It keeps the Python system alive, which keeps the C++ system alive,
+      which keeps the method (Drake issues 22515, 23930 and 24162). Here C++ gets a function that knows its system by a
+      weak reference; the Diagram keeps the system alive. A callback must be a method or a `functools.partial` of one:
+      what a lambda captures stays captured.
+    - With CPython 3.11 the attributes of a Python class that derives from one of pybind11 are counted twice by the
+      garbage collector, which then never frees a cycle (pybind11 issue 4092), and each port is in a cycle with its
+      system. The metaclass leaves them to pybind11: every derived class has empty `__slots__`, and takes attributes all
+      the same.
     """
 
 

@@ -40,8 +40,11 @@ class Scan(Message):
 
 @dataclass(frozen=True, eq=False)
 class StreamedScan(Scan):
-    """A frame of a streaming scanner. When it was captured is not known; `arrival_time` s is on the arm's clock, `device_time` s on
-    the device's own (None: it has none), which stands while the Diagram stands."""
+    """A frame of a streaming scanner.
+
+    When it was captured is not known; `arrival_time` s is on the arm's clock, `device_time` s on the device's own
+    (None: it has none), which stands while the Diagram stands.
+    """
 
     arrival_time: float = -np.inf
     device_time: float | None = None
@@ -58,7 +61,8 @@ class ScanStream(Message):
 class Image(Message):
     """One frame of the finger camera: grey (H, W) uint8.
 
-    `capture_time` is the time, on the arm's clock, of the pose that the frame shows; `exposed_at` the time of the exposure.
+    `capture_time` is the time, on the arm's clock, of the pose that the frame shows; `exposed_at` the time of the
+    exposure.
     """
 
     sequence: int = 0
@@ -78,8 +82,8 @@ class ProfileScan(Message):
 
 @dataclass(frozen=True, eq=False)
 class TorchTouch(Message):
-    """The newest touch: its number, its start time, whether the contact persists, and the joints (6,) rad that its sensor
-    read at its start; None where the sensor reads none, and those at `time` count.
+    """The newest touch: its number, its start time, whether the contact persists, and the joints (6,) rad that its
+    sensor read at its start; None where the sensor reads none, and those at `time` count.
     """
 
     sequence: int = 0
@@ -155,8 +159,9 @@ class VerificationResult(Message):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Refinement(Message):
-    """What became of the refinement of a live calibration: the arm with corrected kinematics or the local field, where one is applied;
-    the text of the kinematics file, the stated errors of the arm, and the JSON object of `calibrate`."""
+    """What became of the refinement of a live calibration: the arm with corrected kinematics or the local field,
+    where one is applied; the text of the kinematics file, the stated errors of the arm, and the JSON object of
+    `calibrate`."""
 
     kind: str
     sentence: str
@@ -223,7 +228,8 @@ class ScanView(Message):
 
 @dataclass(frozen=True, eq=False)
 class SeamRecord(Message):
-    """One plan: the number of its seam, how its parts stand to each other, and the stretches (from, to) m that are not welded."""
+    """One plan: the number of its seam, how its parts stand to each other, and the stretches (from, to) m that are not
+    welded."""
 
     seam: int
     fit_up: FitUp | None = None
@@ -232,7 +238,8 @@ class SeamRecord(Message):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlannedSeam(Message):
-    """The SeamPlanner's result for the workpiece scan, or for several; before the last one it holds the `views` so far."""
+    """The SeamPlanner's result for the workpiece scan, or for several; before the last one it holds the `views` so
+    far."""
 
     sequence: int = 0
     views: tuple[ScanView, ...] = ()
@@ -251,7 +258,8 @@ class PlannedSeam(Message):
     more: bool = False  # another piece of this seam follows
     touch_arc_m: float | None = None  # where the tip comes down; None: near the start
     summary: str = ""  # the result of the scan, in one sentence
-    # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and torch at one place
+    # the torch's rms distance from the felt seam by errors of the arm, and the largest turn of the tool between tip and
+    # torch at one place
     arm_sigma_m: float = np.nan
     arm_turn_rad: float = np.nan
     lean_rad: float = (
@@ -260,7 +268,8 @@ class PlannedSeam(Message):
 
 
 def believed_arm(port: InputPort, context: Context, arm: ArmModel) -> ArmModel:
-    """The arm with refined kinematics of a `calibration_status` port; the given one where the port is open or has none."""
+    """The arm with refined kinematics of a `calibration_status` port; the given one where the port is open or has
+    none."""
     if not port.HasValue(context):
         return arm
     status: CalibrationStatus = port.Eval(context)

@@ -1,4 +1,5 @@
-"""What a person asks of a run: to hold, to go on, to end, to keep a pace; from the terminal, the dashboard or the 3D view."""
+"""What a person asks of a run: to hold, to go on, to end, to keep a pace; from the terminal, the dashboard or the 3D
+view."""
 
 import sys
 import threading
@@ -13,7 +14,9 @@ SLOWEST, FASTEST = 0.0, 3.0
 
 
 class Person:
-    """The wishes of a person; thread-safe. The Diagram reads them in its OperatorPanel, which makes them an input of the run.
+    """The wishes of a person; thread-safe.
+
+    The Diagram reads them in its OperatorPanel, which makes them an input of the run.
 
     `stands`: the run loop keeps the arm at rest now. `held_by`, `ended_by`: from where that was asked for.
     """

@@ -49,14 +49,7 @@ STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
     (
         "Calibrate",
         "calibrate",
-        (
-            "start",
-            "move_home",
-            "move_to_verification_cloud",
-            "scan_verification_cloud",
-            "move_to_pose",
-            "scan_pose",
-        ),
+        ("start", "move_home", "move_to_verification_cloud", "scan_verification_cloud", "move_to_pose", "scan_pose"),
     ),
     ("Verify", "calibrate", ("move_to_verify", "scan_verify")),
     ("Park", None, ("start", "move_home", "park")),
@@ -99,6 +92,7 @@ PROFILER_STEPS = {
 
 
 def phase_words(phase: str, detail: str = "") -> str:
-    """A phase in words, with a detail after a comma; a phase that is not listed (of an installed job) as it is written."""
+    """A phase in words, with a detail after a comma; a phase that is not listed (of an installed job) as it is
+    written."""
     words = TEXT.get(phase) or OTHERS.get(phase) or phase.replace("_", " ")
     return f"{words}, {detail}" if detail else words

@@ -23,11 +23,7 @@ from weldcal.systems.person import KEYS
 from weldcal.systems.wall_clock import PictureWait, WallClock
 
 Progress = Callable[[str, float], None]
-LOOKS = {
-    "job": 0.008,
-    "progress": 1.0,
-    "panel": 0.1,
-}  # seconds between checks; shorter than the sequencer's period
+LOOKS = {"job": 0.008, "progress": 1.0, "panel": 0.1}  # seconds between checks; shorter than the sequencer's period
 AT_REST_RAD_S = 1e-3
 COMMANDED_RAD_S = 1e-6
 PERSON_CHECK_S = 0.02
@@ -42,11 +38,12 @@ def no_progress(stage: str, fraction: float) -> None:
 
 @dataclass(kw_only=True)
 class Run(Generic[JobOf]):
-    """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began.
+    """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase
+    began.
 
     `interrupted`: the reason where a person ended the run before its job. `clock`: the clock of a paced run, else None.
-    `held_by_person`: how often a person held the run and let it go on. `host`: the computer's timing before the first motion.
-    `share`: the completed share of the job, 0 to 1; a run that is held does not advance it.
+    `held_by_person`: how often a person held the run and let it go on. `host`: the computer's timing before the first
+    motion. `share`: the completed share of the job, 0 to 1; a run that is held does not advance it.
     """
 
     cell: Cell[JobOf]
@@ -142,11 +139,13 @@ def run_cell(
     """Advance until the job is done or held (or its time limit holds it) and the arm is at rest.
 
     Records into `meshcat` where one is given. A station with a pace runs at that pace of the wall clock. The station is
-    always closed, also on Ctrl-C, which stops its arm. Before the first motion of a robot the computer's timing is measured.
+    always closed, also on Ctrl-C, which stops its arm. Before the first motion of a robot the computer's timing is
+    measured.
 
-    The cell's `person` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so that the job
-    goes on along the same path when the person says so. During a weld the process is turned off first and the servo brings the tool to
-    rest; it goes on from a little before that place. `ended` is called before the recording is shown.
+    The cell's `person` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so
+    that the job goes on along the same path when the person says so. During a weld the process is turned off first and
+    the servo brings the tool to rest; it goes on from a little before that place. `ended` is called before the
+    recording is shown.
 
     Raises:
         HostTooLate: the computer cannot keep the robot's rate; nothing has moved.

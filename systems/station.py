@@ -1,4 +1,5 @@
-"""Builds the station: arms, sensors and tools with fixed ports; the scenario's driver configs select real or simulated."""
+"""Builds the station: arms, sensors and tools with fixed ports; the scenario's driver configs select real or
+simulated."""
 
 import dataclasses as dc
 import inspect
@@ -176,12 +177,14 @@ def make_station(
 
     Ports: in `arm.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `arm.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
-    `finger_camera.image`, `.capture_time`, `query_object`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`,
-    `cheat.torch`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`. With a
-    profiler: in `profiler.trigger`, out `profiler.profile`; with a simulated one or a touch probe: `torch.touch`.
+    `finger_camera.image`, `.capture_time`, `query_object`; simulated only: `cheat.X_BC`, `cheat.truth`,
+    `cheat.contact`, `cheat.torch`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`,
+    `digitizer.touch`. With a profiler: in `profiler.trigger`, out `profiler.profile`; with a simulated one or a touch
+    probe: `torch.touch`.
 
     Raises:
-        InputError: the scenario has no robot. A driver adds its own: RobotRefused where the robot does not allow the job.
+        InputError: the scenario has no robot. A driver adds its own: RobotRefused where the robot does not allow the
+            job.
     """
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
@@ -288,7 +291,8 @@ def _make_station(
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:
-    """Apply a single-arm driver to the second arm: it gets a world with this arm as its arm, and its ports are renamed."""
+    """Apply a single-arm driver to the second arm: it gets a world with this arm as its arm, and its ports are
+    renamed."""
     world = build.require(SimulatedWorld)
     assert world.second is not None
     own = dc.replace(

@@ -1,4 +1,5 @@
-"""Paces the Diagram by the wall clock: waits while it is ahead, slows the path while it is late, counts how late each tick was."""
+"""Paces the Diagram by the wall clock: waits while it is ahead, slows the path while it is late, counts how late each
+tick was."""
 
 import time
 from collections import deque
@@ -9,10 +10,11 @@ KEPT = 8192  # corners of the course: 16 s of a rate that changes with every tic
 
 
 class LostTime:
-    """The course of the time lost over a clock, both s, as a line through corners: flat while the Diagram keeps its pace.
+    """The course of the time lost over a clock, both s, as a line through corners: flat while the Diagram keeps its
+    pace.
 
-    A device with a clock of its own goes on while the Diagram stands. What the Diagram knows by its own time, such as where
-    the arm was, is paired with the device's time less the time lost by then.
+    A device with a clock of its own goes on while the Diagram stands. What the Diagram knows by its own time, such as
+    where the arm was, is paired with the device's time less the time lost by then.
     """
 
     def __init__(self) -> None:
@@ -31,7 +33,8 @@ class LostTime:
         corners.append((clock_s, total))
 
     def at(self, clock_s: float) -> float:
-        """The time lost by a time of the clock, s; before the first corner that is kept as at it, after the newest as at that."""
+        """The time lost by a time of the clock, s; before the first corner that is kept as at it, after the newest as
+        at that."""
         later: tuple[float, float] | None = None
         for t, lost in reversed(self._corners):
             if t <= clock_s:
@@ -43,14 +46,15 @@ class LostTime:
 LATE_S = 0.020  # of robot time: a longer delay is not made up for
 LIMITS_MS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # upper limits of the histogram's bins; the last bin has none
 ON_TIME_MS = 4.0
-# The path's rate falls from 1 at SLOW_FROM_S late by 1 per SLOW_SPAN_S, no faster than FALL_PER_S, and rises by RISE_PER_S.
-# A computer that manages half of the rate then settles 4 ms late, within one period of the commands.
+# The path's rate falls from 1 at SLOW_FROM_S late by 1 per SLOW_SPAN_S, no faster than FALL_PER_S, and rises by
+# RISE_PER_S. A computer that manages half of the rate then settles 4 ms late, within one period of the commands.
 SLOW_FROM_S, SLOW_SPAN_S = 0.0015, 0.005
 FALL_PER_S, RISE_PER_S = 25.0, 2.0  # moves are at most 1 rad/s: a fall adds 25 rad/s^2 to them, and the link allows 40
 SLOWEST = 0.1
 # The servo needs pictures and detections: where this computer makes them late the path is slowed too.
 PICTURE_LATE_S, PICTURE_SPAN_S = 0.025, 0.100
-# A robot that waits for its cell gives it time for a picture, too: each tick at most so long for one this old, and no longer in all.
+# A robot that waits for its cell gives it time for a picture, too: each tick at most so long for one this old, and no
+# longer in all.
 PICTURE_DUE_S, PICTURE_STEP_S, PICTURE_PATIENCE_S = 0.150, 0.050, 2.0
 # A robot that waits for this computer's next velocity does not move its time: go on after this time of the wall clock.
 ROBOT_STANDS_S, ROBOT_LOOK_S = 0.100, 0.0005
@@ -103,12 +107,13 @@ class Lateness:
 class WallClock:
     """Advances the Diagram's time at `pace` seconds per second of the wall clock, or slower.
 
-    `rate` is the Diagram's seconds per second of the robot. It is 1 on a computer that keeps up. On a late one it falls, and
-    the driver scales each velocity by it: the path stays the same, and the arm follows it more slowly, as with the speed
-    slider. A single delay of more than LATE_S is never made up for, because a robot executes commands when they arrive: the
-    Diagram goes on from where it is. Lateness is in robot time: `late_s` is the maximum while the arm was commanded to move,
-    `thinking_s` the maximum while it was at rest, where computing time is not limited. `reanchored` counts the delays of more
-    than LATE_S during motion, and `lost_s` is their sum. `held`: a person wants the path to stand still.
+    `rate` is the Diagram's seconds per second of the robot. It is 1 on a computer that keeps up. On a late one it
+    falls, and the driver scales each velocity by it: the path stays the same, and the arm follows it more slowly, as
+    with the speed slider. A single delay of more than LATE_S is never made up for, because a robot executes commands
+    when they arrive: the Diagram goes on from where it is. Lateness is in robot time: `late_s` is the maximum while the
+    arm was commanded to move, `thinking_s` the maximum while it was at rest, where computing time is not limited.
+    `reanchored` counts the delays of more than LATE_S during motion, and `lost_s` is their sum. `held`: a person wants
+    the path to stand still.
     """
 
     def __init__(
@@ -133,7 +138,8 @@ class WallClock:
     def following(cls, robot_time: Callable[[], float]) -> "WallClock":
         """A clock that waits for the robot's own time (s), for an emulated robot that waits for this computer.
 
-        Neither gets ahead of the other, however slow both are. The path is not slowed: a robot that waits loses nothing.
+        Neither gets ahead of the other, however slow both are. The path is not slowed: a robot that waits loses
+        nothing.
         """
 
         def wait(seconds: float) -> None:
@@ -201,7 +207,8 @@ class WallClock:
         return found if found - now <= LATE_S else now
 
     def lost_by(self, clock_s: float) -> float:
-        """Seconds by which the Diagram had fallen behind the clock that it waits for at an earlier time of it, since it began."""
+        """Seconds by which the Diagram had fallen behind the clock that it waits for at an earlier time of it, since it
+        began."""
         return self._course.at(clock_s)
 
     def _stand_until(self, clock_s: float) -> None:
@@ -211,7 +218,8 @@ class WallClock:
         self._due = clock_s
 
     def overdue_s(self, diagram_time: float) -> float:
-        """How late (s of robot time) a velocity of this time of the Diagram would leave it now; 0 before the clock has waited."""
+        """How late (s of robot time) a velocity of this time of the Diagram would leave it now; 0 before the clock has
+        waited."""
         if self._at is None:
             return 0.0
         due = self._due + (diagram_time - self._at) / (self.pace * self.rate)
@@ -263,10 +271,11 @@ class WallClock:
 
 
 class PictureWait:
-    """Gives a loaded computer time to take a late picture where the robot waits for its cell; a camera that has stopped gets little of it.
+    """Gives a loaded computer time to take a late picture where the robot waits for its cell; a camera that has stopped
+    gets little of it.
 
-    Picture and Diagram are late by the same computer, and only the Diagram is waited for by the robot: without this the servo misses
-    pictures that are on their way.
+    Picture and Diagram are late by the same computer, and only the Diagram is waited for by the robot: without this the
+    servo misses pictures that are on their way.
     """
 
     def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
@@ -274,7 +283,8 @@ class PictureWait:
         self._waited_s = 0.0
 
     def wait(self, age_s: float) -> None:
-        """Wait a little, once in a tick, where the newest picture was taken more than PICTURE_DUE_S ago (s of the Diagram)."""
+        """Wait a little, once in a tick, where the newest picture was taken more than PICTURE_DUE_S ago (s of the
+        Diagram)."""
         if age_s <= PICTURE_DUE_S:
             self._waited_s = 0.0
         elif self._waited_s < PICTURE_PATIENCE_S:

@@ -35,8 +35,8 @@ FLAGS = (
     "--disable-default-apps",
 )
 
-# Without a graphics card a frame of a cell takes half a second of a core, and it is drawn again as long as it is open: frames queue up,
-# and a screenshot waits for all of them. Once a second, with hard edges, is enough to look at.
+# Without a graphics card a frame of a cell takes half a second of a core, and it is drawn again as long as it is open:
+# frames queue up, and a screenshot waits for all of them. Once a second, with hard edges, is enough to look at.
 SLOW_ANIMATION = """
 window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 1000);
 window.cancelAnimationFrame = clearTimeout;

@@ -1,4 +1,5 @@
-"""One process of the suite compiles a loop and the others wait for its code: after a fresh clone each would compile all of them."""
+"""One process of the suite compiles a loop and the others wait for its code: after a fresh clone each would compile all
+of them."""
 
 from __future__ import annotations
 
@@ -23,8 +24,10 @@ _held: set[str] = set()
 
 @contextmanager
 def _alone(loop: str) -> Iterator[None]:
-    """Held by one thread of one process for this loop; that thread may enter again. A loop that calls another takes that one's lock, too:
-    calls do not go in circles, so no two processes wait for each other.
+    """Held by one thread of one process for this loop; that thread may enter again.
+
+    A loop that calls another takes that one's lock, too: calls do not go in circles, so no two processes wait for each
+    other.
     """
     with _thread:
         if loop in _held:
@@ -41,7 +44,8 @@ def _alone(loop: str) -> Iterator[None]:
 
 
 def compile_one_by_one() -> None:
-    """From here on, Numba looks for a loop's code on disk and compiles it where there is none, without another process between."""
+    """From here on, Numba looks for a loop's code on disk and compiles it where there is none, without another process
+    between."""
     found = Dispatcher.compile
 
     @wraps(found)

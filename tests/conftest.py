@@ -22,7 +22,8 @@ from tests.short_job import finished_demo, short_jobs
 __all__ = ["browser", "finished_demo", "short_jobs"]
 
 compile_one_by_one()
-# Imports and collected tests stay for good: to look through all of them again and again takes a third of what collecting takes.
+# Imports and collected tests stay for good: to look through all of them again and again takes a third of what
+# collecting takes.
 gc.disable()
 
 
@@ -40,7 +41,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
-    """The browser leaves a test's page. A run of a cell has unfrozen all objects; when its file has ended, those that are left are frozen again."""
+    """The browser leaves a test's page.
+
+    A run of a cell has unfrozen all objects; when its file has ended, those that are left are frozen again.
+    """
     last = nextitem is None or nextitem.path != item.path
     running = item.session.stash.get(RUNNING, None)
     if running is not None and "browser" in getattr(item, "fixturenames", ()):
@@ -69,7 +73,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """From here on garbage is collected, of what the tests themselves make; not after each 700 objects, which takes twice the time."""
+    """From here on garbage is collected, of what the tests themselves make; not after each 700 objects, which takes
+    twice the time."""
     gc.freeze()
     gc.set_threshold(10_000, 20, 20)
     gc.enable()

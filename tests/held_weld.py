@@ -36,8 +36,9 @@ def short_weld() -> Scenario:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HeldWeld:
-    """The run, ms of the robot's time from the hold (the torch goes off) to the still arm, and the torch near the join: mean and
-    largest distance from the true seam, the longest stretch that was left out, and how much was welded twice, m."""
+    """The run, ms of the robot's time from the hold (the torch goes off) to the still arm, and the torch near the join:
+    mean and largest distance from the true seam, the longest stretch that was left out, and how much was welded twice,
+    m."""
 
     run: Run[Any]
     still_ms: float

@@ -1,6 +1,7 @@
 """Ends a command at a random moment, as Ctrl-C in its terminal or as SIGTERM, and judges what it leaves.
 
-python -m tests.interrupted [TIMES] [SEED] [LONGEST_S]     prints one line for each time that is not as it should be, and the counts
+python -m tests.interrupted [TIMES] [SEED] [LONGEST_S]     prints one line for each time that is not as it should be,
+and the counts
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ ABSENT = "the measured data (shared/data beside the checkout) are not here"
 
 
 def in_ci() -> bool:
-    """Whether this is a check before a merge: the environment variable CI is set and not 0 or false; `.ci/run` sets it."""
+    """Whether this is a check before a merge: the environment variable CI is set and not 0 or false; `.ci/run` sets
+    it."""
     return os.environ.get("CI", "").lower() not in ("", "0", "false")
 
 

@@ -1,4 +1,5 @@
-"""How the tests are dealt to the processes of pytest-xdist: file by file, and what sleeps most of its time one by one."""
+"""How the tests are dealt to the processes of pytest-xdist: file by file, and what sleeps most of its time one by
+one."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ STREAMING = (
     *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py", "test_hold_and_go_on.py"),
     *("test_wired_cell.py", "test_wired_profiler.py", "test_independent_controller.py"),
 )
-# They wait for a browser, a page or a folder and need next to no processor: beside a stream they leave the cores to what computes.
+# They wait for a browser, a page or a folder and need next to no processor: beside a stream they leave the cores to
+# what computes.
 WAITING = ("test_dashboard.py", "test_panels.py", "test_folder_scanner.py", "test_tablet_page.py")
 SLEEPING = STREAMING + WAITING
 # They look at the finished demo. A core that is left with them at the end keeps the other waiting.
@@ -34,7 +36,8 @@ def processes() -> int:
 def order(item: pytest.Item) -> tuple[object, ...]:
     """What sleeps first, for it takes its time whatever the others do; then what takes longest; short files last.
 
-    The rest is shuffled, each time alike: the files of a folder often wait for the same kind of thing, and two cores would wait at once.
+    The rest is shuffled, each time alike: the files of a folder often wait for the same kind of thing, and two cores
+    would wait at once.
     """
     name, room = item.path.name, item.nodeid.split("/")[1]
     shuffled = zlib.crc32(item.nodeid.partition("::")[0].encode())

@@ -155,9 +155,10 @@ def main(count: int, options: list[str]) -> int:
         with contextlib.suppress(OSError):
             status(page, "/act/go_on", "POST", **{"X-Weldcal-Key": key})
         print(
-            f"{address} {owner}\n  {len(found)} connections in {took:.1f} s; Hold before {statistics.median(before):.0f} ms, while they came "
-            f"median {statistics.median(during):.0f} worst {max(during):.0f} ms ({len(during)}), then median {statistics.median(after):.0f} "
-            f"worst {max(after):.0f} ms; foreign page {foreign}; job (descriptors, threads) {job}; runs {run.poll() is None}",
+            f"{address} {owner}\n  {len(found)} connections in {took:.1f} s; Hold before"
+            f" {statistics.median(before):.0f} ms, while they came median {statistics.median(during):.0f} worst"
+            f" {max(during):.0f} ms ({len(during)}), then median {statistics.median(after):.0f} worst {max(after):.0f}"
+            f" ms; foreign page {foreign}; job (descriptors, threads) {job}; runs {run.poll() is None}",
             flush=True,
         )
     code = run.wait()

@@ -35,8 +35,16 @@ Floats = npt.NDArray[np.floating[Any]]
 FLANGE = "iso9409-1-50-4-m6"
 
 __all__ = [
-    "build_cell", "calibrate", "fit_flange", "hand_eye", "load_scenario", "read_calibration", "read_cloud", "run", "verify",
-]  # fmt: skip
+    "build_cell",
+    "calibrate",
+    "fit_flange",
+    "hand_eye",
+    "load_scenario",
+    "read_calibration",
+    "read_cloud",
+    "run",
+    "verify",
+]
 
 
 def calibrate(
@@ -57,7 +65,8 @@ def calibrate(
         correct_scanner: estimate and apply a correction of the scanner's own errors.
 
     Returns:
-        `.result.X_BC` (pose of the camera in the robot's base, m), `.result.covariance` (6, 6), `.result.held_out_mm`, and more.
+        `.result.X_BC` (pose of the camera in the robot's base, m), `.result.covariance` (6, 6), `.result.held_out_mm`,
+            and more.
 
     Raises:
         InputError, TooFewPoses: the data cannot be used; the message says what to change.
@@ -121,7 +130,8 @@ def read_calibration(file: str | Path) -> CalibrationResult:
     """Read a calibration: the folder that `calibrate` wrote, or its calibration.yaml.
 
     Returns:
-        `.X_BC` (X_FC of a scanner on the flange has the same name), `.covariance` (6, 6); `.correct(points_C)` corrects scanned points.
+        `.X_BC` (X_FC of a scanner on the flange has the same name), `.covariance` (6, 6); `.correct(points_C)` corrects
+            scanned points.
 
     Raises:
         InputError: there is no calibration, or it cannot be read.
@@ -154,10 +164,12 @@ def hand_eye(
     Args:
         robot: X_BF (n, 4, 4), the robot's flange in its base; camera: X_CM (n, 4, 4), the target in the camera; metres.
         mounting: eye_in_hand or eye_on_base, and others of `weldcal hand-eye`.
-        robot_form, camera_form: how the matrices are to be read, as --robot-form and --camera-form: matrix, or "matrix,inverse".
+        robot_form, camera_form: how the matrices are to be read, as --robot-form and --camera-form: matrix, or
+            "matrix,inverse".
 
     Returns:
-        `.poses` by letter (X: the camera on what carries it, Y: the target), `.covariance`, `.held_out`, `.unobservable`. `.warnings` name
+        `.poses` by letter (X: the camera on what carries it, Y: the target), `.covariance`, `.held_out`,
+            `.unobservable`. `.warnings` name
         another reading of the matrices than the usual one, and the rows that were left out.
 
     Raises:
@@ -188,7 +200,8 @@ def build_cell(scenario: Scenario | str, seed: int = 0, meshcat: Meshcat | None 
 
 
 def run(scenario: str, out: str | Path, seed: int = 0, *, recording: bool = True) -> dict[str, object]:
-    """Run the job of a scenario (name or path) and write its result folder, as `weldcal demo` does; returns its summary.
+    """Run the job of a scenario (name or path) and write its result folder, as `weldcal demo` does; returns its
+    summary.
 
     Raises:
         InputError, UnreachableScanner, RobotRefused: the scenario cannot be run; nothing has been written or moved.

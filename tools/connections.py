@@ -1,4 +1,5 @@
-"""Limits and timeouts of every port that weldcal opens: strangers take no descriptors, threads or time from what the port serves."""
+"""Limits and timeouts of every port that weldcal opens: strangers take no descriptors, threads or time from what the
+port serves."""
 
 import os
 import resource
@@ -27,10 +28,12 @@ _TCP_BYTES_RECEIVED = struct.Struct("@128xQ")  # of Linux's tcp_info
 
 
 class Limited(socketserver.ThreadingMixIn, socketserver.TCPServer):
-    """A server with at most CONNECTIONS connections that wait for a request, and as many that are answered. Comes before its own class.
+    """A server with at most CONNECTIONS connections that wait for a request, and as many that are answered.
 
-    A thread is started when a request begins. Every client has TIMEOUT_S to send it and to read its answer. A new connection ends the
-    oldest that is not kept, so idle connections keep nobody away.
+    Comes before its own class.
+
+    A thread is started when a request begins. Every client has TIMEOUT_S to send it and to read its answer. A new
+    connection ends the oldest that is not kept, so idle connections keep nobody away.
     """
 
     daemon_threads = True
@@ -110,7 +113,8 @@ class Limited(socketserver.ThreadingMixIn, socketserver.TCPServer):
 
 
 def guard(view: Any) -> None:
-    """Limit the connections of a Meshcat, whose server in this process has no limit, in a thread, for as long as it lives.
+    """Limit the connections of a Meshcat, whose server in this process has no limit, in a thread, for as long as it
+    lives.
 
     Of more than VIEWS connections those are ended that have sent least.
     """

@@ -74,7 +74,8 @@ WHOLE = ("p[", "weldcal ", "[[")
 
 
 def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
-    """The lines of one row: the name in a column of so many characters, then the text, wrapped between words to a width."""
+    """The lines of one row: the name in a column of so many characters, then the text, wrapped between words to a
+    width."""
     indent = " " * (2 + column + 2)
     found: list[str] = []
     for line in text.splitlines():
@@ -84,7 +85,7 @@ def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
         inner = " " * (len(line) - len(line.lstrip()) + (2 if line.startswith("- ") else 0))
         found += textwrap.wrap(
             line, max(wide - len(indent), 20), subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
-        ) or [""]  # fmt: skip
+        ) or [""]
     lines = [indent + line for line in found]
     if len(name) > column:
         return [f"  {name}", *lines]
@@ -153,14 +154,17 @@ def _short(value: object) -> str:
 
 
 def emit_text(text: str) -> None:
-    """Writes a text on stdout; lines that are wider than the terminal are wrapped between words, below their second column."""
+    """Writes a text on stdout; lines that are wider than the terminal are wrapped between words, below their second
+    column."""
     wide = min(max(shutil.get_terminal_size((100, 24)).columns, NARROW), WIDE)
     for line in text.splitlines():
         column = re.match(r"\S.{0,14}?\s{2,}", line)
         inner = " " * (0 if column is None else column.end())
-        lines = [line] if len(line) <= wide or any(word in line for word in WHOLE) else textwrap.wrap(
-            line, wide, subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
-        )  # fmt: skip
+        lines = (
+            [line]
+            if len(line) <= wide or any(word in line for word in WHOLE)
+            else textwrap.wrap(line, wide, subsequent_indent=inner, break_long_words=False, break_on_hyphens=False)
+        )
         typer.echo("\n".join(lines))
 
 
@@ -188,7 +192,8 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
     """Turns every failure inside the block into one sentence on stderr and exit code 1; with --json, into JSON too.
 
     Raises:
-        typer.Exit: with code 1, for a WeldcalError, an OSError or (named an internal error) anything else; with code 130 for Ctrl-C.
+        typer.Exit: with code 1, for a WeldcalError, an OSError or (named an internal error) anything else; with code
+            130 for Ctrl-C.
     """
     details: dict[str, object] = {}
     code = 1

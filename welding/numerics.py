@@ -56,9 +56,7 @@ def pose(R: Any, p: Any) -> RigidTransform:
 
 
 def box_least_squares(
-    rows: tuple[tuple[float, float, float, float], ...],
-    x_bounds: tuple[float, float],
-    y_bounds: tuple[float, float],
+    rows: tuple[tuple[float, float, float, float], ...], x_bounds: tuple[float, float], y_bounds: tuple[float, float]
 ) -> tuple[float, float]:
     """Minimise sum w (a x + b y - c)^2 over a box, exactly.
 

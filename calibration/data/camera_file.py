@@ -1,4 +1,5 @@
-"""Read a camera's matrix and distortion from the files that ROS, OpenCV, Kalibr, EuRoC, ViSP, Open3D, BOP and RealSense users have."""
+"""Read a camera's matrix and distortion from the files that ROS, OpenCV, Kalibr, EuRoC, ViSP, Open3D, BOP and RealSense
+users have."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -16,12 +17,33 @@ from weldcal.models.documents import as_number
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, LARGEST_NUMBER, read_text
 
-_MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "camk", "mtx", "m1", "m", "cammatrix", "intrinsic", "intrinsics", "kmatrix", "matrix")  # fmt: skip
-_DISTORTION = ("distortioncoefficients", "distortioncoeffs", "distortion", "distcoeffs", "distcoeff", "dist", "d", "d1", "coeffs", "distcoefs", "kc")  # fmt: skip
-_NUMBERS = (("fx", "fu", "px", "focalx"), ("fy", "fv", "py", "focaly"), ("cx", "ppx", "u0", "pu", "centerx"), ("cy", "ppy", "v0", "pv", "centery"))  # fmt: skip
+_MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "camk", "mtx", "m1", "m", "cammatrix", "intrinsic", "intrinsics",
+    "kmatrix", "matrix")  # fmt: skip
+_DISTORTION = (
+    "distortioncoefficients",
+    "distortioncoeffs",
+    "distortion",
+    "distcoeffs",
+    "distcoeff",
+    "dist",
+    "d",
+    "d1",
+    "coeffs",
+    "distcoefs",
+    "kc",
+)
+_NUMBERS = (
+    ("fx", "fu", "px", "focalx"),
+    ("fy", "fv", "py", "focaly"),
+    ("cx", "ppx", "u0", "pu", "centerx"),
+    ("cy", "ppy", "v0", "pv", "centery"),
+)
 _FISHEYE = ("equidistant", "fisheye", "kannala", "omni", "thin_prism", "eucm", "fov")
 _COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients that OpenCV knows
-_NEEDED = "give camera_matrix (or K) and distortion_coefficients, as ROS and OpenCV write them, or fx, fy, cx and cy in pixels"
+_NEEDED = (
+    "give camera_matrix (or K) and distortion_coefficients, as ROS and OpenCV write them, or fx, fy, cx and cy in"
+    " pixels"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +67,8 @@ def read_camera(path: Path) -> CameraFile:
     """The camera of a file.
 
     Raises:
-        DatasetError: the file cannot be read, states no camera, or a lens model that OpenCV's pinhole model does not include.
+        DatasetError: the file cannot be read, states no camera, or a lens model that OpenCV's pinhole model does not
+            include.
     """
     try:
         found = find_camera(path)
@@ -56,8 +79,9 @@ def read_camera(path: Path) -> CameraFile:
     name, K, dist = path.name, found.K, found.distortion
     if any(word in found.model for word in _FISHEYE):
         raise DatasetError(
-            f"'{name}' states the lens model '{found.model.strip()}'; pinhole cameras with radial and tangential distortion are read: calibrate "
-            "the camera with OpenCV's calibrateCamera, or leave the file out and let the camera be estimated."
+            f"'{name}' states the lens model '{found.model.strip()}'; pinhole cameras with radial and tangential"
+            " distortion are read: calibrate the camera with OpenCV's calibrateCamera, or leave the file out and let"
+            " the camera be estimated."
         )
     if dist.size not in _COUNTS:
         raise DatasetError(
@@ -69,7 +93,10 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def find_camera(path: Path) -> CameraFile | None:
-    """The camera of a file as it is stated, not checked; None where it states none. Raises InputError where it cannot be read."""
+    """The camera of a file as it is stated, not checked; None where it states none.
+
+    Raises InputError where it cannot be read.
+    """
     return next((found for node in _nodes(_tree(path)) if (found := _camera(node)) is not None), None)
 
 

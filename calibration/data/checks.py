@@ -33,8 +33,8 @@ ALIASES = {"eye_on_arm": CARRIED[0], "eye_on_arm_base": CARRIED[1]}
 LARGEST_ARM_MM = 5.0
 MODES = ("static", "motion")
 _SAMPLE = 10_000  # points whose distance is enough to tell metres from millimetres
-# Median distances that a flange has from its base, and a scanned point from its camera. The bounds are a factor of 1000 apart, so
-# that metres called millimetres, or the reverse, always fall outside.
+# Median distances that a flange has from its base, and a scanned point from its camera. The bounds are a factor of 1000
+# apart, so that metres called millimetres, or the reverse, always fall outside.
 REACH_M = (0.01, 10.0)
 
 
@@ -83,7 +83,8 @@ def read_header(path: Path) -> DatasetHeader:
         )
     if not 0.0 < header.arm_error_mm <= LARGEST_ARM_MM:
         raise DatasetError(
-            f"'{path.name}': arm_error_mm must be above 0 and at most {LARGEST_ARM_MM:g}, and it is {header.arm_error_mm:g}."
+            f"'{path.name}': arm_error_mm must be above 0 and at most {LARGEST_ARM_MM:g}, and it is"
+            f" {header.arm_error_mm:g}."
         )
     _check_poses(header, path)
     _check_clouds(header, path)
@@ -136,7 +137,10 @@ def is_motion(folder: Path) -> bool:
 
 
 def is_carried(folder: Path) -> bool:
-    """Whether a folder's dataset.yaml is of scans at rest by a scanner that an arm carries. False where it cannot be read."""
+    """Whether a folder's dataset.yaml is of scans at rest by a scanner that an arm carries.
+
+    False where it cannot be read.
+    """
     path = Path(folder) / "dataset.yaml"
     try:
         header = read_header(path) if path.is_file() else None
@@ -181,8 +185,8 @@ def _check_clouds(header: DatasetHeader, path: Path) -> None:
         )
     if not 0.0 <= header.depth_scale <= 1.0:
         raise DatasetError(
-            f"'{path.name}': depth_scale {header.depth_scale:g} must be the metres of one unit of a depth image, such as 0.001 for "
-            "millimetres or 0.0002 for 5000 units a metre."
+            f"'{path.name}': depth_scale {header.depth_scale:g} must be the metres of one unit of a depth image, such"
+            " as 0.001 for millimetres or 0.0002 for 5000 units a metre."
         )
     if (c := header.intrinsics) is not None:
         try:
@@ -210,7 +214,8 @@ def _check_poses(header: DatasetHeader, path: Path) -> None:
         unit_quaternion(found.wxyz, key)
     if guess is not None and not 0.0 < guess.radius_m <= REACH_M[1]:
         raise DatasetError(
-            f"'{path.name}': scanner_guess.radius_m must be a positive number of metres up to {REACH_M[1]:g}, not {guess.radius_m:g}."
+            f"'{path.name}': scanner_guess.radius_m must be a positive number of metres up to {REACH_M[1]:g}, not"
+            f" {guess.radius_m:g}."
         )
 
 

@@ -83,16 +83,16 @@ def read_cloud(path: Path, form: CloudForm | None = None) -> Array:
     """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit.
 
     NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
-    centres at whole numbers; zero or NaN depth is invalid. NPY: such points alone, or a depth image. Text: x, y, z are the first
-    three columns, below a header or none. Points with NaN or at 0 0 0 were not measured: they are NaN in organised clouds and
-    left out of lists. A list in the sensor's order that keeps them becomes organised.
+    centres at whole numbers; zero or NaN depth is invalid. NPY: such points alone, or a depth image. Text: x, y, z are
+    the first three columns, below a header or none. Points with NaN or at 0 0 0 were not measured: they are NaN in
+    organised clouds and left out of lists. A list in the sensor's order that keeps them becomes organised.
 
     Args:
         form: what is known of the files beyond their contents.
 
     Raises:
-        CloudError: not a regular file, unreadable, truncated, larger than the bounds in models/files.py, empty, infinite
-            coordinates, a depth image without intrinsics, a PCD whose VIEWPOINT has no stated meaning.
+        CloudError: not a regular file, unreadable, truncated, larger than the bounds in models/files.py, empty,
+            infinite coordinates, a depth image without intrinsics, a PCD whose VIEWPOINT has no stated meaning.
     """
     form = form or CloudForm()
     reader = _READERS.get(ending_of(path))
@@ -180,8 +180,8 @@ def _read_npz(path: Path, form: CloudForm) -> Array:
 def read_text_cloud(path: Path) -> Array:
     """Points (N, 3): the columns that the header names x, y and z, else the first three; # and // begin comments.
 
-    A first line with one whole number is the number of points, as in .pts files. All rows have as many cells. Decimal commas are
-    read where semicolons, tabs or blanks separate the cells.
+    A first line with one whole number is the number of points, as in .pts files. All rows have as many cells. Decimal
+    commas are read where semicolons, tabs or blanks separate the cells.
 
     Raises:
         CloudError: anything else, with the line's number. InputError: the file cannot be opened, or is not UTF-8.
@@ -234,7 +234,8 @@ def read_text_cloud(path: Path) -> Array:
             block = []
     if whole:
         raise CloudError(
-            f"The commas of {path.name} could be separators or decimal commas; write decimal points, or semicolons between the cells."
+            f"The commas of {path.name} could be separators or decimal commas; write decimal points, or semicolons"
+            " between the cells."
         )
     points = np.concatenate([*blocks, np.array(block, dtype=float).reshape(-1, 3)])
     if promised is not None and promised != len(points):
@@ -306,13 +307,16 @@ def _could_be_decimals(cells: list[str]) -> bool:
 
 def _surplus(path: Path, line: int, n: int, width: int) -> str:
     return (
-        f"The file {path.name}, line {line}, has {n} cells and the first row {width}: give each row the same, and decimal commas only "
-        "with semicolons or tabs between the cells."
+        f"The file {path.name}, line {line}, has {n} cells and the first row {width}: give each row the same, and"
+        " decimal commas only with semicolons or tabs between the cells."
     )
 
 
 _READERS: dict[str, Callable[[Path, CloudForm], Array]] = {
-    ".npz": _read_npz, ".npy": _read_npy, **dict.fromkeys((".ply", ".ply.gz"), lambda path, form: read_ply(path)),
-    **dict.fromkeys((".pcd", ".pcd.gz"), read_pcd), **dict.fromkeys(IMAGES, read_depth_image),
+    ".npz": _read_npz,
+    ".npy": _read_npy,
+    **dict.fromkeys((".ply", ".ply.gz"), lambda path, form: read_ply(path)),
+    **dict.fromkeys((".pcd", ".pcd.gz"), read_pcd),
+    **dict.fromkeys(IMAGES, read_depth_image),
     **dict.fromkeys((*_TEXT, *(f"{s}.gz" for s in _TEXT)), lambda path, form: read_text_cloud(path)),
-}  # fmt: skip
+}

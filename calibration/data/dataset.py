@@ -48,8 +48,8 @@ SECOND_JOINTS = tuple(f"second_q{k}" for k in range(1, 7))
 
 @dataclass(frozen=True)
 class Pair:
-    """A centre found by other means: camera point (3,) m and the robot's pose of the feature (rotation identity where not
-    given)."""
+    """A centre found by other means: camera point (3,) m and the robot's pose of the feature (rotation identity where
+    not given)."""
 
     id: str
     X_BR: RigidTransform
@@ -72,7 +72,8 @@ class Dataset:
     recorded: Mapping[str, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     readings: tuple[PoseReading, ...] = ()
-    """Readings of the poses, in metres and in the order of ``poses``, where their file allows more than one; the used one first."""
+    """Readings of the poses, in metres and in the order of ``poses``, where their file allows more than one; the used
+    one first."""
 
     def read_as(self, reading: PoseReading, note: str) -> Self:
         """The dataset with its poses in another of its readings."""
@@ -81,7 +82,8 @@ class Dataset:
         return replace(self, poses=poses, readings=(reading, *others), notes=(*self.notes, note))
 
     def between(self, ids: str) -> Self:
-        """The dataset without the scans before or after those named "FROM:TO" (ids; either may be left out), in its order.
+        """The dataset without the scans before or after those named "FROM:TO" (ids; either may be left out), in its
+        order.
 
         Raises DatasetError where there is no colon, an id is not in the dataset, or FROM stands after TO.
         """
@@ -122,7 +124,10 @@ class Dataset:
         return None if g is None else RigidTransform(unit_quaternion(g.wxyz, "scanner_guess"), g.xyz)
 
     def joints(self, names: tuple[str, ...] = JOINTS) -> dict[str, Array]:
-        """Joint angles (6,) rad by id, of poses.csv; empty where it has none. Raises DatasetError for bad or missing numbers."""
+        """Joint angles (6,) rad by id, of poses.csv; empty where it has none.
+
+        Raises DatasetError for bad or missing numbers.
+        """
         path = self.folder / "poses.csv"
         rows = table_rows(path, ("id",)) if path.is_file() else []
         missing = [(row["id"], name) for row in rows for name in names if not row.get(name)]
@@ -143,10 +148,12 @@ class Dataset:
 
 
 def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dataset:
-    """Read and check a dataset: dataset.yaml with poses.csv and clouds/, or pairs.csv; or the poses in any form of docs/datasets.md.
+    """Read and check a dataset: dataset.yaml with poses.csv and clouds/, or pairs.csv; or the poses in any form of
+    docs/datasets.md.
 
-    Without dataset.yaml the scanner is taken as fixed beside the robot, and the units follow from the size of the numbers.
-    ``robot`` gives the kinematics of a recording that holds joint angles. ``carried``: the scanner may be carried by an arm.
+    Without dataset.yaml the scanner is taken as fixed beside the robot, and the units follow from the size of the
+    numbers. ``robot`` gives the kinematics of a recording that holds joint angles. ``carried``: the scanner may be
+    carried by an arm.
 
     Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown
     unit or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses
@@ -157,7 +164,8 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
     folder = Path(folder)
     if folder.is_file() and find_bag(folder) is None:
         raise DatasetError(
-            f"'{folder.name}' is a file; give the folder that holds it and dataset.yaml. Pairs of robot and camera poses go to 'weldcal hand-eye ax-yb'."
+            f"'{folder.name}' is a file; give the folder that holds it and dataset.yaml. Pairs of robot and camera"
+            " poses go to 'weldcal hand-eye ax-yb'."
         )
     if not folder.exists():
         raise DatasetError(
@@ -174,13 +182,13 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
         header = read_header(description)
     if header.mode == "motion":
         raise DatasetError(
-            f"'{folder.name}' is a recording in motion (mode: motion); 'weldcal calibrate' and 'weldcal monitor' read it. "
-            "This command needs scans at rest, with poses.csv."
+            f"'{folder.name}' is a recording in motion (mode: motion); 'weldcal calibrate' and 'weldcal monitor' read"
+            " it. This command needs scans at rest, with poses.csv."
         )
     if header.configuration != CONFIGURATIONS[0] and not carried:
         raise DatasetError(
-            f"'{folder.name}' is of a scanner that an arm carries ({header.configuration}); only 'weldcal calibrate' reads it. This command "
-            "needs a scanner beside the robot (eye_on_base)."
+            f"'{folder.name}' is of a scanner that an arm carries ({header.configuration}); only 'weldcal calibrate'"
+            " reads it. This command needs a scanner beside the robot (eye_on_base)."
         )
     hashes = {} if bare else {"dataset.yaml": digest(description)}
     if header.poses is not None and header.poses.file:
@@ -202,16 +210,20 @@ def load_dataset(folder: Path, *, robot: str = "", carried: bool = False) -> Dat
         return _recording(folder, header, bag, hashes, robot)
     if (folder / "stream.csv").is_file():
         raise DatasetError(
-            f"'{folder.name}' holds stream.csv and no poses.csv; for a recording in motion add 'mode: motion' to dataset.yaml."
+            f"'{folder.name}' holds stream.csv and no poses.csv; for a recording in motion add 'mode: motion' to"
+            " dataset.yaml."
         )
     raise DatasetError(
-        f"'{folder.name}' holds neither poses.csv nor pairs.csv; add poses.csv with the columns id,x,y,z,qw,qx,qy,qz, or poses in another "
-        "form of docs/datasets.md."
+        f"'{folder.name}' holds neither poses.csv nor pairs.csv; add poses.csv with the columns id,x,y,z,qw,qx,qy,qz,"
+        " or poses in another form of docs/datasets.md."
     )
 
 
 def joint_angles(data: Dataset, ids: Sequence[str], joints: int) -> Array | None:
-    """Joint angles (n, joints) rad at the poses of these ids; None where poses.csv and pairs.csv have none. Raises DatasetError for bad numbers."""
+    """Joint angles (n, joints) rad at the poses of these ids; None where poses.csv and pairs.csv have none.
+
+    Raises DatasetError for bad numbers.
+    """
     path = data.folder / ("pairs.csv" if data.pairs else "poses.csv")
     if not path.is_file():
         return None  # another form of poses
@@ -328,7 +340,10 @@ def _finished(
 
 
 def _camera_note(folder: Path, header: DatasetHeader, cloud: Path, hashes: dict[str, str]) -> tuple[str, ...]:
-    """Where the intrinsics of depth images come from, a sentence; the file is hashed. The cloud's reader says what is wrong."""
+    """Where the intrinsics of depth images come from, a sentence; the file is hashed.
+
+    The cloud's reader says what is wrong.
+    """
     if not is_depth(cloud):
         return ()
     try:
@@ -359,11 +374,12 @@ def save_dataset(
     joints: Mapping[str, Array] | None = None,
     intrinsics: tuple[float, float, float, float] | None = None,
 ) -> None:
-    """Record scans as a dataset folder that load_dataset reads back: X_BF and a cloud in metres ((N, 3) or (H, W, 3)) per id.
+    """Record scans as a dataset folder that load_dataset reads back: X_BF and a cloud in metres ((N, 3) or (H, W, 3))
+    per id.
 
-    ``times`` (s) adds the column `time`, ``joints`` (6,) or (12,) rad q1 to q6, and of a second arm second_q1 to second_q6;
-    ``intrinsics`` writes organised clouds as depth maps.
-    ``header.units`` is written as metres. Raises DatasetError when the ids of poses and clouds differ.
+    ``times`` (s) adds the column `time`, ``joints`` (6,) or (12,) rad q1 to q6, and of a second arm second_q1 to
+    second_q6; ``intrinsics`` writes organised clouds as depth maps. ``header.units`` is written as metres. Raises
+    DatasetError when the ids of poses and clouds differ.
     """
     if set(poses) != set(clouds):
         raise DatasetError("A recording needs one cloud for each pose; the ids of poses and clouds differ.")
@@ -457,7 +473,8 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
 
 
 def _repeated(scans: Mapping[str, tuple[object, ...]]) -> tuple[tuple[str, str], ...]:
-    """Scans identical to another one, with the reason: a copy would count twice and predict itself in cross-validation."""
+    """Scans identical to another one, with the reason: a copy would count twice and predict itself in
+    cross-validation."""
     first: dict[tuple[object, ...], str] = {}
     again = []
     for id, scan in scans.items():

@@ -8,7 +8,10 @@ from typing import Any
 
 @dataclass
 class Units:
-    """Length units of the files: ``m``, ``mm`` or ``auto`` (by their size). Flange poses and clouds must then lie 10 mm to 10 m away (median)."""
+    """Length units of the files: ``m``, ``mm`` or ``auto`` (by their size).
+
+    Flange poses and clouds must then lie 10 mm to 10 m away (median).
+    """
 
     clouds: str = "m"
     poses: str = "m"
@@ -25,7 +28,8 @@ class Feature:
 
 @dataclass
 class ScannerGuess:
-    """Approximate pose X_BC of the scanner: position m, quaternion wxyz, and the largest error of the feature it causes, m."""
+    """Approximate pose X_BC of the scanner: position m, quaternion wxyz, and the largest error of the feature it
+    causes, m."""
 
     xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])
@@ -34,7 +38,8 @@ class ScannerGuess:
 
 @dataclass
 class SecondRobot:
-    """The second robot of a co-manipulation and the approximate pose X_BD of its base in the first one's base: m, quaternion wxyz."""
+    """The second robot of a co-manipulation and the approximate pose X_BD of its base in the first one's base: m,
+    quaternion wxyz."""
 
     robot: str = "ur10e"
     xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -53,10 +58,10 @@ class DepthCamera:
 
 @dataclass(kw_only=True)
 class PoseForm:
-    """How the poses are written, where it is not x,y,z,qw,qx,qy,qz: ``file`` (a file or folder beside dataset.yaml), ``rotation`` (a
-    notation by name), ``angles`` (rad or deg), ``frame`` (flange_in_base, or base_in_flange for the inverse), ``tcp`` (the
-    controller's TCP x,y,z,rx,ry,rz in m and rad where the poses are the TCP's), and of a ROS recording the names of the frames and
-    topics."""
+    """How the poses are written, where it is not x,y,z,qw,qx,qy,qz: ``file`` (a file or folder beside dataset.yaml),
+    ``rotation`` (a notation by name), ``angles`` (rad or deg), ``frame`` (flange_in_base, or base_in_flange for the
+    inverse), ``tcp`` (the controller's TCP x,y,z,rx,ry,rz in m and rad where the poses are the TCP's), and of a ROS
+    recording the names of the frames and topics."""
 
     file: str = ""
     rotation: str = ""
@@ -71,10 +76,14 @@ class PoseForm:
 
 @dataclass(kw_only=True)
 class DatasetHeader:
-    """Contents of dataset.yaml. ``mode``: static (a scan at each pose) or motion (scans while the arm moves). ``intrinsics`` and
-    ``depth_scale`` (metres of one unit) of depth images; ``viewpoint``: what VIEWPOINT of PCD files means. Of a scanner that an arm carries:
-    ``scanner_guess`` is its pose on its carrier; ``scanner_link`` the link that carries it (eye_on_arm), ``second_robot`` the arm that shows
-    its flange (co_manipulation), ``arm_error_mm`` the rms error of the flange's reported position."""
+    """Contents of dataset.yaml.
+
+    ``mode``: static (a scan at each pose) or motion (scans while the arm moves). ``intrinsics`` and ``depth_scale``
+    (metres of one unit) of depth images; ``viewpoint``: what VIEWPOINT of PCD files means. Of a scanner that an arm
+    carries: ``scanner_guess`` is its pose on its carrier; ``scanner_link`` the link that carries it (eye_on_arm),
+    ``second_robot`` the arm that shows its flange (co_manipulation), ``arm_error_mm`` the rms error of the flange's
+    reported position.
+    """
 
     schema: int = 0
     robot: str = ""

@@ -41,8 +41,8 @@ _NEAR_S = 10.0  # arrivals so far from the stream are on another clock
 
 @dataclass(frozen=True, eq=False)
 class RobotStream:
-    """Robot stream as recorded, in ascending order of ``time`` (n,) s, the robot's clock: ``poses`` X_BF (n, 4, 4) m, and the joint
-    angles ``joints`` (n, J) rad that they were computed from, or None where the stream holds poses."""
+    """Robot stream as recorded, in ascending order of ``time`` (n,) s, the robot's clock: ``poses`` X_BF (n, 4, 4) m,
+    and the joint angles ``joints`` (n, J) rad that they were computed from, or None where the stream holds poses."""
 
     time: Array
     poses: Array
@@ -52,7 +52,8 @@ class RobotStream:
 
 @dataclass(frozen=True)
 class FrameTime:
-    """Times of one frame, s: ``arrival`` on the robot's clock, ``device`` on the scanner's own clock (None without one)."""
+    """Times of one frame, s: ``arrival`` on the robot's clock, ``device`` on the scanner's own clock (None without
+    one)."""
 
     id: str
     arrival: float
@@ -61,8 +62,11 @@ class FrameTime:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MotionDataset:
-    """A recording in motion, checked. ``frames`` ascend by arrival and have a cloud each (``clouds``: id to file); ``refused`` lists
-    (id, reason); ``warnings`` are sentences for the user."""
+    """A recording in motion, checked.
+
+    ``frames`` ascend by arrival and have a cloud each (``clouds``: id to file); ``refused`` lists (id, reason);
+    ``warnings`` are sentences for the user.
+    """
 
     folder: Path
     header: DatasetHeader
@@ -103,9 +107,10 @@ class MotionDataset:
 def load_motion_dataset(folder: Path, *, robot: str | None = None) -> MotionDataset:
     """Read and check a recording in motion: dataset.yaml (`mode: motion`), stream.csv, frames.csv and clouds/.
 
-    ``robot`` overrides the header's; only a stream of joint angles needs one. Rows may come in any order; rows of the stream
-    without values are left out, as is what repeats. A frame without a cloud, or that repeats another one, is refused by name;
-    clouds themselves are read later. Raises DatasetError, one sentence, for what makes the recording unusable.
+    ``robot`` overrides the header's; only a stream of joint angles needs one. Rows may come in any order; rows of the
+    stream without values are left out, as is what repeats. A frame without a cloud, or that repeats another one, is
+    refused by name; clouds themselves are read later. Raises DatasetError, one sentence, for what makes the recording
+    unusable.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -170,10 +175,13 @@ def save_motion_dataset(
     *,
     intrinsics: tuple[float, float, float, float] | None = None,
 ) -> None:
-    """Record a motion as a folder that load_motion_dataset reads back. ``clouds`` gives (id, points in metres (N, 3) or (H, W, 3)) one
-    after the other, so that they need not be in memory together; ``intrinsics`` writes organised clouds as depth maps.
+    """Record a motion as a folder that load_motion_dataset reads back.
 
-    The stream is written as joints where it has them. ``header.mode`` and ``header.units`` are written as motion and metres.
+    ``clouds`` gives (id, points in metres (N, 3) or (H, W, 3)) one after the other, so that they need not be in memory
+    together; ``intrinsics`` writes organised clouds as depth maps.
+
+    The stream is written as joints where it has them. ``header.mode`` and ``header.units`` are written as motion and
+    metres.
     """
     document = {**without_cloud_form(header), "schema": 1, "mode": "motion", "units": {"clouds": "m", "poses": "m"}}
     if header.scanner_guess is None:
@@ -205,8 +213,8 @@ def _write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[objec
 
 
 def read_stream(path: Path, *, robot: str = "", unit: str = "m") -> tuple[RobotStream, list[str]]:
-    """A robot's stream from a file alone, with poses in ``unit`` (m or mm) or joint angles of ``robot``, and sentences about rows that
-    were left out. Raises DatasetError, one sentence."""
+    """A robot's stream from a file alone, with poses in ``unit`` (m or mm) or joint angles of ``robot``, and sentences
+    about rows that were left out. Raises DatasetError, one sentence."""
     if unit not in UNITS:
         raise DatasetError(f"The unit '{unit}' is not known; write m or mm.")
     if not path.is_file():
@@ -226,7 +234,8 @@ def _read_stream(path: Path, header: DatasetHeader, robot: str) -> tuple[RobotSt
     columns = POSE_COLUMNS if set(POSE_COLUMNS) <= set(names) else joints
     if "time" not in names or not columns:
         raise DatasetError(
-            f"'{path.name}' has the columns {','.join(names)[:80]}; it needs time,{','.join(POSE_COLUMNS)} or time,q1,...,q6."
+            f"'{path.name}' has the columns {','.join(names)[:80]}; it needs time,{','.join(POSE_COLUMNS)} or"
+            " time,q1,...,q6."
         )
     table = _numbers(path, rows, ("time", *columns))
     whole = np.isfinite(table).all(axis=1)
@@ -241,8 +250,8 @@ def _read_stream(path: Path, header: DatasetHeader, robot: str) -> tuple[RobotSt
     step = float(np.median(np.diff(table[:, 0]))) if len(table) > 1 else 0.0
     if not _RATE_S[0] <= step <= _RATE_S[1]:
         raise DatasetError(
-            f"The rows of '{path.name}' are {step:.3g} apart in time; a robot's stream has {_RATE_S[0]:g} to {_RATE_S[1]:g} s. "
-            "Give the times in seconds."
+            f"The rows of '{path.name}' are {step:.3g} apart in time; a robot's stream has {_RATE_S[0]:g} to"
+            f" {_RATE_S[1]:g} s. Give the times in seconds."
         )
     if columns is POSE_COLUMNS:
         poses, q = _poses(path, table[:, 1:], header.units.poses), None
@@ -276,14 +285,17 @@ def _numbers(path: Path, rows: list[dict[str, str]], columns: tuple[str, ...]) -
 
 
 def _poses(path: Path, values: Array, unit: str) -> Array:
-    """Poses (n, 4, 4) m of positions and quaternions (n, 7). Raises DatasetError for a wrong unit or no unit quaternions."""
+    """Poses (n, 4, 4) m of positions and quaternions (n, 7).
+
+    Raises DatasetError for a wrong unit or no unit quaternions.
+    """
     w, x, y, z = values[:, 3:].T
     norm = np.sqrt(w * w + x * x + y * y + z * z)
     wrong = np.flatnonzero(np.abs(norm - 1.0) > 1e-2)  # four or five digits are enough
     if len(wrong):
         raise DatasetError(
-            f"'{path.name}' has a quaternion of length {norm[wrong[0]]:.4f} in row {wrong[0] + 1}; a rotation needs length 1 "
-            "(order qw, qx, qy, qz)."
+            f"'{path.name}' has a quaternion of length {norm[wrong[0]]:.4f} in row {wrong[0] + 1}; a rotation needs"
+            " length 1 (order qw, qx, qy, qz)."
         )
     w, x, y, z = values[:, 3:].T / norm
     R = np.array(
@@ -299,15 +311,18 @@ def _poses(path: Path, values: Array, unit: str) -> Array:
 
 
 def _forward(path: Path, q: Array, robot: str) -> Array:
-    """Poses (n, 4, 4) of joint angles (n, J). Raises DatasetError where the robot is not known or the angles are none of it."""
+    """Poses (n, 4, 4) of joint angles (n, J).
+
+    Raises DatasetError where the robot is not known or the angles are none of it.
+    """
     try:
         found = get_chain(robot)
     except InputError as error:
         if is_urdf(robot):
             raise DatasetError(str(error)) from None
         raise DatasetError(
-            f"'{path.name}' holds joint angles, and the robot '{robot}' is not known; use poses (x,y,z,qw,qx,qy,qz), or one of "
-            f"{', '.join(ROBOTS)}."
+            f"'{path.name}' holds joint angles, and the robot '{robot}' is not known; use poses (x,y,z,qw,qx,qy,qz), or"
+            f" one of {', '.join(ROBOTS)}."
         ) from None
     if q.shape[1] != found.n:
         title = Path(robot).name if is_urdf(robot) else get_robot(robot).title
@@ -332,8 +347,9 @@ def _read_frames(path: Path, stream: RobotStream) -> tuple[list[FrameTime], list
     begin, end = stream.time[0] - _NEAR_S, stream.time[-1] + _NEAR_S
     if not any(begin <= f.arrival <= end for f in frames):
         raise DatasetError(
-            f"The arrivals in '{path.name}' ({frames[0].arrival:.3f} to {frames[-1].arrival:.3f} s) do not overlap the stream's times "
-            f"({stream.time[0]:.3f} to {stream.time[-1]:.3f} s); give both on the robot's clock, in seconds."
+            f"The arrivals in '{path.name}' ({frames[0].arrival:.3f} to {frames[-1].arrival:.3f} s) do not overlap the"
+            f" stream's times ({stream.time[0]:.3f} to {stream.time[-1]:.3f} s); give both on the robot's clock, in"
+            " seconds."
         )
     return frames, refused
 

@@ -15,7 +15,7 @@ from weldcal.calibration.data.scanner_clock import ScannerClock, clock_from_docu
 from weldcal.calibration.data.scanner_correction import TERMS, correction_from_document
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
-from weldcal.models.documents import Section, read_document, shown
+from weldcal.models.documents import DocumentSection, read_document, shown
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import require_whole, write_atomic
 
@@ -38,7 +38,8 @@ class PoseRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class IcpRecord:
-    """Algorithm 1's ICP figure at one verification pose: six numbers at the flange centre, and the components it does not see."""
+    """Algorithm 1's ICP figure at one verification pose: six numbers at the flange centre, and the components it does
+    not see."""
 
     id: str
     method: str
@@ -51,15 +52,19 @@ class IcpRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationResult:
-    """Contents of calibration.yaml. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera
-    origin; ``joint_covariance`` (6 + K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one;
-    ``clock`` of the scanner and ``clock_covariance`` (6 + K, 6 + K) of X_BC and its offset (s), drift and rolling time (s), as far as
-    they were estimated, where the calibration was made in motion;
-    With the ``configuration`` eye_in_hand ``X_BC`` holds X_FC, and ``target`` the centre (3,) m and normal (3,) of what was seen, in the base.
-    ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans; ``local_field``: document of
-    what --refine local found, ``kinematics_file``: name of the file beside it with what --refine joints or links found,
-    ``arm_errors`` the document of it (values, sigmas, covariance with X_BC and the correction). ``orientations``: mean (quaternion wxyz) of
-    the flange's in the base, and how far they lie from it at most (deg). ``observed``: the poses used, for what a touch of the arm states."""
+    """Contents of calibration.yaml.
+
+    ``covariance`` (6, 6): [rotation; translation] on the base side about the camera origin; ``joint_covariance`` (6 +
+    K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one; ``clock`` of the scanner and
+    ``clock_covariance`` (6 + K, 6 + K) of X_BC and its offset (s), drift and rolling time (s), as far as they were
+    estimated, where the calibration was made in motion; With the ``configuration`` eye_in_hand ``X_BC`` holds X_FC, and
+    ``target`` the centre (3,) m and normal (3,) of what was seen, in the base. ``axis_turn_deg`` how far the hole
+    pattern is turned about the flange's axis, and its spread over the scans; ``local_field``: document of what --refine
+    local found, ``kinematics_file``: name of the file beside it with what --refine joints or links found,
+    ``arm_errors`` the document of it (values, sigmas, covariance with X_BC and the correction). ``orientations``: mean
+    (quaternion wxyz) of the flange's in the base, and how far they lie from it at most (deg). ``observed``: the poses
+    used, for what a touch of the arm states.
+    """
 
     X_BC: RigidTransform
     covariance: Array
@@ -96,10 +101,12 @@ class CalibrationResult:
         return "X_BC" if self.configuration == ON_BASE else "X_FC"
 
     def correct(self, points_C: Array) -> Array:
-        """Correct measured points (..., 3) m of the camera frame for the scanner's own errors, as the pose expects them.
+        """Correct measured points (..., 3) m of the camera frame for the scanner's own errors, as the pose expects
+        them.
 
         Returns:
-            The corrected points (..., 3) m; the same points where the result has no `scanner_correction`. NaN stays NaN.
+            The corrected points (..., 3) m; the same points where the result has no `scanner_correction`. NaN stays
+                NaN.
         """
         correction = correction_from_document(self.scanner_correction)
         points = np.asarray(points_C, dtype=float)
@@ -141,19 +148,28 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
         },
         **({} if result.target is None else {"target": target_document(result.target)}),
         "scanner_correction": result.scanner_correction,
-        "joint_covariance": None
-        if result.joint_covariance is None
-        else {
-            "order": "as covariance, then the scanner correction's factors: scale, gradient_per_m, bend_per_m2, bend_per_m3",
-            "matrix": [[float(v) for v in row] for row in result.joint_covariance],
-        },
+        "joint_covariance": (
+            None
+            if result.joint_covariance is None
+            else {
+                "order": (
+                    "as covariance, then the scanner correction's factors: scale, gradient_per_m, bend_per_m2,"
+                    " bend_per_m3"
+                ),
+                "matrix": [[float(v) for v in row] for row in result.joint_covariance],
+            }
+        ),
         "clock": None if result.clock is None else result.clock.document(),
-        "clock_covariance": None
-        if result.clock_covariance is None
-        else {
-            "order": "as covariance, then offset (s), drift (s/s) and rolling time (s), as far as the clock has them",
-            "matrix": [[float(v) for v in row] for row in result.clock_covariance],
-        },
+        "clock_covariance": (
+            None
+            if result.clock_covariance is None
+            else {
+                "order": (
+                    "as covariance, then offset (s), drift (s/s) and rolling time (s), as far as the clock has them"
+                ),
+                "matrix": [[float(v) for v in row] for row in result.clock_covariance],
+            }
+        ),
         "axis_turn_deg": None if result.axis_turn_deg is None else list(result.axis_turn_deg),
         **({} if result.local_field is None else {"local_field": result.local_field}),
         **({} if not result.kinematics_file else {"kinematics_file": result.kinematics_file}),
@@ -184,8 +200,8 @@ def target_document(target: tuple[Array, Array]) -> dict[str, list[float]]:
 def load_result(path: Path) -> CalibrationResult:
     """Read a calibration.yaml (or the folder that holds it).
 
-    Raises InputError, with the file and the key, when it is missing, not a calibration, holds a value of the wrong kind, or its
-    rotation is not orthonormal.
+    Raises InputError, with the file and the key, when it is missing, not a calibration, holds a value of the wrong
+    kind, or its rotation is not orthonormal.
     """
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path
@@ -199,7 +215,7 @@ def load_result(path: Path) -> CalibrationResult:
         )
     if not isinstance(document, dict) or not {"schema", "X_BC", "covariance"} <= set(document):
         raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.")
-    d = Section.of(path.name, document)
+    d = DocumentSection.of(path.name, document)
     if d.values["schema"] != 1:
         raise InputError(f"'{path.name}' is not a calibration result of schema 1; run 'weldcal calibrate' again.")
     M = d.section("X_BC").array("matrix", 4, 4)
@@ -240,14 +256,19 @@ def load_result(path: Path) -> CalibrationResult:
         orientations=d.values.get("orientations"),
         observed=d.values.get("observed"),
         clock=clock_from_document(d.values.get("clock"), path.name),
-        clock_covariance=_covariance(d, "clock_covariance", len(d.section("clock_covariance").items("matrix")))
-        if d.has("clock_covariance")
-        else None,
+        clock_covariance=(
+            _covariance(d, "clock_covariance", len(d.section("clock_covariance").items("matrix")))
+            if d.has("clock_covariance")
+            else None
+        ),
     )
 
 
-def _covariance(d: Section, key: str, size: int) -> Array:
-    """The matrix (size, size) of a covariance. Raises InputError where it is not symmetric or has a negative variance."""
+def _covariance(d: DocumentSection, key: str, size: int) -> Array:
+    """The matrix (size, size) of a covariance.
+
+    Raises InputError where it is not symmetric or has a negative variance.
+    """
     C = d.section(key).array("matrix", size, size)
     scale = np.sqrt(np.abs(np.diag(C)))
     scale[scale == 0.0] = 1.0
@@ -259,7 +280,7 @@ def _covariance(d: Section, key: str, size: int) -> Array:
     return C
 
 
-def _pose_record(r: Section) -> PoseRecord:
+def _pose_record(r: DocumentSection) -> PoseRecord:
     _only(r, PoseRecord)
     return PoseRecord(
         id=r.text("id"),
@@ -272,7 +293,7 @@ def _pose_record(r: Section) -> PoseRecord:
     )
 
 
-def _icp_record(r: Section) -> IcpRecord:
+def _icp_record(r: DocumentSection) -> IcpRecord:
     _only(r, IcpRecord)
     rotation, translation = (tuple(float(v) for v in r.array(key, 3)) for key in ("rotation_deg", "translation_mm"))
     return IcpRecord(
@@ -286,7 +307,7 @@ def _icp_record(r: Section) -> IcpRecord:
     )
 
 
-def _only(r: Section, kind: type) -> None:
+def _only(r: DocumentSection, kind: type) -> None:
     """Refuses keys that a record does not have."""
     known = {f.name for f in fields(kind)}
     surplus = next((k for k in r.values if k not in known), None)
@@ -297,7 +318,8 @@ def _only(r: Section, kind: type) -> None:
 def export_urdf(
     X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame", note: str | None = None
 ) -> str:
-    """A xacro file for `xacro:include` into a robot that has the parent link: the child link on a fixed joint, one root element."""
+    """A xacro file for `xacro:include` into a robot that has the parent link: the child link on a fixed joint, one root
+    element."""
     roll, pitch, yaw = X_BC.rotation().ToRollPitchYaw().vector()
     x, y, z = X_BC.translation()
     # two hyphens may not stand in an XML comment
@@ -338,7 +360,8 @@ def correction_note(result: CalibrationResult, file: Path | str | None = None) -
     """Note for users of X_BC that it applies to corrected points; None where it needs none.
 
     Args:
-        file: the calibration.yaml, for a reader who can use it; None: for another program, with the correction as a formula.
+        file: the calibration.yaml, for a reader who can use it; None: for another program, with the correction as a
+            formula.
     """
     said = []
     correction = correction_from_document(result.scanner_correction)
@@ -351,8 +374,8 @@ def correction_note(result: CalibrationResult, file: Path | str | None = None) -
         )
     if result.local_field is not None:
         said.append(
-            "This format cannot hold the local field (--refine local) of calibration.yaml: without it errors are those of the plain "
-            "calibration."
+            "This format cannot hold the local field (--refine local) of calibration.yaml: without it errors are those"
+            " of the plain calibration."
         )
     if result.kinematics_file:
         said.append(f"X_BC belongs to the arm with the kinematics of {result.kinematics_file}.")

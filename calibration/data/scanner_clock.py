@@ -16,11 +16,12 @@ _NUMBERS = ("offset_s", "sigma_s", "jitter_s", "reference_s", "drift", "drift_si
 class ScannerClock:
     """When a frame was taken, on the robot's clock, s.
 
-    ``kind`` arrival: capture = arrival - offset. ``kind`` device: capture = device + offset + drift (device - reference).
-    ``offset_s`` is the mean over frames, ``sigma_s`` its standard deviation, both None where the motion does not show them;
-    ``jitter_s`` the standard deviation of single frames about it; ``reference_s`` the clock's time that the offset holds for;
-    ``drift`` and ``drift_sigma`` s/s (None for arrivals); ``rolling_s``: an image row y/z is exposed so much later per unit (None where
-    the data do not show it). ``late``: ids of frames left out of the offset as grossly late or early; ``reason``: why this clock.
+    ``kind`` arrival: capture = arrival - offset. ``kind`` device: capture = device + offset + drift (device -
+    reference). ``offset_s`` is the mean over frames, ``sigma_s`` its standard deviation, both None where the motion
+    does not show them; ``jitter_s`` the standard deviation of single frames about it; ``reference_s`` the clock's time
+    that the offset holds for; ``drift`` and ``drift_sigma`` s/s (None for arrivals); ``rolling_s``: an image row y/z is
+    exposed so much later per unit (None where the data do not show it). ``late``: ids of frames left out of the offset
+    as grossly late or early; ``reason``: why this clock.
     """
 
     kind: str
@@ -36,8 +37,8 @@ class ScannerClock:
     reason: str = ""
 
     def capture(self, arrival: float, device: float | None = None, row: float = 0.0) -> float | None:
-        """Capture time (s) of a frame on the robot's clock, expected from its times; ``row`` is y/z of what is looked at. None where
-        the offset is not known, or the frame lacks the clock's time."""
+        """Capture time (s) of a frame on the robot's clock, expected from its times; ``row`` is y/z of what is looked
+        at. None where the offset is not known, or the frame lacks the clock's time."""
         if self.offset_s is None or (self.kind == DEVICE and device is None):
             return None
         rolled = (self.rolling_s or 0.0) * row
@@ -68,5 +69,9 @@ def clock_from_document(value: Any, file: str) -> ScannerClock | None:
     if not isinstance(late, list) or not all(isinstance(id, str) for id in late):
         raise InputError(f"'{file}': clock.late must be a list of ids; the file was changed by hand.")
     return ScannerClock(
-        kind=str(value["kind"]), reference_s=reference or 0.0, late=tuple(late), reason=str(value.get("reason", "")), **numbers
-    )  # fmt: skip
+        kind=str(value["kind"]),
+        reference_s=reference or 0.0,
+        late=tuple(late),
+        reason=str(value.get("reason", "")),
+        **numbers,
+    )

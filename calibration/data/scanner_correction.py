@@ -17,19 +17,21 @@ TERMS = {1: 3, 2: 6, 3: 10}
 LARGEST = 0.05
 """A factor farther from 1 is no property of a scanner that measures."""
 LOOSE = np.array([0.03, 0.3, 0.3])
-"""Standard deviations of scale and gradient that keep poses on one spot solvable, and a gradient that no circle shows."""
+"""Standard deviations of scale and gradient that keep poses on one spot solvable, and a gradient that no circle
+shows."""
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2])  # what scanners are off in scale and gradient (1/m)
 _USUAL_BEND, _EDGE = 1e-3, 0.35  # and by a bend, at the edge of the image: so many depths from its middle
 
 
 @dataclass(frozen=True)
 class ScannerCorrection:
-    """p_C corrected = p_C (scale + gx x + gy y + bends), with x and y (m) of the point as it was measured, camera frame.
+    """p_C corrected = p_C (scale + gx x + gy y + bends), with x and y (m) of the point as it was measured, camera
+    frame.
 
-    ``gradient_per_m`` is (gx, gy) in 1/m. ``bend`` is empty, or the factors of x^2, x y, y^2 (1/m^2), or those and of x^3, x^2 y,
-    x y^2, y^3 (1/m^3): what a lens that is not quite known does. Bends hold within ``field_m`` (smallest and largest x, then y, m), where
-    they were seen; beyond, they stay as at its edge, because a polynomial is no forecast. Raises InputError for numbers that are
-    not finite or a scale that is off by more than 5 %.
+    ``gradient_per_m`` is (gx, gy) in 1/m. ``bend`` is empty, or the factors of x^2, x y, y^2 (1/m^2), or those and of
+    x^3, x^2 y, x y^2, y^3 (1/m^3): what a lens that is not quite known does. Bends hold within ``field_m`` (smallest
+    and largest x, then y, m), where they were seen; beyond, they stay as at its edge, because a polynomial is no
+    forecast. Raises InputError for numbers that are not finite or a scale that is off by more than 5 %.
     """
 
     scale: float = 1.0
@@ -139,13 +141,16 @@ class ScannerCorrection:
             return text
         x0, x1, y0, y1 = self.field_m
         return (
-            f"{text} (in all terms but the first three, x between {x0:.3f} and {x1:.3f}, y between {y0:.3f} and {y1:.3f}: "
-            "beyond, the value at the edge)"
+            f"{text} (in all terms but the first three, x between {x0:.3f} and {x1:.3f}, y between {y0:.3f} and"
+            f" {y1:.3f}: beyond, the value at the edge)"
         )
 
 
 def correction_from_document(document: dict[str, Any] | None, file: str = "") -> ScannerCorrection | None:
-    """Read a correction from its document, of the file of that name; None for None. Raises InputError where it is malformed."""
+    """Read a correction from its document, of the file of that name; None for None.
+
+    Raises InputError where it is malformed.
+    """
     if document is None:
         return None
     where = f"'{file}': " if file else ""
@@ -171,7 +176,8 @@ def correction_of(change: Array, field: tuple[float, float, float, float] | None
 
 
 def expected_factors(terms: int, depth: float, usual: bool = True) -> Array:
-    """Standard deviations (K,) of the factors of a scanner before its first scan; bends by their size at the edge of the image."""
+    """Standard deviations (K,) of the factors of a scanner before its first scan; bends by their size at the edge of
+    the image."""
     edge = _EDGE * depth
     bends = np.concatenate([np.full(3, _USUAL_BEND / edge**2), np.full(4, _USUAL_BEND / edge**3)])
     return np.concatenate([_USUAL if usual else LOOSE, bends])[:terms]

@@ -1,4 +1,5 @@
-"""Read the pose that another program, or weldcal, calibrated: matrices, quaternions, URDF origins, static transforms and result files."""
+"""Read the pose that another program, or weldcal, calibrated: matrices, quaternions, URDF origins, static transforms
+and result files."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -31,7 +32,8 @@ _MILLIMETRES_FROM = 10.0  # no camera is 10 m from the flange or the base that c
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _TOKEN = re.compile(rf"--[a-z][\w-]*|(?<![\w.]){_NUMBER}(?![\w.])|[A-Za-z_/][\w/.-]*")
 _NAMED = re.compile(
-    r"(?i)(hand_?eye|cam(era)?2|2cam|cam(era)?_(to|in)|(to|in)_cam|t_?cam|x_?f?c$|x_?bc$|^x$|emc|fmc|bmc|rmc|t_.*cam|cam.*_t|calib|result)"
+    r"(?i)(hand_?eye|cam(era)?2|2cam|cam(era)?_(to|in)|(to|in)_cam|t_?cam|x_?f?c$|x_?bc$|^x$|emc|fmc|bmc"
+    r"|rmc|t_.*cam|cam.*_t|calib|result)"
 )
 _CAMERA_LINK = re.compile(r"(?i)(cam|scanner|sensor|optical|eye|zivid|realsense|phoxi|kinect)")
 
@@ -46,7 +48,8 @@ class StatedPose:
         readings: every reading that the numbers allow, the usual one first; each X (4, 4) in metres.
         unit: the unit of length that was taken, m or mm.
         mounting: the mounting that the file names, or None.
-        covariance: (6, 6) [rotation rad; translation m] on the parent's side about the camera's origin, where the file states it.
+        covariance: (6, 6) [rotation rad; translation m] on the parent's side about the camera's origin, where the file
+            states it.
         data: SHA-256 of the data that the file names as its source.
     """
 
@@ -95,7 +98,8 @@ def read_stated_pose(path: Path, pose: str | None = None) -> StatedPose:
     one = _chosen(lists, path.name, pose)
     if one.left_out:
         raise DatasetError(
-            f"'{one.name}' holds no calibrated pose: it is zero or the identity. Give the file of a finished calibration."
+            f"'{one.name}' holds no calibrated pose: it is zero or the identity. Give the file of a finished"
+            " calibration."
         )
     far = float(np.abs(one.numbers[0].p).max())
     unit = one.unit or ("mm" if far > _MILLIMETRES_FROM else "m")
@@ -120,11 +124,12 @@ def _chosen(lists: list[Listing], name: str, pose: str | None) -> Listing:
     if not single:
         if lists:
             raise DatasetError(
-                f"'{name}' holds lists of poses and no single one. Give the file of the result first and the file of the pairs second."
+                f"'{name}' holds lists of poses and no single one. Give the file of the result first and the file of"
+                " the pairs second."
             )
         raise DatasetError(
-            f"'{name}' holds no pose that can be read: give a 4 x 4 matrix, x y z with a quaternion, a URDF origin or the result file of a "
-            "calibration."
+            f"'{name}' holds no pose that can be read: give a 4 x 4 matrix, x y z with a quaternion, a URDF origin or"
+            " the result file of a calibration."
         )
     known = ", ".join(one.name.removeprefix(f"{name}, ") for one in single[:8])
     if pose is not None:
@@ -181,7 +186,8 @@ def _of_tree(tree: Any, name: str) -> tuple[list[Listing], _Own]:
 
 
 def _own_result(tree: Mapping[Any, Any], name: str) -> tuple[list[Listing], _Own] | None:
-    """The camera's pose in weldcal's files: hand_eye.yaml or .json, calibration.yaml, X_BC.json and what --json prints; None for others."""
+    """The camera's pose in weldcal's files: hand_eye.yaml or .json, calibration.yaml, X_BC.json and what --json prints;
+    None for others."""
     configuration = tree.get("configuration")
     mounting = configuration if configuration in MOUNTINGS else None
     poses = tree.get("poses")

@@ -16,10 +16,10 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
 def read_rows(path: Path) -> tuple[list[str], list[Row]]:
     """Names of the columns (lower case) and the rows by name, all stripped; a cell that is missing is empty.
 
-    The separator is the one that the header has most of: comma, semicolon, tab, else blanks. Lines that begin with #, empty
-    lines and rows without a value are skipped. Decimal commas become points where the comma separates nothing. Raises
-    InputError: no regular file, no UTF-8 text, larger than the bounds in models/files.py, a column named twice, a row with more
-    values than columns, a quote that does not end; with the line's number.
+    The separator is the one that the header has most of: comma, semicolon, tab, else blanks. Lines that begin with #,
+    empty lines and rows without a value are skipped. Decimal commas become points where the comma separates nothing.
+    Raises InputError: no regular file, no UTF-8 text, larger than the bounds in models/files.py, a column named twice,
+    a row with more values than columns, a quote that does not end; with the line's number.
     """
     names: list[str] = []
     rows: list[Row] = []
@@ -29,8 +29,8 @@ def read_rows(path: Path) -> tuple[list[str], list[Row]]:
             continue
         if any(values[len(names) :]):
             raise InputError(
-                f"'{path.name}', line {line}: {len(values)} cells, and the header names {len(names)} columns; decimal commas need "
-                "semicolons or tabs between the columns."
+                f"'{path.name}', line {line}: {len(values)} cells, and the header names {len(names)} columns; decimal"
+                " commas need semicolons or tabs between the columns."
             )
         if any(values):
             rows.append(dict.fromkeys(names, "") | dict(zip(names, values, strict=False)))
@@ -40,8 +40,9 @@ def read_rows(path: Path) -> tuple[list[str], list[Row]]:
 
 
 def cut_off(path: Path) -> str | None:
-    """A sentence where a CSV file seems to end within its last row, None else: that row has fewer cells than the header, or no
-    line break follows it and its last number is shorter than all others of its column. Raises what read_rows raises."""
+    """A sentence where a CSV file seems to end within its last row, None else: that row has fewer cells than the
+    header, or no line break follows it and its last number is shorter than all others of its column. Raises what
+    read_rows raises."""
     table = [values for _, values in _cells(path)]
     rows = [row for row in table[1:] if any(row)]
     if not rows:
@@ -49,18 +50,24 @@ def cut_off(path: Path) -> str | None:
     width, last = len(table[0]), rows[-1]
     if len(last) < width:
         return (
-            f"The last row of '{path.name}' has {len(last)} of {width} cells: the file is cut off there, and that row is not used. "
-            "Copy the file again."
+            f"The last row of '{path.name}' has {len(last)} of {width} cells: the file is cut off there, and that row"
+            " is not used. Copy the file again."
         )
     open_end = not path.read_bytes().endswith((b"\n", b"\r"))
     others = [len(row[width - 1]) for row in rows[:-1] if len(row) >= width and row[width - 1]]
     if open_end and last[width - 1] and len(others) > 1 and len(last[width - 1]) < min(others):
-        return f"The last row of '{path.name}' may be cut off within its last number, {last[width - 1]}. Copy the file again."
+        return (
+            f"The last row of '{path.name}' may be cut off within its last number, {last[width - 1]}. Copy the file"
+            " again."
+        )
     return None
 
 
 def _cells(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and stripped cells of all rows, the header first, with decimal points. Raises InputError as read_rows."""
+    """Line numbers and stripped cells of all rows, the header first, with decimal points.
+
+    Raises InputError as read_rows.
+    """
     lines = [
         (number, line)
         for number, line in enumerate(re.split(r"\r\n|\n|\r", read_text(path)), start=1)

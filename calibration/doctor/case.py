@@ -1,4 +1,5 @@
-"""What the doctor examines: the robot's poses and what the scanner measured of the flange, as arrays in recording order."""
+"""What the doctor examines: the robot's poses and what the scanner measured of the flange, as arrays in recording
+order."""
 
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -12,9 +13,9 @@ Which = NDArray[np.bool_] | NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class ArmErrors:
-    """What joint zeros and link lengths of p numbers do: change D (n, 3, p) of p_CR's place in the base, change T (n, 3, p) of the normals,
-    and one sigma (p,) of the numbers for an arm as it leaves the factory."""
+class ArmDerivatives:
+    """What joint zeros and link lengths of p numbers do: change D (n, 3, p) of p_CR's place in the base, change T (n,
+    3, p) of the normals, and one sigma (p,) of the numbers for an arm as it leaves the factory."""
 
     D: Array
     T: Array
@@ -22,15 +23,15 @@ class ArmErrors:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Case:
-    """n scans of a flange: X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and outward normals m
-    (n, 3) in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise`` (n,) m rms of each face about its plane
-    (NaN: unknown), ``coverage`` (n,) share of the edge that was seen.
+class DoctorCase:
+    """n scans of a flange: X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and
+    outward normals m (n, 3) in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise``
+    (n,) m rms of each face about its plane (NaN: unknown), ``coverage`` (n,) share of the edge that was seen.
 
-    ``robot`` names the arm; ``guess`` is X_BC (4, 4) as somebody measured it, good to ``guess_radius`` m at the feature. ``flange`` is
-    the stated designation, ``fits_flange`` the one that was found (empty: the stated one). ``refused`` lists (id, reason);
-    ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have positions only. Every fit holds the errors of the
-    ``arm`` to their usual size (None: no fit has them).
+    ``robot`` names the arm; ``guess`` is X_BC (4, 4) as somebody measured it, good to ``guess_radius`` m at the
+    feature. ``flange`` is the stated designation, ``fits_flange`` the one that was found (empty: the stated one).
+    ``refused`` lists (id, reason); ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have
+    positions only. Every fit holds the errors of the ``arm`` to their usual size (None: no fit has them).
     """
 
     ids: tuple[str, ...]
@@ -49,7 +50,7 @@ class Case:
     refused: tuple[tuple[str, str], ...] = ()
     near_far: tuple[float, float] | None = None
     oriented: bool = True
-    arm: ArmErrors | None = None
+    arm: ArmDerivatives | None = None
 
     @property
     def n(self) -> int:

@@ -1,16 +1,17 @@
 """Names the causes that the scans give evidence of, the likeliest first.
 
-Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the Bayesian
-information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a size that matters. The
-thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its false alarms are counted on.
+Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the
+Bayesian information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a
+size that matters. The thresholds were fixed on simulated sets (tools/worlds/doctor.py), other ones than those that its
+false alarms are counted on.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.calibration.doctor.case import Case
-from weldcal.calibration.doctor.fit import NU, Fit, fit
+from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.fit import NU, CauseFit, fit
 from weldcal.calibration.doctor.models import Explained, explanations, with_arm_errors
 from weldcal.calibration.doctor.readings import (
     FEWEST,
@@ -19,7 +20,7 @@ from weldcal.calibration.doctor.readings import (
     best_reading,
     looks_wrong,
     mixed_units,
-)  # fmt: skip
+)
 from weldcal.calibration.geometry.robust import f_tail
 from weldcal.calibration.geometry.se3 import log_rotation
 from weldcal.models.arrays import Array
@@ -35,8 +36,9 @@ _NOISE_CHANCE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
-    """A cause that shows without a model of the residuals: its name, its weight (twice a log-likelihood ratio) and its numbers."""
+class DirectCause:
+    """A cause that shows without a model of the residuals: its name, its weight (twice a log-likelihood ratio) and its
+    numbers."""
 
     cause: str
     score: float
@@ -44,8 +46,9 @@ class Finding:
     where: tuple[str, ...] = ()
 
 
-def outliers(case: Case, null: Fit) -> Explained | None:
-    """Single scans that disagree with all others, each of them anywhere (uniform in the ball that holds their errors)."""
+def outliers(case: DoctorCase, null: CauseFit) -> Explained | None:
+    """Single scans that disagree with all others, each of them anywhere (uniform in the ball that holds their
+    errors)."""
     r = np.linalg.norm(null.e, axis=1)
     scale = max(float(np.median(r)) / 1.5382, 2e-5)
     bad = r > _GROSS * scale
@@ -70,8 +73,9 @@ def outliers(case: Case, null: Fit) -> Explained | None:
     )
 
 
-def sure_outliers(case: Case, null: Fit) -> Finding | None:
-    """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the residuals."""
+def sure_outliers(case: DoctorCase, null: CauseFit) -> DirectCause | None:
+    """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the
+    residuals."""
     r = np.linalg.norm(null.e, axis=1)
     chance = f_tail((r / null.sigma_m) ** 2 / 3.0, 3, NU)
     bad = (chance * case.n < _ODD) & (r > _GROSS_M)
@@ -80,28 +84,30 @@ def sure_outliers(case: Case, null: Fit) -> Finding | None:
         return None
     numbers = {"worst_mm": 1e3 * float(r[bad].max()), "others_mm": 1e3 * float(np.median(r[~bad]))}
     score = float(-2.0 * np.log(chance[bad] * case.n).sum())
-    return Finding("outlier scans or partial views", score, numbers, tuple(np.array(case.ids)[bad]))
+    return DirectCause("outlier scans or partial views", score, numbers, tuple(np.array(case.ids)[bad]))
 
 
-def _centre_errors(case: Case, one: Fit) -> Array:
+def _centre_errors(case: DoctorCase, one: CauseFit) -> Array:
     q = case.c @ one.R[0].T + one.p[0] - case.b
     return np.asarray(np.linalg.norm(q, axis=1))
 
 
-def partial_views(case: Case) -> Finding | None:
+def partial_views(case: DoctorCase) -> DirectCause | None:
     """Scans that show little of the flange's edge, or none of it."""
     few = np.zeros(case.n, dtype=bool) if case.coverage is None else np.nan_to_num(case.coverage, nan=1.0) < _LEAST_SEEN
     lost = [i for i, _ in case.refused]
     share = (int(few.sum()) + len(lost)) / max(case.n + len(lost), 1)
     if share < _REFUSED or int(few.sum()) + len(lost) < 2:
         return None
-    return Finding(
-        "outlier scans or partial views", 40.0 * share + 12.0, {"share": share, "refused": float(len(lost))},
+    return DirectCause(
+        "outlier scans or partial views",
+        40.0 * share + 12.0,
+        {"share": share, "refused": float(len(lost))},
         (*tuple(np.array(case.ids)[few]), *lost),
-    )  # fmt: skip
+    )
 
 
-def noise_growth(case: Case) -> Finding | None:
+def noise_growth(case: DoctorCase) -> DirectCause | None:
     """Noise of the faces that grows away from a distance faster than triangulation's square law."""
     z = np.linalg.norm(case.c, axis=1)
     if case.noise is None or case.n < 8:
@@ -130,11 +136,14 @@ def noise_growth(case: Case) -> Finding | None:
     numbers = {"factor": factor, "at_mm": 1e3 * at, "chance": chance}
     if case.near_far is not None:
         numbers |= {"near_mm": 1e3 * case.near_far[0], "far_mm": 1e3 * case.near_far[1]}
-    return Finding("scanner out of focus or range", float(score), numbers, tuple(worst))
+    return DirectCause("scanner out of focus or range", float(score), numbers, tuple(worst))
 
 
-def too_alike(case: Case) -> Finding | None:
-    """Poses that differ too little to fix the camera. One orientation alone is no fault where the places differ enough."""
+def too_alike(case: DoctorCase) -> DirectCause | None:
+    """Poses that differ too little to fix the camera.
+
+    One orientation alone is no fault where the places differ enough.
+    """
     b = case.b - case.b.mean(axis=0)
     width = np.linalg.svd(b, compute_uv=False) / np.sqrt(case.n)
     R = case.X_BF[:, :3, :3]
@@ -143,11 +152,12 @@ def too_alike(case: Case) -> Finding | None:
     if width[1] >= _FLAT_M:
         return None
     numbers = {"spread_mm": 1e3 * float(width[0]), "second_mm": 1e3 * float(width[1]), "turn_deg": middle}
-    return Finding("poses too alike", 60.0, numbers)
+    return DirectCause("poses too alike", 60.0, numbers)
 
 
-def installation(case: Case, one: Fit) -> Finding | None:
-    """The camera is elsewhere than somebody measured it, by more than the measurement's stated error, while all scans agree."""
+def installation(case: DoctorCase, one: CauseFit) -> DirectCause | None:
+    """The camera is elsewhere than somebody measured it, by more than the measurement's stated error, while all scans
+    agree."""
     if case.guess is None:
         return None
     seen = case.c @ one.R[0].T + one.p[0]
@@ -165,7 +175,9 @@ def installation(case: Case, one: Fit) -> Finding | None:
         "shift_mm": 1e3 * float(np.linalg.norm(shift)),
         "stated_mm": 1e3 * case.guess_radius,
     }
-    return Finding("robot in another installation", float(min(10.0 * (off / case.guess_radius) ** 2, 400.0)), numbers)
+    return DirectCause(
+        "robot in another installation", float(min(10.0 * (off / case.guess_radius) ** 2, 400.0)), numbers
+    )
 
 
 _WRONG_RAD = 0.05  # normals disagree with the poses as they are
@@ -176,8 +188,9 @@ def _off(u: Array, z: Array) -> float:
     return float(np.median(np.arctan2(np.linalg.norm(np.cross(u, z), axis=1), (u * z).sum(axis=1))))
 
 
-def rotations_disagree(case: Case) -> dict[str, float] | None:
-    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind; None where both agree."""
+def rotations_disagree(case: DoctorCase) -> dict[str, float] | None:
+    """The figures where the centres agree and the normals do not: wrong rotations of an unknown kind; None where both
+    agree."""
     seen = np.asarray(np.isfinite(case.m).all(axis=1))
     if seen.sum() < 5:
         return None
@@ -197,7 +210,8 @@ THRESHOLDS = {
     "outlier scans or partial views": 20.0,
     "scanner scale error": 20.0,
 }
-"""Least difference of the criterion at which each is named; the evidence of a difference of 10 is called very strong (Raftery 1995)."""
+"""Least difference of the criterion at which each is named; the evidence of a difference of 10 is called very strong
+(Raftery 1995)."""
 LEAST_EFFECT_M = {
     "scanner moved": 3e-4,
     "TCP set at the controller": 2e-3,
@@ -215,8 +229,10 @@ CLEAR = 1.2  # factor by which a cause must bring the median residual down
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """A named cause: ``confidence`` 0 to 1 (its weight among the models that were compared), ``score`` (twice the log-likelihood ratio
-    less the cost of its numbers), the ``numbers`` of the evidence, ``words`` of a misreading and the scans ``where`` it shows."""
+    """A named cause: ``confidence`` 0 to 1 (its weight among the models that were compared), ``score`` (twice the
+    log-likelihood ratio less the cost of its numbers), the ``numbers`` of the evidence, ``words`` of a misreading and
+    the scans ``where`` it shows.
+    """
 
     name: str
     confidence: float
@@ -228,14 +244,15 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The causes, likeliest first; the number of scans, and the spread (m) of their centres about what explains them best."""
+    """The causes, likeliest first; the number of scans, and the spread (m) of their centres about what explains them
+    best."""
 
     causes: tuple[Cause, ...]
     n: int
     spread_m: float
 
 
-def diagnose(case: Case) -> Diagnosis:
+def diagnose(case: DoctorCase) -> Diagnosis:
     """The causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
     causes: list[Cause] = []
     if case.fits_flange and case.fits_flange != case.flange:
@@ -295,18 +312,18 @@ def diagnose(case: Case) -> Diagnosis:
     return Diagnosis(tuple(causes), case.n, float(np.median(np.linalg.norm(best.e, axis=1))))
 
 
-def _ranked(case: Case, null: Fit) -> list[Explained]:
+def _ranked(case: DoctorCase, null: CauseFit) -> list[Explained]:
     found = [*explanations(case, null)]
     single = outliers(case, null)
     return sorted([*found, *([] if single is None else [single])], key=lambda m: m.bic)
 
 
-def _named(m: Explained, null: Fit) -> bool:
+def _named(m: Explained, null: CauseFit) -> bool:
     shows = m.cause.startswith("outlier") or null.rms > CLEAR * m.fit.rms
     return shows and null.bic - m.bic > THRESHOLDS[m.cause] and m.effect_m > LEAST_EFFECT_M[m.cause]
 
 
-def _unexplained(case: Case, best: Fit) -> Cause | None:
+def _unexplained(case: DoctorCase, best: CauseFit) -> Cause | None:
     """What remains after the best model and is too large for any arm and scanner; None where nothing does."""
     turned = rotations_disagree(case)
     tilt = float(np.degrees(np.nanmedian(best.tilt))) if np.isfinite(best.tilt).any() else 0.0
@@ -320,13 +337,13 @@ def _unexplained(case: Case, best: Fit) -> Cause | None:
     return None
 
 
-def _weight(winner: Explained, models: list[Explained], null: Fit) -> float:
+def _weight(winner: Explained, models: list[Explained], null: CauseFit) -> float:
     """Share of the winner in the weights of all models, exp(-bic / 2)."""
     lead = [0.5 * (winner.bic - m.bic) for m in models] + [0.5 * (winner.bic - null.bic)]
     return float(1.0 / np.exp(np.minimum(lead, 0.0)).sum())
 
 
-def _residuals(null: Fit, best: Fit) -> dict[str, float]:
+def _residuals(null: CauseFit, best: CauseFit) -> dict[str, float]:
     """Medians of centres (mm) and, where normals were seen, of their angles (deg), without and with the cause."""
     out = {"without_mm": 1e3 * null.rms, "with_mm": 1e3 * best.rms}
     if np.isfinite(null.tilt).any() and np.isfinite(best.tilt).any():

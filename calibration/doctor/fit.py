@@ -1,9 +1,10 @@
 """Fits a model of the scans, X_BC with the scanner's usual error and what a cause adds, and gives its log-likelihood.
 
-Model: e_k = X_g(k) s(c_k) - b_k + D_k a, with a camera pose for each group g of scans, the scanner's scale and gradients s held to
-their usual size, and columns D_k (3, p) of the cause. Residuals of centres and of normals follow Student's t (6 free), so that a few
-outliers decide nothing. Gauss-Newton, reweighted (Lange, Little and Taylor 1989). Models are compared by the Bayesian
-information criterion (Schwarz 1978) with the factor of Hurvich and Tsai for few residuals.
+Model: e_k = X_g(k) s(c_k) - b_k + D_k a, with a camera pose for each group g of scans, the scanner's scale and
+gradients s held to their usual size, and columns D_k (3, p) of the cause. Residuals of centres and of normals follow
+Student's t (6 free), so that a few outliers decide nothing. Gauss-Newton, reweighted (Lange, Little and Taylor 1989).
+Models are compared by the Bayesian information criterion (Schwarz 1978) with the factor of Hurvich and Tsai for few
+residuals.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.geometry.rigid import drawn_triples, fit_rigid, fit_rigid_sets
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arrays import Array
@@ -26,12 +27,12 @@ _BEST = 0.6  # share of the scans that the start must explain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fit:
-    """A fitted model: camera poses R (G, 3, 3), p (G, 3); scanner terms; the cause's numbers a (p,); residuals of centres e (n, 3) m and of
-    normals (n,) rad; spreads per axis; log-likelihood.
+class CauseFit:
+    """A fitted model: camera poses R (G, 3, 3), p (G, 3); scanner terms; the cause's numbers a (p,); residuals of
+    centres e (n, 3) m and of normals (n,) rad; spreads per axis; log-likelihood.
 
-    ``size`` counts the free numbers, not those that a prior holds (the scanner's, the arm's); ``occam`` is what numbers with a prior cost:
-    the logarithm of how much the scans narrow them (Laplace's approximation of the evidence).
+    ``size`` counts the free numbers, not those that a prior holds (the scanner's, the arm's); ``occam`` is what numbers
+    with a prior cost: the logarithm of how much the scans narrow them (Laplace's approximation of the evidence).
     """
 
     R: Array
@@ -61,7 +62,8 @@ class Fit:
 
 
 def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
-    """Rotation (3, 3) and position (3,) that explain most of the centres (least trimmed squares over seeded triples)."""
+    """Rotation (3, 3) and position (3,) that explain most of the centres (least trimmed squares over seeded
+    triples)."""
     n = len(b)
     sets = drawn_triples(n, _TRIPLES if n > 3 else 1, seed)
     R, t = fit_rigid_sets(b[sets], c[sets])
@@ -82,19 +84,19 @@ def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
 
 
 def fit(
-    case: Case,
+    case: DoctorCase,
     *,
     groups: NDArray[np.int64] | None = None,
     columns: Array | None = None,
-    start: Fit | None = None,
+    start: CauseFit | None = None,
     normals: bool = True,
     turning: Array | None = None,
     prior: Array | None = None,
-) -> Fit:
+) -> CauseFit:
     """The best numbers of a model; ``columns`` (n, 3, p) of the cause, ``groups`` (n,) the camera pose of each scan.
 
-    ``turning`` (n, 3, p) is what the cause does to the normals z; ``prior`` (p,) one sigma of its numbers about zero. The arm's usual errors
-    are in the model, too, where the case has them.
+    ``turning`` (n, 3, p) is what the cause does to the normals z; ``prior`` (p,) one sigma of its numbers about zero.
+    The arm's usual errors are in the model, too, where the case has them.
     """
     n, b, c = case.n, case.b, case.c
     g = np.zeros(n, dtype=int) if groups is None else groups
@@ -152,16 +154,22 @@ def fit(
         J[:, :, at : at + 4] = np.einsum("kij,kj->ki", R[g], c)[:, :, None] * terms[:, None]
         J[:, :, at + 4 :] = D
         Jn[:, :, at + 4 :] = np.einsum("kij,kjp->kip", skew(u), T)
-        rows = np.concatenate([
-            (J * (np.sqrt(w) / sigma)[:, None, None]).reshape(-1, size),
-            (Jn * (np.sqrt(wn) / sigma_n)[:, None, None]).reshape(-1, size)[np.repeat(has, 3)],
-            np.eye(size)[at : at + 4] / _USUAL[:, None],
-            np.eye(size)[at + 4 :] * weak[:, None],
-        ])  # fmt: skip
-        left = np.concatenate([
-            (e * (np.sqrt(w) / sigma)[:, None]).ravel(), (en * (np.sqrt(wn) / sigma_n)[:, None]).ravel()[np.repeat(has, 3)], s / _USUAL,
-            a * weak,
-        ])  # fmt: skip
+        rows = np.concatenate(
+            [
+                (J * (np.sqrt(w) / sigma)[:, None, None]).reshape(-1, size),
+                (Jn * (np.sqrt(wn) / sigma_n)[:, None, None]).reshape(-1, size)[np.repeat(has, 3)],
+                np.eye(size)[at : at + 4] / _USUAL[:, None],
+                np.eye(size)[at + 4 :] * weak[:, None],
+            ]
+        )
+        left = np.concatenate(
+            [
+                (e * (np.sqrt(w) / sigma)[:, None]).ravel(),
+                (en * (np.sqrt(wn) / sigma_n)[:, None]).ravel()[np.repeat(has, 3)],
+                s / _USUAL,
+                a * weak,
+            ]
+        )
         unit = np.maximum(np.linalg.norm(rows, axis=0), 1e-12)
         x = -np.linalg.lstsq(rows / unit, left, rcond=1e-7)[0] / unit
         for k in range(G):
@@ -177,7 +185,7 @@ def fit(
     occam = (
         _narrowed(rows, np.concatenate([np.zeros(6 * G + 4, dtype=bool), held]), sigmas[held]) if held.any() else 0.0
     )
-    return Fit(
+    return CauseFit(
         R=R,
         p=t,
         scanner=s,
@@ -194,7 +202,8 @@ def fit(
 
 
 def _narrowed(rows: Array, held: NDArray[np.bool_], sigma: Array) -> float:
-    """Logarithm of how much the rows narrow the numbers that a prior holds, all others free (twice Laplace's factor)."""
+    """Logarithm of how much the rows narrow the numbers that a prior holds, all others free (twice Laplace's
+    factor)."""
     H = rows.T @ rows
     cross = H[np.ix_(~held, held)]
     kept = H[np.ix_(held, held)] - cross.T @ np.linalg.lstsq(H[np.ix_(~held, ~held)], cross, rcond=1e-12)[0]

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.doctor.case import ArmErrors, Case
-from weldcal.calibration.doctor.fit import Fit, fit
+from weldcal.calibration.doctor.case import ArmDerivatives, DoctorCase
+from weldcal.calibration.doctor.fit import CauseFit, fit
 from weldcal.calibration.geometry.se3 import exp_rotation, log_rotation, skew
 from weldcal.models.arms.chain import Chain, chain_inverse, chain_poses, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics
@@ -29,26 +29,32 @@ _ZERO_RAD, _LENGTH_M = 5e-3, 4e-3  # what joint zeros and link lengths of two ar
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """A cause's model fitted: its criterion (less is better), the fit, how far it moves the centres (rms, m) and its numbers."""
+    """A cause's model fitted: its criterion (less is better), the fit, how far it moves the centres (rms, m) and its
+    numbers."""
 
     cause: str
     bic: float
-    fit: Fit
+    fit: CauseFit
     effect_m: float
     numbers: dict[str, float]
     where: tuple[str, ...] = ()
 
 
-def explanations(case: Case, null: Fit) -> Iterator[Explained]:
+def explanations(case: DoctorCase, null: CauseFit) -> Iterator[Explained]:
     """Every model of a disturbance that these scans can bear."""
     for one in (
-        moved(case), tcp(case, null), drift(case, null), loose(case, null), kinematics(case, null), scaled(case, null),
-    ):  # fmt: skip
+        moved(case),
+        tcp(case, null),
+        drift(case, null),
+        loose(case, null),
+        kinematics(case, null),
+        scaled(case, null),
+    ):
         if one is not None:
             yield one
 
 
-def moved(case: Case) -> Explained | None:
+def moved(case: DoctorCase) -> Explained | None:
     """One camera pose before a scan and another one from it on."""
     n = case.n
     if n < 2 * LEAST_PART + 1:
@@ -56,7 +62,7 @@ def moved(case: Case) -> Explained | None:
     order = np.argsort(case.clock, kind="stable")
     place = np.empty(n, dtype=int)
     place[order] = np.arange(n)
-    best: tuple[float, int, Fit] | None = None
+    best: tuple[float, int, CauseFit] | None = None
     for k in range(LEAST_PART, n - LEAST_PART + 1):
         one = fit(case, groups=(place >= k).astype(int))
         if best is None or one.bic < best[0]:
@@ -75,7 +81,7 @@ def moved(case: Case) -> Explained | None:
     return Explained("scanner moved", bic + 2.0 * np.log(n), one, float(np.sqrt((shift**2).mean())), numbers, ids)
 
 
-def tcp(case: Case, null: Fit) -> Explained | None:
+def tcp(case: DoctorCase, null: CauseFit) -> Explained | None:
     """A constant offset in the flange's frame."""
     D = -case.X_BF[:, :3, :3]
     if case.n < 5:
@@ -95,8 +101,9 @@ def tcp(case: Case, null: Fit) -> Explained | None:
     return Explained("TCP set at the controller", bic, one, float(np.linalg.norm(one.a)), numbers)
 
 
-def _faces_straight(case: Case, found: Fit) -> Case | None:
-    """The case with the poses turned so that the faces seen look along z; None where they do, or no normals were seen."""
+def _faces_straight(case: DoctorCase, found: CauseFit) -> DoctorCase | None:
+    """The case with the poses turned so that the faces seen look along z; None where they do, or no normals were
+    seen."""
     has = np.isfinite(case.m).all(axis=1)
     if has.sum() < 4:
         return None
@@ -114,7 +121,7 @@ def _faces_straight(case: Case, found: Fit) -> Case | None:
     return replace(case, X_FR=X_FR)
 
 
-def _tcp_starts(case: Case, null: Fit) -> Iterator[Fit]:
+def _tcp_starts(case: DoctorCase, null: CauseFit) -> Iterator[CauseFit]:
     """Camera poses with the rotation's nine numbers free, so that an offset of any size is linear."""
     n = case.n
     if n < 6:
@@ -126,7 +133,7 @@ def _tcp_starts(case: Case, null: Fit) -> Iterator[Fit]:
     x = np.linalg.lstsq(A.reshape(-1, 15), case.b.ravel(), rcond=1e-9)[0]
     U, _, Vt = np.linalg.svd(x[:9].reshape(3, 3))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    yield Fit(
+    yield CauseFit(
         R=np.asarray(R[None]),
         p=np.asarray(x[9:12][None]),
         scanner=null.scanner,
@@ -141,8 +148,9 @@ def _tcp_starts(case: Case, null: Fit) -> Iterator[Fit]:
     )
 
 
-def scaled(case: Case, null: Fit) -> Explained:
-    """The scanner's scale free of what is usual: least squares along the undisturbed fit, then twice by the fit itself."""
+def scaled(case: DoctorCase, null: CauseFit) -> Explained:
+    """The scanner's scale free of what is usual: least squares along the undisturbed fit, then twice by the fit
+    itself."""
     b, c = case.b - case.b.mean(axis=0), (case.c - case.c.mean(axis=0)) @ null.R[0].T
     ratio = float((b * c).sum() / max(float((c * c).sum()), 1e-12))
     for _ in range(2):
@@ -152,10 +160,10 @@ def scaled(case: Case, null: Fit) -> Explained:
     return Explained("scanner scale error", one.bic + float(np.log(3.0 * case.n)), one, abs(ratio - 1.0), numbers)
 
 
-def drift(case: Case, null: Fit) -> Explained | None:
+def drift(case: DoctorCase, null: CauseFit) -> Explained | None:
     """The camera creeps with time, evenly or as a thing that warms up."""
     t = case.clock
-    best: tuple[Fit, Array, str] | None = None
+    best: tuple[CauseFit, Array, str] | None = None
     arm = case.b - case.b.mean(axis=0)
     for tau in (None, 0.15, 0.4):
         f = t if tau is None else 1.0 - np.exp(-t / tau)
@@ -176,12 +184,13 @@ def drift(case: Case, null: Fit) -> Explained | None:
     )
 
 
-def loose(case: Case, null: Fit) -> Explained | None:
-    """Two states that the scans fall into in no order: an offset in the flange's frame, or of the camera, in some of them."""
+def loose(case: DoctorCase, null: CauseFit) -> Explained | None:
+    """Two states that the scans fall into in no order: an offset in the flange's frame, or of the camera, in some of
+    them."""
     n = case.n
     if n < 8:
         return None
-    best: tuple[float, Fit, Array, str] | None = None
+    best: tuple[float, CauseFit, Array, str] | None = None
     for frame, T in (("flange", -case.X_BF[:, :3, :3]), ("camera", np.broadcast_to(np.eye(3), (n, 3, 3)))):
         local = np.einsum("kji,kj->ki", T, null.e)
         spread = local - np.median(local, axis=0)
@@ -202,7 +211,7 @@ def loose(case: Case, null: Fit) -> Explained | None:
     return Explained("slack flange or loose mount", bic, one, float(np.linalg.norm(one.a)), numbers, ids)
 
 
-def _two_states(case: Case, null: Fit, T: Array, state: Array) -> tuple[float, Fit, Array] | None:
+def _two_states(case: DoctorCase, null: CauseFit, T: Array, state: Array) -> tuple[float, CauseFit, Array] | None:
     """Scans and states in turn until nothing changes (classification EM); None where one state has too few scans."""
     n = case.n
     least = max(3, int(np.ceil(_LEAST_SHARE * n)))
@@ -227,7 +236,7 @@ def _two_states(case: Case, null: Fit, T: Array, state: Array) -> tuple[float, F
     return one.bic + float(labels) + 2.0 * np.log(4.0), one, state
 
 
-def kinematics(case: Case, null: Fit) -> Explained | None:
+def kinematics(case: DoctorCase, null: CauseFit) -> Explained | None:
     """Other joint zeros and link lengths than those by which the poses were computed."""
     if not case.robot or case.n < FEWEST_FOR_ARM:
         return None
@@ -250,20 +259,23 @@ def kinematics(case: Case, null: Fit) -> Explained | None:
     return best
 
 
-def with_arm_errors(case: Case) -> Case:
-    """The case with the errors of its arm as it leaves the factory, on the branch of joint angles that suits the scans best."""
+def with_arm_errors(case: DoctorCase) -> DoctorCase:
+    """The case with the errors of its arm as it leaves the factory, on the branch of joint angles that suits the scans
+    best."""
     if not case.robot or case.n < FEWEST_FOR_ARM:
         return case
     try:
         arm = load_chain(case.robot)
     except InputError:
         return case
-    best: tuple[float, Case] | None = None
+    best: tuple[float, DoctorCase] | None = None
     for q in joint_angles(case, arm):
         D, T, usual, _ = _arm_columns(case, arm, q)
         one = replace(
             case,
-            arm=ArmErrors(D, T, usual * np.where(usual == _ZERO_RAD, FACTORY_RAD / _ZERO_RAD, FACTORY_M / _LENGTH_M)),
+            arm=ArmDerivatives(
+                D, T, usual * np.where(usual == _ZERO_RAD, FACTORY_RAD / _ZERO_RAD, FACTORY_M / _LENGTH_M)
+            ),
         )
         bic = fit(one).bic
         if best is None or bic < best[0]:
@@ -271,8 +283,9 @@ def with_arm_errors(case: Case) -> Case:
     return case if best is None else best[1]
 
 
-def another_arm(case: Case, null: Fit, arm: Chain) -> Explained | None:
-    """The poses as another arm makes them from the same joint angles; None where no other arm explains the scans better."""
+def another_arm(case: DoctorCase, null: CauseFit, arm: Chain) -> Explained | None:
+    """The poses as another arm makes them from the same joint angles; None where no other arm explains the scans
+    better."""
     best: Explained | None = None
     if null.rms < _ANOTHER_ARM_M or arm.name not in known_arms():
         return None
@@ -291,7 +304,7 @@ def another_arm(case: Case, null: Fit, arm: Chain) -> Explained | None:
     return best
 
 
-def joint_angles(case: Case, arm: Chain) -> Iterator[Array]:
+def joint_angles(case: DoctorCase, arm: Chain) -> Iterator[Array]:
     """Joint angles (n, joints) for all poses, on each branch of the arm that reaches them all."""
     poses = [RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]) for X in case.X_BF]
     if arm.name in known_arms():
@@ -313,9 +326,9 @@ def joint_angles(case: Case, arm: Chain) -> Iterator[Array]:
     yield np.array(found)
 
 
-def _arm_columns(case: Case, arm: Chain, q: Array) -> tuple[Array, Array, Array, tuple[str, ...]]:
-    """Change (n, 3, p) of the feature's centre and of its normal by joint zeros and link lengths (but those that only move base or
-    flange), and one sigma (p,) of those numbers between two files of one arm."""
+def _arm_columns(case: DoctorCase, arm: Chain, q: Array) -> tuple[Array, Array, Array, tuple[str, ...]]:
+    """Change (n, 3, p) of the feature's centre and of its normal by joint zeros and link lengths (but those that only
+    move base or flange), and one sigma (p,) of those numbers between two files of one arm."""
     poses = chain_poses(arm, q)
     made: list[Array] = []
     sigma: list[float] = []

@@ -1,4 +1,5 @@
-"""Tries the ways in which poses and scans are misread: rotations, the inverse, a mirrored scanner, the order of rows, units."""
+"""Tries the ways in which poses and scans are misread: rotations, the inverse, a mirrored scanner, the order of rows,
+units."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -7,8 +8,8 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.doctor.case import Case
-from weldcal.calibration.doctor.fit import Fit, fit
+from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.fit import CauseFit, fit
 from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.models.arrays import Array
 
@@ -29,8 +30,8 @@ class Reading:
 
     cause: str
     words: str
-    case: Case
-    fit: Fit
+    case: DoctorCase
+    fit: CauseFit
 
 
 def _rotations(R: Array) -> Iterator[tuple[str, str, Array]]:
@@ -63,7 +64,7 @@ def _rotations(R: Array) -> Iterator[tuple[str, str, Array]]:
         yield "wrong rotation convention", f"the {words}", np.asarray(other_turn.as_matrix())
 
 
-def _misreadings(case: Case) -> Iterator[tuple[str, str, Case, Case]]:
+def _misreadings(case: DoctorCase) -> Iterator[tuple[str, str, DoctorCase, DoctorCase]]:
     """Cause, words, the scans as given, and the same scans in another reading."""
     for cause, words, R in _rotations(case.X_BF[:, :3, :3]):
         yield cause, words, case, case.with_poses(pose(R, case.X_BF[:, :3, 3]))
@@ -87,14 +88,15 @@ def _misreadings(case: Case) -> Iterator[tuple[str, str, Case, Case]]:
             yield "scans and poses shifted by one", words, inside, inside.with_poses(case.X_BF[rows - shift])
 
 
-def looks_wrong(one: Fit) -> bool:
+def looks_wrong(one: CauseFit) -> bool:
     """Whether residuals are larger than those of any arm and scanner that works, in the centres or in the normals."""
     tilted = bool(np.isfinite(one.tilt).any()) and float(np.nanmedian(one.tilt)) > LOOKS_WRONG_RAD
     return one.rms > LOOKS_WRONG_M or tilted
 
 
-def best_reading(case: Case, null: Fit) -> Reading | None:
-    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's; else None."""
+def best_reading(case: DoctorCase, null: CauseFit) -> Reading | None:
+    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's; else
+    None."""
     found: list[Reading] = []
     for cause, words, given, other in _misreadings(case):
         one = fit(other)
@@ -111,11 +113,11 @@ def best_reading(case: Case, null: Fit) -> Reading | None:
     return best if better else None
 
 
-def mixed_units(case: Case) -> tuple[Case, float, tuple[str, ...]] | None:
+def mixed_units(case: DoctorCase) -> tuple[DoctorCase, float, tuple[str, ...]] | None:
     """The case in one unit, the factor and the scans that were in another one; None where all are in one.
 
-    Distances of poses from the base, or of scans from the camera, in two groups that a unit's factor separates: those within the reach of
-    an arm are in metres. Else one factor between the spreads of both sides.
+    Distances of poses from the base, or of scans from the camera, in two groups that a unit's factor separates: those
+    within the reach of an arm are in metres. Else one factor between the spreads of both sides.
     """
     for name, points in (("poses", case.X_BF[:, :3, 3]), ("scans", case.c)):
         size = np.linalg.norm(points, axis=1)
@@ -135,7 +137,7 @@ def mixed_units(case: Case) -> tuple[Case, float, tuple[str, ...]] | None:
     return None
 
 
-def _scaled(case: Case, what: str, factor: Array) -> Case:
+def _scaled(case: DoctorCase, what: str, factor: Array) -> DoctorCase:
     if what == "scans":
         return replace(case, c=case.c * factor[:, None])
     X = case.X_BF.copy()

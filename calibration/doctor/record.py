@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.tables import read_rows
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, pose
@@ -36,11 +36,11 @@ def case_of(
     oriented: bool = True,
     fits_flange: str = "",
     near_far: tuple[float, float] | None = None,
-) -> Case:
+) -> DoctorCase:
     """The case of observations in their order; X_FR (4, 4) is the feature in the flange."""
     nan = np.full(3, np.nan)
     X_BR = np.array([o.X_BR.GetAsMatrix4() for o in observations]).reshape(-1, 4, 4)
-    return Case(
+    return DoctorCase(
         ids=tuple(o.id for o in observations),
         X_BF=X_BR @ inverse(X_FR),
         c=np.array([o.p_CR for o in observations]).reshape(-1, 3),
@@ -59,8 +59,9 @@ def case_of(
     )
 
 
-def case_text(case: Case) -> str:
-    """The table: a row for each scan (m, rad), with the feature, the guess and the refused scans as rows of their own."""
+def case_text(case: DoctorCase) -> str:
+    """The table: a row for each scan (m, rad), with the feature, the guess and the refused scans as rows of their
+    own."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     words = {
@@ -89,7 +90,7 @@ def _six(X: Array) -> list[str]:
     return [repr(float(v)) for v in (*X[:3, 3], *log_rotation(X[None, :3, :3])[0])]
 
 
-def read_case(path: Path) -> Case:
+def read_case(path: Path) -> DoctorCase:
     """The case of such a table. Raises InputError where it is damaged."""
     names, rows = read_rows(path)
     if tuple(names) != _COLUMNS:
@@ -107,7 +108,7 @@ def read_case(path: Path) -> Case:
     ids = tuple(r["id"] for r in scans)
     if not np.isfinite(seen[:, :3]).all() or not all(np.isfinite(X).all() for X in poses.values()):
         raise InputError(f"'{path.name}' lacks a number of a scan.")
-    return Case(
+    return DoctorCase(
         ids=ids,
         X_BF=np.array([poses[i] for i in ids]).reshape(-1, 4, 4),
         c=seen[:, :3],

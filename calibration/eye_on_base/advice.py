@@ -44,21 +44,21 @@ def sampling_advice(
     turned = turn_deg([o.X_BR for o in used])
     if not has_orientations([o.X_BR for o in used]):
         out.append(
-            "Give the orientations of the poses (base_qw ... base_qz in pairs.csv): without them a constant error of the flange centre or "
-            "of the tool's offset cannot be seen."
+            "Give the orientations of the poses (base_qw ... base_qz in pairs.csv): without them a constant error of"
+            " the flange centre or of the tool's offset cannot be seen."
         )
     elif turned < _TURN_DEG:
         out.append(
-            f"Turn and tilt the flange between poses by 20 degrees or more: these poses differ by {turned:.1f} degrees, so a "
-            "constant error of the flange centre or of the tool's offset cannot be seen."
+            f"Turn and tilt the flange between poses by 20 degrees or more: these poses differ by {turned:.1f} degrees,"
+            " so a constant error of the flange centre or of the tool's offset cannot be seen."
         )
     sigma = sigma_at(estimate, middle)
     weak = weakest_place(estimate, p)
     if sigma_at(estimate, weak) > _WEAK_FACTOR * sigma:
         x, y, z = 1e3 * weak
         out.append(
-            f"The most informative next pose is near ({x:.0f}, {y:.0f}, {z:.0f}) mm in the base: the uncertainty of a scanned point is "
-            f"{1e3 * sigma_at(estimate, weak):.2f} mm there and {1e3 * sigma:.2f} mm in the middle."
+            f"The most informative next pose is near ({x:.0f}, {y:.0f}, {z:.0f}) mm in the base: the uncertainty of a"
+            f" scanned point is {1e3 * sigma_at(estimate, weak):.2f} mm there and {1e3 * sigma:.2f} mm in the middle."
         )
     n = len(used)
     gain = 1.0 - np.sqrt(n / (n + 1.0))
@@ -74,14 +74,15 @@ def sampling_advice(
     elif gain >= _LITTLE:
         want = int(np.ceil(1.0 / (1.0 - (1.0 - _LITTLE) ** 2)))
         out.append(
-            f"Add poses, up to {want} or more: each reduces the uncertainty of {1e3 * sigma:.2f} mm by {100 * gain:.0f} % or more."
+            f"Add poses, up to {want} or more: each reduces the uncertainty of {1e3 * sigma:.2f} mm by {100 * gain:.0f}"
+            " % or more."
         )
     return tuple(out)
 
 
 def weakest_place(estimate: CalibrationEstimate, p_B: Array) -> Array:
-    """The place (3,) m with the largest uncertainty of a scanned point, of the ends of the principal axes of poses (n, 3) m,
-    half as far again."""
+    """The place (3,) m with the largest uncertainty of a scanned point, of the ends of the principal axes of poses (n,
+    3) m, half as far again."""
     middle = p_B.mean(axis=0)
     spread = np.linalg.svd(p_B - middle, full_matrices=False)
     reach = spread[2] * (spread[1] / np.sqrt(len(p_B)))[:, None]

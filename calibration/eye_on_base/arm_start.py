@@ -1,4 +1,5 @@
-"""Finds roughly where the scanner stands from the visible arm: its capsules at the recorded joints against one scan or more."""
+"""Finds roughly where the scanner stands from the visible arm: its capsules at the recorded joints against one scan or
+more."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,8 +43,8 @@ _FACE_M, _FACE_POINTS = 0.0025, 60  # half a face's thickness in a noisy scan, a
 _SAME_M, _SAME_RAD = 0.08, 0.25  # hypotheses that are the same
 _EXPLAINED, _SEEN_THROUGH = 0.72, 0.12  # of an accepted start: the least share of points, the largest of surface
 _MARGIN = 0.04  # and its lead over the next
-# Capsules are thicker than the links inside them, so some of their surface is seen through (0.15 of a UR10e's, rendered): allowed where
-# nothing else comes near.
+# Capsules are thicker than the links inside them, so some of their surface is seen through (0.15 of a UR10e's,
+# rendered): allowed where nothing else comes near.
 _THROUGH_FAR_AHEAD, _FAR_AHEAD = 0.18, 0.3
 
 
@@ -57,8 +58,11 @@ class ArmShape:
 
 @dataclass(frozen=True, eq=False)
 class ArmStart:
-    """Where the scanner seems to stand. ``explained``: share of the moving points on the arm; ``seen_through``: share of the arm's
-    surface in view behind which the scanner measured; ``next_best``: the score of the best other place; ``score`` of this one."""
+    """Where the scanner seems to stand.
+
+    ``explained``: share of the moving points on the arm; ``seen_through``: share of the arm's surface in view behind
+    which the scanner measured; ``next_best``: the score of the best other place; ``score`` of this one.
+    """
 
     X_BC: RigidTransform
     explained: float
@@ -78,13 +82,13 @@ class ArmStart:
         """Where the arm puts the scanner, or that it does not."""
         if not self.accepted:
             return (
-                "The visible arm does not show where the scanner stands either: scan more of the arm, or state scanner_guess in "
-                "dataset.yaml."
+                "The visible arm does not show where the scanner stands either: scan more of the arm, or state"
+                " scanner_guess in dataset.yaml."
             )
         x, y, z = self.X_BC.translation()
         return (
-            f"The visible arm puts the scanner at about ({x:.2f}, {y:.2f}, {z:.2f}) m in the robot's base; turn the flange to it, "
-            "nearer and with nothing between."
+            f"The visible arm puts the scanner at about ({x:.2f}, {y:.2f}, {z:.2f}) m in the robot's base; turn the"
+            " flange to it, nearer and with nothing between."
         )
 
     def agreement(self, X_BC: RigidTransform, p_B: Array) -> str:
@@ -98,8 +102,8 @@ class ArmStart:
         turn = D.rotation().ToAngleAxis().angle()
         if off > _GUESS_M or turn > _GUESS_RAD:
             raise InconsistentPoses(
-                f"Flange and visible arm put the scanner {1e3 * off:.0f} mm and {np.degrees(turn):.0f} degrees apart: scan the flange "
-                "in more poses."
+                f"Flange and visible arm put the scanner {1e3 * off:.0f} mm and {np.degrees(turn):.0f} degrees apart:"
+                " scan the flange in more poses."
             )
         return f"The visible arm agrees with X_BC to {1e3 * off:.0f} mm and {np.degrees(turn):.1f} degrees."
 
@@ -107,7 +111,8 @@ class ArmStart:
 def see_with_arm(
     data: Dataset, seen: FlangeObservations, standard: FlangeStandard, robot: str, *, seed: int = 0
 ) -> tuple[FlangeObservations, ArmStart | None]:
-    """The flanges of scans, looked for where the visible arm puts them; as they were seen where the arm decides nothing."""
+    """The flanges of scans, looked for where the visible arm puts them; as they were seen where the arm decides
+    nothing."""
     start = start_from_arm(data, robot, seed=seed)
     if start is None or not start.accepted:
         return seen, start
@@ -124,7 +129,8 @@ def see_with_arm(
 
 
 def face_guess(points: Array, X_CR: RigidTransform, standard: FlangeStandard) -> FlangeGuess:
-    """Where the flange's face is in a cloud (N, 3) m, to a millimetre or two, from a pose X_CR that is right to some centimetres.
+    """Where the flange's face is in a cloud (N, 3) m, to a millimetre or two, from a pose X_CR that is right to some
+    centimetres.
 
     The face is where most points lie on the ring, and fewest in the bore and just outside, on a plane
     along the expected axis; plane and place are found in turns.
@@ -190,7 +196,8 @@ def start_from_arm(data: Dataset, robot: str, *, seed: int = 0) -> ArmStart | No
 
 
 def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
-    """Recorded joint angles (n,) rad by scan; none where there are none, or where they lead elsewhere than the stated poses."""
+    """Recorded joint angles (n,) rad by scan; none where there are none, or where they lead elsewhere than the stated
+    poses."""
     try:
         q = joint_angles(data, ids, arm.n)
     except DatasetError:
@@ -203,7 +210,8 @@ def _recorded(data: Dataset, arm: Chain, ids: list[str]) -> dict[str, Array]:
 
 
 def _branches(data: Dataset, arm: Chain, ids: list[str]) -> list[list[Array]]:
-    """Joint angles of the scans for each branch of the inverse kinematics of a Universal Robots arm, followed from scan to scan."""
+    """Joint angles of the scans for each branch of the inverse kinematics of a Universal Robots arm, followed from scan
+    to scan."""
     poses = [data.poses[id] for id in ids]
     if arm.name not in known_arms() or not ids:
         return []
@@ -241,11 +249,12 @@ def capsule_distance(points: Array, shape: ArmShape) -> tuple[Array, Array]:
 
 
 def find_arm(clouds: Sequence[Array], shapes: Sequence[ArmShape], *, seed: int = 0) -> ArmStart | None:
-    """X_BC to some centimetres from clouds, m in C, and the arm's capsules at each; None where too little of the arm is seen.
+    """X_BC to some centimetres from clouds, m in C, and the arm's capsules at each; None where too little of the arm is
+    seen.
 
-    What stands still in two clouds or more is no arm. Points of a scan with their normals are laid on points of the arm's surface,
-    turned about the common normal; the scanner then must see the arm's surface wherever nothing hides it, and
-    nothing behind it. The best hypotheses are refined by Gauss-Newton with a common allowance on the radii.
+    What stands still in two clouds or more is no arm. Points of a scan with their normals are laid on points of the
+    arm's surface, turned about the common normal; the scanner then must see the arm's surface wherever nothing hides
+    it, and nothing behind it. The best hypotheses are refined by Gauss-Newton with a common allowance on the radii.
     """
     rng = np.random.default_rng(seed)
     views = _views(clouds, shapes, rng)
@@ -270,8 +279,10 @@ def find_arm(clouds: Sequence[Array], shapes: Sequence[ArmShape], *, seed: int =
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _View:
-    """A scan against the arm: points (N, 3) m on what moved with their normals, depth image (h, w) m of the nearest points with the
-    rays' origin and pitch, samples of the arm's surface (S, 3) m in B with normals, and its distance field with its origin."""
+    """A scan against the arm: points (N, 3) m on what moved with their normals, depth image (h, w) m of the nearest
+    points with the rays' origin and pitch, samples of the arm's surface (S, 3) m in B with normals, and its distance
+    field with its origin.
+    """
 
     points: Array
     normals: Array

@@ -32,8 +32,9 @@ _FLOOR_M = 1e-6
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChangePoint:
-    """A change between two poses: ids of the last before and of the first after it; the two camera poses; the rms shift (m)
-    of the flange centres that it makes, the spread per axis (m) with and without it, and the probability by chance."""
+    """A change between two poses: ids of the last before and of the first after it; the two camera poses; the rms
+    shift (m) of the flange centres that it makes, the spread per axis (m) with and without it, and the probability
+    by chance."""
 
     index: int
     before: str
@@ -58,8 +59,8 @@ def find_change(observations: Sequence[Observation]) -> ChangePoint | None:
     One camera pose is compared with two, for every place of a change that leaves four poses on either side. Both models
     leave the scanner's own error open, held to its usual size, which a recording from near to far would else take for a
     change. Centres only; Huber weights. A change is named if the F-test, corrected for the number of places, gives it a
-    probability by chance below FALSE_ALARM, and if it shifts the centres by more than three sigmas of a single pose and 0.1 mm.
-    Deterministic. Fewer than nine poses show none.
+    probability by chance below FALSE_ALARM, and if it shifts the centres by more than three sigmas of a single pose and
+    0.1 mm. Deterministic. Fewer than nine poses show none.
     """
     n = len(observations)
     if n < _LEAST:
@@ -118,8 +119,8 @@ class _Split:
 
 
 def _starts(observations: Sequence[Observation]) -> list[RigidTransform]:
-    """Camera poses to begin with: from all poses, from the first and from the last of them; those that can be estimated and
-    that lead elsewhere than an earlier one."""
+    """Camera poses to begin with: from all poses, from the first and from the last of them; those that can be estimated
+    and that lead elsewhere than an earlier one."""
     n = len(observations)
     config = SolveConfig(leave_one_out=False, hypotheses=150, allow_coplanar=True)
     middle = np.mean([o.p_CR for o in observations], axis=0)
@@ -141,7 +142,8 @@ def _starts(observations: Sequence[Observation]) -> list[RigidTransform]:
 def _fit(
     b: Array, c: Array, start: RigidTransform, split: int | None, order: int, sigma: float | None = None
 ) -> _Split:
-    """Camera poses before and from ``split`` on (None: one for all) and the scanner's factors, by reweighted Gauss-Newton.
+    """Camera poses before and from ``split`` on (None: one for all) and the scanner's factors, by reweighted
+    Gauss-Newton.
 
     ``sigma`` (m, an axis) is estimated from the residuals where it is not given.
     """

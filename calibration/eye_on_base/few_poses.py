@@ -24,8 +24,8 @@ ENOUGH = 4
 _TURN_KNOWN_RAD = float(np.radians(0.1))  # as well as a calibration from many poses states it, and as a person would
 _HOLE_CIRCLE_M = 0.025
 _TURN_STATED = (
-    "The rotation about the flange's axis is as stated with --axis-turn: a degree of error there turns the scanner by a degree. A "
-    "calibration from many scans reports it."
+    "The rotation about the flange's axis is as stated with --axis-turn: a degree of error there turns the scanner by a"
+    " degree. A calibration from many scans reports it."
 )
 _TERMS = 6  # of the correction that few scans leave open
 _USUAL_WEIGHT = 4.0  # residuals' worth of what is usual of robot and scanner
@@ -45,9 +45,9 @@ def estimate_from_whole_poses(
 ) -> FewPosesEstimate:
     """X_BC from the observations whose hole pattern shows its rotation (n >= 1): each gives all six degrees of freedom.
 
-    ``turn_rad`` is how far the drilled pattern is turned about the face normal from where the robot's flange frame says it is;
-    ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged (chordal
-    mean), then centres. Raises TooFewPoses where no scan shows one.
+    ``turn_rad`` is how far the drilled pattern is turned about the face normal from where the robot's flange frame says
+    it is; ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged
+    (chordal mean), then centres. Raises TooFewPoses where no scan shows one.
     """
     seen = _with_turn(observations, patterns)
     turn = RotationMatrix.MakeZRotation(turn_rad).matrix()
@@ -69,9 +69,9 @@ def estimate_from_whole_poses(
 def axis_turn(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float]:
-    """How far (rad) the drilled pattern is turned about the face normal from the robot's flange frame, and its spread over
-    the scans (standard deviation, rad; NaN for one scan). Circular median over the scans that show its rotation; raises
-    TooFewPoses where none does."""
+    """How far (rad) the drilled pattern is turned about the face normal from the robot's flange frame, and its spread
+    over the scans (standard deviation, rad; NaN for one scan). Circular median over the scans that show its rotation;
+    raises TooFewPoses where none does."""
     turns = []
     for o in _with_turn(observations, patterns):
         R = (o.X_BR.rotation().inverse() @ X_BC.rotation() @ patterns[o.id].X_CR.rotation()).matrix()
@@ -106,12 +106,12 @@ def calibrate_from_few(
     *,
     seed: int = 0,
 ) -> CalibrationEstimate:
-    """X_BC from one to three observations, with a covariance from the usual errors of robot and scanner where the data are
-    too few.
+    """X_BC from one to three observations, with a covariance from the usual errors of robot and scanner where the data
+    are too few.
 
-    With ``axis_turn_rad`` (see estimate_from_whole_poses) one scan that shows the holes is enough; without it three pairs, or two
-    scans with face normals. Held-out errors are those of each pose under the others, NaN where the others are too few. Raises
-    TooFewPoses, RepeatedPoses, CoplanarPoses or InconsistentPoses.
+    With ``axis_turn_rad`` (see estimate_from_whole_poses) one scan that shows the holes is enough; without it three
+    pairs, or two scans with face normals. Held-out errors are those of each pose under the others, NaN where the others
+    are too few. Raises TooFewPoses, RepeatedPoses, CoplanarPoses or InconsistentPoses.
     """
     n = len(observations)
     if axis_turn_rad is not None:
@@ -124,8 +124,9 @@ def calibrate_from_few(
     if n < need:
         there = "One scan leaves" if n == 1 else "Two centres leave"
         raise TooFewPoses(
-            f"{there} a rotation open: take {ENOUGH} poses or more, whose flange centres do not lie in one plane, or state how far the "
-            "hole pattern is turned about the flange's axis with --axis-turn DEGREES (a calibration from many scans reports it)."
+            f"{there} a rotation open: take {ENOUGH} poses or more, whose flange centres do not lie in one plane, or"
+            " state how far the hole pattern is turned about the flange's axis with --axis-turn DEGREES (a calibration"
+            " from many scans reports it)."
         )
     config = SolveConfig(seed=seed, min_poses=need, allow_coplanar=True, usual_weight=_USUAL_WEIGHT)
     estimate = estimate_eye_on_base(tuple(observations), config)
@@ -212,7 +213,8 @@ def _said(estimate: CalibrationEstimate, n: int) -> CalibrationEstimate:
         else "each held-out error is that of one under the others"
     )
     text = (
-        f"From {scans} only: the uncertainty is based on typical errors of robot and scanner ({1e3 * USUAL_SPREAD_M:.2f} mm and "
-        f"{np.degrees(USUAL_TILT_RAD):.2f} degrees per axis); {judged}. A calibration from {ENOUGH} poses or more estimates its own errors."
+        f"From {scans} only: the uncertainty is based on typical errors of robot and scanner"
+        f" ({1e3 * USUAL_SPREAD_M:.2f} mm and {np.degrees(USUAL_TILT_RAD):.2f} degrees per axis); {judged}. A"
+        f" calibration from {ENOUGH} poses or more estimates its own errors."
     )
     return replace(estimate, warnings=(*estimate.warnings, text))

@@ -9,12 +9,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
 from weldcal.calibration.eye_on_base.observations import corrected_observation
-from weldcal.calibration.eye_on_base.scanner_fit import (
-    CIRCLE_OWN,
-    CorrectionEstimate,
-    from_holes,
-    from_motion,
-)
+from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate, from_holes, from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
@@ -36,8 +31,10 @@ _HYPOTHESES = 60  # of an estimate from poses that are cleared of gross outliers
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScannerVerdict:
-    """What the scans say of the scanner: the correction to apply (None: none), what the robot's motion and the flange's hole circle ask
-    for, each alone (None where unknown), and the sentence; ``worth_saying`` where a reader of the result should know it."""
+    """What the scans say of the scanner: the correction to apply (None: none), what the robot's motion and the flange's
+    hole circle ask for, each alone (None where unknown), and the sentence; ``worth_saying`` where a reader of the
+    result should know it.
+    """
 
     accepted: ScannerCorrection | None
     motion: CorrectionEstimate | None
@@ -72,12 +69,13 @@ def estimate_jointly(
 ) -> tuple[CalibrationEstimate, ScannerVerdict | None]:
     """X_BC with a scanner correction from n poses (n >= 4) and the hole circles seen in them (by id).
 
-    The correction (order 2, from twelve poses on 3) is held to its usual size: scale 0.2 %, gradient 0.15 % per 100 mm, bends
-    0.1 % at the image's edge. So few poses state what they know. It is applied where it is not zero by chance (99 %); where it is not
-    applied, the covariance contains what the scans leave open of it all the same. Robot motion and hole circles that contradict each
-    other change nothing, and the verdict says so. Held-out errors repeat the estimate and the decision without the pose (20 folds at
-    most). Outliers are those of the rigid estimate. Without ``correct_scanner`` and below four inliers it is the rigid estimate, with
-    no verdict. Deterministic. Raises what estimate_eye_on_base raises.
+    The correction (order 2, from twelve poses on 3) is held to its usual size: scale 0.2 %, gradient 0.15 % per 100 mm,
+    bends 0.1 % at the image's edge. So few poses state what they know. It is applied where it is not zero by chance (99
+    %); where it is not applied, the covariance contains what the scans leave open of it all the same. Robot motion and
+    hole circles that contradict each other change nothing, and the verdict says so. Held-out errors repeat the estimate
+    and the decision without the pose (20 folds at most). Outliers are those of the rigid estimate. Without
+    ``correct_scanner`` and below four inliers it is the rigid estimate, with no verdict. Deterministic. Raises what
+    estimate_eye_on_base raises.
     """
     observations, patterns = tuple(observations), patterns or {}
     config = config or SolveConfig()
@@ -106,8 +104,10 @@ def solve_jointly(
     correct_scanner: bool = True,
     seed: int = 0,
 ) -> tuple[RigidTransform, ScannerCorrection]:
-    """X_BC and correction of estimate_jointly, without its held-out errors: for cross-validation. Raises InputError where the poses
-    do not fix it."""
+    """X_BC and correction of estimate_jointly, without its held-out errors: for cross-validation.
+
+    Raises InputError where the poses do not fix it.
+    """
     config = SolveConfig(seed=seed, leave_one_out=False, hypotheses=_HYPOTHESES, allow_coplanar=True)
     rigid = estimate_eye_on_base(tuple(observations), config)
     good = [o for o, keep in zip(observations, rigid.inliers, strict=True) if keep]
@@ -147,7 +147,8 @@ def _held_out(
     fit: _Fit,
     seed: int,
 ) -> HeldOut:
-    """Errors of each pose under estimates that did not see it; outliers are measured against the estimate from the others."""
+    """Errors of each pose under estimates that did not see it; outliers are measured against the estimate from the
+    others."""
     n = len(observations)
     position, tilt = np.full((2, n), np.nan)
     folds = min(n, _FOLDS)
@@ -180,7 +181,10 @@ def _verdict(fit: _Fit, n: int, rigid: CalibrationEstimate, estimate: Calibratio
         before, after = _means(rigid.held_out.position_m[rigid.inliers], estimate.held_out.position_m[rigid.inliers])
         text = f"The scanner is corrected: {both}. "
         if np.isfinite([before, after]).all():
-            text += f"Held-out errors are {1e3 * after:.3f} mm with the correction and {1e3 * before:.3f} mm without (mean). "
+            text += (
+                f"Held-out errors are {1e3 * after:.3f} mm with the correction and {1e3 * before:.3f} mm without"
+                " (mean). "
+            )
         text += "X_BC applies to scans with this correction."
         known = True
     elif fit.contradict:

@@ -1,4 +1,5 @@
-"""Fits the flange in every cloud of a dataset, with the reasons of refused scans, and decides how its poses are to be read."""
+"""Fits the flange in every cloud of a dataset, with the reasons of refused scans, and decides how its poses are to be
+read."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -40,8 +41,8 @@ _SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error
 
 @dataclass(frozen=True, eq=False)
 class FlangeObservations:
-    """Results of the flange fits: an observation for each usable scan, its fit, its hole pattern where one shows and its face's points
-    (N, 3) m by id (none for pairs), and (id, reason) for each scan that is refused."""
+    """Results of the flange fits: an observation for each usable scan, its fit, its hole pattern where one shows and
+    its face's points (N, 3) m by id (none for pairs), and (id, reason) for each scan that is refused."""
 
     observations: tuple[Observation, ...]
     fits: dict[str, FlangeFit]
@@ -65,8 +66,9 @@ def see_flanges(
     """Fit the flange in every cloud of a dataset, or use its pairs as they are.
 
     ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole.
-    ``guesses`` says it scan by scan instead. Without ``holes`` no hole pattern is looked for. Deterministic for ``seed``.
-    ``tell`` is told the fraction done. A damaged file is refused with its reason, as is a scan that shows no flange.
+    ``guesses`` says it scan by scan instead. Without ``holes`` no hole pattern is looked for. Deterministic for
+    ``seed``. ``tell`` is told the fraction done. A damaged file is refused with its reason, as is a scan that shows no
+    flange.
     """
     if data.pairs:
         return FlangeObservations(
@@ -119,9 +121,7 @@ def _read_by_scans(data: Dataset, observations: list[Observation]) -> Dataset:
 def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:
     """An observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
     return replace(
-        o,
-        p_CR=correction.points(o.p_CR),
-        n_C=None if o.n_C is None else correction.normals(np.asarray(o.p_CR), o.n_C),
+        o, p_CR=correction.points(o.p_CR), n_C=None if o.n_C is None else correction.normals(np.asarray(o.p_CR), o.n_C)
     )
 
 
@@ -153,8 +153,9 @@ def _guess(data: Dataset, id: str, standard: FlangeStandard, X_BC: RigidTransfor
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanAgreement:
-    """How well the scans agree with a reading: rms angle of the normals (rad) and distance of the centres (m) of so many scans that are no
-    outliers, the spread of the centres (m), R_BC and p_BC, and whether a list is changed beyond what is stated."""
+    """How well the scans agree with a reading: rms angle of the normals (rad) and distance of the centres (m) of so
+    many scans that are no outliers, the spread of the centres (m), R_BC and p_BC, and whether a list is changed beyond
+    what is stated."""
 
     reading: PoseReading
     scans: int
@@ -174,12 +175,13 @@ class ScanAgreement:
 def choose_reading(
     readings: Sequence[PoseReading], rows: Array, p_CR: Array, n_C: Array, X_FR: Array
 ) -> tuple[PoseReading | None, str]:
-    """The reading of the flange poses with which the scans agree, and a sentence about it; None where the usual one stands.
+    """The reading of the flange poses with which the scans agree, and a sentence about it; None where the usual one
+    stands.
 
-    Centres of the feature in the base do not depend on the notation of rotations, its normals do. For each reading the rigid X_BC that
-    fits centres and normals best leaves residuals of normals with at least 2 m - 3 degrees of freedom, m of the n scans being no outliers,
-    and more of centres; a reading whose residuals exceed those of the best by more than the quantile of F(2 m - 3, 2 m - 3) for CHANCE is
-    rejected.
+    Centres of the feature in the base do not depend on the notation of rotations, its normals do. For each reading the
+    rigid X_BC that fits centres and normals best leaves residuals of normals with at least 2 m - 3 degrees of freedom,
+    m of the n scans being no outliers, and more of centres; a reading whose residuals exceed those of the best by more
+    than the quantile of F(2 m - 3, 2 m - 3) for CHANCE is rejected.
 
     Args:
         readings: poses X_BF (N, 4, 4) in metres, the usual reading first.
@@ -219,9 +221,9 @@ def choose_reading(
     if rivals:
         other = min(rivals, key=_cost)
         raise InconsistentPoses(
-            f"The scans agree with the poses in more than one reading, and the results differ: {best.reading.words} ({_residual(best)}), or "
-            f"{other.reading.words} ({_residual(other)}). State the right one in dataset.yaml: {_statement(best.reading.form)}, or "
-            f"{_statement(other.reading.form)}."
+            f"The scans agree with the poses in more than one reading, and the results differ: {best.reading.words}"
+            f" ({_residual(best)}), or {other.reading.words} ({_residual(other)}). State the right one in dataset.yaml:"
+            f" {_statement(best.reading.form)}, or {_statement(other.reading.form)}."
         )
     dead = [one for one in tried if one is not best and one not in alive]
     text = f"Poses read as {best.reading.words}: {_residual(best)}"

@@ -28,8 +28,8 @@ LEAST_PATTERNS = 6
 STARTS = 30  # random starts of an estimate: these observations are cleared of gross outliers
 _MARGIN_M = 0.03  # a face reaches so far about its centre: there, too, a bend was seen
 _USUAL_SPREAD_M = 1e-4
-# how far a hole circle may differ from what motion shows: the maker's pitch circle is trusted to 25 micrometres on 50 mm,
-# and a circle sees a distortion of higher order in one place, motion sees it over the whole field
+# how far a hole circle may differ from what motion shows: the maker's pitch circle is trusted to 25 micrometres on 50
+# mm, and a circle sees a distortion of higher order in one place, motion sees it over the whole field
 CIRCLE_OWN = np.array([5e-4, 3e-3, 3e-3])
 _RATIO_SIGMA, _RATIO_DOF = 1e-3, 6.0  # what is expected of a hole circle's size before any is seen, and its weight
 
@@ -38,9 +38,10 @@ _RATIO_SIGMA, _RATIO_DOF = 1e-3, 6.0  # what is expected of a hole circle's size
 class CorrectionEstimate:
     """A correction and the covariance (K, K) of its factors, in 1 and 1/m and so on.
 
-    ``X_BC`` and ``joint`` (6 + K, 6 + K), where the robot's motion took part, are the camera's pose that goes with it and the
-    covariance of both: rotation on the base side about the camera origin, its displacement, factors. The sigmas are the spread of
-    positions and normals about them (per axis), ``redundancy`` how many spare numbers the former was found from.
+    ``X_BC`` and ``joint`` (6 + K, 6 + K), where the robot's motion took part, are the camera's pose that goes with it
+    and the covariance of both: rotation on the base side about the camera origin, its displacement, factors. The sigmas
+    are the spread of positions and normals about them (per axis), ``redundancy`` how many spare numbers the former was
+    found from.
     """
 
     correction: ScannerCorrection
@@ -77,14 +78,15 @@ def from_motion(
     usual: bool = False,
     start: RigidTransform | None = None,
 ) -> CorrectionEstimate:
-    """Fit correction and camera pose together to observations (n >= 3) and robot poses; with ``patterns`` the hole circles'
-    nominal size is fitted, too.
+    """Fit correction and camera pose together to observations (n >= 3) and robot poses; with ``patterns`` the hole
+    circles' nominal size is fitted, too.
 
-    The observations are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With ``usual`` it is
-    held to what scanners are usually off, which lets few poses say as much as they know. Gauss-Newton over the 9, 12 or 16 unknowns,
-    reweighted (soft L1 beyond two sigma); each kind of datum counts by its own spread, found from the residuals over its own
-    redundancy. ``start`` is a camera pose near by, as from the same observations and one more: it saves the search for one. Raises
-    TooFewPoses below three and, without ``start``, what estimate_eye_on_base raises.
+    The observations are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With
+    ``usual`` it is held to what scanners are usually off, which lets few poses say as much as they know. Gauss-Newton
+    over the 9, 12 or 16 unknowns, reweighted (soft L1 beyond two sigma); each kind of datum counts by its own spread,
+    found from the residuals over its own redundancy. ``start`` is a camera pose near by, as from the same observations
+    and one more: it saves the search for one. Raises TooFewPoses below three and, without ``start``, what
+    estimate_eye_on_base raises.
     """
     if len(observations) < 3:
         raise TooFewPoses("A scanner correction needs at least three usable poses; add poses.")
@@ -171,12 +173,13 @@ def _gauss_newton(
     sigma_n: float,
     sigma_r: float,
 ) -> tuple[Array, Array, Array, Array, float, float, float]:
-    """The loop of from_motion: pose, change of the unknowns after it, information, redundancy of positions, both sigmas.
+    """The loop of from_motion: pose, change of the unknowns after it, information, redundancy of positions, both
+    sigmas.
 
-    Centres c, b (n, 3) with ``vague`` (n,) and the correction's terms (n, K); of those with a normal m (h, 3), z (h, 3) in the base,
-    their centres, terms and ``slopes`` (h, K, 2); of k hole circles rows (k, K) and ratio (k,). ``prior`` (6 + K or 9 + K,) are
-    inverse sigmas. A normal turns by the inverse transpose of the correction's derivative f 1 + c s'; its linear part at the identity
-    is what a small change of a factor does.
+    Centres c, b (n, 3) with ``vague`` (n,) and the correction's terms (n, K); of those with a normal m (h, 3), z (h, 3)
+    in the base, their centres, terms and ``slopes`` (h, K, 2); of k hole circles rows (k, K) and ratio (k,). ``prior``
+    (6 + K or 9 + K,) are inverse sigmas. A normal turns by the inverse transpose of the correction's derivative f 1 + c
+    s'; its linear part at the identity is what a small change of a factor does.
     """
     n, h, k, terms, size = len(b), len(z), len(ratio), basis.shape[1], len(prior)
     own = size - 6 - terms
@@ -265,7 +268,8 @@ def _spread(e: Array, count: int) -> float:
 
 
 def _circles(patterns: Sequence[HolePattern], shape: ScannerCorrection) -> tuple[Array, Array]:
-    """Of k hole circles: derivative (k, K) of their stretch by the factors of ``shape``, and measured over nominal size (k,).
+    """Of k hole circles: derivative (k, K) of their stretch by the factors of ``shape``, and measured over nominal size
+    (k,).
 
     The stretch of a small circle is half the trace of the correction's derivative in the circle's plane.
     """

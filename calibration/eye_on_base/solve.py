@@ -41,9 +41,12 @@ USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
 
 @dataclass(frozen=True, kw_only=True)
 class SolveConfig:
-    """Settings of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
-    agree). ``usual_weight`` is how many residuals the usual spread of robot and scanner (USUAL_SPREAD_M, USUAL_TILT_RAD) counts
-    for beside the residuals themselves: three poses have too few of them."""
+    """Settings of the estimator.
+
+    ``max_outliers`` is the share of gross outliers it must survive (and the least that agree). ``usual_weight`` is how
+    many residuals the usual spread of robot and scanner (USUAL_SPREAD_M, USUAL_TILT_RAD) counts for beside the
+    residuals themselves: three poses have too few of them.
+    """
 
     seed: int = 0
     max_outliers: float = 0.40
@@ -92,8 +95,9 @@ def estimate_eye_on_base(
     of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and
     of normals are estimated from the residuals (Helmert's simplified estimator, each group divided by its own
     redundancy), never set by taste. Held-out errors repeat the weighted fit without each pose in turn (of more than 100
-    poses: without each of 100 groups). Deterministic for ``config.seed``. Raises TooFewPoses, RepeatedPoses, CoplanarPoses
-    (see observability.check_diversity) and InconsistentPoses when no rigid transform explains enough of the poses.
+    poses: without each of 100 groups). Deterministic for ``config.seed``. Raises TooFewPoses, RepeatedPoses,
+    CoplanarPoses (see observability.check_diversity) and InconsistentPoses when no rigid transform explains enough of
+    the poses.
     """
     config = config or SolveConfig()
     observations = tuple(observations)
@@ -105,14 +109,15 @@ def estimate_eye_on_base(
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
         raise InconsistentPoses(
-            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to {100 * config.max_outliers:.0f} % outliers are "
-            "excluded); check units, pose order and that the camera did not move."
+            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to"
+            f" {100 * config.max_outliers:.0f} % outliers are excluded); check units, pose order and that the camera"
+            " did not move."
         )
     spread = float(np.sqrt(((data.b - data.b.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if np.sqrt(solution.var_p) > _WORST_SHARE * spread:
         raise InconsistentPoses(
-            f"The poses disagree by {1e3 * np.sqrt(solution.var_p):.0f} mm per axis; check units, pose order, the quaternion"
-            " order and that the camera did not move."
+            f"The poses disagree by {1e3 * np.sqrt(solution.var_p):.0f} mm per axis; check units, pose order, the"
+            " quaternion order and that the camera did not move."
         )
     if not inliers.all():
         check_diversity(
@@ -122,8 +127,9 @@ def estimate_eye_on_base(
     used = inliers & data.has
     if used.any() and float(np.median(tilt[used])) > _WORST_TILT_RAD:
         raise InconsistentPoses(
-            f"The faces seen are turned by {np.degrees(np.median(tilt[used])):.0f} degrees from where the poses have the flange's z axis:"
-            " check the quaternion order (qw, qx, qy, qz) and that the poses are those of the flange, not of a tool."
+            f"The faces seen are turned by {np.degrees(np.median(tilt[used])):.0f} degrees from where the poses have"
+            " the flange's z axis: check the quaternion order (qw, qx, qy, qz) and that the poses are those of the"
+            " flange, not of a tool."
         )
     held_out = HeldOut(residual.copy(), tilt.copy())
     if config.leave_one_out:
@@ -275,8 +281,10 @@ def _reweighted(data: _Data, start: RigidTransform, usual: float = 0.0) -> tuple
 
 @cache
 def _loose(redundancy: int) -> float:
-    """How much wider a gate must be whose scale was found from few spare numbers: it may be far too small by chance. The ratio of
-    the quantiles of F (3, redundancy) and chi-square (3) that one good pose in ten thousand exceeds."""
+    """How much wider a gate must be whose scale was found from few spare numbers: it may be far too small by chance.
+
+    The ratio of the quantiles of F (3, redundancy) and chi-square (3) that one good pose in ten thousand exceeds.
+    """
     wide = 3.0 * f_quantile(1.0 - 1e-4, 3, max(redundancy, 1)) / chi2_quantile(1.0 - 1e-4, 3)
     return float(min(np.sqrt(wide), _WIDEST_GATE))
 
@@ -325,9 +333,11 @@ def _gauss_newton(
     var_n: float,
     usual: float,
 ) -> tuple[Array, Array, Array, Array, float, float, float, float]:
-    """The loop of _fit: pose, information of all and of the positions, redundancies and variance components of both kinds.
+    """The loop of _fit: pose, information of all and of the positions, redundancies and variance components of both
+    kinds.
 
-    Places b and centres c (n, 3) with the fits' covariances (n, 3, 3); normals m seen and z stated (h, 3) with their variances (h,).
+    Places b and centres c (n, 3) with the fits' covariances (n, 3, 3); normals m seen and z stated (h, 3) with their
+    variances (h,).
     """
     n, h = len(b), len(z)
     pivot = np.array([b[:, 0].mean(), b[:, 1].mean(), b[:, 2].mean()])
@@ -406,11 +416,12 @@ def _covariance_at_camera(solution: _Solution) -> Array:
 
 
 def _widened(solution: _Solution) -> Array:
-    """Covariance about the pivot, such that its Gaussian 95 % region holds the truth in 95 of 100 calibrations of few poses.
+    """Covariance about the pivot, such that its Gaussian 95 % region holds the truth in 95 of 100 calibrations of few
+    poses.
 
     Two things that a plain inverse leaves out: the weights between positions and normals are estimates too (Kenward and
-    Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself), and so is the scale (the ratio
-    of the 95 % quantiles of F (6, redundancy) and chi-square (6)).
+    Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself), and so is the scale (the
+    ratio of the 95 % quantiles of F (6, redundancy) and chi-square (6)).
     """
     inverse = np.linalg.pinv(solution.information)
     N_p = solution.information_p

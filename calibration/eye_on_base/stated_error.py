@@ -34,13 +34,13 @@ def stated_median_limit(
 ) -> float | None:
     """Limit (mm) that the median error at these new observations (n) exceeds by chance in FALSE_ALARM of verifications.
 
-    The median of n errors has no closed form where all share the calibration's own error, so it is drawn: one error of pose
-    and scanner correction from their joint covariance for all scans, and for each scan the spread of robot and scanner and the
-    noise of its fit. The spread was estimated from few residuals, so its square is drawn as well (scaled inverse chi-square). A
-    calibration with a local field states the spread (n,) m per axis that this leaves at each scan: ``scatter_m``; one with errors of the
-    arm what these contribute: ``shared``, derivatives (n, 3, p) of the positions and the covariance (p, p) in place of the result's. A
-    calibration states its held-out errors besides: their 95 % percentile counts where it is larger. None where it states no
-    error at all. Deterministic.
+    The median of n errors has no closed form where all share the calibration's own error, so it is drawn: one error of
+    pose and scanner correction from their joint covariance for all scans, and for each scan the spread of robot and
+    scanner and the noise of its fit. The spread was estimated from few residuals, so its square is drawn as well
+    (scaled inverse chi-square). A calibration with a local field states the spread (n,) m per axis that this leaves at
+    each scan: ``scatter_m``; one with errors of the arm what these contribute: ``shared``, derivatives (n, 3, p) of the
+    positions and the covariance (p, p) in place of the result's. A calibration states its held-out errors besides:
+    their 95 % percentile counts where it is larger. None where it states no error at all. Deterministic.
     """
     stated = result.held_out_mm.get("p95")
     floor = float(stated) if stated is not None and np.isfinite(stated) else None
@@ -75,8 +75,9 @@ def stated_median_limit(
 def joint_terms(
     result: CalibrationResult, correction: ScannerCorrection | None
 ) -> tuple[Array, ScannerCorrection | None]:
-    """The covariance of X_BC and correction together, (6 + K, 6 + K), with the correction whose K terms belong to it (one that changes
-    nothing where the scanner was not found wrong); that of X_BC alone and None where the two do not fit."""
+    """The covariance of X_BC and correction together, (6 + K, 6 + K), with the correction whose K terms belong to it
+    (one that changes nothing where the scanner was not found wrong); that of X_BC alone and None where the two do not
+    fit."""
     joint = result.joint_covariance
     if joint is not None and correction is None and len(joint) - 6 in TERMS.values():
         correction = ScannerCorrection.unchanged(len(joint) - 6)
@@ -86,8 +87,8 @@ def joint_terms(
 
 
 def orientations_of(observations: Sequence[Observation], X_FR: RigidTransform | None = None) -> dict[str, Any]:
-    """Mean orientation of the feature in the base and the largest angle (deg) from it, for CalibrationResult.orientations; with the
-    feature's orientation on the flange where X_FR turns it."""
+    """Mean orientation of the feature in the base and the largest angle (deg) from it, for
+    CalibrationResult.orientations; with the feature's orientation on the flange where X_FR turns it."""
     turned = Rotation.from_matrix(np.array([o.X_BR.rotation().matrix() for o in observations]))
     mean = turned.mean()
     x, y, z, w = (float(v) for v in mean.as_quat())
@@ -112,9 +113,9 @@ def feature_rotation(result: CalibrationResult) -> RotationMatrix:
 def scatter_elsewhere(result: CalibrationResult, observations: Sequence[Observation]) -> Array | None:
     """Spread (n,) m per axis of new scans, grown where the flange is turned beyond the orientations of the calibration.
 
-    What an arm leaves at one orientation says nothing of it at another: there its usual size is added, with the covariance over angles that
-    a local field has before any scan (0.15 mm per axis, 10 degrees). None where the result does not hold its orientations. Raises
-    InputError where they cannot be read.
+    What an arm leaves at one orientation says nothing of it at another: there its usual size is added, with the
+    covariance over angles that a local field has before any scan (0.15 mm per axis, 10 degrees). None where the result
+    does not hold its orientations. Raises InputError where they cannot be read.
     """
     if result.orientations is None:
         return None

@@ -17,14 +17,18 @@ from weldcal.models.arrays import Array
 FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone
 _SHORTEST_M = 2e-3  # twice what arms are off: a joint's zero error looks like a TCP of a millimetre
 _ARM_M = 5e-4
-"""What arms err systematically per coordinate (1 mm a point). However such errors are spread over the poses, they move the offset by
-no more than the norm of its row of the pseudo-inverse times theirs: a weak geometry makes much of little."""
+"""What arms err systematically per coordinate (1 mm a point).
+
+However such errors are spread over the poses, they move the offset by no more than the norm of its row of the
+pseudo-inverse times theirs: a weak geometry makes much of little.
+"""
 _UNKNOWN_M = 5e-3  # one sigma of an axis from which on it is not known
 _SURE_SIGMAS = 4.0
 _LEAST_FREE = 5  # spare numbers of the test
 _SCANNER_ORDERS = ((12, 2), (7, 1), (0, 0))
-"""From how many poses on the scanner's own error is left open to which power of x, y and z: a scale error looks like a TCP along z
-where every pose faces the scanner. Depth is among them: triangulation errs with its square, time of flight in waves over it."""
+"""From how many poses on the scanner's own error is left open to which power of x, y and z: a scale error looks like a
+TCP along z where every pose faces the scanner. Depth is among them: triangulation errs with its square, time of flight
+in waves over it."""
 _GATE = 6.5  # sigmas of a pose that takes no part, as in the calibration
 _USUAL_SPREAD_M = 1e-4
 _SINGULAR = 1e-6
@@ -34,10 +38,10 @@ _SINGULAR = 1e-6
 class TcpOffset:
     """A TCP that the poses seem to carry.
 
-    ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z; ``sigma_m`` (3,), infinite where
-    these poses do not show it; ``pretended_m`` (3,) what systematic errors of the arm, or of the size of the residuals, may pretend at
-    most; ``with_m`` and ``without_m`` rms of the centres with and without it; ``probability`` that chance
-    alone does as much.
+    ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z; ``sigma_m`` (3,), infinite
+    where these poses do not show it; ``pretended_m`` (3,) what systematic errors of the arm, or of the size of the
+    residuals, may pretend at most; ``with_m`` and ``without_m`` rms of the centres with and without it; ``probability``
+    that chance alone does as much.
     """
 
     offset_m: Array
@@ -82,8 +86,9 @@ class TcpOffset:
             f" Its {' and '.join(hidden)} cannot be seen in these poses: take it from the controller." if hidden else ""
         )
         return (
-            f"The poses look as if a TCP of ({tcp}) mm were set at the robot: with it, centres fit to {1e3 * self.with_m:.2f} mm instead "
-            f"of {1e3 * self.without_m:.2f}. Set the TCP to zero and record again, {cure}.{open_axes}"
+            f"The poses look as if a TCP of ({tcp}) mm were set at the robot: with it, centres fit to"
+            f" {1e3 * self.with_m:.2f} mm instead of {1e3 * self.without_m:.2f}. Set the TCP to zero and record again,"
+            f" {cure}.{open_axes}"
         )
 
 
@@ -91,8 +96,8 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
     """The TCP that observations (n >= 5) seem to carry; None where they show none, or cannot.
 
     With the scanner's own errors left open, centres are fitted with and without a constant offset b in the frame of the
-    poses, R_BC p_C + p_BC = p_BR + R_BR b. The F-test of both holds FALSE_ALARM for normal errors; besides, the offset must be
-    longer than systematic errors may pretend. ``start`` of the camera's pose where one is known.
+    poses, R_BC p_C + p_BC = p_BR + R_BR b. The F-test of both holds FALSE_ALARM for normal errors; besides, the offset
+    must be longer than systematic errors may pretend. ``start`` of the camera's pose where one is known.
     """
     n = len(observations)
     order = next(k for least, k in _SCANNER_ORDERS if n >= least)
@@ -128,7 +133,8 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
 
 @dataclass(frozen=True)
 class _Data:
-    """Centres c (n, 3) in the camera, b (n, 3) in the base, rotations R (n, 3, 3) of the poses, terms (n, K), weights (n,)."""
+    """Centres c (n, 3) in the camera, b (n, 3) in the base, rotations R (n, 3, 3) of the poses, terms (n, K), weights
+    (n,)."""
 
     c: Array
     b: Array
@@ -211,7 +217,8 @@ def _fit(data: _Data, start: RigidTransform, *, offset: bool, robust: bool = Tru
 
 
 def _linear_start(data: _Data) -> RigidTransform | None:
-    """The camera's pose with the rotation's nine numbers free, so that an offset of any size is linear; None below six poses."""
+    """The camera's pose with the rotation's nine numbers free, so that an offset of any size is linear; None below six
+    poses."""
     n = len(data.c)
     if n < 6:
         return None

@@ -1,4 +1,5 @@
-"""Held-out errors of a calibration: k-fold cross-validation, convergence over the number of scans, intervals of new errors."""
+"""Held-out errors of a calibration: k-fold cross-validation, convergence over the number of scans, intervals of new
+errors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -140,8 +141,8 @@ def convergence(
     seed: int = 0,
     solve: Solve | None = None,
 ) -> Convergence:
-    """Both methods over seeded orders of the same scans, in the manner of the paper's Fig. 11; at least two scans judge. ``solve``
-    replaces the plain estimate, as in k_fold."""
+    """Both methods over seeded orders of the same scans, in the manner of the paper's Fig. 11; at least two scans
+    judge. ``solve`` replaces the plain estimate, as in k_fold."""
     n = len(observations)
     counts = np.unique(np.concatenate([np.arange(4, 10), np.round(np.geomspace(9, max(n, 10), 8)).astype(int)]))
     counts = counts[counts <= n - 2]
@@ -173,10 +174,12 @@ def convergence(
 
 
 def mean_interval(errors: Array, level: float = 0.95) -> tuple[float, float] | None:
-    """Interval in which the mean error of as many new poses lies with that probability; None for fewer than four errors.
+    """Interval in which the mean error of as many new poses lies with that probability; None for fewer than four
+    errors.
 
-    From the scatter of the held-out ``errors`` (n,) themselves: both means know theirs to c / sqrt(n), c the coefficient
-    of variation, so the logarithm of their ratio has the variance 2 c^2 / n (Student's t with n - 1 degrees of freedom).
+    From the scatter of the held-out ``errors`` (n,) themselves: both means know theirs to c / sqrt(n), c the
+    coefficient of variation, so the logarithm of their ratio has the variance 2 c^2 / n (Student's t with n - 1 degrees
+    of freedom).
     """
     e = np.asarray(errors, dtype=float)
     e = e[np.isfinite(e)]
@@ -190,10 +193,12 @@ def mean_interval(errors: Array, level: float = 0.95) -> tuple[float, float] | N
 def bootstrap_interval(
     errors: Array, share: float = 0.5, level: float = 0.95, seed: int = 0
 ) -> tuple[float, float] | None:
-    """Interval in which the quantile ``share`` of as many new errors lies with that probability; None for fewer than four errors.
+    """Interval in which the quantile ``share`` of as many new errors lies with that probability; None for fewer than
+    four errors.
 
-    From 4 000 pairs of resamples of the held-out ``errors`` (n,): one stands for what was seen, the other for what comes, and the
-    ratio of their quantiles is that of the new one to the reported one (bootstrap, Efron and Tibshirani 1993, 13.3).
+    From 4 000 pairs of resamples of the held-out ``errors`` (n,): one stands for what was seen, the other for what
+    comes, and the ratio of their quantiles is that of the new one to the reported one (bootstrap, Efron and Tibshirani
+    1993, 13.3).
     """
     e = np.asarray(errors, dtype=float)
     e = e[np.isfinite(e)]

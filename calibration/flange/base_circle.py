@@ -30,8 +30,11 @@ _BAND_PX = 3.0  # about the edge whose pixels place it
 
 @dataclass(frozen=True)
 class BaseCircleConfig:
-    """Limits of the fit. ``radius_sigma_m``: uncertainty of the drawing's outer radius, which an arc determines badly; ``min_arc``: share of
-    the edge that must be seen; ``min_points`` on the ring."""
+    """Limits of the fit.
+
+    ``radius_sigma_m``: uncertainty of the drawing's outer radius, which an arc determines badly; ``min_arc``: share of
+    the edge that must be seen; ``min_points`` on the ring.
+    """
 
     radius_sigma_m: float = 2.2e-4
     min_arc: float = 0.25
@@ -54,9 +57,9 @@ def fit_base_circle(
 ) -> FlangeFit:
     """Find the ring in an organised cloud (H, W, 3) m, NaN where invalid, near a guess with its normal.
 
-    The planes near the guess are tried in turn: on the right one the face ends in an arc of the drawn radius with something
-    lower beyond it. The arc's centre is placed by its pixels, the radius held to the drawing as far as that is known.
-    ``coverage`` is the share of the outer edge that was seen. Raises FlangeNotFound with the reason.
+    The planes near the guess are tried in turn: on the right one the face ends in an arc of the drawn radius with
+    something lower beyond it. The arc's centre is placed by its pixels, the radius held to the drawing as far as that
+    is known. ``coverage`` is the share of the outer edge that was seen. Raises FlangeNotFound with the reason.
     """
     config = config or BaseCircleConfig()
     if guess.normal_C is None:
@@ -184,8 +187,8 @@ def _places(u: Array, v: Array, view: _View, rays: RayModel) -> tuple[Array, Arr
 
 
 def _where_it_ends(xy: Array, lowered: Array, center: Array, view: _View) -> Array:
-    """Places (n, 2) at which a face one thickness thick ends: on the scanner's side of the ring its upright side shows, and
-    the face seems to end only where that is one thickness lower."""
+    """Places (n, 2) at which a face one thickness thick ends: on the scanner's side of the ring its upright side shows,
+    and the face seems to end only where that is one thickness lower."""
     eye = -(view.plane.point + view.axes @ center) @ view.axes  # towards the scanner, in the plane
     return np.where(((xy - center) @ eye > 0.0)[:, None], lowered, xy)
 

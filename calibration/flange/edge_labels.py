@@ -138,8 +138,10 @@ def _pair_likelihood(
 
 @compiled()
 def exponential(x: np.float32) -> np.float32:
-    """exp(x) for -80 < x < 80 with a relative error of 5e-6: 2^n by its bits, the rest by a series. Vectorises, unlike a
-    library call in a compiled loop."""
+    """exp(x) for -80 < x < 80 with a relative error of 5e-6: 2^n by its bits, the rest by a series.
+
+    Vectorises, unlike a library call in a compiled loop.
+    """
     y = x * _LOG2_E
     n = np.floor(y + _HALF)
     f = (y - n) * _LN_2

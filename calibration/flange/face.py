@@ -29,8 +29,11 @@ _MIXED, _MOST_MIXED = 1.5, 0.2  # pitches, and at most this share of the ring
 
 @dataclass(frozen=True, kw_only=True)
 class FlangeFitConfig:
-    """Acceptance limits of the flange fit. Lengths in m; the defaults suit structured-light scanners and admit time-of-
-    flight ones. Below half of the outer edge, ``min_coverage`` of it is enough only beside a quarter of a concentric bore."""
+    """Acceptance limits of the flange fit.
+
+    Lengths in m; the defaults suit structured-light scanners and admit time-of- flight ones. Below half of the outer
+    edge, ``min_coverage`` of it is enough only beside a quarter of a concentric bore.
+    """
 
     seed: int = 0
     hypothesis_tolerance_m: float = 0.0008
@@ -43,7 +46,7 @@ class FlangeFitConfig:
 
 
 @dataclass
-class Refusal:
+class FaceRefusal:
     """The reason of the candidate that passed most tests before it failed."""
 
     stage: int = -1
@@ -56,7 +59,7 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Face:
+class FlangeFace:
     """A flange face: its plane, its edges (centres (2,) in the plane's axes), share of the outer edge seen, and its
     quality."""
 
@@ -69,9 +72,10 @@ class Face:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Measured:
-    """Measurements that the tests of a flange use: its plane and edges, the pitch between points m, the share of the outer edge seen,
-    the points on the face, and the shares of the bore's core and of the ring between the edges that are face."""
+class FaceMeasurements:
+    """Measurements that the tests of a flange use: its plane and edges, the pitch between points m, the share of the
+    outer edge seen, the points on the face, and the shares of the bore's core and of the ring between the edges that
+    are face."""
 
     plane: PlaneFit
     outer: CircleFit
@@ -95,8 +99,8 @@ def faces_on_plane(
     normal: Array,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
-) -> list[Face]:
+    refusal: FaceRefusal,
+) -> list[FlangeFace]:
     """Find flange faces on one plane (point and normal (3,)), among its connected parts of about the flange's size."""
     d = points - seed_point
     around = np.einsum("nk,nk->n", d, d) < (1.2 * standard.outer_m) ** 2
@@ -135,7 +139,7 @@ def edge_bounds(pitch: float, standard: FlangeStandard, config: FlangeFitConfig)
 
 
 def _first_circle(
-    part: Array, pitch: float, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal
+    part: Array, pitch: float, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> CircleFit | None:
     """The outer edge of a connected part (N, 2), roughly."""
     bounds = edge_bounds(pitch, standard, config)
@@ -166,8 +170,8 @@ def _measure(
     pitch: float,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
-) -> Face | None:
+    refusal: FaceRefusal,
+) -> FlangeFace | None:
     """Plane and edges in turn, twice; then the tests."""
     bounds = edge_bounds(pitch, standard, config)
     slack = bounds[1] - standard.outer_radius_m
@@ -208,7 +212,7 @@ def _measure(
     span = (standard.face_inner_radius_m + 0.5 * pitch, outer.radius - 0.5 * pitch)
     middle = (span[0] + 0.75 * (span[1] - span[0]), span[1])  # where every ring of the size has its face
     full = np.count_nonzero((rho > middle[0]) & (rho < middle[1])) / (middle[1] ** 2 - middle[0] ** 2)
-    measured = Measured(
+    measured = FaceMeasurements(
         plane=plane,
         outer=outer,
         bore=bore,
@@ -216,9 +220,9 @@ def _measure(
         coverage=coverage(xy[np.abs(rho - outer.radius) < 2.0 * pitch + 0.0005], outer.center),
         count=count,
         core_share=int((rho < core).sum()) / core**2 / max(density, 1e-9),
-        bore_coverage=0.0
-        if bore is None
-        else coverage(xy[np.abs(rho - bore.radius) < 2.0 * pitch + 0.0005], outer.center),
+        bore_coverage=(
+            0.0 if bore is None else coverage(xy[np.abs(rho - bore.radius) < 2.0 * pitch + 0.0005], outer.center)
+        ),
         ring_share=np.count_nonzero((rho > span[0]) & (rho < span[1]))
         / (span[1] ** 2 - span[0] ** 2)
         / max(full, 1e-9),
@@ -227,8 +231,8 @@ def _measure(
 
 
 def _margin(pitch: float, width: float) -> float:
-    """How far (m) from its edges a face ``width`` wide is taken for the plane: points within a pixel of an edge are mixed with what
-    lies behind it, and with 0.5 mm of noise they are not told from the face."""
+    """How far (m) from its edges a face ``width`` wide is taken for the plane: points within a pixel of an edge are
+    mixed with what lies behind it, and with 0.5 mm of noise they are not told from the face."""
     return min(_MIXED * pitch, _MOST_MIXED * width)
 
 
@@ -241,9 +245,11 @@ def _between(d: Array, normal: Array, inner: float, outer: float, height: float)
 def clear_band(standard: FlangeStandard, pitch: float, outer: bool) -> float:
     """Half width (m) of the ring about an edge that holds no screw hole."""
     gaps = [
-        standard.face_outer_radius_m - np.hypot(x, y) - r
-        if outer
-        else np.hypot(x, y) - r - standard.face_inner_radius_m
+        (
+            standard.face_outer_radius_m - np.hypot(x, y) - r
+            if outer
+            else np.hypot(x, y) - r - standard.face_inner_radius_m
+        )
         for x, y, r in standard.openings()
     ]
     return float(max(min([2.5 * pitch, *gaps]), 1.2 * pitch))
@@ -253,9 +259,9 @@ def lowered_by(beyond: Array, height: float, chamfer: float) -> float:
     """How far below its plane (m) a face ``height`` thick ends at an edge, from the heights (N,) past the edge.
 
     Where a chamfer continues the face, the face "ends" one thickness below its plane, and a slanting ray moves that
-    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. A rough face
-    is thicker than the ``chamfer`` (m) is deep: it ends with it, and on the side that shows its wall one thickness below
-    the plane (docs/flange.md).
+    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole. A rough
+    face is thicker than the ``chamfer`` (m) is deep: it ends with it, and on the side that shows its wall one thickness
+    below the plane (docs/flange.md).
     """
     beyond = beyond[np.isfinite(beyond)]
     # what is past the edge lies lower than the thickness: where that is much, chamfer and wall are looked for deeper
@@ -299,27 +305,31 @@ def _parts(points: Array, plane: PlaneFit, center: Array, reach: float) -> tuple
     return xy, pitch, connected_parts(xy, 2.5 * pitch)
 
 
-def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> Face | None:
+def judge(
+    m: FaceMeasurements, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal
+) -> FlangeFace | None:
     """Test size, edge and bore; return the face, or None with the reason noted."""
     bounds = edge_bounds(m.pitch, standard, config)
     rough = max(config.max_rim_rms_m, 0.7 * m.pitch)
     if not bounds[0] < m.outer.radius < bounds[1]:
         refusal.note(
             5,
-            f"The circle found is {2e3 * m.outer.radius:.1f} mm across; the flange has {1e3 * standard.outer_m:.0f} mm.",
+            f"The circle found is {2e3 * m.outer.radius:.1f} mm across; the flange has"
+            f" {1e3 * standard.outer_m:.0f} mm.",
         )
     elif m.count < config.min_points:
         refusal.note(5, f"Only {m.count} points lie on the face; the flange needs {config.min_points}.")
     elif m.coverage < config.min_coverage:
         refusal.note(
             6,
-            f"Only {100 * m.coverage:.0f} % of the flange's edge was seen; {100 * config.min_coverage:.0f} % are needed.",
+            f"Only {100 * m.coverage:.0f} % of the flange's edge was seen; {100 * config.min_coverage:.0f} % are"
+            " needed.",
         )
     elif m.coverage < _ALONE and (m.bore is None or m.bore_coverage < _BORE_SEEN):
         refusal.note(
             6,
-            f"Only {100 * m.coverage:.0f} % of the flange's edge was seen, and too little of its bore; {100 * _ALONE:.0f} % "
-            "are needed without it.",
+            f"Only {100 * m.coverage:.0f} % of the flange's edge was seen, and too little of its bore;"
+            f" {100 * _ALONE:.0f} % are needed without it.",
         )
     elif m.coverage < _ALONE and m.bore is not None and not _concentric(m.outer, m.bore, m.pitch):
         refusal.note(6, "The part of an edge seen and the bore beside it are not concentric: it is not the flange.")
@@ -334,16 +344,16 @@ def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusa
     elif m.ring_share < _least_ring(m):
         refusal.note(
             6,
-            f"Only {100 * m.ring_share:.0f} % of the ring between the edge and a bore of {1e3 * standard.bore_m:.1f} mm is "
-            "face: it is another ring, not the flange.",
+            f"Only {100 * m.ring_share:.0f} % of the ring between the edge and a bore of {1e3 * standard.bore_m:.1f} mm"
+            " is face: it is another ring, not the flange.",
         )
     else:
         quality = m.coverage + (1.0 if m.bore is not None else 0.0) - m.outer.rms / rough
-        return Face(m.plane, m.outer, m.bore, m.coverage, m.count, quality)
+        return FlangeFace(m.plane, m.outer, m.bore, m.coverage, m.count, quality)
     return None
 
 
-def _least_ring(m: Measured) -> float:
+def _least_ring(m: FaceMeasurements) -> float:
     """The share of the ring between the edges that must be face."""
     if m.bore is None:
         return _FULL

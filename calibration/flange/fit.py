@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange.face import Face, FlangeFitConfig, Refusal, faces_on_plane, near
+from weldcal.calibration.flange.face import FaceRefusal, FlangeFace, FlangeFitConfig, faces_on_plane, near
 from weldcal.calibration.flange.lattice import interpolated, is_thinned, rebuild_grid
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.flange.search import search_frame, typical_pitches, window_about
@@ -26,10 +26,11 @@ _MAX_ISLANDS = 40  # bodies that are tried, largest first
 _GOOD_COVERAGE = 0.8  # a face seen this well, with its bore, ends the search
 _WARP = 0.2  # and so much of that along the normal: a scanner's warp tilts a half more than it tilts the whole
 _TRACKED_RADIUS = 0.7  # of the flange's diameter: about the fit of the scan before
-# What the centre is off, per axis of the face, where there is no grid, beside the noise: ray-cast scans with noise of 0.05 and 0.2 mm and
-# 0.4 to 1 mm between points (tests/calibration/flange/test_forms.py).
+# What the centre is off, per axis of the face, where there is no grid, beside the noise: ray-cast scans with noise of
+# 0.05 and 0.2 mm and 0.4 to 1 mm between points (tests/calibration/flange/test_forms.py).
 _PULL_M, _PULL_SHARE = 2e-5, 0.22
-# How far the chamfers of edge and holes draw the plane down, rms^2 over this: 4 um at 0.2 and 10 um at 0.3 mm of noise, in ray-cast scans.
+# How far the chamfers of edge and holes draw the plane down, rms^2 over this: 4 um at 0.2 and 10 um at 0.3 mm of noise,
+# in ray-cast scans.
 _SINK_M = 9e-3
 _OUT_OF_ROUND_M = 7e-5  # per axis, from half of an edge: halves of recorded clouds against the whole ones
 
@@ -80,15 +81,16 @@ def fit_flange(
 ) -> FlangeFit:
     """Find the flange face in a cloud (N, 3), or organised (H, W, 3) with NaN where invalid, in metres, camera frame.
 
-    The method follows from what is given, fastest first; where one finds nothing or doubts its result, the next one decides.
-    Organised scans: tracking within 3 mm of a guess that has a normal, a fit of the window about that guess, a search of the
-    guess's surroundings; without a guess a search of the whole scan. Unordered clouds: the same on the
-    sensor's rebuilt grid; where it cannot be rebuilt, a search about the guess, or of every separate body of about the flange's size.
+    The method follows from what is given, fastest first; where one finds nothing or doubts its result, the next one
+    decides. Organised scans: tracking within 3 mm of a guess that has a normal, a fit of the window about that guess, a
+    search of the guess's surroundings; without a guess a search of the whole scan. Unordered clouds: the same on the
+    sensor's rebuilt grid; where it cannot be rebuilt, a search about the guess, or of every separate body of about the
+    flange's size.
 
-    ``guess`` limits the search; a FlangeFit of the scan before is a guess, too. Deterministic for ``config.seed``. Raises
-    FlangeNotFound with the reason: nothing there, no plane, wrong size (also millimetres taken for metres), too little of the
-    edge seen, too rough an edge, no bore. Feature and check of radius: paper, section 2.1.4; edges instead of its 3-point
-    circle search, which repeats to 0.4 mm.
+    ``guess`` limits the search; a FlangeFit of the scan before is a guess, too. Deterministic for ``config.seed``.
+    Raises FlangeNotFound with the reason: nothing there, no plane, wrong size (also millimetres taken for metres), too
+    little of the edge seen, too rough an edge, no bore. Feature and check of radius: paper, section 2.1.4; edges
+    instead of its 3-point circle search, which repeats to 0.4 mm.
     """
     config = config or FlangeFitConfig()
     cloud = np.asarray(points_C)
@@ -96,7 +98,7 @@ def fit_flange(
         raise FlangeNotFound(f"A cloud must be (N, 3) or (H, W, 3); this one has the shape {cloud.shape}.")
     if isinstance(guess, FlangeFit):
         guess = FlangeGuess(guess.center_C, _TRACKED_RADIUS * standard.outer_m, guess.normal_C)
-    refusal = Refusal()
+    refusal = FaceRefusal()
     find = _organised if cloud.ndim == 3 else _unordered
     found = find(cloud, standard, guess, config, refusal)
     if found is None and (cloud.ndim == 3 or guess is None):
@@ -107,12 +109,13 @@ def fit_flange(
 
 
 def _unordered(
-    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
-    """A list of points: on its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then searched."""
+    """A list of points: on its sensor's pixel grid where that can be rebuilt, else taken for the flange's own, then
+    searched."""
     grid = rebuild_grid(cloud)
     if grid is not None:
-        on_grid = Refusal()
+        on_grid = FaceRefusal()
         found = _organised(grid, standard, guess, config, on_grid)
         if found is not None:
             return found
@@ -131,7 +134,7 @@ def _unordered(
 
 
 def _organised(
-    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
     """A scan with its pixel grid: the whole of it, or the window about a guess."""
     measured = None
@@ -151,8 +154,8 @@ def _organised(
         if inside is None:
             refusal.note(
                 0,
-                f"Only 0 valid points lie within {1e3 * guess.radius_m:.0f} mm of the expected flange; the flange needs "
-                f"{config.min_points}.",
+                f"Only 0 valid points lie within {1e3 * guess.radius_m:.0f} mm of the expected flange; the flange needs"
+                f" {config.min_points}.",
             )
             return None
         if guess.normal_C is not None:
@@ -171,7 +174,7 @@ def _where_it_was(
     pitch: float,
     config: FlangeFitConfig,
     measured: NDArray[np.bool_] | None,
-) -> Face | None:
+) -> FlangeFace | None:
     """The flange within a few millimetres of a guessed pose, as when it is tracked; None where it must be searched."""
     assert guess.normal_C is not None
     reach = 0.5 * standard.outer_m + 2.0 * pitch + 0.003
@@ -181,12 +184,12 @@ def _where_it_was(
     center, normal = np.asarray(guess.center_C, dtype=float), np.asarray(guess.normal_C, dtype=float)
     known = None if measured is None else measured[window]
     face = measure_window(
-        cloud[window], center, normal, standard.face_outer_radius_m, standard, config, Refusal(), known
+        cloud[window], center, normal, standard.face_outer_radius_m, standard, config, FaceRefusal(), known
     )
     return face if face is not None and face.coverage > _GOOD_COVERAGE and face.bore is not None else None
 
 
-def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> FlangeFit | None:
+def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, refusal: FaceRefusal) -> FlangeFit | None:
     """A cloud that shows little more than a flange as it is; a larger scene body by body."""
     if len(points) == 0:
         refusal.note(0, "The cloud holds no valid point.")
@@ -203,7 +206,8 @@ def _search(points: Array, standard: FlangeStandard, config: FlangeFitConfig, re
 
 
 def _islands(points: Array, diameter: float) -> list[Array]:
-    """Centres (3,) of the separate bodies among points (N, 3) that are about ``diameter`` m across, largest first, at most 40.
+    """Centres (3,) of the separate bodies among points (N, 3) that are about ``diameter`` m across, largest first, at
+    most 40.
 
     Bodies end where space is empty for 3 mm.
     """
@@ -236,21 +240,21 @@ def _explain_unit(cloud: Array, standard: FlangeStandard, config: FlangeFitConfi
         (1e3, "small", "metres, read as millimetres"),
     ):
         find = _organised if cloud.ndim == 3 else _unordered
-        if find(cloud * factor, standard, None, config, Refusal()) is not None:
+        if find(cloud * factor, standard, None, config, FaceRefusal()) is not None:
             raise FlangeNotFound(
                 f"The flange in the cloud is 1000 times too {size}: the coordinates are {unit}; correct the unit."
             )
 
 
 def _find(
-    points: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+    points: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: FaceRefusal
 ) -> FlangeFit | None:
     if len(points) < config.min_points:
         where = "in the cloud" if guess is None else f"within {1e3 * guess.radius_m:.0f} mm of the expected flange"
         refusal.note(0, f"Only {len(points)} valid points lie {where}; the flange needs {config.min_points}.")
         return None
     refusal.note(0, "No plane was found in the cloud.")
-    best: Face | None = None
+    best: FlangeFace | None = None
     for p, n, support in local_planes(
         points, reach=0.9 * standard.outer_m, tolerance=config.hypothesis_tolerance_m, seed=config.seed
     ):
@@ -270,11 +274,12 @@ def _find(
     return None if best is None else _result(best)
 
 
-def _result(face: Face) -> FlangeFit:
+def _result(face: FlangeFace) -> FlangeFit:
     axes = np.column_stack(plane_axes(face.plane.normal))
     circles = [face.outer] + ([face.bore] if face.bore is not None else [])
     center, cov = fuse([c.center for c in circles], [c.covariance[:2, :2] for c in circles])
-    # edges of real faces are no perfect circles: round the whole of one it averages out, over a half it moves the centre
+    # edges of real faces are no perfect circles: round the whole of one it averages out, over a half it moves the
+    # centre
     missing = max(_GOOD_COVERAGE - face.coverage, 0.0) / (_GOOD_COVERAGE - 0.5)
     cov = cov + (_OUT_OF_ROUND_M * missing) ** 2 * np.eye(2)
     # the plane pivots about the middle of its points, where `center` is measured from

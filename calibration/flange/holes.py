@@ -26,15 +26,16 @@ _OFF_M = 0.0004  # from its place in the pattern: such a hole is a dent or a gap
 
 @dataclass(frozen=True, kw_only=True)
 class HolePattern:
-    """Holes detected in a flange's face: their centres (k, 3) m in the camera frame, their angles (k,) rad in the standard,
-    the circle centre (3,) m they fix, the flange's pose X_CR with the rotation about its axis, and how the pitch circle
-    measures against the standard (1 where the scanner's scale is right).
+    """Holes detected in a flange's face: their centres (k, 3) m in the camera frame, their angles (k,) rad in the
+    standard, the circle centre (3,) m they fix, the flange's pose X_CR with the rotation about its axis, and how the
+    pitch circle measures against the standard (1 where the scanner's scale is right).
 
     ``off_m`` (k,) is how far each hole lies from its place in the pattern and ``rms_m`` their root mean square.
-    ``turn_sigma`` rad is the spread of the rotation about the axis and ``covariance`` (6, 6) that of X_CR, rotation then
-    translation, in the camera's axes; both cover this scan's noise and how well the holes agree. ``other_turns_rad`` are
-    rotations about the axis, from that of X_CR, under which the scan shows the pattern as well (the threads alone are
-    symmetric; the dowel hole decides): the spread then covers all of them, and ``turn_known`` is false.
+    ``turn_sigma`` rad is the spread of the rotation about the axis and ``covariance`` (6, 6) that of X_CR, rotation
+    then translation, in the camera's axes; both cover this scan's noise and how well the holes agree.
+    ``other_turns_rad`` are rotations about the axis, from that of X_CR, under which the scan shows the pattern as well
+    (the threads alone are symmetric; the dowel hole decides): the spread then covers all of them, and ``turn_known`` is
+    false.
     """
 
     holes_C: Array
@@ -57,9 +58,9 @@ class HolePattern:
 def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> HolePattern | None:
     """Find the hole pattern in the face of a fitted flange; None where fewer than four of its holes are seen well.
 
-    ``points_C`` (N, 3) or (H, W, 3) m. The phase is where the pattern's discs hold the fewest points of the face and have
-    rims: slots are as empty as holes. Each hole's rim is a circle, with one radius for all threads in the end, and the pattern is a similarity of the centres
-    (Umeyama 1991 in the plane). Deterministic.
+    ``points_C`` (N, 3) or (H, W, 3) m. The phase is where the pattern's discs hold the fewest points of the face and
+    have rims: slots are as empty as holes. Each hole's rim is a circle, with one radius for all threads in the end, and
+    the pattern is a similarity of the centres (Umeyama 1991 in the plane). Deterministic.
     """
     angles = np.array([*standard.hole_angles_rad, *([standard.pin_angle_rad] if standard.pin_m > 0.0 else [])])
     if len(angles) < _LEAST_HOLES:
@@ -134,8 +135,8 @@ def _face(points: Array, fit: FlangeFit, standard: FlangeStandard, axes: Array) 
 def _placed(
     xy: Array, angles: Array, phase: float, standard: FlangeStandard, pitch: float
 ) -> tuple[NDArray[np.intp], NDArray[np.complex128], Array, complex, complex] | None:
-    """The holes at a phase (rad): which ones, their centres, covariances (k, 2, 2) m^2, shift and gain of the pattern; None where
-    fewer than four have a rim at their places."""
+    """The holes at a phase (rad): which ones, their centres, covariances (k, 2, 2) m^2, shift and gain of the pattern;
+    None where fewer than four have a rim at their places."""
     nominal = 0.5 * np.array([standard.hole_m] * standard.n_holes + [standard.pin_m] * (len(angles) - standard.n_holes))
     start, gain = 0j, complex(0.5 * standard.pitch_circle_m * np.exp(1j * phase))
     near = _about(xy, start + gain * np.exp(1j * angles), nominal)
@@ -163,7 +164,8 @@ def _placed(
 
 
 def _phases(xy: Array, angles: Array, standard: FlangeStandard) -> list[float]:
-    """Rotations (rad) of the standard's pattern, in the plane's axes, at which its holes are emptiest, the emptiest first."""
+    """Rotations (rad) of the standard's pattern, in the plane's axes, at which its holes are emptiest, the emptiest
+    first."""
     place, disc = 0.5 * standard.pitch_circle_m, 0.35 * standard.hole_m
     rho = np.sqrt(xy[0] * xy[0] + xy[1] * xy[1])
     ring = np.flatnonzero(np.abs(rho - place) < disc)
@@ -279,15 +281,16 @@ def _holes(
 
 
 def _similarity(z: NDArray[np.complex128], angles: Array) -> tuple[complex, complex]:
-    """Shift and gain (complex numbers are points of the plane) that take the unit circle's points at ``angles`` to z."""
+    """Shift and gain (complex numbers are points of the plane) that take the unit circle's points at ``angles`` to
+    z."""
     M = np.column_stack([np.ones(len(z)), np.exp(1j * angles)])
     shift, gain = np.linalg.lstsq(M, z, rcond=None)[0]
     return complex(shift), complex(gain)
 
 
 def _turn_sigma(off: NDArray[np.complex128], gain: complex, angles: Array, covariances: Array) -> float:
-    """Spread (rad) of the pattern's rotation: the holes' own covariances (k, 2, 2) through the similarity, inflated where
-    the holes lie farther off their places than those allow (Birge ratio, never below one)."""
+    """Spread (rad) of the pattern's rotation: the holes' own covariances (k, 2, 2) through the similarity, inflated
+    where the holes lie farther off their places than those allow (Birge ratio, never below one)."""
     k = len(off)
     a = np.exp(1j * angles)
     J = np.zeros((2 * k, 4))  # shift x, y, gain real, imaginary

@@ -18,11 +18,12 @@ _STEP_M = 0.003  # depth per pixel at which one body ends before another
 
 
 def rebuild_grid(points: Array) -> Array | None:
-    """The organised scan (H, W, 3) m, NaN where nothing was measured, of an unordered cloud (N, 3) in its sensor's frame.
+    """The organised scan (H, W, 3) m, NaN where nothing was measured, of an unordered cloud (N, 3) in its sensor's
+    frame.
 
-    A sensor measures along the rays of its pixels: x/z and y/z of the points lie on a lattice, which a polynomial of the
-    third degree bends where a lens does. None where they do not: a cloud of several views, in another frame, or noisy
-    across its rays.
+    A sensor measures along the rays of its pixels: x/z and y/z of the points lie on a lattice, which a polynomial of
+    the third degree bends where a lens does. None where they do not: a cloud of several views, in another frame, or
+    noisy across its rays.
     """
     points = points[np.isfinite(points).all(axis=1)]
     z = points[:, 2]
@@ -100,7 +101,8 @@ def _reduced(basis: Array) -> Array:
 
 
 def _indices(ray: Array, basis: Array) -> NDArray[np.intp] | None:
-    """Pixel (N, 2) of each ray (N, 2) about the middle: a plane's lattice, or one that grows from the middle and bends."""
+    """Pixel (N, 2) of each ray (N, 2) about the middle: a plane's lattice, or one that grows from the middle and
+    bends."""
     at = ray @ np.linalg.inv(basis)
     order = np.argsort((at * at).sum(axis=1), kind="stable")
     for degree in (1, 3):
@@ -143,8 +145,8 @@ def is_thinned(grid: Array) -> bool:
 def interpolated(grid: Array) -> Array:
     """A thinned scan (H, W, 3) with its gaps filled, along the rows and then along the columns.
 
-    x/z, y/z and 1/z are linear across a gap, as they are on a plane; where the depth steps, the nearest one goes on. Gaps
-    longer than twice the common one stay.
+    x/z, y/z and 1/z are linear across a gap, as they are on a plane; where the depth steps, the nearest one goes on.
+    Gaps longer than twice the common one stay.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / grid[..., 2]

@@ -65,8 +65,8 @@ def _pinhole(A: Array, p: Array) -> Array | None:
 
 
 def pinhole_window(cloud: Array, center: Array, reach: float) -> tuple[tuple[slice, slice], Array | None] | None:
-    """Rectangle of the pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of all pixels; and
-    their rays, as ``pinhole_rays`` gives them, where that pinhole fits the whole image."""
+    """Rectangle of the pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of
+    all pixels; and their rays, as ``pinhole_rays`` gives them, where that pinhole fits the whole image."""
     some = _sampled(cloud, 12)
     if some is None or not float(center[2]) > 2.0 * reach:
         return None

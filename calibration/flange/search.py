@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.flange.face import Face, FlangeFitConfig, Refusal
+from weldcal.calibration.flange.face import FaceRefusal, FlangeFace, FlangeFitConfig
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.flange.window import measure_window
 from weldcal.models.arrays import Array
@@ -29,7 +29,7 @@ _MOST = 60  # parts that are looked at closely
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class FlatPart:
     """A flat part of about the flange's size: where its outer edge seems to be (centre (3,) m, radius m), the outward
     normal (3,), and how little its outline differs from that circle."""
 
@@ -43,11 +43,13 @@ def search_frame(
     cloud: Array,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
+    refusal: FaceRefusal,
     measured: NDArray[np.bool_] | None = None,
-) -> Face | None:
-    """The best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted. Of a thinned scan,
-    whose missing pixels are interpolated, ``measured`` (H, W) says which were not."""
+) -> FlangeFace | None:
+    """The best flange face in a scan (H, W, 3) m, NaN where nothing was measured; None with the reason noted.
+
+    Of a thinned scan, whose missing pixels are interpolated, ``measured`` (H, W) says which were not.
+    """
     pitches = typical_pitches(cloud)
     if pitches is None:
         refusal.note(0, "The cloud holds no valid point.")
@@ -64,7 +66,7 @@ def search_frame(
     scales += [(w, _BEND_SIGMAS[0], "smoothed") for w in sizes]
     tried: list[tuple[Array, float]] = []
     for wide, sigmas, noise in scales:
-        best: Face | None = None
+        best: FlangeFace | None = None
         step = (round(wide / along), round(wide / across))
         for part in flat_parts(cloud[:: step[0], :: step[1]], standard, config, sigmas, noise):
             if any(
@@ -94,8 +96,8 @@ def search_frame(
 
 
 def typical_pitches(cloud: Array) -> tuple[float, float] | None:
-    """Distances (m) between neighbouring pixels on the nearest things and on nearer than middling ones; None where no two
-    neighbours were measured. Quantiles (1 and 25 %) over a few thousand of them."""
+    """Distances (m) between neighbouring pixels on the nearest things and on nearer than middling ones; None where no
+    two neighbours were measured. Quantiles (1 and 25 %) over a few thousand of them."""
     step = max(1, int(np.sqrt(cloud.shape[0] * cloud.shape[1] / 4000.0)))
     a, b = cloud[:-1:step, :-1:step], cloud[:-1:step, 1::step]
     h, w = min(a.shape[0], b.shape[0]), min(a.shape[1], b.shape[1])
@@ -108,8 +110,8 @@ def typical_pitches(cloud: Array) -> tuple[float, float] | None:
 
 
 def window_about(cloud: Array, center: Array, radius: float, step: int | tuple[int, int]) -> tuple[slice, slice] | None:
-    """The rows and columns of a scan that hold all pixels within ``radius`` (m) of a centre (3,), found on every ``step``-th one, or
-    every so many rows and columns."""
+    """The rows and columns of a scan that hold all pixels within ``radius`` (m) of a centre (3,), found on every
+    ``step``-th one, or every so many rows and columns."""
     sv, su = (step, step) if isinstance(step, int) else step
     thin = cloud[::sv, ::su]
     with np.errstate(invalid="ignore"):
@@ -129,7 +131,7 @@ def flat_parts(
     config: FlangeFitConfig,
     sigmas: float = _BEND_SIGMAS[0],
     noise: _Noise = "of all",
-) -> Iterator[Part]:
+) -> Iterator[FlatPart]:
     """Connected flat parts of a thinned scan (h, w, 3) whose size and outline could be the flange's, most likely first.
 
     A plane seen in perspective has an inverse depth that is linear over the image: where its second differences
@@ -149,7 +151,7 @@ def flat_parts(
     with np.errstate(invalid="ignore"):
         flat = (bend < np.maximum(_BEND_M * np.square(inverse[1:-1, 1:-1]), sigmas * sigma)).astype(np.uint8)
     _count, labels, stats, _centroids = cv2.connectedComponentsWithStats(flat, connectivity=4, ltype=cv2.CV_32S)
-    parts: list[Part] = []
+    parts: list[FlatPart] = []
     for k in _likeliest(labels, stats, z, grid, standard):
         x, y, w, h = stats[k, :4].tolist()
         inside = labels[y : y + h, x : x + w] == k
@@ -162,8 +164,9 @@ def flat_parts(
 
 
 def _noise(bend: NDArray[np.float32], inverse: NDArray[np.float32], *, by_depth: bool) -> NDArray[np.float32]:
-    """Noise (h, w) of the bend at each pixel: what the lower third of all pixels, or of those of about its depth, shows, most of a
-    scan being smooth. A floor far behind the flange may have another noise in inverse depth than the flange."""
+    """Noise (h, w) of the bend at each pixel: what the lower third of all pixels, or of those of about its depth,
+    shows, most of a scan being smooth. A floor far behind the flange may have another noise in inverse depth than the
+    flange."""
     with np.errstate(invalid="ignore", divide="ignore"):
         layer = np.rint(_LAYERS * np.log(np.abs(inverse)))
     known = np.isfinite(bend) & np.isfinite(layer)
@@ -209,7 +212,7 @@ def _likeliest(
     return [int(k) for k in ks[np.argsort(np.abs(np.log(diagonal[ks] / (0.9 * expected))), kind="stable")][:_MOST]]
 
 
-def _parts(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> list[Part]:
+def _parts(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> list[FlatPart]:
     """The part as it is, or the planes it consists of where it leaked over a shallow step onto another."""
     extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
     if not 0.55 * standard.outer_m < extent < _WIDEST * standard.outer_m:
@@ -243,7 +246,7 @@ def _draws(seed: int) -> Array:
     return np.random.default_rng(seed).random((3, _TRIPLES))
 
 
-def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[Part | None, float]:
+def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[FlatPart | None, float]:
     """Plane and outline of points (N, 3), None where they could not be a flange's, and the rms from the plane, m."""
     middle = points.mean(axis=0)
     d = points - middle
@@ -262,11 +265,12 @@ def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> t
     if found is None or found[2] > _ROUND * standard.outer_m:
         return None, rms
     center, radius, misfit = found
-    return Part(middle + axes @ center, normal, radius + pitch, misfit / standard.outer_m), rms
+    return FlatPart(middle + axes @ center, normal, radius + pitch, misfit / standard.outer_m), rms
 
 
 def _hull_circle(hull: Array, bounds: tuple[float, float]) -> tuple[Array, float, float] | None:
-    """A circle through most of a convex outline (N, 2) with a radius within ``bounds`` (m): centre, radius, misfit (m)."""
+    """A circle through most of a convex outline (N, 2) with a radius within ``bounds`` (m): centre, radius, misfit
+    (m)."""
     if len(hull) < 6:
         return None
     n = len(hull)

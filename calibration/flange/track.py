@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.flange.edge_labels import refine_pair
 from weldcal.calibration.flange.face import (
-    Face,
+    FaceMeasurements,
+    FaceRefusal,
+    FlangeFace,
     FlangeFitConfig,
-    Measured,
-    Refusal,
     clear_band,
     judge,
     lowered_by,
@@ -45,7 +45,7 @@ _THREE = np.ones((3, 3), np.uint8)
 
 def fit_tracked(
     cloud: Array, center: Array, normal: Array, standard: FlangeStandard, config: FlangeFitConfig
-) -> Face | None:
+) -> FlangeFace | None:
     """Fit the face in a scan (H, W, 3) m within 3 mm of the centre (3,) m and near the outward normal (3,) given.
 
     None where it is absent, partly hidden or without a bore, and where the rays are not a pinhole's.
@@ -69,7 +69,7 @@ def fit_tracked(
         fits, pitch = _edges(view, view.onto(center), height, standard)
     except CircleFitError:
         return None
-    return judge(_measured(view, fits, pitch, standard), standard, config, Refusal())
+    return judge(_measured(view, fits, pitch, standard), standard, config, FaceRefusal())
 
 
 def _plane(
@@ -152,7 +152,10 @@ class _View:
 
 
 def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) -> tuple[list[CircleFit], float]:
-    """Outer edge and bore, and the pitch of the pixels on the plane. Raises CircleFitError where either does not show."""
+    """Outer edge and bore, and the pitch of the pixels on the plane.
+
+    Raises CircleFitError where either does not show.
+    """
     h, w = view.shape
     corner = view.places(0.5 * w + np.array([0.0, 1.0, 0.0]), 0.5 * h + np.array([0.0, 0.0, 1.0]))
     along, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
@@ -205,7 +208,7 @@ def _labelled(
     return [replace(f, covariance=_SHARED * f.covariance) for f in refine_pair(places, sides, starts, pitch)]
 
 
-def _measured(view: _View, fits: list[CircleFit], pitch: float, standard: FlangeStandard) -> Measured:
+def _measured(view: _View, fits: list[CircleFit], pitch: float, standard: FlangeStandard) -> FaceMeasurements:
     """What the tests of a flange need, from every fourth pixel along rows and columns."""
     h, w = view.shape
     s = slice(None, None, _BLOCK)
@@ -220,7 +223,7 @@ def _measured(view: _View, fits: list[CircleFit], pitch: float, standard: Flange
     rim = face & (rho > fits[0].radius - (0.5 * _BLOCK + 2.0) * pitch) & (rho < fits[0].radius + 2.0 * pitch)
     parts = 36
     sector = ((np.arctan2(d[1][rim], d[0][rim]) + np.pi) * (parts / (2.0 * np.pi))).astype(np.intp) % parts
-    return Measured(
+    return FaceMeasurements(
         plane=view.plane,
         outer=fits[0],
         bore=fits[1],
@@ -266,8 +269,8 @@ def ring_points(
 def borders(face: Mask, known: Mask, turned: Array, at: Array, near: Array) -> tuple[Single, Mask, Index]:
     """Crossings of the face mask (h, w) between two neighbouring known pixels.
 
-    ``turned`` and ``at`` as in ``places``; ``near`` (2,) m is a point on the plane. Returns the places (2, N) m about it
-    in its axes, whether the face lies on the inner side of each, and the flat index of the pixel off the face.
+    ``turned`` and ``at`` as in ``places``; ``near`` (2,) m is a point on the plane. Returns the places (2, N) m about
+    it in its axes, whether the face lies on the inner side of each, and the flat index of the pixel off the face.
     """
     h, w = face.shape
     first, down = np.empty(2 * h * w, np.int64), np.empty(2 * h * w, np.bool_)

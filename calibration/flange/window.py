@@ -10,10 +10,10 @@ from scipy import ndimage
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
 from weldcal.calibration.flange.edge_labels import refine_circle
 from weldcal.calibration.flange.face import (
-    Face,
+    FaceMeasurements,
+    FaceRefusal,
+    FlangeFace,
     FlangeFitConfig,
-    Measured,
-    Refusal,
     clear_band,
     judge,
     lowered_by,
@@ -62,9 +62,9 @@ def measure_window(
     radius: float,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
+    refusal: FaceRefusal,
     measured: Mask | None = None,
-) -> Face | None:
+) -> FlangeFace | None:
     """Fit the face with an outer edge near ``center`` (3,) m and ``radius`` m in a part (h, w, 3) of a scan.
 
     ``normal`` (3,) outward, within a few degrees. ``measured`` (h, w) of a thinned scan with interpolated pixels: only
@@ -138,13 +138,7 @@ def _noise(z: Array, rays: tuple[Array, Array], plane: PlaneFit) -> float:
 
 
 def _window(
-    z: Array,
-    valid: Mask,
-    rays: tuple[Array, Array],
-    plane: PlaneFit,
-    axes: Array,
-    height: float,
-    measured: Mask | None,
+    z: Array, valid: Mask, rays: tuple[Array, Array], plane: PlaneFit, axes: Array, height: float, measured: Mask | None
 ) -> _Window:
     rx, ry = rays
     n, p = plane.normal, plane.point
@@ -179,8 +173,8 @@ def _edges(
     radius: float,
     standard: FlangeStandard,
 ) -> tuple[CircleFit, CircleFit | None, Mask, float]:
-    """Outer edge, bore (None where it does not show), the directions (sectors,) in which the outer edge is hidden, and the
-    pitch of the pixels on the plane."""
+    """Outer edge, bore (None where it does not show), the directions (sectors,) in which the outer edge is hidden, and
+    the pitch of the pixels on the plane."""
     v, u = w.x.shape[0] // 2, w.x.shape[1] // 2
     pitch = float(
         np.sqrt(
@@ -242,8 +236,8 @@ def _sector(dx: Array, dy: Array, sectors: int) -> NDArray[np.intp]:
 
 
 def _hidden_directions(w: _Window, center: Array, radius: float, pitch: float, clear: float, *, outer: bool) -> Mask:
-    """Directions (sectors,) in which the face does not show beside an edge, nor anything that lies lower: it is hidden, by
-    a cable, a shadow or the image's border, and what looks like an edge there is none."""
+    """Directions (sectors,) in which the face does not show beside an edge, nor anything that lies lower: it is hidden,
+    by a cable, a shadow or the image's border, and what looks like an edge there is none."""
     way = -1.0 if outer else 1.0
     count = int(np.clip(2.0 * np.pi * radius / (4.0 * pitch), 18, 72))
     low, high = sorted(radius + way * d for d in (pitch, max(2.5 * pitch, min(5.0 * pitch, clear))))
@@ -331,10 +325,10 @@ def _face(
     pitch: float,
     standard: FlangeStandard,
     config: FlangeFitConfig,
-    refusal: Refusal,
+    refusal: FaceRefusal,
     grid: Array,
     axes: Array,
-) -> Face | None:
+) -> FlangeFace | None:
     """The tests, then the plane once more, of all that proved to be the face."""
     low, high = standard.face_inner_radius_m + 0.5 * pitch, outer.radius - 0.5 * pitch
     ring = (rho2 > low**2) & (rho2 < high**2)
@@ -348,7 +342,7 @@ def _face(
     spacing = pitch
     if w.measured is not None:
         spacing *= float(np.sqrt(count / max(int(np.count_nonzero(ring & w.face & w.measured)), 1)))
-    measured = Measured(
+    measured = FaceMeasurements(
         plane=plane,
         outer=outer,
         bore=bore,
@@ -356,8 +350,8 @@ def _face(
         coverage=_seen(w, outer, hidden, pitch),
         bore_coverage=0.0 if bore is None else _seen(w, bore, None, pitch),
         count=count,
-        # a bore that is hidden is no bore seen, but lone pixels without a return say nothing (half of a dark bore's floor);
-        # a ring of which less than half is seen is no ring
+        # a bore that is hidden is no bore seen, but lone pixels without a return say nothing (half of a dark bore's
+        # floor); a ring of which less than half is seen is no ring
         core_share=1.0 - float(np.count_nonzero(core & w.known & ~w.face)) / max(int(np.count_nonzero(said)), 1),
         ring_share=count / max(on_ring, int(_RING_SEEN * np.count_nonzero(ring)), 1),
     )

@@ -123,8 +123,8 @@ def refine_circles(
 def circle_steps(
     x: Array, y: Array, radius: float, free: int, noise_floor: float, settled: float
 ) -> tuple[bool, Array, Array, float, float, NDArray[np.bool_]]:
-    """Gauss-Newton with Tukey's weights for one circle about the origin of its points x, y (N,) m; ``free`` is 2 where the
-    radius is known, else 3.
+    """Gauss-Newton with Tukey's weights for one circle about the origin of its points x, y (N,) m; ``free`` is 2 where
+    the radius is known, else 3.
 
     The scale is the one of the third step. Returns whether the points fix a circle, (cx, cy, r), the information J^T J
     (3, 3), the variance of psi over its mean slope squared, the rms of the inliers, and which those are (N,).

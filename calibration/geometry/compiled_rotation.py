@@ -11,7 +11,8 @@ from weldcal.models.compiled import compiled
 
 @compiled()
 def cross_rows(J: Array, v: NDArray[np.floating[Any]], weight: float) -> None:
-    """Set the first three columns of J (3, columns) to -skew(v), v (3,), times the weight: how v turns; the diagonal stays."""
+    """Set the first three columns of J (3, columns) to -skew(v), v (3,), times the weight: how v turns; the diagonal
+    stays."""
     J[0, 1], J[0, 2], J[1, 2] = weight * v[2], -weight * v[1], weight * v[0]
     J[1, 0], J[2, 0], J[2, 1] = -weight * v[2], weight * v[1], -weight * v[0]
 

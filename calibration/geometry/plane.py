@@ -82,8 +82,8 @@ def fit_plane(points: Array, start: tuple[Array, Array], *, tolerance: float, no
 def plane_steps(p: Array, tolerance: float) -> tuple[bool, Array, Array, float, Array]:
     """Fit the plane height = a + b x + c y to points (3, N) m with Tukey weights, starting at the median height.
 
-    Returns whether more than three points in ten agree, (a, b, c), the moments (3, 3) of (1, x, y) with those weights, the
-    residual beyond which a point says nothing and all residuals (N,).
+    Returns whether more than three points in ten agree, (a, b, c), the moments (3, 3) of (1, x, y) with those weights,
+    the residual beyond which a point says nothing and all residuals (N,).
     """
     n = p.shape[1]
     few = max(1, n // _FEW_COMPILED)
@@ -138,8 +138,8 @@ def plane_steps(p: Array, tolerance: float) -> tuple[bool, Array, Array, float, 
 def shared_noise(e: Array, good: NDArray[np.bool_], at: NDArray[np.intp], shape: tuple[int, int]) -> float:
     """Number of grid readings per independent one, from the noise that neighbours share; at least 1.
 
-    ``e`` (N,) are residuals at the flat indices ``at`` (N,) of an image of that ``shape``, 0 where not ``good`` (N,). The
-    variance of sums over blocks of 10 x 10 pixels over what independent readings would have.
+    ``e`` (N,) are residuals at the flat indices ``at`` (N,) of an image of that ``shape``, 0 where not ``good`` (N,).
+    The variance of sums over blocks of 10 x 10 pixels over what independent readings would have.
     """
     image = np.zeros((2, shape[0] * shape[1]), dtype=np.float32)
     image[0, at], image[1, at] = e, good

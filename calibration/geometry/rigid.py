@@ -34,7 +34,8 @@ def fit_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array]:
 
 
 def fit_all_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Rotations (s, 3, 3), translations (s, 3) and whether they are fixed (s,) of s point sets (s, n, 3), as fit_rigid."""
+    """Rotations (s, 3, 3), translations (s, 3) and whether they are fixed (s,) of s point sets (s, n, 3), as
+    fit_rigid."""
     mean_B, mean_C = p_B.mean(axis=1), p_C.mean(axis=1)
     U, D, Vt = np.linalg.svd(np.swapaxes(p_B - mean_B[:, None], 1, 2) @ (p_C - mean_C[:, None]))
     good = (D[:, 1] >= 1e-12 * np.maximum(D[:, 0], 1e-30)) & (D[:, 0] > 0.0)
@@ -45,7 +46,8 @@ def fit_all_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array, NDArray[np
 
 @lru_cache(maxsize=64)
 def drawn_triples(n: int, count: int, seed: int) -> NDArray[np.int64]:
-    """Minimal sets (count, 3) of n points, each of three different ones; drawn once, for folds and models ask for the same."""
+    """Minimal sets (count, 3) of n points, each of three different ones; drawn once, for folds and models ask for the
+    same."""
     rng = np.random.default_rng(seed)
     sets = np.array([rng.choice(n, 3, replace=False) for _ in range(count)])
     sets.setflags(write=False)

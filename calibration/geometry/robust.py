@@ -68,7 +68,8 @@ def middle(a: Array) -> float:
 
 @compiled()
 def solved(N: Array, g: Array, free: int) -> tuple[bool, Array]:
-    """Solve N x = g for the leading ``free`` rows of a symmetric matrix (3, 3) by Cholesky; False where not positive definite."""
+    """Solve N x = g for the leading ``free`` rows of a symmetric matrix (3, 3) by Cholesky; False where not positive
+    definite."""
     L, x = np.zeros((3, 3)), np.zeros(3)
     for i in range(free):
         for j in range(i + 1):

@@ -97,7 +97,8 @@ def nearest_rotation(M: Array) -> Array:
 
 
 def moved(X: Array, change: Array) -> Array:
-    """X after a change (6,) [rotation; translation] on the parent's side about the child's origin: (exp(a) R, p + b)."""
+    """X after a change (6,) [rotation; translation] on the parent's side about the child's origin: (exp(a) R, p +
+    b)."""
     out = X.copy()
     out[:3, :3] = exp_rotation(change[:3]) @ X[:3, :3]
     out[:3, 3] += change[3:]
@@ -141,8 +142,8 @@ def mean_of(poses: list[Array]) -> Array:
 
 
 def flange_poses(arm: Chain, q: Array, errors: Array) -> Array:
-    """Flange poses (m, 4, 4) at joint angles q (m, n) rad; ``errors`` (n, 6) [rotation; translation] of each joint in its own
-    frame before it turns: the third is the joint's offset."""
+    """Flange poses (m, 4, 4) at joint angles q (m, n) rad; ``errors`` (n, 6) [rotation; translation] of each joint in
+    its own frame before it turns: the third is the joint's offset."""
     X = np.broadcast_to(IDENTITY, (len(q), 4, 4))
     for i in range(arm.n):
         turn = exp_rotation(q[:, i : i + 1] * [0.0, 0.0, 1.0])

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.hand_eye.fit import Fit, descend, fit, noise_of
+from weldcal.calibration.hand_eye.fit import EquationFit, descend, fit, noise_of
 from weldcal.calibration.hand_eye.linearisation import Loss
 from weldcal.calibration.hand_eye.problem import Problem, State, residuals
 from weldcal.calibration.hand_eye.starts import closed_forms, grid
@@ -24,7 +24,8 @@ _SUBSETS = 60
 
 
 USUAL_DISCORD_RAD = 5e-3
-"""Angle, an axis, by which positions and rotations of usual cameras disagree: six pixels of the principal point at a focal length of 1,200."""
+"""Angle, an axis, by which positions and rotations of usual cameras disagree: six pixels of the principal point at a
+focal length of 1,200."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Choice:
 
     state: State
     covariance: Array
-    fit: Fit
+    fit: EquationFit
     method: str
     start: str
 
@@ -52,14 +53,15 @@ def solve(
 ) -> Choice:
     """Solve one problem; ``known`` holds the poses that are not free. Deterministic for ``seed``.
 
-    Where the rotations can be had without the translations, a discord between both is estimated (see Scaled) whose size is
-    ``usual_discord`` (rad) beforehand; 0: least squares, without discord. Raises InconsistentPoses where no rigid poses explain enough observations.
+    Where the rotations can be had without the translations, a discord between both is estimated (see Scaled) whose size
+    is ``usual_discord`` (rad) beforehand; 0: least squares, without discord. Raises InconsistentPoses where no rigid
+    poses explain enough observations.
     """
     state, name = _start(problem, known, seed, starts)
     state = _concentrated(problem, state)
     w, d = residuals(problem, state)
     keep = _gate(problem, w, d)
-    base: Fit | None = None
+    base: EquationFit | None = None
     tried_sets: set[bytes] = set()
     for _ in range(10):
         noise = noise_of(problem, w, d, keep) if base is None else base.noise
@@ -74,8 +76,8 @@ def solve(
     need = max(3, int(np.ceil((1.0 - max_outliers) * len(problem) - 1e-9)))
     if int(keep.sum()) < need and len(problem) > 4:
         raise InconsistentPoses(
-            f"Only {int(keep.sum())} of {len(problem)} poses agree on one answer; check units, pose order, the quaternion"
-            " order, and which pose is stated from which frame."
+            f"Only {int(keep.sum())} of {len(problem)} poses agree on one answer; check units, pose order, the"
+            " quaternion order, and which pose is stated from which frame."
         )
     seen = bool((problem.full | problem.normal).any())
     turned = float(np.sqrt(base.noise.rotation)) if seen else 0.0
@@ -104,10 +106,11 @@ def solve(
 
 
 def _concentrated(problem: Problem, state: State) -> State:
-    """The state of the poses that agree best, where some may be outliers: few outliers of few poses hide in the noise that they cause.
+    """The state of the poses that agree best, where some may be outliers: few outliers of few poses hide in the noise
+    that they cause.
 
-    Least trimmed squares by concentration steps (Rousseeuw and Van Driessen 1999). Poses with less than three numbers for each unknown
-    are not trimmed.
+    Least trimmed squares by concentration steps (Rousseeuw and Van Driessen 1999). Poses with less than three numbers
+    for each unknown are not trimmed.
     """
     n, kept, begin, least = len(problem), None, state, np.inf
     most = int(np.ceil(_AGREEING * n))
@@ -142,7 +145,7 @@ def _gate(problem: Problem, w: Array, d: Array) -> Flags:
     return _inside(problem, w, d, noise.rotation, noise.translation)
 
 
-def _within(problem: Problem, base: Fit) -> Flags:
+def _within(problem: Problem, base: EquationFit) -> Flags:
     if len(problem) <= 4:
         return np.ones(len(problem), dtype=bool)
     return _inside(problem, base.w, base.d, base.noise.rotation, base.noise.translation)

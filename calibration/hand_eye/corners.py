@@ -23,8 +23,11 @@ _COLUMN_LOSS = 0.01  # how much worse one column may get held out while the othe
 
 @dataclass(frozen=True)
 class CornerRefinement:
-    """Result of the refinement by corners. ``shift_px``, ``sigma_px`` (2,): estimated shift of the principal point and its standard
-    deviation; ``accepted``: applied in ``result`` (else ``result`` is that of the poses as given); ``sentence`` says why."""
+    """Result of the refinement by corners.
+
+    ``shift_px``, ``sigma_px`` (2,): estimated shift of the principal point and its standard deviation; ``accepted``:
+    applied in ``result`` (else ``result`` is that of the poses as given); ``sentence`` says why.
+    """
 
     shift_px: Array
     sigma_px: Array
@@ -36,7 +39,8 @@ class CornerRefinement:
 def poses_from_corners(pairs: PosePairs, shift_px: Array, least: int = 6) -> Array:
     """Poses (n, 4, 4) of the board in the camera that reproject best, the principal point moved by ``shift_px``.
 
-    Raises DatasetError where the file has no corners, fewer than ``least`` in an image, or arrays that do not belong together.
+    Raises DatasetError where the file has no corners, fewer than ``least`` in an image, or arrays that do not belong
+    together.
     """
     if pairs.img is None or pairs.obj is None or pairs.K is None:
         raise DatasetError(f"'{pairs.source}' holds no corners (img, obj, K): omit --corners.")
@@ -64,10 +68,10 @@ def poses_from_corners(pairs: PosePairs, shift_px: Array, least: int = 6) -> Arr
 def refine_with_corners(pairs: PosePairs, config: HandEyeConfig | None = None) -> CornerRefinement:
     """Estimate the shift of the principal point together with the poses and apply it only if the data allow.
 
-    A principal point that is off turns every board about the camera: hand-eye motion shows it, reprojection does not. The
-    shift maximises the likelihood of the hand-eye residuals; it is applied if it is no chance (likelihood ratio, 1 %), if
-    it lies within a tenth of the image, and if the held-out errors fall. Its uncertainty then goes into the covariance.
-    Raises as poses_from_corners and solve_problem.
+    A principal point that is off turns every board about the camera: hand-eye motion shows it, reprojection does not.
+    The shift maximises the likelihood of the hand-eye residuals; it is applied if it is no chance (likelihood ratio, 1
+    %), if it lies within a tenth of the image, and if the held-out errors fall. Its uncertainty then goes into the
+    covariance. Raises as poses_from_corners and solve_problem.
     """
     config = config or HandEyeConfig()
     quick = replace(config, folds=0, usual_discord_rad=0.0)

@@ -112,8 +112,8 @@ def check_poses(problem: Problem, *, allow_coplanar: bool = False) -> Diversity:
     open_pair = problem.tied or sum(problem.free) > 1
     if open_pair and d.turn_deg < np.degrees(NO_TURN_RAD):
         raise PureTranslation(
-            f"The robot turned by at most {d.turn_deg:.2f} deg between poses: the position of the camera is unobservable"
-            " in every direction; turn the hand about at least two axes."
+            f"The robot turned by at most {d.turn_deg:.2f} deg between poses: the position of the camera is"
+            " unobservable in every direction; turn the hand about at least two axes."
         )
     alone = ~problem.full & ~problem.normal
     if alone.all():
@@ -130,8 +130,8 @@ def _check_points(p: Array, allow_coplanar: bool) -> None:
         )
     if spread[2] < 0.01 * spread[0] and not allow_coplanar:
         raise CoplanarPoses(
-            f"The {len(p)} measured points lie in one plane as the camera sees them, so that an error along its normal is"
-            " unobservable; move the point in depth too."
+            f"The {len(p)} measured points lie in one plane as the camera sees them, so that an error along its normal"
+            " is unobservable; move the point in depth too."
         )
 
 

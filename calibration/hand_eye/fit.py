@@ -21,7 +21,7 @@ _HERE = 0.1  # share of the tolerance up to which derivatives are those of the p
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit:
+class EquationFit:
     """A converged fit. ``w``, ``d`` (n, 3): residuals; ``scaled``, ``lin``: normal equations and derivatives of the
     observations kept."""
 
@@ -110,15 +110,15 @@ def fit(
     begin: Linearised | None = None,
     iterations: int = 60,
     tolerance: float = 1e-6,
-) -> Fit:
+) -> EquationFit:
     """Newton's method on the robust cost from a good start; the variances are re-estimated at every step.
 
-    Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. The noise centre is
-    an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
-    displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so the
-    answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``usual_discord``:
-    see Scaled. ``keep`` (n,): observations that count; the others get residuals
-    only. ``begin``: the derivatives at the start, where known. ``tolerance``: of what is left, in standard deviations.
+    Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. The noise centre
+    is an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
+    displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so
+    the answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``usual_discord``:
+    see Scaled. ``keep`` (n,): observations that count; the others get residuals only. ``begin``: the derivatives at the
+    start, where known. ``tolerance``: of what is left, in standard deviations.
     """
     sub = problem if keep.all() else problem.pick(keep)
     floor = sub.extent**2 * TINY
@@ -168,14 +168,4 @@ def fit(
         before = leap
     # every observation, at the same state
     w, d = (lin.w, lin.d) if sub is problem else residuals(problem, state, centre)
-    return Fit(
-        state=state,
-        noise=noise,
-        centre=centre,
-        loss=loss,
-        keep=keep,
-        scaled=s,
-        lin=lin,
-        w=w,
-        d=d,
-    )
+    return EquationFit(state=state, noise=noise, centre=centre, loss=loss, keep=keep, scaled=s, lin=lin, w=w, d=d)

@@ -9,13 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.se3 import (
-    IDENTITY,
-    flange_poses,
-    inverse,
-    log_rotation,
-    mean_pose,
-)
+from weldcal.calibration.geometry.se3 import IDENTITY, flange_poses, inverse, log_rotation, mean_pose
 from weldcal.calibration.hand_eye.linearisation import TINY, inverse_information
 from weldcal.calibration.hand_eye.mountings import chain as mounted
 from weldcal.calibration.hand_eye.mountings import get_mounting
@@ -55,8 +49,11 @@ class JointPrior:
 
 @dataclass(frozen=True)
 class JointRefinement:
-    """Result of the refinement by joint angles. ``names``, ``values``, ``sigma`` (k,): errors of the robot (rad or m) with their standard
-    deviations; ``accepted``: applied in ``result`` (else ``result`` is that of the poses as given); ``sentence``: why."""
+    """Result of the refinement by joint angles.
+
+    ``names``, ``values``, ``sigma`` (k,): errors of the robot (rad or m) with their standard deviations; ``accepted``:
+    applied in ``result`` (else ``result`` is that of the poses as given); ``sentence``: why.
+    """
 
     names: tuple[str, ...]
     values: Array
@@ -115,12 +112,13 @@ def refine_joints(
     prior: JointPrior | None = None,
     config: HandEyeConfig | None = None,
 ) -> JointRefinement:
-    """Estimate joint offsets (``kind`` "joints") or all errors of the links ("links": six numbers a joint) with the camera.
+    """Estimate joint offsets (``kind`` "joints") or all errors of the links ("links": six numbers a joint) with the
+    camera.
 
-    Maximum a posteriori: the prior keeps what the poses do not show at zero. What only moves the base or the flange as a
-    whole is no error of the robot and is omitted (all of the first joint; turn and shift of the last one about and along
-    its axis). Applied only if held-out errors fall, in a paired test on five folds, and not one column at the cost of
-    the other; otherwise the sentence says that it does not help. ``plain`` is the result of the poses as given.
+    Maximum a posteriori: the prior keeps what the poses do not show at zero. What only moves the base or the flange as
+    a whole is no error of the robot and is omitted (all of the first joint; turn and shift of the last one about and
+    along its axis). Applied only if held-out errors fall, in a paired test on five folds, and not one column at the
+    cost of the other; otherwise the sentence says that it does not help. ``plain`` is the result of the poses as given.
     Raises DatasetError without joint angles, InputError where they do not belong to the arm or the mounting.
     """
     prior, config = prior or JointPrior(), config or HandEyeConfig()
@@ -174,14 +172,15 @@ def refine_joints(
         if u < _SHOWN
     )
     said = (
-        f"Robot errors applied ({told}); {change}. The result applies to the robot with these corrections: enter these errors in its "
-        "kinematics, or calibrate without them."
+        f"Robot errors applied ({told}); {change}. The result applies to the robot with these corrections: enter these"
+        " errors in its kinematics, or calibrate without them."
     )
     return JointRefinement(names, values, sigma * robot.scale, True, better, said)
 
 
 def poses_of_arm(pairs: PosePairs, arm: Chain) -> PosePairs:
-    """The pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles; a constant tool stays.
+    """The pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles; a constant
+    tool stays.
 
     Raises as refine_joints does.
     """
@@ -213,16 +212,19 @@ def _robot(pairs: PosePairs, arm: Chain, kind: str, prior: JointPrior) -> tuple[
     wanted = [6 * j + p for j in range(1, arm.n) for p in ((2,) if kind == "joints" else range(6))]
     which = np.array([i for i in wanted if i not in (last + 2, last + 5)])
     names = tuple(f"{arm.joint_names[i // 6]} {parts[i % 6]}" for i in which)
-    return _Robot(
-        stated=pairs.robot,
-        arm=arm,
-        q=pairs.q,
-        tool=tool,
-        mode=pairs.mode,
-        which=which,
-        scale=each[which % 6],
-        camera=pairs.camera,
-    ), names
+    return (
+        _Robot(
+            stated=pairs.robot,
+            arm=arm,
+            q=pairs.q,
+            tool=tool,
+            mode=pairs.mode,
+            which=which,
+            scale=each[which % 6],
+            camera=pairs.camera,
+        ),
+        names,
+    )
 
 
 def _tool(pairs: PosePairs, arm: Chain) -> Array:
@@ -242,8 +244,8 @@ def _tool(pairs: PosePairs, arm: Chain) -> Array:
     except WeldcalError:
         pass
     raise InputError(
-        f"The joint angles of '{pairs.source}' do not lead {arm.name} to the stated poses; check the robot's name, the order of "
-        "the joints, and that angles are radians."
+        f"The joint angles of '{pairs.source}' do not lead {arm.name} to the stated poses; check the robot's name, the"
+        " order of the joints, and that angles are radians."
     )
 
 
@@ -305,7 +307,8 @@ def _by_errors(robot: _Robot, state: State, k: int, centre: Array, u: Array) -> 
 def _held_out(
     robot: _Robot, state: State, keep: NDArray[np.bool_], k: int, *, centre: Array, label: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """Errors (n,), (n,) of every pose under a fit with ``k`` robot errors that never saw its fold; ``label`` (n,): the folds."""
+    """Errors (n,), (n,) of every pose under a fit with ``k`` robot errors that never saw its fold; ``label`` (n,): the
+    folds."""
     w, d = np.full(len(keep), np.nan), np.full(len(keep), np.nan)
     for fold in range(int(label.max()) + 1):
         test = label == fold

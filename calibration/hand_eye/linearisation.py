@@ -29,19 +29,22 @@ class Loss(Enum):
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances per axis beyond the observations' own covariances: rotation rad^2 and translation of the noise centre."""
+    """Variances per axis beyond the observations' own covariances: rotation rad^2 and translation of the noise
+    centre."""
 
     rotation: float
     translation: float
 
 
 class Scaled:
-    """The observations of a linearisation, weighed. ``lin`` may hold three more columns than the problem has unknowns: those of
-    the noise centre.
+    """The observations of a linearisation, weighed.
 
-    ``usual_discord`` (rad, 0: none): the displacements are those of a camera that is turned by a rotation vector with the
-    same variance per axis against the camera of the rotations. Its size has a log-normal prior about ``usual_discord`` and the
-    restricted likelihood (REML). The answer is the mean over the posterior; ``discord`` has the information that is the mean over the likelihood.
+    ``lin`` may hold three more columns than the problem has unknowns: those of the noise centre.
+
+    ``usual_discord`` (rad, 0: none): the displacements are those of a camera that is turned by a rotation vector with
+    the same variance per axis against the camera of the rotations. Its size has a log-normal prior about
+    ``usual_discord`` and the restricted likelihood (REML). The answer is the mean over the posterior; ``discord`` has
+    the information that is the mean over the likelihood.
     """
 
     def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss, usual_discord: float = 0.0) -> None:
@@ -83,17 +86,20 @@ class Scaled:
         self.free_w, self.free_d = max(self.total_w - taken_w, 0.3), max(self.total_d - taken_d, 0.3)
 
     def step(self) -> Array:
-        """Change (m,) of the unknowns. Without discord: Newton's, with the exact second derivative of the robust cost."""
+        """Change (m,) of the unknowns.
+
+        Without discord: Newton's, with the exact second derivative of the robust cost.
+        """
         if self.discord or self.loss is Loss.SQUARES:
             return -(self._by_w @ self.gw + self._by_d @ self.gd)
         return np.asarray(-self._newton() @ (self.gw + self.gd))
 
     def _marginal(self, usual: float) -> tuple[float, Array, Array]:
-        """The discord whose information is the mean over its likelihood, and the means over it of what the gradients (m,) of rotations and of displacements
-        move (m, m).
+        """The discord whose information is the mean over its likelihood, and the means over it of what the gradients
+        (m,) of rotations and of displacements move (m, m).
 
-        At one discord the rotations follow from both, as far as it lets the displacements know them. The positions are the
-        best for these rotations and the displacements as measured: so they predict them best.
+        At one discord the rotations follow from both, as far as it lets the displacements know them. The positions are
+        the best for these rotations and the displacements as measured: so they predict them best.
         """
         Ad, V, k = self._Ad, self.V, len(self.A)
         own = Ad[:3]
@@ -148,7 +154,8 @@ class Scaled:
         return e, self.root @ np.concatenate([lin.Jw, lin.Jd], axis=1)
 
     def variances(self, lin: Linearised, noise: Noise, floor: float) -> Noise:
-        """The variances that make each group's weighted squares equal to its redundancy (one Newton step in the log)."""
+        """The variances that make each group's weighted squares equal to its redundancy (one Newton step in the
+        log)."""
         if self.root is None:
             qw = np.einsum("ij,ij->i", lin.w, lin.w) / noise.rotation
             qd = np.einsum("ij,ij->i", lin.d, lin.d) / noise.translation
@@ -201,8 +208,10 @@ def weigh(q: Array, m: Array, loss: Loss) -> tuple[Array, Array]:
 
 
 def _growth(q: Array, m: Array, loss: Loss, redundancy: float, share: Array | float) -> float:
-    """Factor on a variance: squares over redundancy, to the power that makes the step a Newton step. ``share`` (n,): how
-    much of each observation's variance it is."""
+    """Factor on a variance: squares over redundancy, to the power that makes the step a Newton step.
+
+    ``share`` (n,): how much of each observation's variance it is.
+    """
     w, _ = weigh(q, m, loss)
     total = float((w * q).sum())
     power = float((w * q * share * np.where(w < 1.0, 0.5, 1.0)).sum())
@@ -243,7 +252,8 @@ def inverse_information(N: Array) -> Array:
 
 
 def _sure_inverse(N: Array) -> Array | None:
-    """Inverse of a matrix that is plainly positive definite, by its Cholesky factor; None where eigenvalues must decide."""
+    """Inverse of a matrix that is plainly positive definite, by its Cholesky factor; None where eigenvalues must
+    decide."""
     try:
         L = np.linalg.cholesky(N)
     except np.linalg.LinAlgError:

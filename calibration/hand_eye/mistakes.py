@@ -1,4 +1,5 @@
-"""Name the usual mistakes in pairs of poses: in whole lists, in single rows, and in the scale of the camera's distances."""
+"""Name the usual mistakes in pairs of poses: in whole lists, in single rows, and in the scale of the camera's
+distances."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.poses.readings import PoseReading, apply_change
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
 from weldcal.calibration.hand_eye.linearisation import inverse_information
-from weldcal.calibration.hand_eye.pairs.conventions import Agreement
+from weldcal.calibration.hand_eye.pairs.conventions import ReadingAgreement
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import LEAST_SCALE, SCALE_SIGMA, decided
 from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, residuals
@@ -28,10 +29,12 @@ _LEAST_SCALE = 3e-3  # and by how much it must be, to be worth a sentence
 
 
 def likely_mistake(pairs: PosePairs) -> str | None:
-    """Find the correction of the input that the data select, where they reject the poses as they stand; else None. One robot only.
+    """Find the correction of the input that the data select, where they reject the poses as they stand; else None.
 
-    Besides the readings of a file (pairs.conventions) the matrices may be of quaternions in the other order. With both lists inverted the
-    equation holds as well, camera and target exchanged: no data can tell.
+    One robot only.
+
+    Besides the readings of a file (pairs.conventions) the matrices may be of quaternions in the other order. With both
+    lists inverted the equation holds as well, camera and target exchanged: no data can tell.
     """
     n = len(pairs.robot)
     if pairs.mode not in ("eye_in_hand", "eye_on_base") or n < _FEWEST:
@@ -48,11 +51,15 @@ def likely_mistake(pairs: PosePairs) -> str | None:
         words.append(f"the camera poses come {_COUNTS[abs(shift)]} {later} than the robot poses")
     if not words:
         return None
-    return f"These poses contradict each other as given, but agree if {' and '.join(words)}: correct the file and run again."
+    return (
+        f"These poses contradict each other as given, but agree if {' and '.join(words)}: correct the file and run"
+        " again."
+    )
 
 
-def _solvable(one: Agreement, mode: str) -> bool:
-    """Whether the solver finds a result, where a quarter of outliers or more hides from the comparison that a reading agrees."""
+def _solvable(one: ReadingAgreement, mode: str) -> bool:
+    """Whether the solver finds a result, where a quarter of outliers or more hides from the comparison that a reading
+    agrees."""
     F = one.robot.X if mode == "eye_in_hand" else inverse(one.robot.X)
     try:
         solve_problem(
@@ -72,7 +79,7 @@ def _orders(X: Array) -> list[PoseReading]:
     return some
 
 
-def _words(one: Agreement, mode: str) -> list[str]:
+def _words(one: ReadingAgreement, mode: str) -> list[str]:
     """What must be corrected for an agreement."""
     other = "eye_on_base" if mode == "eye_in_hand" else "eye_in_hand"
     said, forms = [], {"robot": one.robot.form.split(","), "camera": one.camera.form.split(",")}
@@ -102,9 +109,10 @@ def _words(one: Agreement, mode: str) -> list[str]:
 def explain_outliers(pairs: PosePairs, result: HandEyeResult) -> tuple[str, ...]:
     """Sentences with the cause of poses that were excluded, where the solution of the others shows one. One robot only.
 
-    A pose of one list that fits another row's pose of the other list was paired wrongly. One transform on the flange's side of the robot's
-    poses (TCP), or on the base's side (frame), that makes several rows fit is their cause. Of one row alone six free numbers would always
-    fit: its cause is a shift along one axis of the flange that leaves nothing else.
+    A pose of one list that fits another row's pose of the other list was paired wrongly. One transform on the flange's
+    side of the robot's poses (TCP), or on the base's side (frame), that makes several rows fit is their cause. Of one
+    row alone six free numbers would always fit: its cause is a shift along one axis of the flange that leaves nothing
+    else.
     """
     odd = np.flatnonzero(~result.inliers)
     if pairs.mode not in ("eye_in_hand", "eye_on_base") or not 0 < len(odd) <= _MOST_ODD:
@@ -137,8 +145,8 @@ def explain_outliers(pairs: PosePairs, result: HandEyeResult) -> tuple[str, ...]
         named |= set(wrong)
         if wrong:
             said.append(
-                f"The {who}'s pose{'s' * (len(wrong) > 1)} {_listed(pairs, wrong)} fit{'s' * (len(wrong) == 1)} the {other}'s "
-                f"{_listed(pairs, [moved[who][i] for i in wrong])} instead: check how these rows are paired."
+                f"The {who}'s pose{'s' * (len(wrong) > 1)} {_listed(pairs, wrong)} fit{'s' * (len(wrong) == 1)} the"
+                f" {other}'s {_listed(pairs, [moved[who][i] for i in wrong])} instead: check how these rows are paired."
             )
     left = np.array([i for i in odd if i not in named], dtype=int)
     R, G = pairs.robot[left], pairs.camera[left]
@@ -157,7 +165,8 @@ def explain_outliers(pairs: PosePairs, result: HandEyeResult) -> tuple[str, ...]
             p = ", ".join(f"{1e3 * v:.1f}" for v in np.median(changes[rows, :3, 3], axis=0))
             turn = np.degrees(np.median(Rotation.from_matrix(changes[rows, :3, :3]).magnitude()))
             said.append(
-                f"Poses {_listed(pairs, left[rows].tolist())} fit if the robot's poses had {words}: offset ({p}) mm, turned by {turn:.1f} degrees."
+                f"Poses {_listed(pairs, left[rows].tolist())} fit if the robot's poses had {words}: offset ({p}) mm,"
+                f" turned by {turn:.1f} degrees."
             )
             return tuple(said)
     for k, i in enumerate(left):
@@ -171,8 +180,8 @@ def explain_outliers(pairs: PosePairs, result: HandEyeResult) -> tuple[str, ...]
         if good[:3].any() and not good[3:].any():
             axis = int(np.argmax(good[:3]))
             said.append(
-                f"Pose {_listed(pairs, [i])} fits if the robot's pose had another TCP: offset {1e3 * shift[axis]:.1f} mm along {'xyz'[axis]} of "
-                "the flange."
+                f"Pose {_listed(pairs, [i])} fits if the robot's pose had another TCP: offset {1e3 * shift[axis]:.1f}"
+                f" mm along {'xyz'[axis]} of the flange."
             )
     return tuple(said)
 
@@ -187,8 +196,9 @@ def _listed(pairs: PosePairs, rows: Sequence[int]) -> str:
 
 
 def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
-    """A sentence where the robot's motion says that all camera distances are too long or too short by one factor (a target of
-    another size, a wrong focal length): such an error shifts the answer without showing in any reprojection."""
+    """A sentence where the robot's motion says that all camera distances are too long or too short by one factor (a
+    target of another size, a wrong focal length): such an error shifts the answer without showing in any
+    reprojection."""
     # repeats say nothing more about the scale than one sample does
     used = one_per_pose(problem).problem.pick(np.unique(result.observation[result.inliers]))
     if problem.tied or not used.all_full or 6 * len(used) < problem.size + 12 or result.unobservable:
@@ -210,8 +220,9 @@ def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
         return None
     # the positions fit when multiplied by 1 + s
     return (
-        f"The camera's distances seem {abs(100 * s):.1f} % (+- {100 * sigma:.1f}) too {'short' if s > 0.0 else 'long'} for the "
-        "robot's motion; check the size of the target and the camera's focal length: an error of either shifts the result."
+        f"The camera's distances seem {abs(100 * s):.1f} % (+- {100 * sigma:.1f}) too {'short' if s > 0.0 else 'long'}"
+        " for the robot's motion; check the size of the target and the camera's focal length: an error of either"
+        " shifts the result."
     )
 
 

@@ -113,8 +113,10 @@ MOUNTINGS: dict[str, Mounting] = {
 
 @dataclass(frozen=True, kw_only=True)
 class TargetObservation:
-    """One observation of the target. ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that
-    carries the camera (eye_on_arm only); ``X_DE``: the second robot's flange in its base (co_manipulation only).
+    """One observation of the target.
+
+    ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that carries the
+    camera (eye_on_arm only); ``X_DE``: the second robot's flange in its base (co_manipulation only).
 
     Measured: ``p_CM`` (3,) always, with ``n_CM`` (3,) the unit z axis of the target (its normal) or ``R_CM`` all of its
     rotation where known. ``covariance`` (6, 6) [rotation; translation] of the measurement in the target's axes, None
@@ -157,7 +159,10 @@ def chain(mounting: Mounting, X_BF: Array, X_BL: Array | None = None, X_DE: Arra
 def problem_of(
     mounting: Mounting, observations: Sequence[TargetObservation], known: dict[str, RigidTransform]
 ) -> Problem:
-    """The equation of these observations. ``known``: letters of unknowns that are given (a flange as target: Y or Z)."""
+    """The equation of these observations.
+
+    ``known``: letters of unknowns that are given (a flange as target: Y or Z).
+    """
     X_BF = np.array([s.X_BF.GetAsMatrix4() for s in observations]).reshape(-1, 4, 4)
     links = [s.X_BL for s in observations]
     others = [s.X_DE for s in observations]

@@ -32,8 +32,8 @@ def most_compared(n: int) -> int:
 def opencv_solve(method: str, F: Array, G: Array) -> tuple[Array, Array] | None:
     """(X, Y) of F_i X G_i = Y by one of METHODS; None where it throws or returns no finite rigid pose.
 
-    Y is the mean over the poses for every method: calibrateHandEye gives X alone, and the Y of calibrateRobotWorldHandEye
-    fits worse than that mean (camera 1 of the workcell, LI: 1.35 against 1.01 mm held out).
+    Y is the mean over the poses for every method: calibrateHandEye gives X alone, and the Y of
+    calibrateRobotWorldHandEye fits worse than that mean (camera 1 of the workcell, LI: 1.35 against 1.01 mm held out).
     """
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # a refusal is told in the table
     try:
@@ -70,8 +70,8 @@ def opencv_held_out(
 ) -> HandEyeHeldOut:
     """Held-out errors of one of METHODS on the folds that weldcal uses; NaN where a fold gave no answer.
 
-    ``observation``: of each sample, as weldcal's result has it.
-    ``most``: fit each fold to so many of its poses at most, evenly spaced; calibrateHandEye holds all pairs of poses in memory.
+    ``observation``: of each sample, as weldcal's result has it. ``most``: fit each fold to so many of its poses at
+    most, evenly spaced; calibrateHandEye holds all pairs of poses in memory.
     """
     n = len(F)
     if observation is None:

@@ -24,10 +24,11 @@ class Repeats:
     """Observations without repeats.
 
     Attributes:
-        problem: the means over the repeats (m observations); its covariances state by how much a mean of few repeats is less
-            certain than one of the most repeats.
+        problem: the means over the repeats (m observations); its covariances state by how much a mean of few repeats is
+            less certain than one of the most repeats.
         observation: (n,) for each sample the observation that it belongs to.
-        agrees: (n,) whether the sample is part of its observation's mean: not where it disagrees grossly with the other repeats.
+        agrees: (n,) whether the sample is part of its observation's mean: not where it disagrees grossly with the other
+            repeats.
     """
 
     problem: Problem
@@ -47,9 +48,9 @@ class _Noise:
 def one_per_pose(problem: Problem, known: State = (IDENTITY, IDENTITY, IDENTITY), *, join: bool = True) -> Repeats:
     """Join the samples at one robot pose into one observation.
 
-    An error of the robot or of the camera at that pose is the same in each repeat, so that repeats do not average it. Poses and
-    measurements are averaged on SE(3). The noise of a sample, which holds that error and the repeat's own, is the most that repeats may
-    vary by. Motions, points and normals stay as they are.
+    An error of the robot or of the camera at that pose is the same in each repeat, so that repeats do not average it.
+    Poses and measurements are averaged on SE(3). The noise of a sample, which holds that error and the repeat's own, is
+    the most that repeats may vary by. Motions, points and normals stay as they are.
     """
     n = len(problem)
     alone = Repeats(problem, np.arange(n), np.ones(n, dtype=bool))
@@ -105,7 +106,8 @@ def _without_gross(
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """The numbers (n,) of the observations, and whether each sample agrees with its like.
 
-    Of three repeats or more, one that disagrees grossly with the others is wrong. Of two, nobody knows which: each is an observation.
+    Of three repeats or more, one that disagrees grossly with the others is wrong. Of two, nobody knows which: each is
+    an observation.
     """
     gross = np.zeros(len(place), dtype=bool)
     for k in np.flatnonzero(np.bincount(place) > 1):

@@ -32,9 +32,13 @@ _RIGID = 0.05  # deviation of a rotation from orthonormal that two printed decim
 
 @dataclass(frozen=True, kw_only=True)
 class HandEyeConfig:
-    """Settings. ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive;
-    ``allow_open``: give an answer even where more than one direction of translation stays open; ``join_repeats``: samples at one robot
-    pose are one observation; ``usual_discord_rad``: angle by which rotations and positions of the camera disagree beforehand."""
+    """Settings.
+
+    ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive; ``allow_open``: give
+    an answer even where more than one direction of translation stays open; ``join_repeats``: samples at one robot pose
+    are one observation; ``usual_discord_rad``: angle by which rotations and positions of the camera disagree
+    beforehand.
+    """
 
     seed: int = 0
     folds: int = 5
@@ -47,8 +51,8 @@ class HandEyeConfig:
 
 @dataclass(frozen=True)
 class HandEyeHeldOut:
-    """Errors (n,) of each pose under a calibration that never saw its fold: rotation rad, translation in the unit of the
-    data; NaN where a fold could not be solved. rms over poses as the properties say."""
+    """Errors (n,) of each pose under a calibration that never saw its fold: rotation rad, translation in the unit of
+    the data; NaN where a fold could not be solved. rms over poses as the properties say."""
 
     rotation_rad: Array
     translation: Array
@@ -73,9 +77,9 @@ class HandEyeResult:
     the parent's axes; open directions carry a standard deviation of ten (rad, or extents of the motion).
     ``joint_covariance`` (m, m): all of them, in the order of ``poses``. ``rotation_rad`` (n,) (NaN where none was seen)
     and ``translation`` (n,): residuals of all observations at the origin of the target. ``sigma_rotation_rad``,
-    ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target where it
-    holds. ``observation`` (n,): the observation that each sample belongs to; repeats of a pose are one. Lengths are in the unit of
-    the data.
+    ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target
+    where it holds. ``observation`` (n,): the observation that each sample belongs to; repeats of a pose are one.
+    Lengths are in the unit of the data.
     """
 
     equation: str
@@ -131,8 +135,8 @@ def pose_difference(estimate: RigidTransform, truth: RigidTransform) -> Array:
 def solve_ax_xb(A: ArrayLike, B: ArrayLike, config: HandEyeConfig | None = None) -> HandEyeResult:
     """A_k X = X B_k for motions (k, 4, 4) of hand and camera; at least two, about axes that are not parallel.
 
-    For poses rather than motions use solve_ax_yb or solve_mounting: each pose then counts once and its noise is its own.
-    Raises as solve_problem.
+    For poses rather than motions use solve_ax_yb or solve_mounting: each pose then counts once and its noise is its
+    own. Raises as solve_problem.
     """
     a, b = as_poses(A, "A"), as_poses(B, "B")
     _same_length(a, b)
@@ -150,8 +154,8 @@ def solve_ax_yb(
 ) -> HandEyeResult:
     """A_i X = Y B_i for poses (n, 4, 4); B_i is what was measured, and residuals are seen in the child frame of B.
 
-    With the paper's Eq. (4): A = X_BF, B = X_CM, X = X_FM, Y = X_BC. ``covariance`` (n, 6, 6) of B in its child's tangent,
-    beyond which the noise is estimated. Raises as solve_problem.
+    With the paper's Eq. (4): A = X_BF, B = X_CM, X = X_FM, Y = X_BC. ``covariance`` (n, 6, 6) of B in its child's
+    tangent, beyond which the noise is estimated. Raises as solve_problem.
     """
     a, b = as_poses(A, "A"), as_poses(B, "B")
     _same_length(a, b)
@@ -241,8 +245,8 @@ def solve_problem(
     numbers = float(used.numbers_w.sum()) + 3.0 * len(used)
     if numbers < _SPARE * problem.size:
         warnings.append(
-            f"{len(used)} {'motions' if problem.tied else 'poses'} are {numbers:.0f} numbers for {problem.size} unknowns: "
-            "a wrong sample or convention is hard to detect; add samples before you rely on the result."
+            f"{len(used)} {'motions' if problem.tied else 'poses'} are {numbers:.0f} numbers for {problem.size}"
+            " unknowns: a wrong sample or convention is hard to detect; add samples before you rely on the result."
         )
     if not inliers.all():
         names = ", ".join(str(i) for i in np.nonzero(~inliers)[0])
@@ -259,9 +263,11 @@ def solve_problem(
         rotation_rad=np.where(seen, np.linalg.norm(w, axis=1), np.nan),
         translation=np.linalg.norm(d, axis=1),
         inliers=inliers,
-        held_out=_held_out(samples, problem, observation, known, config=config, starts=starts)
-        if config.folds
-        else _nothing(len(samples)),
+        held_out=(
+            _held_out(samples, problem, observation, known, config=config, starts=starts)
+            if config.folds
+            else _nothing(len(samples))
+        ),
         sigma_rotation_rad=float(np.sqrt(noise.rotation)) if s.total_w else float("nan"),
         sigma_translation=float(np.sqrt(noise.translation)),
         noise_centre=choice.fit.centre,
@@ -330,7 +336,10 @@ def _held_out(
 
 
 def as_poses(value: ArrayLike | Sequence[RigidTransform], name: str) -> Array:
-    """A stack (n, 4, 4) of rigid poses, checked; RigidTransforms are welcome. Raises InputError naming the first bad one."""
+    """A stack (n, 4, 4) of rigid poses, checked; RigidTransforms are welcome.
+
+    Raises InputError naming the first bad one.
+    """
     if isinstance(value, (list, tuple)) and value and isinstance(value[0], RigidTransform):
         value = [X.GetAsMatrix4() for X in value]
     M = np.array(value, dtype=float)

@@ -180,8 +180,8 @@ def closed_forms(problem: Problem, state: State) -> Iterator[tuple[str, State]]:
 
 
 def grid(problem: Problem, state: State, rng: np.random.Generator, n: int = 24) -> list[tuple[str, State]]:
-    """Turns of the cube, seen from a random side, for X; the rotations of the other unknowns follow from the observations
-    where these are poses, or stay as they are."""
+    """Turns of the cube, seen from a random side, for X; the rotations of the other unknowns follow from the
+    observations where these are poses, or stay as they are."""
     tilt = np.asarray(Rotation.random(rng=rng).as_matrix())
     out = []
     for k in range(n):

@@ -15,9 +15,11 @@ _MOST_DRIFT = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class FrameClock:
-    """Times of the frames by one clock: ``base`` (N,) s near the robot's time, NaN where a frame has none. A frame's nominal capture
-    time is base + sign * offset (+ drift * (base - reference)). ``shift`` s was added to the clock's own times. ``reason`` says why
-    the clock was chosen."""
+    """Times of the frames by one clock: ``base`` (N,) s near the robot's time, NaN where a frame has none.
+
+    A frame's nominal capture time is base + sign * offset (+ drift * (base - reference)). ``shift`` s was added to the
+    clock's own times. ``reason`` says why the clock was chosen.
+    """
 
     kind: str
     base: Array
@@ -54,7 +56,8 @@ def choose_clock(frames: ObservedFrames) -> FrameClock:
     if not abs(rate - 1.0) < _MOST_DRIFT:
         return arrival_clock(
             frames,
-            f"The device times advance {rate:.3g} times as slowly as the robot's; they are not in seconds or not of the frames.",
+            f"The device times advance {rate:.3g} times as slowly as the robot's; they are not in seconds or not of the"
+            " frames.",
         )
     late = arrival - device
     shift = float(np.median(late))

@@ -1,16 +1,17 @@
-"""Estimates X_BC and the scanner's clock together from frames taken in motion, with the variances of all that is random in them.
+"""Estimates X_BC and the scanner's clock together from frames taken in motion, with the variances of all that is random
+in them.
 
 Model of frame k, with capture time t_k = nominal_k(offset, drift, rolling) + j_k and random j_k (variance sigma_j^2):
 
     X_BC p_C,k - p_BR(t_k) = e_k,    R_BC n_C,k - n_BR(t_k) = m_k.
 
-j_k is eliminated, so that frame k has the covariance S_k + sigma_j^2 g_k g_k^T with g_k the rates of centre and normal. The motion
-is linearised at each frame's own most probable capture time, not at the nominal one, since jitter takes a frame past the ends of a
-move. The variances (a factor of the fit's own noise, a common spread of centres and of normals, sigma_j) solve the equations of
-restricted maximum likelihood.
+j_k is eliminated, so that frame k has the covariance S_k + sigma_j^2 g_k g_k^T with g_k the rates of centre and normal.
+The motion is linearised at each frame's own most probable capture time, not at the nominal one, since jitter takes a
+frame past the ends of a move. The variances (a factor of the fit's own noise, a common spread of centres and of
+normals, sigma_j) solve the equations of restricted maximum likelihood.
 
-A scanner on the flange that sees a fixed target is the same with the inverted motion: X_FC p_C,k - X_FB(t_k) p_BT = e_k. The target's
-centre p_BT and the two angles of its normal are then unknown, too.
+A scanner on the flange that sees a fixed target is the same with the inverted motion: X_FC p_C,k - X_FB(t_k) p_BT =
+e_k. The target's centre p_BT and the two angles of its normal are then unknown, too.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.variances import (
     FREE_S2,
-    Linearised,
+    LinearisedStream,
     Variances,
     frame_weights,
     new_variances,
@@ -57,12 +58,16 @@ _PRIOR = np.array([0.0] * 9 + [1.0 / 3.0**2] + [0.0] * 5)  # information: edges 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClockFit:
-    """Result of the joint fit of N frames. ``X_BC``; ``offset`` s and ``drift`` of the FrameClock's nominal times, ``rolling`` s, ``edge`` height of the
-    edges found over the face's noise; ``free`` indices of the unknowns that were estimated (0..5: X_BC, rotation then translation on the base side about ``pivot``);
-    ``information`` (K, K) of those; ``keep`` (N,) frames used; ``late`` (N,) frames whose time was left free; ``capture`` (N,) s most
-    probable capture times and ``nominal`` (N,) s; ``centre`` (N, 3) m residuals at the capture times and ``lean`` (N, 2) rad those of
-    the normals; ``rates`` (N, 3) m/s of the centre; ``jitters`` (N,) s as each frame alone tells it, and their variances
-    ``jitter_variance`` (N,) s^2; ``weighted`` (N, K) scores. ``X_FR``: the feature on what moves; where TARGET is free, X_BT as estimated."""
+    """Result of the joint fit of N frames.
+
+    ``X_BC``; ``offset`` s and ``drift`` of the FrameClock's nominal times, ``rolling`` s, ``edge`` height of the edges
+    found over the face's noise; ``free`` indices of the unknowns that were estimated (0..5: X_BC, rotation then
+    translation on the base side about ``pivot``); ``information`` (K, K) of those; ``keep`` (N,) frames used; ``late``
+    (N,) frames whose time was left free; ``capture`` (N,) s most probable capture times and ``nominal`` (N,) s;
+    ``centre`` (N, 3) m residuals at the capture times and ``lean`` (N, 2) rad those of the normals; ``rates`` (N, 3)
+    m/s of the centre; ``jitters`` (N,) s as each frame alone tells it, and their variances ``jitter_variance`` (N,)
+    s^2; ``weighted`` (N, K) scores. ``X_FR``: the feature on what moves; where TARGET is free, X_BT as estimated.
+    """
 
     X_BC: RigidTransform
     offset: float
@@ -109,7 +114,8 @@ class MotionProblem:
     def residuals(
         self, X: RigidTransform, t: Array, rolling: float, edge: float
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """Residuals e (N, 3), m (N, 2) and rates v (N, 3), turn (N, 2) at times t, and the tangents A (N, 3, 2) of the normal."""
+        """Residuals e (N, 3), m (N, 2) and rates v (N, 3), turn (N, 2) at times t, and the tangents A (N, 3, 2) of the
+        normal."""
         f = self.frames
         at = self.motion.feature(t, self.X_FR)
         R = X.rotation().matrix()
@@ -137,9 +143,10 @@ def fit_clock(
 ) -> ClockFit:
     """Fit X_BC and the clock from a start that is right to some millimetres and tens of milliseconds.
 
-    ``offset`` s is that of ``clock``; ``free``: which unknowns to estimate. ``keep`` (N,) limits the frames, for cross-validation.
-    ``after``: a fit of the same frames whose drift, rolling time, variances and capture times begin this one.
-    Gauss-Newton with the pivot of rotations at the middle of the feature's places; frames with gross errors are left out.
+    ``offset`` s is that of ``clock``; ``free``: which unknowns to estimate. ``keep`` (N,) limits the frames, for
+    cross-validation. ``after``: a fit of the same frames whose drift, rolling time, variances and capture times begin
+    this one. Gauss-Newton with the pivot of rotations at the middle of the feature's places; frames with gross errors
+    are left out.
     """
     problem = MotionProblem(frames, clock, motion, X_FR)
     moving_target = TARGET[0] in free
@@ -242,7 +249,8 @@ def _tangents(n: Array) -> Array:
 def _first_variances(
     problem: MotionProblem, X: RigidTransform, nominal: Array, allowed: Flags
 ) -> tuple[Variances, Flags]:
-    """Variances from medians of the start's residuals, across and along the motion, and the frames that agree with them."""
+    """Variances from medians of the start's residuals, across and along the motion, and the frames that agree with
+    them."""
     e, m, v, _, _ = problem.residuals(X, nominal, 0.0, 0.0)
     speed = np.linalg.norm(v, axis=1)
     fast = allowed & (speed > 0.3 * float(np.nanmax(np.where(allowed, speed, 0.0), initial=0.0))) & (speed > 1e-3)
@@ -313,9 +321,9 @@ def _polished_capture(
 
 def linearised(
     problem: MotionProblem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, edge: float, pivot: Array
-) -> Linearised:
-    """The model at capture times (N,) s: residuals extrapolated to the nominal times, and their derivatives by all unknowns. ``rolling``
-    s, ``edge`` in noises of the face, rotations about ``pivot`` (3,) m."""
+) -> LinearisedStream:
+    """The model at capture times (N,) s: residuals extrapolated to the nominal times, and their derivatives by all
+    unknowns. ``rolling`` s, ``edge`` in noises of the face, rotations about ``pivot`` (3,) m."""
     f = problem.frames
     e, m, v, turn, A = problem.residuals(X, capture, rolling, edge)
     R = X.rotation().matrix()
@@ -343,11 +351,11 @@ def linearised(
     bad = ~np.isfinite(y).all(axis=1)
     for array in (y, J, g):
         array[bad] = np.nan
-    return Linearised(y, J, g, own, own_lean)
+    return LinearisedStream(y, J, g, own, own_lean)
 
 
 def _sorted_frames(
-    linear: Linearised, variances: Variances, W: Array, allowed: Flags, kept: Flags, late: Flags, step: int
+    linear: LinearisedStream, variances: Variances, W: Array, allowed: Flags, kept: Flags, late: Flags, step: int
 ) -> tuple[Flags, Flags, bool]:
     """Frames to use and frames whose time is grossly late, from the present residuals; whether both sets stayed."""
     if step < 2 or step > 25:

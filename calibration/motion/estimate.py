@@ -1,9 +1,9 @@
 """Calibrates from frames in motion: chooses the clock and the model, fits, and says what the motion leaves open.
 
-Frames of a stream are many, and near each other: what the arm's kinematics or the scanner's warp do at one place they do in all
-frames there, so that their error does not average away with the number of frames. The covariance of residuals at two places is
-modelled as variance * exp(-(distance / length)^2 / 2), from products of residuals of different frames (an empirical covariogram,
-Cressie 1993, section 2.4), and carried through the weighted fit (the sandwich formula).
+Frames of a stream are many, and near each other: what the arm's kinematics or the scanner's warp do at one place they
+do in all frames there, so that their error does not average away with the number of frames. The covariance of residuals
+at two places is modelled as variance * exp(-(distance / length)^2 / 2), from products of residuals of different frames
+(an empirical covariogram, Cressie 1993, section 2.4), and carried through the weighted fit (the sandwich formula).
 """
 
 from dataclasses import dataclass
@@ -31,8 +31,10 @@ _MOST = 900  # frames whose pairs are looked at
 
 @dataclass(frozen=True, eq=False)
 class PlaceErrors:
-    """Errors that depend on the place: ``sigma_m`` an axis of the centre and ``sigma_rad`` an axis of the normal, correlated over
-    ``length_m``; ``found`` whether they are significant; ``meat`` (K, K): covariance of the fit's scores that they add."""
+    """Errors that depend on the place: ``sigma_m`` an axis of the centre and ``sigma_rad`` an axis of the normal,
+    correlated over ``length_m``; ``found`` whether they are significant; ``meat`` (K, K): covariance of the fit's
+    scores that they add.
+    """
 
     found: bool
     sigma_m: float
@@ -48,8 +50,9 @@ class PlaceErrors:
     def sentence(self) -> str:
         """One sentence for the user."""
         return (
-            f"The errors depend on the place by {1e3 * self.sigma_m:.3f} mm and {np.degrees(self.sigma_rad):.3f} degrees an axis (arm or "
-            f"scanner, over some {1e3 * self.length_m:.0f} mm); the stated covariance includes them."
+            f"The errors depend on the place by {1e3 * self.sigma_m:.3f} mm and {np.degrees(self.sigma_rad):.3f}"
+            f" degrees an axis (arm or scanner, over some {1e3 * self.length_m:.0f} mm); the stated covariance includes"
+            " them."
         )
 
 
@@ -99,7 +102,8 @@ def find_place_errors(fit: ClockFit, frames: ObservedFrames) -> PlaceErrors:
 
 
 def _covariogram(d: Array, products: Array, share: Array) -> tuple[float, float] | None:
-    """Variance and length of the correlated error from products of residuals (P,) at distances d (P,); None where there is none."""
+    """Variance and length of the correlated error from products of residuals (P,) at distances d (P,); None where there
+    is none."""
     near = d < _NEAR_M
     if np.count_nonzero(near) < 20:
         return None
@@ -153,12 +157,12 @@ _NAMES = (
 class MotionEstimate:
     """Calibration from N frames in motion.
 
-    ``covariance`` (6, 6) of X_BC as in CalibrationResult; ``joint`` (6 + K, 6 + K) with the clock's unknowns behind it, offset (s),
-    drift, rolling (s) as far as ``names`` lists them. ``clock`` what was found of it. ``inliers`` (N,) frames used; ``capture`` (N,) s
-    their most probable capture times on the robot's clock; ``residual_m`` (N,) distance of the centres there, ``along_m`` (N,) along
-    the motion at the time that the clock says, ``before_m`` (N,) the same if arrivals are taken for captures (X_BC fitted so),
-    ``tilt_rad`` (N,); ``held_out_m``, ``held_out_along_m``, ``held_out_tilt_rad`` (N,) from fits without the frame's own block of time.
-    ``speed`` (N,) m/s.
+    ``covariance`` (6, 6) of X_BC as in CalibrationResult; ``joint`` (6 + K, 6 + K) with the clock's unknowns behind it,
+    offset (s), drift, rolling (s) as far as ``names`` lists them. ``clock`` what was found of it. ``inliers`` (N,)
+    frames used; ``capture`` (N,) s their most probable capture times on the robot's clock; ``residual_m`` (N,) distance
+    of the centres there, ``along_m`` (N,) along the motion at the time that the clock says, ``before_m`` (N,) the same
+    if arrivals are taken for captures (X_BC fitted so), ``tilt_rad`` (N,); ``held_out_m``, ``held_out_along_m``,
+    ``held_out_tilt_rad`` (N,) from fits without the frame's own block of time. ``speed`` (N,) m/s.
     """
 
     X_BC: RigidTransform
@@ -194,18 +198,17 @@ class MotionEstimate:
 
 
 def estimate_in_motion(
-    frames: ObservedFrames,
-    motion: ContinuousMotion,
-    X_FR: RigidTransform | None = None,
-    *,
-    held_out: bool = True,
+    frames: ObservedFrames, motion: ContinuousMotion, X_FR: RigidTransform | None = None, *, held_out: bool = True
 ) -> MotionEstimate:
-    """X_BC and the scanner's clock from frames in motion. With an inverted ``motion``, of a scanner on the flange that sees a fixed target,
-    X_FC takes the place of X_BC, and the target's pose, found with it, is ``fit.X_FR``; ``X_FR`` is then not used.
+    """X_BC and the scanner's clock from frames in motion.
 
-    The device's clock is used where it runs evenly, else the arrivals. The clock's drift is estimated for a device, a rolling time
-    within the frame where it is significant. Without motion that shows the offset, X_BC comes from the frames as they are and the
-    offset is None. Raises TooFewPoses, InconsistentPoses, and UndeterminedPoses where the motion leaves X_BC open.
+    With an inverted ``motion``, of a scanner on the flange that sees a fixed target, X_FC takes the place of X_BC, and
+    the target's pose, found with it, is ``fit.X_FR``; ``X_FR`` is then not used.
+
+    The device's clock is used where it runs evenly, else the arrivals. The clock's drift is estimated for a device, a
+    rolling time within the frame where it is significant. Without motion that shows the offset, X_BC comes from the
+    frames as they are and the offset is None. Raises TooFewPoses, InconsistentPoses, and UndeterminedPoses where the
+    motion leaves X_BC open.
     """
     if len(frames) < FEWEST:
         raise TooFewPoses(f"Only {len(frames)} frames show the flange; {FEWEST} are needed, some hundred are good.")
@@ -233,14 +236,15 @@ def estimate_in_motion(
         places = find_place_errors(fit, frames)
         inverse, open_names, weak = _determined(fit, places)
         told = [
-            "The motion does not show the clock's offset: the arm hardly moves, or all of it can as well be a shift of the scanner."
+            "The motion does not show the clock's offset: the arm hardly moves, or all of it can as well be a shift of"
+            " the scanner."
         ]
     else:
         told = []
     if open_names:
         raise UndeterminedPoses(
-            f"The motion leaves X_BC open ({', '.join(open_names)}): move the flange in more than one direction, to and fro, and "
-            "tilt it by ten degrees or more."
+            f"The motion leaves X_BC open ({', '.join(open_names)}): move the flange in more than one direction, to and"
+            " fro, and tilt it by ten degrees or more."
         )
     told += [f"The motion shows {name} only to about {sigma}." for name, sigma in weak]
     outside = ~np.isfinite(fit.centre[:, 0]) | ~(motion.known(fit.nominal))
@@ -296,7 +300,8 @@ def _fitted(
     if start is None:
         begin, end = motion.span
         raise InconsistentPoses(
-            f"Too few frames were taken within the robot's stream ({begin:.3f} to {end:.3f} s); record both over the same time."
+            f"Too few frames were taken within the robot's stream ({begin:.3f} to {end:.3f} s); record both over the"
+            " same time."
         )
     X_FR = start.X_FR if motion.inverted else X_FR
     edge = () if frames.slide is None else (EDGE,)
@@ -341,8 +346,9 @@ def _check(fit: ClockFit, frames: ObservedFrames) -> None:
         )
     if used < _LEAST_SHARE * int(np.isfinite(fit.centre[:, 0]).sum()) or fit.variances.spread > _WORST_M**2:
         raise InconsistentPoses(
-            f"Only {used} of {len(frames)} frames agree with one pose of the scanner (spread {1e3 * fit.variances.spread**0.5:.1f} mm); "
-            "check units, the quaternion order and that stream.csv holds the flange's poses."
+            f"Only {used} of {len(frames)} frames agree with one pose of the scanner (spread"
+            f" {1e3 * fit.variances.spread**0.5:.1f} mm); check units, the quaternion order and that stream.csv holds"
+            " the flange's poses."
         )
 
 
@@ -356,7 +362,8 @@ def _inverse(information: Array, free: tuple[int, ...]) -> tuple[Array, Array]:
 
 
 def _determined(fit: ClockFit, places: PlaceErrors) -> tuple[Array, tuple[str, ...], list[tuple[str, str]]]:
-    """Covariance of the unknowns about the pivot, names of those that the motion leaves open, and those it shows weakly."""
+    """Covariance of the unknowns about the pivot, names of those that the motion leaves open, and those it shows
+    weakly."""
     inverse, _ = _inverse(fit.information, fit.free)
     inverse = inverse + places.excess(inverse)
     sigma = np.sqrt(np.diag(inverse))
@@ -402,10 +409,7 @@ def _along(
     """Residuals along the motion (N,) m without and with the clock's offset, and the speeds (N,) m/s."""
     plain = search_start(frames, arrival_clock(frames), motion, X_FR, delays=np.array([0.0]))
     out = []
-    for X, t in (
-        (plain.X_BC if plain is not None else start.X_BC, frames.arrival),
-        (fit.X_BC, fit.nominal),
-    ):
+    for X, t in ((plain.X_BC if plain is not None else start.X_BC, frames.arrival), (fit.X_BC, fit.nominal)):
         at = motion.feature(t, X_FR)
         e = _corrected(frames, fit) @ X.rotation().matrix().T + X.translation() - at.p
         speed = np.linalg.norm(at.v, axis=1)
@@ -416,8 +420,8 @@ def _along(
 def _held_out(
     frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion, fit: ClockFit, X_FR: RigidTransform | None
 ) -> tuple[Array, Array, Array]:
-    """Errors (N,) of each frame by a fit without its own block of time: of the centre (m) at its most probable capture time, along
-    the motion (m) at the clock's time, and of the normal (rad)."""
+    """Errors (N,) of each frame by a fit without its own block of time: of the centre (m) at its most probable capture
+    time, along the motion (m) at the clock's time, and of the normal (rad)."""
     n = len(frames)
     position, along, tilt = (np.full(n, np.nan) for _ in range(3))
     used = np.flatnonzero(fit.keep)

@@ -18,10 +18,10 @@ _LARGEST = 1e6  # sigmas beyond this are of directions that the motion does not 
 
 
 @dataclass(frozen=True)
-class Expected:
-    """What a motion is expected to tell, one sigma: ``work_m`` of a point among the flange's places (3-D), ``turn_rad`` of X_BC's
-    rotation (3-D), ``offset_s`` of the clock, ``shared`` the largest correlation 0..1 of the offset with a shift of the scanner. Infinite
-    where the motion does not show it."""
+class PredictedSigma:
+    """What a motion is expected to tell, one sigma: ``work_m`` of a point among the flange's places (3-D), ``turn_rad``
+    of X_BC's rotation (3-D), ``offset_s`` of the clock, ``shared`` the largest correlation 0..1 of the offset with a
+    shift of the scanner. Infinite where the motion does not show it."""
 
     work_m: float
     turn_rad: float
@@ -38,10 +38,12 @@ def expected_of_motion(
     normal_sigma: float = 1e-3,
     jitter_s: float = 0.015,
     X_FR: RigidTransform | None = None,
-) -> Expected:
-    """Expected sigmas of a calibration from a planned motion, with a frame every ``frame_s``, as the joint fit would state them.
+) -> PredictedSigma:
+    """Expected sigmas of a calibration from a planned motion, with a frame every ``frame_s``, as the joint fit would
+    state them.
 
-    ``jitter_s`` is that of the arrivals; for device times give their own, 0.0001 for instance. Raises InputError: less than six frames.
+    ``jitter_s`` is that of the arrivals; for device times give their own, 0.0001 for instance. Raises InputError: less
+    than six frames.
     """
     begin, end = motion.span
     t = np.arange(begin, end, frame_s)
@@ -74,7 +76,7 @@ def expected_of_motion(
     spread = np.mean([np.trace(np.hstack([S, np.eye(3)]) @ C[:6, :6] @ np.hstack([S, np.eye(3)]).T) for S in slack])
     share = float(np.abs(C[3:6, 6] / (sigma[3:6] * sigma[6])).max())
     limits = 0.01 * _LARGEST * unit
-    return Expected(
+    return PredictedSigma(
         work_m=float(np.sqrt(spread)) if (sigma[:6] < limits[:6]).all() else float("inf"),
         turn_rad=float(np.linalg.norm(sigma[:3])) if (sigma[:3] < limits[:3]).all() else float("inf"),
         offset_s=float(sigma[6]) if sigma[6] < limits[6] else float("inf"),

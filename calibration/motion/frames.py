@@ -1,4 +1,5 @@
-"""Fits the flange in every frame of a recording: a search in some frames, then near where the robot's stream says it is."""
+"""Fits the flange in every frame of a recording: a search in some frames, then near where the robot's stream says it
+is."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -27,14 +28,16 @@ _MOST_LOST = 12  # frames in a row that a whole search does not help either
 # 0.25 m/s over an exposure of 10 ms smears an edge by 2.5 mm, 0.7 mm rms, and pixel noise adds half a millimetre
 IN_MOTION = FlangeFitConfig(max_rim_rms_m=0.0012)
 """How a frame taken in motion is fitted, live and in a recording."""
-# Edges of a rough face at a slant scatter by their share of its noise, beside the common error that the calibration estimates.
+# Edges of a rough face at a slant scatter by their share of its noise, beside the common error that the calibration
+# estimates.
 _ROUGH_M, _SLANT = 3e-4, 1.0
 
 Tell = Callable[[float], None]
 
 
 class FramesSeen:
-    """Fits of the frames of a recording: ``observed`` as arrays, ``fits`` by id, and (id, reason) of those ``refused``."""
+    """Fits of the frames of a recording: ``observed`` as arrays, ``fits`` by id, and (id, reason) of those
+    ``refused``."""
 
     def __init__(self, data: MotionDataset) -> None:
         self.fits: dict[str, FlangeFit] = {}
@@ -71,7 +74,8 @@ def fit_covariance(fit: FlangeFit) -> Array:
 
 
 def _slant(fit: FlangeFit) -> Array:
-    """How far a centre (3,) moves across the face per metre that its edges are taken too low: the line of sight slides along the face."""
+    """How far a centre (3,) moves across the face per metre that its edges are taken too low: the line of sight slides
+    along the face."""
     view = fit.center_C / np.linalg.norm(fit.center_C)
     along = float(view @ fit.normal_C)
     return np.asarray((view - along * fit.normal_C) / max(abs(along), 0.1))
@@ -88,10 +92,10 @@ def see_frames(
 ) -> FramesSeen:
     """Fit the flange in every frame.
 
-    Some frames, spread over the recording, are searched whole. They give a first X_BC and delay, and with them the robot's
-    stream says where the flange is in each other frame; where it is not there, the whole frame is searched. ``X_BC``: pose to
-    begin with. An inverted ``motion`` is that of a fixed target before a scanner on the flange. Deterministic for ``seed``. Raises
-    TooFewPoses where too few frames show the flange to begin.
+    Some frames, spread over the recording, are searched whole. They give a first X_BC and delay, and with them the
+    robot's stream says where the flange is in each other frame; where it is not there, the whole frame is searched.
+    ``X_BC``: pose to begin with. An inverted ``motion`` is that of a fixed target before a scanner on the flange.
+    Deterministic for ``seed``. Raises TooFewPoses where too few frames show the flange to begin.
     """
     seen = FramesSeen(data)
     finder = _Finder(data, standard, seed)
@@ -194,7 +198,8 @@ def _place(
 
 
 def _scattered(n: int) -> Array:
-    """Ranks (n,) that visit a row of n things evenly from the first few on (van der Corput's sequence by the golden ratio)."""
+    """Ranks (n,) that visit a row of n things evenly from the first few on (van der Corput's sequence by the golden
+    ratio)."""
     return np.asarray(np.mod(np.arange(n) * 0.6180339887498949, 1.0))
 
 
@@ -202,6 +207,6 @@ def _nothing(seen: FramesSeen, tried: int) -> str:
     reasons = Counter(reason for _, reason in seen.refused)
     common = reasons.most_common(1)[0][0] if reasons else "there are too few frames"
     return (
-        f"Only {len(seen.fits)} of {tried} frames spread over the recording show the flange; {_LEAST_FIRST} are needed to begin. "
-        f"Most frequent reason: {common}"
+        f"Only {len(seen.fits)} of {tried} frames spread over the recording show the flange; {_LEAST_FIRST} are needed"
+        f" to begin. Most frequent reason: {common}"
     )

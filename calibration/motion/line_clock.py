@@ -19,8 +19,10 @@ _BLOCK_S = 0.5  # within which errors are common: the edge is not straight, the 
 
 @dataclass(frozen=True, eq=False)
 class LineClock:
-    """``offset_s``: the profile's stamp less the robot's time of the same instant, and its standard deviation ``sigma_s``; a ``point``
-    (3,) m and the ``direction`` (3,) of the edge in the base; ``rms_m`` the points' distance from it, and ``before_m`` at offset zero."""
+    """``offset_s``: the profile's stamp less the robot's time of the same instant, and its standard deviation
+    ``sigma_s``; a ``point`` (3,) m and the ``direction`` (3,) of the edge in the base; ``rms_m`` the points' distance
+    from it, and ``before_m`` at offset zero.
+    """
 
     offset_s: float
     sigma_s: float
@@ -33,9 +35,10 @@ class LineClock:
 def offset_from_line(time: Array, points_P: Array, X_FP: Array, motion: ContinuousMotion) -> LineClock:
     """Clock offset of a profiler on the flange from points of one straight edge.
 
-    ``time`` (n,) s stamps of the profiles; ``points_P`` (n, 3) m where each profile crosses the edge, profiler frame; ``X_FP`` (4, 4)
-    the profiler in the flange. A wrong time moves a point by the velocity across the edge: where that velocity is the same all
-    along, it looks like a shift of the edge. Raises TooFewPoses, and UndeterminedPoses where the motion does not show the offset.
+    ``time`` (n,) s stamps of the profiles; ``points_P`` (n, 3) m where each profile crosses the edge, profiler frame;
+    ``X_FP`` (4, 4) the profiler in the flange. A wrong time moves a point by the velocity across the edge: where that
+    velocity is the same all along, it looks like a shift of the edge. Raises TooFewPoses, and UndeterminedPoses where
+    the motion does not show the offset.
     """
     order = np.argsort(time, kind="stable")
     time, points = np.asarray(time, dtype=float)[order], np.asarray(points_P, dtype=float)[order]
@@ -43,7 +46,8 @@ def offset_from_line(time: Array, points_P: Array, X_FP: Array, motion: Continuo
     inside = motion.known(time - _WIDEST_S) & motion.known(time + _WIDEST_S)
     if np.count_nonzero(inside) < _FEWEST:
         raise TooFewPoses(
-            f"{int(np.count_nonzero(inside))} profiles lie within the robot's stream; {_FEWEST} are needed, half a second from its ends."
+            f"{int(np.count_nonzero(inside))} profiles lie within the robot's stream; {_FEWEST} are needed, half a"
+            " second from its ends."
         )
     time, points = time[inside] - zero, points[inside]
 
@@ -87,7 +91,8 @@ def offset_from_line(time: Array, points_P: Array, X_FP: Array, motion: Continuo
     offset = start + float(x[4])
     if sigma > _OPEN_S or abs(offset) > _WIDEST_S - 2.0 * _STEP_S or float(N[4, 4]) < 1e-6:
         raise UndeterminedPoses(
-            "The motion does not show the profiler's clock offset: cross the edge to and fro, so that the velocity across it changes its sign."
+            "The motion does not show the profiler's clock offset: cross the edge to and fro, so that the velocity"
+            " across it changes its sign."
         )
     a, b = point + side.T @ x[:2], direction + side.T @ x[2:4] / half
     rms = float(np.sqrt(np.mean(np.sum((residuals(x) * scale) ** 2, axis=1))))

@@ -1,8 +1,10 @@
-"""Synchronises two streams of poses for hand-eye calibration: the clock offset between a robot's hand and a camera, and pose pairs.
+"""Synchronises two streams of poses for hand-eye calibration: the clock offset between a robot's hand and a camera, and
+pose pairs.
 
-Equation (eye in hand; the other mounting alike): H(t - d) X = Y E(t), with H the robot's hand in its base on the robot's clock, E the
-camera in the target's frame on its own clock, and d the camera's stamps less the robot's time of the same instant. The offset is
-searched by correlating the angular speeds, which no unknown pose changes (Furrer et al. 2017), then estimated together with X and Y.
+Equation (eye in hand; the other mounting alike): H(t - d) X = Y E(t), with H the robot's hand in its base on the
+robot's clock, E the camera in the target's frame on its own clock, and d the camera's stamps less the robot's time of
+the same instant. The offset is searched by correlating the angular speeds, which no unknown pose changes (Furrer et al.
+2017), then estimated together with X and Y.
 """
 
 import itertools
@@ -55,7 +57,8 @@ _LEAST_TURN = 0.02  # rad/s (rms): slower motion shows no offset by its speed
 
 @dataclass(frozen=True, eq=False)
 class PoseStreams:
-    """Two recorded streams: times (n,), (m,) s and poses ``hand`` X_BF (n, 4, 4) and ``eye`` X_world_eye (m, 4, 4) in metres."""
+    """Two recorded streams: times (n,), (m,) s and poses ``hand`` X_BF (n, 4, 4) and ``eye`` X_world_eye (m, 4, 4) in
+    metres."""
 
     hand_time: Array
     hand: Array
@@ -64,10 +67,10 @@ class PoseStreams:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Synchronised:
-    """``offset_s``: time of the eye's stamps less the hand's time of the same instant, ``sigma_s`` its standard deviation; ``X`` eye in
-    the hand, ``Y`` world in the base, 4 x 4; ``rms_deg`` and ``rms_m`` of the frames; ``pairs`` for the solvers; ``before_m`` the rms
-    at offset zero with the same poses."""
+class ClockOffset:
+    """``offset_s``: time of the eye's stamps less the hand's time of the same instant, ``sigma_s`` its standard
+    deviation; ``X`` eye in the hand, ``Y`` world in the base, 4 x 4; ``rms_deg`` and ``rms_m`` of the frames; ``pairs``
+    for the solvers; ``before_m`` the rms at offset zero with the same poses."""
 
     offset_s: float
     sigma_s: float
@@ -82,8 +85,8 @@ class Synchronised:
     def sentence(self) -> str:
         """One sentence for the user."""
         return (
-            f"The camera's stamps are {1e3 * self.offset_s:+.2f} +- {1e3 * self.sigma_s:.2f} ms later than the hand's (one sigma); "
-            f"{len(self.pairs.robot)} pairs at that offset."
+            f"The camera's stamps are {1e3 * self.offset_s:+.2f} +- {1e3 * self.sigma_s:.2f} ms later than the hand's"
+            f" (one sigma); {len(self.pairs.robot)} pairs at that offset."
         )
 
 
@@ -117,7 +120,8 @@ def read_streams(path: Path) -> PoseStreams:
 
 
 def are_trajectories(robot: Listing, camera: Listing) -> bool:
-    """Whether two lists of poses with times are recordings in motion, of different lengths: they pair by interpolation."""
+    """Whether two lists of poses with times are recordings in motion, of different lengths: they pair by
+    interpolation."""
     if len(robot) == len(camera):
         return False
     for one in (robot, camera):
@@ -131,8 +135,9 @@ def are_trajectories(robot: Listing, camera: Listing) -> bool:
 
 def synchronise_lists(
     robot: Listing, camera: Listing, *, mounting: str = "eye_in_hand", source: str = "trajectories"
-) -> Synchronised:
-    """Clock offset, both poses and pairs of two trajectories, the camera's as X_CM or as the camera in the target's or the world's frame.
+) -> ClockOffset:
+    """Clock offset, both poses and pairs of two trajectories, the camera's as X_CM or as the camera in the target's or
+    the world's frame.
 
     Orders of quaternions and the direction of the camera's poses follow from the residuals where nobody states them.
 
@@ -144,18 +149,20 @@ def synchronise_lists(
     if len(a) * len(b) > _MOST_READINGS:
         who = "robot" if len(a) >= len(b) else "camera"
         raise DatasetError(
-            f"The rotations of '{(robot if who == 'robot' else camera).name}' can be read in {max(len(a), len(b))} ways. State how they are written, "
-            f"for example --{who}-form {(a if who == 'robot' else b)[0].form}."
+            f"The rotations of '{(robot if who == 'robot' else camera).name}' can be read in {max(len(a), len(b))}"
+            f" ways. State how they are written, for example --{who}-form {(a if who == 'robot' else b)[0].form}."
         )
-    tried: list[tuple[float, Synchronised, str, str]] = []
+    tried: list[tuple[float, ClockOffset, str, str]] = []
     problem: WeldcalError | None = None
     for one, other in itertools.product(a, b):
         for inverted in (False, True):
             eye = _metres(other.X, camera.unit)
             streams = PoseStreams(
-                _good(robot.times, robot), _metres(one.X, robot.unit)[robot.good], _good(camera.times, camera),
+                _good(robot.times, robot),
+                _metres(one.X, robot.unit)[robot.good],
+                _good(camera.times, camera),
                 (eye if inverted else inverse(eye))[camera.good],
-            )  # fmt: skip
+            )
             try:
                 found = synchronise(streams, mounting=mounting, source=source)
             except WeldcalError as why:
@@ -170,8 +177,8 @@ def synchronise_lists(
     tried.sort(key=lambda t: t[0])
     if len(tried) > 1 and tried[1][0] < _FAR_BETTER**2 * tried[0][0]:
         raise DatasetError(
-            f"Two readings of the trajectories fit alike: {tried[0][2]} with {tried[0][3]}, and {tried[1][2]} with {tried[1][3]}. State one with "
-            "--robot-form and --camera-form."
+            f"Two readings of the trajectories fit alike: {tried[0][2]} with {tried[0][3]}, and {tried[1][2]} with"
+            f" {tried[1][3]}. State one with --robot-form and --camera-form."
         )
     _, found, form, other_form = tried[0]
     reading = {
@@ -205,12 +212,12 @@ def _metres(X: Array, unit: str) -> Array:
     return out
 
 
-def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: str = "streams") -> Synchronised:
+def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: str = "streams") -> ClockOffset:
     """Clock offset and both poses from two streams, and pairs at the offset for the solvers of hand-eye calibration.
 
-    The eye's stamps are used as they are; X and Y are those of the mounting. The standard deviation of the offset counts errors as
-    common within a second (the sandwich formula by blocks of time). Raises UndeterminedPoses where the hand hardly turns,
-    DatasetError where the streams do not overlap.
+    The eye's stamps are used as they are; X and Y are those of the mounting. The standard deviation of the offset
+    counts errors as common within a second (the sandwich formula by blocks of time). Raises UndeterminedPoses where the
+    hand hardly turns, DatasetError where the streams do not overlap.
     """
     # numerical derivatives need times near zero
     zero = float(streams.hand_time[0])
@@ -268,7 +275,7 @@ def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: 
     known = hand.known(t)
     before = residuals(none)[:, 3:] * scales[1]
     pairs = PosePairs(source=source, robot=hand.poses(t[chosen] - offset), camera=inverse(E[chosen]), mode=mounting)
-    return Synchronised(
+    return ClockOffset(
         offset_s=offset,
         sigma_s=sigma,
         X=A,
@@ -287,8 +294,8 @@ def _correlated(streams: PoseStreams, hand: ContinuousMotion) -> float:
     end = min(hand.span[1], eye.span[1] + _WIDEST_S) - _RATE_S
     if end - begin < 2.0:
         raise DatasetError(
-            f"The streams overlap for less than two seconds (hand {hand.span[0]:.3f} to {hand.span[1]:.3f} s, eye {eye.span[0]:.3f} to "
-            f"{eye.span[1]:.3f} s); give both on clocks that agree to {_WIDEST_S:g} s."
+            f"The streams overlap for less than two seconds (hand {hand.span[0]:.3f} to {hand.span[1]:.3f} s, eye"
+            f" {eye.span[0]:.3f} to {eye.span[1]:.3f} s); give both on clocks that agree to {_WIDEST_S:g} s."
         )
     t = np.arange(begin, end, 2.0 * _STEP_S)
     of_hand = _speed(hand, t)
@@ -322,7 +329,10 @@ def _jacobian(f: Callable[[Array], Array], x: Array, unit: Array) -> Array:
 
 
 def _sigma(J: Array, r: Array, t: Array) -> float:
-    """Standard deviation of the last unknown, with errors common within blocks of time. J (6 n, K), residuals r (n, 6)."""
+    """Standard deviation of the last unknown, with errors common within blocks of time.
+
+    J (6 n, K), residuals r (n, 6).
+    """
     weight = 1.0 / np.sqrt(1.0 + (r.ravel() / _SOFT) ** 2)  # of the soft loss
     N = J.T @ (weight[:, None] * J)
     d = np.sqrt(np.maximum(np.diag(N), 1e-30))

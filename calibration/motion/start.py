@@ -23,8 +23,10 @@ _LEAST_KNOWN = 0.5  # of the frames must lie within the stream
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Coarse result: the delay (s) of the clock's base behind capture, X_BC, and the curve of cost against delay: ``delays`` (D,) s
-    and ``rms_m`` (D,) of the better part of the frames, NaN where too few lie within the stream. ``X_FR``: the feature on what moves, or the fixed target X_BT."""
+    """Coarse result: the delay (s) of the clock's base behind capture, X_BC, and the curve of cost against delay:
+    ``delays`` (D,) s and ``rms_m`` (D,) of the better part of the frames, NaN where too few lie within the stream.
+    ``X_FR``: the feature on what moves, or the fixed target X_BT.
+    """
 
     delay_s: float
     X_BC: RigidTransform
@@ -41,8 +43,9 @@ def search_start(
     *,
     delays: Array | None = None,
 ) -> Start | None:
-    """The delay, searched from EARLIEST_S to LATEST_S (or only those given, s), with the least error of a rigid fit; None where no delay puts enough frames
-    within the stream. Centres and normals are used together, so that a motion along a line is enough for a start."""
+    """The delay, searched from EARLIEST_S to LATEST_S (or only those given, s), with the least error of a rigid fit;
+    None where no delay puts enough frames within the stream. Centres and normals are used together, so that a motion
+    along a line is enough for a start."""
     usable = np.flatnonzero(np.isfinite(clock.base))
     if len(usable) < 3:
         return None
@@ -78,7 +81,8 @@ def plausible(delays: Array, cost: Array) -> float:
 def _costs(
     frames: ObservedFrames, base: Array, delays: Array, motion: ContinuousMotion, X_FR: RigidTransform | None
 ) -> tuple[Array, Array, Array]:
-    """Mean square errors (D,) m^2 of the better frames, NaN where too few are known, rotations (D, 3, 3) and positions (D, 3)."""
+    """Mean square errors (D,) m^2 of the better frames, NaN where too few are known, rotations (D, 3, 3) and positions
+    (D, 3)."""
     t = base - delays[:, None]
     X = motion.poses(t.ravel())
     if X_FR is not None:

@@ -1,4 +1,5 @@
-"""Searches the clock's offset of a scanner on the flange coarsely: for each of many offsets a fit of X_FC and of the fixed target."""
+"""Searches the clock's offset of a scanner on the flange coarsely: for each of many offsets a fit of X_FC and of the
+fixed target."""
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -21,11 +22,11 @@ _STEP_RAD = 1.5e-8  # of a difference: the root of the machine's precision
 
 
 def search_in_hand(frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion) -> Start | None:
-    """The delay from EARLIEST_S to LATEST_S that fits best, with X_FC (as ``X_BC``) and the target X_BT (as ``X_FR``); ``motion`` is
-    inverted. None where no delay puts enough frames within the stream.
+    """The delay from EARLIEST_S to LATEST_S that fits best, with X_FC (as ``X_BC``) and the target X_BT (as ``X_FR``);
+    ``motion`` is inverted. None where no delay puts enough frames within the stream.
 
-    For a delay, R_BF (R_FC p_C + p_FC) + p_BF = p_BT and R_BF R_FC n_C = n_BT are linear in the nine elements of R_FC, p_FC, p_BT
-    and n_BT. The rotation nearest to those elements begins a robust fit with eleven unknowns.
+    For a delay, R_BF (R_FC p_C + p_FC) + p_BF = p_BT and R_BF R_FC n_C = n_BT are linear in the nine elements of R_FC,
+    p_FC, p_BT and n_BT. The rotation nearest to those elements begins a robust fit with eleven unknowns.
     """
     usable = np.flatnonzero(np.isfinite(clock.base))
     if len(usable) < _FEWEST:
@@ -56,7 +57,8 @@ def search_in_hand(frames: ObservedFrames, clock: FrameClock, motion: Continuous
 def _at(
     frames: ObservedFrames, base: Array, delay: float, motion: ContinuousMotion
 ) -> tuple[float, Array, Array, Array, Array]:
-    """Mean square error (m^2) of the better frames at a delay (s), R_FC, p_FC, p_BT and n_BT; NaN where too few are known."""
+    """Mean square error (m^2) of the better frames at a delay (s), R_FC, p_FC, p_BT and n_BT; NaN where too few are
+    known."""
     X_FB = motion.poses(base - delay)
     known = np.isfinite(X_FB[:, 0, 0])
     nothing = (float("nan"), np.eye(3), np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
@@ -77,7 +79,8 @@ def _at(
         return np.asarray(np.concatenate([e, _ARM_M * m], axis=1).ravel())
 
     def slopes(x: Array) -> Array:
-        # forward differences for the rotation only: a call of the residuals for each of eleven unknowns takes most of the search
+        # forward differences for the rotation only: a call of the residuals for each of eleven unknowns takes most of
+        # the search
         J = np.zeros((len(R_B), 6, 11))
         n = n_T + x[9] * a + x[10] * b
         length = np.linalg.norm(n)

@@ -1,4 +1,5 @@
-"""Interpolates a robot's recorded stream in continuous time: smoothed joints or poses, velocities, and where it has no data."""
+"""Interpolates a robot's recorded stream in continuous time: smoothed joints or poses, velocities, and where it has no
+data."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -29,8 +30,8 @@ _HELD_SHARE = 0.4  # of the samples in motion that repeat, for a stream to count
 
 @dataclass(frozen=True, eq=False)
 class FeatureMotion:
-    """Motion of the flange feature at N times, base frame: centre ``p`` (N, 3) m, outward normal ``n`` (N, 3), and their rates
-    ``v`` (N, 3) m/s and ``turn`` (N, 3) 1/s. NaN where the stream has no data."""
+    """Motion of the flange feature at N times, base frame: centre ``p`` (N, 3) m, outward normal ``n`` (N, 3), and
+    their rates ``v`` (N, 3) m/s and ``turn`` (N, 3) 1/s. NaN where the stream has no data."""
 
     p: Array
     n: Array
@@ -41,9 +42,10 @@ class FeatureMotion:
 class ContinuousMotion:
     """Flange pose X_BF as a function of the robot's time, from its stream.
 
-    Joints (or positions and quaternions) are smoothed by local parabolas; how wide is found by leave-one-out prediction of the
-    stream itself, so that a clean stream is hardly touched, and jitter of its times and rounding are averaged. In between, cubic
-    Hermite polynomials through the parabolas' values and slopes. No value is given across a gap or outside the stream.
+    Joints (or positions and quaternions) are smoothed by local parabolas; how wide is found by leave-one-out prediction
+    of the stream itself, so that a clean stream is hardly touched, and jitter of its times and rounding are averaged.
+    In between, cubic Hermite polynomials through the parabolas' values and slopes. No value is given across a gap or
+    outside the stream.
 
     ``inverted``: the poses are X_FB. A scanner on the flange sees the fixed world move so.
     """
@@ -128,7 +130,8 @@ def _continuous_quaternions(R: Array) -> Array:
 
 
 def _held(t: Array, values: Array) -> Flags:
-    """Samples (n,) that repeat the one before because the robot had not updated it yet; none where that is not usual."""
+    """Samples (n,) that repeat the one before because the robot had not updated it yet; none where that is not
+    usual."""
     same = np.concatenate([[False], (np.diff(values, axis=0) == 0.0).all(axis=1)])
     first = np.maximum.accumulate(np.where(same, 0, np.arange(len(t))))
     runs = np.bincount(first, minlength=len(t))  # samples of the run that begins here
@@ -141,10 +144,12 @@ def _held(t: Array, values: Array) -> Flags:
 
 
 def _smoothed(t: Array, values: Array, bounds: NDArray[np.int64]) -> tuple[Array, Array, int]:
-    """Values and slopes (n, c) of local parabolas, and their half width in samples: half of that with the least leave-one-out error.
+    """Values and slopes (n, c) of local parabolas, and their half width in samples: half of that with the least
+    leave-one-out error.
 
-    That one balances noise and bias of a single time. Here the noise averages over the frames, while the bias where a move's
-    acceleration jumps is the same in every lap; half the width has a quarter of the bias and 1.4 times the noise.
+    That one balances noise and bias of a single time. Here the noise averages over the frames, while the bias where a
+    move's acceleration jumps is the same in every lap; half the width has a quarter of the bias and 1.4 times the
+    noise.
     """
     step = float(np.median(np.diff(t)))
     best: tuple[float, int] | None = None
@@ -165,8 +170,8 @@ def _smoothed(t: Array, values: Array, bounds: NDArray[np.int64]) -> tuple[Array
 
 
 def _parabolas(t: Array, values: Array, bounds: NDArray[np.int64], m: int) -> tuple[Array, Array, float]:
-    """Local parabolas over ``m`` samples on either side: values and slopes (n, c), and the mean square of the errors with
-    which each sample is predicted without itself."""
+    """Local parabolas over ``m`` samples on either side: values and slopes (n, c), and the mean square of the errors
+    with which each sample is predicted without itself."""
     fitted, slopes = values.copy(), np.zeros_like(values)
     total, count = 0.0, 0
     for a, b in pairwise(bounds.tolist()):

@@ -23,9 +23,11 @@ _WORST_S = 0.01  # a less certain offset is not used
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Synchronised:
-    """Nominal capture times (N,) s on the robot's clock, NaN where a frame has none, and how they were found: ``clock`` of the
-    frames, its delay (s, capture = base - delay + drift (base - reference)) with a standard deviation, both None where neither the
-    motion nor the calibration tells it, the drift, and the jitter (s) of single frames; ``source`` is "recording" or "calibration"."""
+    """Nominal capture times (N,) s on the robot's clock, NaN where a frame has none, and how they were found: ``clock``
+    of the frames, its delay (s, capture = base - delay + drift (base - reference)) with a standard deviation, both None
+    where neither the motion nor the calibration tells it, the drift, and the jitter (s) of single frames; ``source`` is
+    "recording" or "calibration".
+    """
 
     clock: FrameClock
     times: Array
@@ -44,13 +46,13 @@ def synchronise(
     X_FR: RigidTransform | None = None,
     known: ScannerClock | None = None,
 ) -> Synchronised:
-    """Find the clock's delay in a recording itself, with the scanner near ``X_BC``; ``known`` is a calibration's clock, used where
-    the recording does not show it.
+    """Find the clock's delay in a recording itself, with the scanner near ``X_BC``; ``known`` is a calibration's clock,
+    used where the recording does not show it.
 
-    First a search: for each delay the residuals e_k = X_BC p_C,k - p_BR(t_k), without their median, which takes out a scanner
-    that stands a little elsewhere; the delay with the least median of |e|. A scanner that moves by some millimetres in the middle
-    does not change which delay is the best, since what the motion makes of a wrong one changes its sign with the motion. Then the
-    joint fit of ``fit_clock``, whose pose is left free and given up.
+    First a search: for each delay the residuals e_k = X_BC p_C,k - p_BR(t_k), without their median, which takes out a
+    scanner that stands a little elsewhere; the delay with the least median of |e|. A scanner that moves by some
+    millimetres in the middle does not change which delay is the best, since what the motion makes of a wrong one
+    changes its sign with the motion. Then the joint fit of ``fit_clock``, whose pose is left free and given up.
     """
     clock = choose_clock(frames)
     coarse = _search(frames, clock, motion, X_BC, X_FR)
@@ -123,7 +125,8 @@ def _search(
 
 
 def _spreads(seen: Array, base: Array, delays: Array, motion: ContinuousMotion, X_FR: RigidTransform | None) -> Array:
-    """Median distances (D,) m of the residuals from their median; NaN where fewer than half of the frames lie in the stream."""
+    """Median distances (D,) m of the residuals from their median; NaN where fewer than half of the frames lie in the
+    stream."""
     X = motion.poses((base - delays[:, None]).ravel())
     if X_FR is not None:
         X = X @ X_FR.GetAsMatrix4()

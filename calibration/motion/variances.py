@@ -1,4 +1,5 @@
-"""Variances of what is random in frames taken in motion, by restricted maximum likelihood, and the weights that follow."""
+"""Variances of what is random in frames taken in motion, by restricted maximum likelihood, and the weights that
+follow."""
 
 from dataclasses import dataclass
 
@@ -17,7 +18,8 @@ FREE_S2 = 1.0  # variance of the time of a frame that is grossly late
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """``factor`` of the fits' own covariances; ``spread`` m^2 and ``lean`` rad^2 beyond them, an axis; ``jitter`` s^2."""
+    """``factor`` of the fits' own covariances; ``spread`` m^2 and ``lean`` rad^2 beyond them, an axis; ``jitter``
+    s^2."""
 
     factor: float
     spread: float
@@ -31,9 +33,9 @@ class Variances:
 
 
 @dataclass(eq=False)
-class Linearised:
-    """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5), Jacobians J (N, 5, 15),
-    rates g (N, 5) and the unit covariances of the three kinds of noise in 5 x 5."""
+class LinearisedStream:
+    """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5),
+    Jacobians J (N, 5, 15), rates g (N, 5) and the unit covariances of the three kinds of noise in 5 x 5."""
 
     y: Array
     J: Array
@@ -42,9 +44,11 @@ class Linearised:
     own_lean: Array
 
 
-def total_variances(linear: Linearised, variances: Variances, keep: Flags) -> Array:
-    """Mean variances of a centre and a normal, an axis, and of the time: what the weights follow from. The share of the fits' own noise
-    in them converges slowly, and matters little."""
+def total_variances(linear: LinearisedStream, variances: Variances, keep: Flags) -> Array:
+    """Mean variances of a centre and a normal, an axis, and of the time: what the weights follow from.
+
+    The share of the fits' own noise in them converges slowly, and matters little.
+    """
     own = np.einsum("nii->", linear.own[keep]) / (3.0 * np.count_nonzero(keep))
     lean = np.einsum("nii->", linear.own_lean[keep]) / (2.0 * np.count_nonzero(keep))
     return np.array(
@@ -52,7 +56,7 @@ def total_variances(linear: Linearised, variances: Variances, keep: Flags) -> Ar
     )
 
 
-def noise_covariances(linear: Linearised, variances: Variances) -> Array:
+def noise_covariances(linear: LinearisedStream, variances: Variances) -> Array:
     """Covariances (N, 5, 5) without the jitter."""
     P = variances.factor * (linear.own + linear.own_lean)
     P[:, range(3), range(3)] += variances.spread
@@ -60,7 +64,7 @@ def noise_covariances(linear: Linearised, variances: Variances) -> Array:
     return P
 
 
-def frame_weights(linear: Linearised, variances: Variances, late: Flags) -> Array:
+def frame_weights(linear: LinearisedStream, variances: Variances, late: Flags) -> Array:
     """Inverse covariances (N, 5, 5) with the jitter."""
     j = np.where(late, FREE_S2, variances.jitter)
     V = noise_covariances(linear, variances) + j[:, None, None] * linear.g[:, :, None] * linear.g[:, None, :]
@@ -69,7 +73,7 @@ def frame_weights(linear: Linearised, variances: Variances, late: Flags) -> Arra
 
 
 def new_variances(
-    linear: Linearised,
+    linear: LinearisedStream,
     variances: Variances,
     W: Array,
     information: Array,

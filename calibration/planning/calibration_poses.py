@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
-from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes, self_distance
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, lowest_point, occludes, self_distance
 from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
@@ -26,9 +26,9 @@ class PlannerConfig:
     ``theta_max_rad``: largest angle between face normal and line of sight (paper, section 2.1.4). ``table_z_m``: height
     of the table in B; ``margin_m`` above it. ``image_margin``: share of the image kept free at each side, and of the
     working range at each end, for an uncertain X_BC. ``sight_margin_m``: how far the scanner may stand from its guess
-    without the arm coming into its sight. ``feature_radius_m``: outer radius of the flange or ring.
-    ``max_travel_rad``: farthest any joint may go from the start. ``surroundings``: what else the arm must not touch. The sigmas weigh positions and normals in the
-    information.
+    without the arm coming into its sight. ``feature_radius_m``: outer radius of the flange or ring. ``max_travel_rad``:
+    farthest any joint may go from the start. ``surroundings``: what else the arm must not touch. The sigmas weigh
+    positions and normals in the information.
     """
 
     seed: int = 0
@@ -75,8 +75,8 @@ def plan_calibration_poses(
     config: PlannerConfig | None = None,
     tool: Sequence[Capsule] = (),
 ) -> list[PlannedPose]:
-    """Plan ``n`` (>= 4) flange poses, most informative first: greedy D-optimal on the information of X_BC about the work
-    point.
+    """Plan ``n`` (>= 4) flange poses, most informative first: greedy D-optimal on the information of X_BC about the
+    work point.
 
     A constant bias of the feature in the flange counts as unknown too, so tilts and turns of the flange are valued.
     ``tool`` are capsules in the frame F that must clear the table and must not hide the feature. Deterministic for
@@ -190,7 +190,7 @@ def _refuse(
     X_BC: RigidTransform,
     X_BR: RigidTransform,
     ring_R: Array,
-    bodies: list[Body],
+    bodies: list[LinkCapsule],
     q_start: Array,
     config: PlannerConfig,
 ) -> str | None:
@@ -240,7 +240,8 @@ def _sigma_at_work(information: Array) -> float:
 
 
 def _greedy(pool: list[PlannedPose], n: int, X_BC: RigidTransform, config: PlannerConfig) -> list[PlannedPose]:
-    """The ``n`` poses of the pool that in turn add most to the log determinant of the information, apart from each other."""
+    """The ``n`` poses of the pool that in turn add most to the log determinant of the information, apart from each
+    other."""
     if not pool:
         return []
     work = _work_point(config, X_BC, [c.X_BR for c in pool])

@@ -19,7 +19,7 @@ _SAMPLES = np.linspace(0.0, 1.0, 5)
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class LinkCapsule:
     """A capsule and the link that carries it (TOOL for the tool, whose frame is the flange)."""
 
     link: int
@@ -29,25 +29,25 @@ class Body:
     radius: float
 
 
-def arm_bodies(arm: ArmModel, tool: Sequence[Capsule] = ()) -> list[Body]:
+def arm_bodies(arm: ArmModel, tool: Sequence[Capsule] = ()) -> list[LinkCapsule]:
     """Capsules of the arm's links and of a tool given in the flange frame."""
-    bodies = [Body(c.link_index, c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(arm)]
-    return bodies + [Body(TOOL, 6, c.p_start, c.p_end, c.radius) for c in tool]
+    bodies = [LinkCapsule(c.link_index, c.link_index, c.p_start, c.p_end, c.radius) for c in link_capsules(arm)]
+    return bodies + [LinkCapsule(TOOL, 6, c.p_start, c.p_end, c.radius) for c in tool]
 
 
-def body_ends(body: Body, frames: list[RigidTransform]) -> tuple[Array, Array]:
+def body_ends(body: LinkCapsule, frames: list[RigidTransform]) -> tuple[Array, Array]:
     """Both ends of a body's axis (3,) in B, m, with the arm's links at `frames`."""
     X = frames[body.frame]
     return np.asarray(X @ body.p_start), np.asarray(X @ body.p_end)
 
 
-def lowest_point(bodies: list[Body], frames: list[RigidTransform], up: Array = _UP) -> float:
+def lowest_point(bodies: list[LinkCapsule], frames: list[RigidTransform], up: Array = _UP) -> float:
     """Lowest height (m over B's origin, along ``up`` (3,), a unit vector in B) of all bodies that move."""
     moving = [b for b in bodies if b.link not in STANDING]
     return min(min(float(e @ up) for e in body_ends(b, frames)) - b.radius for b in moving)
 
 
-def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
+def self_distance(bodies: list[LinkCapsule], frames: list[RigidTransform]) -> float:
     """Smallest gap (m) between bodies at least three links apart (nearer ones share a joint housing); segments are
     sampled."""
     ends = np.array([body_ends(b, frames) for b in bodies])
@@ -57,7 +57,8 @@ def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
 
 @compiled()
 def _smallest_gap(ends: Array, links: NDArray[np.int64], radii: Array, samples: Array) -> float:
-    """Smallest gap between bodies at least three links apart; ``ends`` (n, 2, 3) m, ``samples`` (s,) where their axes are sampled."""
+    """Smallest gap between bodies at least three links apart; ``ends`` (n, 2, 3) m, ``samples`` (s,) where their axes
+    are sampled."""
     n, m = len(ends), len(samples)
     points = np.empty((n, m, 3))
     for i in range(n):
@@ -81,9 +82,10 @@ def _smallest_gap(ends: Array, links: NDArray[np.int64], radii: Array, samples: 
 
 
 def path_clearance(
-    arm: ArmModel, bodies: list[Body], q_a: Array, q_b: Array, step_rad: float = 0.1
+    arm: ArmModel, bodies: list[LinkCapsule], q_a: Array, q_b: Array, step_rad: float = 0.1
 ) -> tuple[float, float]:
-    """Lowest height (m over B's origin, along the arm's ``up``) of the moving bodies and smallest gap (m) between bodies on a path straight in joint space.
+    """Lowest height (m over B's origin, along the arm's ``up``) of the moving bodies and smallest gap (m) between
+    bodies on a path straight in joint space.
 
     ``q_a``, ``q_b`` (6,) rad; the path is sampled so that no joint turns by more than ``step_rad`` between samples.
     """
@@ -93,7 +95,7 @@ def path_clearance(
 
 
 def occludes(
-    bodies: list[Body], frames: list[RigidTransform], eye: Array, targets: Array, margin_m: float = 0.0
+    bodies: list[LinkCapsule], frames: list[RigidTransform], eye: Array, targets: Array, margin_m: float = 0.0
 ) -> tuple[bool, float]:
     """Whether a body hides any of the targets (N, 3) from the eye (3,), and the smallest gap (m) from a body to the
     eye.

@@ -1,4 +1,5 @@
-"""Estimates the poses of a mounting together with the scanner's correction, from circles that were seen at known joint angles."""
+"""Estimates the poses of a mounting together with the scanner's correction, from circles that were seen at known joint
+angles."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ _ROUNDS = 12
 _FIT = FlangeFitConfig(
     min_coverage=0.85
 )  # poses are chosen with the whole circle in view; an object before it spoils its edge
-_FIT_SHARE = 1.25  # errors of the fits over their stated sigma (which assumes independent noise in a scan), rms in simulated scans
+# Errors of the fits over their stated sigma (which assumes independent noise in a scan), rms in simulated scans
+_FIT_SHARE = 1.25
 _HUBER = 3.0  # root mean square residual of an observation, in sigma, beyond which its weight falls
 _VAGUE = 0.7  # of a factor's usual error: what the scans leave of a factor that they do not determine
 _FACTORS = ("scale", "gradient along x", "gradient along y", "bend in x", "twist", "bend in y")
@@ -48,8 +50,8 @@ _FACTORS = ("scale", "gradient along x", "gradient along y", "bend in x", "twist
 
 @dataclass(frozen=True)
 class Circle:
-    """The circle to look for: its dimensions, how far it may lie from its prediction (m), and whether it is the ring of the base mounting, whose
-    far side is hidden by its column."""
+    """The circle to look for: its dimensions, how far it may lie from its prediction (m), and whether it is the ring of
+    the base mounting, whose far side is hidden by its column."""
 
     standard: FlangeStandard
     guess_radius_m: float
@@ -58,7 +60,8 @@ class Circle:
 
 @dataclass(frozen=True, eq=False)
 class SeenCircle:
-    """One scan with the circle: the arms' joints and expected view, the observation, and the visible share of the circle's edge."""
+    """One scan with the circle: the arms' joints and expected view, the observation, and the visible share of the
+    circle's edge."""
 
     label: str
     pose: MountingPose
@@ -70,8 +73,9 @@ class SeenCircle:
 class MountingResult(HandEyeResult):
     """The unknown poses, and the scanner's correction that goes with them.
 
-    ``with_factors`` (m + 6, m + 6): covariance of the poses, in the order of ``joint_covariance``, and of the correction's factors.
-    ``undetermined``: factors that the scans do not determine. ``arm_error_m``: rms error of the arm's flange that the residuals support.
+    ``with_factors`` (m + 6, m + 6): covariance of the poses, in the order of ``joint_covariance``, and of the
+    correction's factors. ``undetermined``: factors that the scans do not determine. ``arm_error_m``: rms error of the
+    arm's flange that the residuals support.
     """
 
     correction: ScannerCorrection
@@ -80,7 +84,8 @@ class MountingResult(HandEyeResult):
     arm_error_m: float
 
     def point_covariance(self, p_C: Array) -> Array:
-        """Covariance (3, 3) m^2 of a scanned point, in the frame that carries the scanner; ``p_C`` (3,) m, as scanned."""
+        """Covariance (3, 3) m^2 of a scanned point, in the frame that carries the scanner; ``p_C`` (3,) m, as
+        scanned."""
         return np.asarray(self.slopes(p_C) @ self.with_factors @ self.slopes(p_C).T)
 
     def place(self, p_C: Array) -> Array:
@@ -114,7 +119,10 @@ class _Fit:
 def see_circle(
     points_C: Array, belief: MountingScene, label: str, q: Array, q_2: Array | None, circle: Circle
 ) -> SeenCircle:
-    """Find the circle in a cloud, (H, W, 3) or (N, 3) m, near its predicted place. Raises FlangeNotFound with the reason."""
+    """Find the circle in a cloud, (H, W, 3) or (N, 3) m, near its predicted place.
+
+    Raises FlangeNotFound with the reason.
+    """
     X_CR = belief.seen(q, q_2)
     R = X_CR.rotation().matrix()
     guess = FlangeGuess(X_CR.translation(), circle.guess_radius_m + 0.5 * circle.standard.outer_m, R[:, 2])
@@ -149,10 +157,11 @@ def fewest(scene: MountingScene) -> int:
 def solve_mounting(scene: MountingScene, seen: Sequence[SeenCircle], *, folds: int = 0) -> MountingResult:
     """Solve for the unknown poses and the scanner's correction with all observations.
 
-    Maximum a posteriori. Unknown poses have no prior. Factors of the correction are held to what scanners are usually off, errors of the
-    arm's links to ``scene.arm_error_m``. The spread of observations, and the size of the arm's error, follow from the residuals
-    (Helmert), with the expected ones as prior. The poses are those that go with the arm as its controller reports it; the covariance
-    contains errors of arm and scanner. Held-out errors are predictions with the reported poses. Raises as solve_problem.
+    Maximum a posteriori. Unknown poses have no prior. Factors of the correction are held to what scanners are usually
+    off, errors of the arm's links to ``scene.arm_error_m``. The spread of observations, and the size of the arm's
+    error, follow from the residuals (Helmert), with the expected ones as prior. The poses are those that go with the
+    arm as its controller reports it; the covariance contains errors of arm and scanner. Held-out errors are predictions
+    with the reported poses. Raises as solve_problem.
     """
     problem = scene.problem([s.observation for s in seen])
     start = solve_problem(
@@ -183,8 +192,14 @@ def solve_mounting(scene: MountingScene, seen: Sequence[SeenCircle], *, folds: i
     joint = fit.covariance[: m + K, : m + K]
     used = problem.pick(keep)
     found = determinacy(
-        used, fit.state, np.asarray(np.linalg.pinv(joint[:m, :m], hermitian=True), dtype=np.float64), joint[:m, :m], start.extent, float(fit.noise[0]), start.labels
-    )  # fmt: skip
+        used,
+        fit.state,
+        np.asarray(np.linalg.pinv(joint[:m, :m], hermitian=True), dtype=np.float64),
+        joint[:m, :m],
+        start.extent,
+        float(fit.noise[0]),
+        start.labels,
+    )
     poses = with_open_directions(joint[:m, :m], found, start.extent)
     joint = joint.copy()
     joint[:m, :m] = poses
@@ -222,8 +237,10 @@ def _state(result: HandEyeResult, given: State) -> State:
 
 @dataclass(eq=False, kw_only=True)
 class _Data:
-    """Observations (n) of a circle: problem, centres and normals as measured, their stated covariance (n, 5, 5), derivatives (n, 5, k) by
-    errors of links and covariance (n, 5, 5) of stops (both follow from the state), usual factors, and field of the correction."""
+    """Observations (n) of a circle: problem, centres and normals as measured, their stated covariance (n, 5, 5),
+    derivatives (n, 5, k) by errors of links and covariance (n, 5, 5) of stops (both follow from the state), usual
+    factors, and field of the correction.
+    """
 
     problem: Problem
     p: Array
@@ -264,7 +281,10 @@ def _data(scene: MountingScene, seen: Sequence[SeenCircle]) -> _Data:
 
 
 def _fitted(data: _Data, state: State, scene: MountingScene | None) -> _Fit:
-    """Gauss-Newton over poses, factors and links; the spreads are estimated on the way. ``scene`` renews links and stops of ``data``."""
+    """Gauss-Newton over poses, factors and links; the spreads are estimated on the way.
+
+    ``scene`` renews links and stops of ``data``.
+    """
     n, m, K, own = len(data.p), data.problem.size, TERMS[_ORDER], data.own
     fit = _Fit(state=state, factors=np.zeros(K), links=np.zeros(data.links.shape[2]))
     w, more = np.ones(n), np.ones(5)
@@ -337,8 +357,8 @@ def _corrected(problem: Problem, p: Array, normal: Array) -> Problem:
 
 
 def _links(scene: MountingScene, poses: Sequence[MountingPose], state: State) -> tuple[Array, Array]:
-    """Derivatives (n, 5, links) by errors of the links between circle and scanner, each in units of its expected size, and the
-    covariance (n, 5, 5) that the arm's repeatability gives."""
+    """Derivatives (n, 5, links) by errors of the links between circle and scanner, each in units of its expected size,
+    and the covariance (n, 5, 5) that the arm's repeatability gives."""
     belief = scene.believing(
         {name: as_transform(X) for name, X in zip(NAMES, state, strict=True) if name not in scene.known}
     )
@@ -360,7 +380,8 @@ def _links(scene: MountingScene, poses: Sequence[MountingPose], state: State) ->
 
 
 def expected_error(scene: MountingScene, result: MountingResult) -> tuple[float, float]:
-    """Expected error (m) of a scanned point at the scanner's best distance: rms, and the bound that it keeps with 95 %."""
+    """Expected error (m) of a scanned point at the scanner's best distance: rms, and the bound that it keeps with 95
+    %."""
     S = result.point_covariance(work_point(scene))
     return float(np.sqrt(np.trace(S))), radius_95(S)
 

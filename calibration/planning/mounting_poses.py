@@ -23,9 +23,9 @@ _BIAS_M = 1e-3  # and of a constant error of the circle's centre in its own fram
 class MountingPlan:
     """Limits (m, rad) and how the poses are weighed.
 
-    ``theta_max_rad``: between the circle's normal and the line of sight. ``image_margin``: share of the image, and of the
-    working range, kept free at each side for an uncertain belief. ``spread_rad``: how far a joint may go from home where
-    joints are drawn. ``max_travel_rad``: farthest any joint goes from home.
+    ``theta_max_rad``: between the circle's normal and the line of sight. ``image_margin``: share of the image, and of
+    the working range, kept free at each side for an uncertain belief. ``spread_rad``: how far a joint may go from home
+    where joints are drawn. ``max_travel_rad``: farthest any joint goes from home.
     """
 
     seed: int = 0
@@ -56,9 +56,9 @@ class MountingPose:
 
 
 def plan_mounting_poses(scene: MountingScene, n: int, held_out: int, plan: MountingPlan) -> tuple[MountingPose, ...]:
-    """Plan ``n`` poses, most informative first (greedy, D-optimal in the unknowns), then ``held_out`` drawn at random, then all
-    others that would do. Each of the first n + held_out has a free way from home, the second arm going first, and is
-    reached on it or from the pose before (the first held-out one from home). Deterministic for ``plan.seed``.
+    """Plan ``n`` poses, most informative first (greedy, D-optimal in the unknowns), then ``held_out`` drawn at random,
+    then all others that would do. Each of the first n + held_out has a free way from home, the second arm going first,
+    and is reached on it or from the pose before (the first held-out one from home). Deterministic for ``plan.seed``.
 
     Raises:
         UnreachableScanner: one sentence that names the commonest obstacle.
@@ -73,17 +73,17 @@ def plan_mounting_poses(scene: MountingScene, n: int, held_out: int, plan: Mount
     if len(chosen) < n or len(aside) < held_out:
         reason = why.most_common(1)[0][0] if why else "the poses found lie too close together"
         raise UnreachableScanner(
-            f"Only {len(chosen) + len(aside)} of {n + held_out} poses show the circle to the scanner, most often because "
-            f"{reason}; mount the scanner elsewhere, correct its guessed pose, or choose another home_deg."
+            f"Only {len(chosen) + len(aside)} of {n + held_out} poses show the circle to the scanner, most often"
+            f" because {reason}; mount the scanner elsewhere, correct its guessed pose, or choose another home_deg."
         )
     others = [p for p in rest if not any(p.q is a.q for a in aside)]
     return (*chosen, *aside, *others)
 
 
 def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: Array | float, sigma_rad: float) -> Array:
-    """Information of observations of the circle at some poses (k, m + 3, m + 3): of the free unknowns, in the order of the
-    solver, and of a constant bias of the centre in its own frame. ``sigma_m``: of the centre, one for all or (3,) along the
-    circle's own axes."""
+    """Information of observations of the circle at some poses (k, m + 3, m + 3): of the free unknowns, in the order of
+    the solver, and of a constant bias of the centre in its own frame. ``sigma_m``: of the centre, one for all or (3,)
+    along the circle's own axes."""
     observations = [
         scene.observation(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses
     ]
@@ -113,7 +113,8 @@ def _at(pose: MountingPose) -> tuple[Array, Array | None]:
 def _way(
     bodies: Bodies, start: tuple[Array, Array | None], end: tuple[Array, Array | None], plan: MountingPlan
 ) -> bool:
-    """Whether one arm after the other, the second first, gets from start to end, and back home in the opposite order."""
+    """Whether one arm after the other, the second first, gets from start to end, and back home in the opposite
+    order."""
     between = (start[0], end[1])
     if bodies.scene.two and not bodies.clear(start, between, plan.table_z_m, plan.step_rad):
         return False
@@ -121,8 +122,8 @@ def _way(
 
 
 def _chain(bodies: Bodies, poses: Sequence[MountingPose], n: int, plan: MountingPlan) -> list[MountingPose]:
-    """The first n poses with a free way from home (the way home is the same backwards), each reached from the one before it
-    where that is free too."""
+    """The first n poses with a free way from home (the way home is the same backwards), each reached from the one
+    before it where that is free too."""
     home = (bodies.scene.q_home, bodies.scene.q_home_2)
     kept: list[MountingPose] = []
     for pose in poses:

@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from weldcal.calibration.geometry.se3 import IDENTITY
 from weldcal.calibration.hand_eye.mountings import Mounting, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import Problem, State
-from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, lowest_point, occludes
 from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
@@ -25,7 +25,8 @@ BASE, FLANGE = 0, 6
 FOOT = ("eye_in_hand", "eye_on_arm_target_on_base")
 """Configurations with the circle of the base mounting as target; the others have a flange."""
 SCANNER_BODY = (0.13, 0.06, -0.045)
-"""A scanner that is carried, as a capsule: half its length along x of the camera, radius, and where it lies along z (m)."""
+"""A scanner that is carried, as a capsule: half its length along x of the camera, radius, and where it lies along z
+(m)."""
 ARM_ERROR_M = 4e-4
 """Rms error of the flange's position that an arm with its maker's calibration usually has."""
 LENGTH_M = 0.5
@@ -36,8 +37,8 @@ _ALONG = np.linspace(0.0, 1.0, 9)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class CarriedLink:
-    """A link between base and scanner (``sign`` +1) or circle (-1): frames in B of the link before it and of itself; its errors' size, and its
-    joint's spread at a stop, rad."""
+    """A link between base and scanner (``sign`` +1) or circle (-1): frames in B of the link before it and of itself;
+    its errors' size, and its joint's spread at a stop, rad."""
 
     X_before: RigidTransform
     X: RigidTransform
@@ -50,10 +51,10 @@ class CarriedLink:
 class MountingScene:
     """The estimated scene during planning.
 
-    ``link``: place in link_frames of what carries the scanner (0 base, 6 flange), ``X_LC`` the scanner there. ``X_HR``: the
-    circle on what carries it: in the base, on the flange, or on the second arm's flange. ``radius_m``: its outer edge.
-    ``target_known``: the drawing of X_HR is believed. ``arm_error_m``: rms error of the flange's reported position.
-    ``arm_2``, ``X_BD``, ``q_home_2``: the second arm of a co-manipulation.
+    ``link``: place in link_frames of what carries the scanner (0 base, 6 flange), ``X_LC`` the scanner there. ``X_HR``:
+    the circle on what carries it: in the base, on the flange, or on the second arm's flange. ``radius_m``: its outer
+    edge. ``target_known``: the drawing of X_HR is believed. ``arm_error_m``: rms error of the flange's reported
+    position. ``arm_2``, ``X_BD``, ``q_home_2``: the second arm of a co-manipulation.
     """
 
     configuration: str
@@ -74,8 +75,8 @@ class MountingScene:
 
     @cached_property
     def sizes(self) -> tuple[tuple[float, float], ...]:
-        """Of each arm: error (rad) of each angle of a link, for which the flange at home is off by ``arm_error_m`` (rms), and spread (rad)
-        of each joint at a stop, by which it moves by ``repeatability_m``."""
+        """Of each arm: error (rad) of each angle of a link, for which the flange at home is off by ``arm_error_m``
+        (rms), and spread (rad) of each joint at a stop, by which it moves by ``repeatability_m``."""
         found = []
         for arm, q in ((self.arm, self.q_home), (self.arm_2, self.q_home_2)):
             if arm is not None and q is not None:
@@ -167,7 +168,8 @@ class MountingScene:
 
 
 class Bodies:
-    """Bodies that may collide or occlude: arms, the scanner where an arm carries it; each capsule is nine points with a radius."""
+    """Bodies that may collide or occlude: arms, the scanner where an arm carries it; each capsule is nine points with a
+    radius."""
 
     def __init__(self, scene: MountingScene) -> None:
         self.scene = scene
@@ -176,7 +178,7 @@ class Bodies:
         half, radius, z = SCANNER_BODY
         ends = [np.asarray(scene.X_LC @ np.array([side * half, 0.0, z])) for side in (-1.0, 1.0)]
         carried = scene.link != BASE
-        self.scanner = [Body(scene.link, scene.link, ends[0], ends[1], radius)] if carried else []
+        self.scanner = [LinkCapsule(scene.link, scene.link, ends[0], ends[1], radius)] if carried else []
         first = [*self.arm, *self.scanner]
         self._first, self._second = _stack(first), _stack(self.arm_2)
         link = np.array([b.link for b in first])
@@ -226,7 +228,8 @@ class Bodies:
     def clear(
         self, starts: tuple[Array, Array | None], ends: tuple[Array, Array | None], table_z_m: float, step_rad: float
     ) -> bool:
-        """Whether a move straight in the joints of both arms (one of them may rest) keeps off the table and of what may touch."""
+        """Whether a move straight in the joints of both arms (one of them may rest) keeps off the table and of what may
+        touch."""
         (a, a_2), (b, b_2) = starts, ends
         far = float(np.abs(b - a).max())
         if a_2 is not None and b_2 is not None:
@@ -243,7 +246,7 @@ Stacked = tuple[NDArray[np.intp], Array]
 """Frames (n,) and points in them (n, 9, 3) of n capsules."""
 
 
-def _stack(bodies: Sequence[Body]) -> Stacked:
+def _stack(bodies: Sequence[LinkCapsule]) -> Stacked:
     points = [b.p_start + _ALONG * (b.p_end - b.p_start) for b in bodies]
     return np.array([b.frame for b in bodies], dtype=np.intp), np.array(points).reshape(-1, len(_ALONG), 3)
 

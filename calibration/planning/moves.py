@@ -1,4 +1,5 @@
-"""Motions of a robot through waypoints, exactly: trapezoidal speed, straight in joints or in space; and its stream of them."""
+"""Motions of a robot through waypoints, exactly: trapezoidal speed, straight in joints or in space; and its stream of
+them."""
 
 from dataclasses import dataclass
 
@@ -17,8 +18,9 @@ PAUSE_S = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """Moves between waypoints ``q`` (n, J) rad, one after the other and round again: each trapezoidal in one path parameter,
-    straight in joints (moveJ) or in space (moveL); ``lengths`` (n,) m are those of the paths of the flange."""
+    """Moves between waypoints ``q`` (n, J) rad, one after the other and round again: each trapezoidal in one path
+    parameter, straight in joints (moveJ) or in space (moveL); ``lengths`` (n,) m are those of the paths of the
+    flange."""
 
     q: Array
     poses: Array

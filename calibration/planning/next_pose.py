@@ -26,9 +26,13 @@ _STEEPEST_RAD = float(np.radians(60.0))
 
 
 @dataclass(frozen=True)
-class View:
-    """Visible volume. ``tan_x``, ``tan_y``: half field of view; ``near``, ``far``: along the optical axis, in the unit of the data; ``tilt_rad``:
-    largest angle between the target's normal and the line of sight; ``source``: its description for messages."""
+class VisibleVolume:
+    """Visible volume.
+
+    ``tan_x``, ``tan_y``: half field of view; ``near``, ``far``: along the optical axis, in the unit of the data;
+    ``tilt_rad``: largest angle between the target's normal and the line of sight; ``source``: its description for
+    messages.
+    """
 
     tan_x: float
     tan_y: float
@@ -52,13 +56,13 @@ def tilt(G: Array) -> Array:
     return np.asarray(np.arccos(np.clip(np.abs((ray * G[:, :3, 2]).sum(axis=1)), 0.0, 1.0)))
 
 
-def view_of(seen: Array, K: Array | None = None, scanner: ScannerPreset | None = None) -> View:
-    """View of a scanner preset, else of a camera matrix ``K`` (picture centred on its principal point), else of what was
-    ``seen`` (n, 4, 4) so far, a little wider. Distances of a camera matrix are those seen, too."""
+def view_of(seen: Array, K: Array | None = None, scanner: ScannerPreset | None = None) -> VisibleVolume:
+    """View of a scanner preset, else of a camera matrix ``K`` (picture centred on its principal point), else of what
+    was ``seen`` (n, 4, 4) so far, a little wider. Distances of a camera matrix are those seen, too."""
     steep = max(_STEEPEST_RAD, float(np.quantile(tilt(seen), 0.9)))
     if scanner is not None:
         wide = [min(c, size - 1 - c) / f for c, size, f in _axes(scanner)]
-        return View(
+        return VisibleVolume(
             _MARGIN * wide[0],
             _MARGIN * wide[1],
             scanner.near_m,
@@ -70,10 +74,12 @@ def view_of(seen: Array, K: Array | None = None, scanner: ScannerPreset | None =
     near, far = float(z.min()) / _WIDER, float(z.max()) * _WIDER
     if K is not None:
         tan = _MARGIN * K[0, 2] / K[0, 0], _MARGIN * K[1, 2] / K[1, 1]
-        return View(float(tan[0]), float(tan[1]), near, far, steep, "the camera's picture and the distances so far")
+        return VisibleVolume(
+            float(tan[0]), float(tan[1]), near, far, steep, "the camera's picture and the distances so far"
+        )
     across = np.abs(seen[:, :2, 3]) / np.maximum(z, 1e-12)[:, None]
     x, y = (_WIDER * float(across[:, k].max()) for k in range(2))
-    return View(x, y, near, far, steep, "where the target has been seen so far")
+    return VisibleVolume(x, y, near, far, steep, "where the target has been seen so far")
 
 
 def _axes(scanner: ScannerPreset) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -91,9 +97,9 @@ _MOST = 0.8  # of the poses so far that a robot must reach, to be the one that t
 
 @dataclass(frozen=True, kw_only=True)
 class NextPose:
-    """A pose to add: robot pose X_BF (the first robot's, or None where the mounting leaves it open) with joint angles ``q``
-    (rad) where a robot was named, target in the camera X_CM, like which taken sample and turned how, the predicted sigma (3-D)
-    at the work point before and after, and what was ``checked``."""
+    """A pose to add: robot pose X_BF (the first robot's, or None where the mounting leaves it open) with joint angles
+    ``q`` (rad) where a robot was named, target in the camera X_CM, like which taken sample and turned how, the
+    predicted sigma (3-D) at the work point before and after, and what was ``checked``."""
 
     X_BF: RigidTransform | None
     X_CM: RigidTransform
@@ -120,8 +126,9 @@ class NextPose:
         if self.q is not None:
             joints = " Joints (" + ", ".join(f"{v:.1f}" for v in np.degrees(self.q)) + ") deg."
         return (
-            f"Like sample {self.like}, with the target seen turned by {self.turn_deg:.0f} deg about {a} of the camera: the "
-            f"uncertainty at the work point goes from {before} to {1e3 * self.sigma_after:.2f} mm.{where}{joints} {self.checked}"
+            f"Like sample {self.like}, with the target seen turned by {self.turn_deg:.0f} deg about {a} of the camera:"
+            f" the uncertainty at the work point goes from {before} to {1e3 * self.sigma_after:.2f} mm.{where}{joints}"
+            f" {self.checked}"
         ).rstrip()
 
 
@@ -132,14 +139,16 @@ def next_pose(
     known: State,
     *,
     arm: Chain | None = None,
-    view: View | None = None,
+    view: VisibleVolume | None = None,
 ) -> NextPose | None:
-    """Choose the most informative of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there or elsewhere.
+    """Choose the most informative of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there
+    or elsewhere.
 
-    Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for it
-    within its limits; where none is named, or where it does not even reach the poses so far (another base or tool frame), the
-    flange stays about where it has been, and ``checked`` says so. The work point is the mean place of the target before the
-    camera. None where no candidate is left. For a scanner that watches a flange, pose_planning plans with the arm's bodies too.
+    Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for
+    it within its limits; where none is named, or where it does not even reach the poses so far (another base or tool
+    frame), the flange stays about where it has been, and ``checked`` says so. The work point is the mean place of the
+    target before the camera. None where no candidate is left. For a scanner that watches a flange, pose_planning plans
+    with the arm's bodies too.
     """
     state = _state(result, known, problem)
     # one sample of each observation: repeats add nothing
@@ -196,7 +205,7 @@ def next_pose(
     )
 
 
-def _candidates(seen: Array, view: View) -> tuple[NDArray[np.int64], Array, Array, Array]:
+def _candidates(seen: Array, view: VisibleVolume) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Sample (k,), turn (k,) rad, its axis (k, 3), and the target in the camera (k, 4, 4) of all that is visible."""
     samples = np.arange(0, len(seen), max(1, len(seen) // _SAMPLES))
     axes = np.vstack([np.eye(3), -np.eye(3)])

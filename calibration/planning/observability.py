@@ -22,10 +22,10 @@ def check_diversity(
 ) -> None:
     """Refuse sets of flange centres (n, 3) m that do not fix a calibration by the paper's rule (four, not coplanar).
 
-    ``min_poses`` and ``allow_coplanar`` relax the rule: with face normals two poses are enough, without three that do not lie on
-    one line.
-    Raises TooFewPoses, RepeatedPoses (fewer than ``min_poses`` distinct places, 2 mm apart) and CoplanarPoses (rms
-    distance from the best plane under 2 mm or under 1 % of the extent). Source: paper, after Eq. (12).
+    ``min_poses`` and ``allow_coplanar`` relax the rule: with face normals two poses are enough, without three that do
+    not lie on one line. Raises TooFewPoses, RepeatedPoses (fewer than ``min_poses`` distinct places, 2 mm apart) and
+    CoplanarPoses (rms distance from the best plane under 2 mm or under 1 % of the extent). Source: paper, after Eq.
+    (12).
     """
     n = len(p_B)
     if n < min_poses:

@@ -1,4 +1,5 @@
-"""The cell's surroundings as surfaces in the base: how near the arm comes to them, and which lines of sight they block."""
+"""The cell's surroundings as surfaces in the base: how near the arm comes to them, and which lines of sight they
+block."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.planning.clearance import STANDING, Body, body_ends
+from weldcal.calibration.planning.clearance import STANDING, LinkCapsule, body_ends
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh
@@ -59,7 +60,7 @@ class Surroundings:
 
     obstacles: tuple[Obstacle, ...] = ()
 
-    def touched(self, bodies: Sequence[Body], frames: list[RigidTransform]) -> str:
+    def touched(self, bodies: Sequence[LinkCapsule], frames: list[RigidTransform]) -> str:
         """Name of the first obstacle nearer to a moving body than its margin; empty where all are free."""
         points, radii = _sampled(bodies, frames)
         for obstacle in self.obstacles:
@@ -67,7 +68,7 @@ class Surroundings:
                 return obstacle.name
         return ""
 
-    def touched_on_path(self, arm: ArmModel, bodies: Sequence[Body], q_a: Array, q_b: Array) -> str:
+    def touched_on_path(self, arm: ArmModel, bodies: Sequence[LinkCapsule], q_a: Array, q_b: Array) -> str:
         """As `touched`, on a path straight in joint space from q_a to q_b (6,) rad."""
         if not self.obstacles:
             return ""
@@ -82,7 +83,7 @@ class Surroundings:
         return next((o.name for o in self.obstacles if o.blocks(eye, targets)), "")
 
 
-def _sampled(bodies: Sequence[Body], frames: list[RigidTransform]) -> tuple[Array, Array]:
+def _sampled(bodies: Sequence[LinkCapsule], frames: list[RigidTransform]) -> tuple[Array, Array]:
     """Points (N, 3) along the axes of the bodies that move, and the radius (N,) at each, m."""
     points, radii = [], []
     for body in bodies:

@@ -19,19 +19,20 @@ ARM_ERRORS = len(OFFSET_JOINTS) + len(SAG_JOINTS) + 6 * len(TABLE)
 
 
 @dataclass(frozen=True, eq=False)
-class ArmErrors:
-    """Offsets (4,) rad of joints 2 to 5, sag (2,) rad/m of joints 2 and 3, and the table's errors (6, 3): a m, alpha rad, d m."""
+class ProfilerArmErrors:
+    """Offsets (4,) rad of joints 2 to 5, sag (2,) rad/m of joints 2 and 3, and the table's errors (6, 3): a m, alpha
+    rad, d m."""
 
     offsets: Floats
     sag: Floats
     table: Floats
 
     @staticmethod
-    def of(values: Floats) -> ArmErrors:
+    def of(values: Floats) -> ProfilerArmErrors:
         """From a vector (24,) in this order."""
         k = len(OFFSET_JOINTS)
         m = k + len(SAG_JOINTS)
-        return ArmErrors(values[:k], values[k:m], values[m:].reshape(6, 3))
+        return ProfilerArmErrors(values[:k], values[k:m], values[m:].reshape(6, 3))
 
     @property
     def values(self) -> Floats:
@@ -39,14 +40,15 @@ class ArmErrors:
         return np.concatenate([self.offsets, self.sag, self.table.ravel()])
 
     @staticmethod
-    def none() -> ArmErrors:
+    def none() -> ProfilerArmErrors:
         """An arm as drawn."""
-        return ArmErrors.of(np.zeros(ARM_ERRORS))
+        return ProfilerArmErrors.of(np.zeros(ARM_ERRORS))
 
 
 @dataclass(frozen=True, eq=False)
 class DhArm:
-    """A six-axis arm by standard Denavit-Hartenberg rows (6, 4): a m, alpha rad, d m, theta offset rad; base z upwards."""
+    """A six-axis arm by standard Denavit-Hartenberg rows (6, 4): a m, alpha rad, d m, theta offset rad; base z
+    upwards."""
 
     rows: Floats
 
@@ -94,7 +96,8 @@ class DhArm:
         return out
 
     def loads(self, q: Floats) -> Floats:
-        """Horizontal lever (n, 2) m of the flange about the axes of joints 2 and 3: what gravity turns them by, but for a factor."""
+        """Horizontal lever (n, 2) m of the flange about the axes of joints 2 and 3: what gravity turns them by, but for
+        a factor."""
         frames = self.frames(q)
         flange = frames[:, 6, :2, 3]
         radial = flange / np.maximum(np.linalg.norm(flange, axis=1, keepdims=True), 1e-9)
@@ -111,15 +114,16 @@ class DhArm:
         rows[:, TABLE] += table
         return DhArm(rows)
 
-    def with_errors(self, q: Floats, errors: ArmErrors, loads: Floats) -> FlangePoses:
+    def with_errors(self, q: Floats, errors: ProfilerArmErrors, loads: Floats) -> FlangePoses:
         """Flange poses of the arm with its errors."""
         return self.changed(errors.table).poses(q, errors.offsets, errors.sag, loads)
 
-    def twists(self, q: Floats, errors: ArmErrors, loads: Floats) -> tuple[Floats, Floats]:
-        """How the flange moves with each error: turns w (n, 24, 3) and shifts v (n, 24, 3) with dp = w x p + v for p in B.
+    def twists(self, q: Floats, errors: ProfilerArmErrors, loads: Floats) -> tuple[Floats, Floats]:
+        """How the flange moves with each error: turns w (n, 24, 3) and shifts v (n, 24, 3) with dp = w x p + v for p in
+        B.
 
-        An offset turns all beyond it about the joint's axis, d shifts it along that axis; a shifts along, and alpha turns
-        about, the x axis of the frame after the joint.
+        An offset turns all beyond it about the joint's axis, d shifts it along that axis; a shifts along, and alpha
+        turns about, the x axis of the frame after the joint.
         """
         moved = _moved(q, errors.offsets, errors.sag, loads)
         X = self.changed(errors.table).frames(moved)

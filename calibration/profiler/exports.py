@@ -1,4 +1,5 @@
-"""Read profiles from the exports of laser profilers: tables, blocks, grids of heights, LMI Gocator sections and OpenCV documents."""
+"""Read profiles from the exports of laser profilers: tables, blocks, grids of heights, LMI Gocator sections and OpenCV
+documents."""
 
 import re
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ from weldcal.calibration.data.poses.text import table_lists
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.profiler.gocator import gocator_profiles, is_gocator
 from weldcal.calibration.profiler.motion import Floats
-from weldcal.calibration.profiler.text_blocks import Block, blocks_of
+from weldcal.calibration.profiler.text_blocks import NumberRows, blocks_of
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, MOST_COLUMNS, read_text, require_short_numbers
 
@@ -55,7 +56,8 @@ class Profiles:
         form: a phrase for the reader.
         columns: the names of the columns that the file has, for messages.
         ids: a name for each profile, or empty.
-        times: a time for each profile (n), or None; time_unit: its unit of SECONDS where the file states it, else empty.
+        times: a time for each profile (n), or None; time_unit: its unit of SECONDS where the file states it, else
+            empty.
         poses: the poses of the same table, one for each profile, or None.
         single: whether each profile is one point of a table without a number of the scan.
     """
@@ -92,9 +94,14 @@ def read_profiles(path: Path, pitch_mm: float | None = None) -> Profiles:
     if is_gocator(text):
         found = gocator_profiles(text, path.name)
         return Profiles(
-            source=path.name, points=found.points, unit="mm", form=f"LMI Gocator {found.section}", columns=found.columns, ids=found.ids,
+            source=path.name,
+            points=found.points,
+            unit="mm",
+            form=f"LMI Gocator {found.section}",
+            columns=found.columns,
+            ids=found.ids,
             times=found.times,
-        )  # fmt: skip
+        )
     blocks = blocks_of(text, path.name)
     if not blocks:
         raise InputError(f"'{path.name}' holds no row of numbers. A table of profiles has columns such as {EXAMPLE}.")
@@ -111,7 +118,7 @@ def _check(profiles: Profiles) -> None:
             )
 
 
-def _with_header(blocks: list[Block], name: str) -> Profiles:
+def _with_header(blocks: list[NumberRows], name: str) -> Profiles:
     """Tables with named columns: x and z of each point, with the scan's number, or a block for each profile."""
     header = blocks[0].header
     if any(b.header != header for b in blocks):
@@ -165,16 +172,24 @@ def _with_header(blocks: list[Block], name: str) -> Profiles:
             name,
         )
     return Profiles(
-        source=name, points=tuple(split), unit=unit, form="one row a point" if n == len(table) else f"{n} profiles, one row a point",
-        columns=header, ids=ids, times=None if time is None else table[first, time], poses=poses,
-        time_unit=re.sub("[µμ]", "u", clocks[time][2] or "").lower().replace("sec", "s") if time is not None else "", single=scan is None and n == len(table) > 1,
-    )  # fmt: skip
+        source=name,
+        points=tuple(split),
+        unit=unit,
+        form="one row a point" if n == len(table) else f"{n} profiles, one row a point",
+        columns=header,
+        ids=ids,
+        times=None if time is None else table[first, time],
+        poses=poses,
+        time_unit=re.sub("[µμ]", "u", clocks[time][2] or "").lower().replace("sec", "s") if time is not None else "",
+        single=scan is None and n == len(table) > 1,
+    )
 
 
 def _one_list(lists: list[Listing], name: str) -> Listing:
     if len(lists) > 1:
         raise DatasetError(
-            f"'{name}' holds {len(lists)} lists of poses: {', '.join(repr(one.name) for one in lists[:4])}. Keep the one of the flange in the base."
+            f"'{name}' holds {len(lists)} lists of poses: {', '.join(repr(one.name) for one in lists[:4])}. Keep the"
+            " one of the flange in the base."
         )
     return lists[0]
 
@@ -216,15 +231,17 @@ def _numbered(scan: Floats) -> np.ndarray[Any, Any]:
 
 
 def _runs(poses: Floats) -> np.ndarray[Any, Any]:
-    """The number of each row's profile where no column tells it: rows that follow each other with one pose, else each row."""
+    """The number of each row's profile where no column tells it: rows that follow each other with one pose, else each
+    row."""
     new = np.concatenate([[True], (np.abs(np.diff(poses, axis=0)) > 0.0).any(axis=1)])
     if np.count_nonzero(new) * _REPEATED <= len(poses):
         return np.asarray(np.cumsum(new) - 1)
     return np.arange(len(poses))
 
 
-def _captions(blocks: list[Block]) -> tuple[str, ...]:
-    """Names of profiles by the captions of their blocks, such as "Profile 3"; empty where they have no numbers of their own."""
+def _captions(blocks: list[NumberRows]) -> tuple[str, ...]:
+    """Names of profiles by the captions of their blocks, such as "Profile 3"; empty where they have no numbers of their
+    own."""
     numbers = [number_of(b.caption) for b in blocks]
     if None in numbers or len(set(numbers)) < len(numbers):
         return ()
@@ -239,7 +256,8 @@ def _without_empty(points: Floats) -> Floats:
 
 
 def _empty(z: Floats) -> np.ndarray[Any, Any]:
-    """Heights that mean that nothing was measured: -99.9999 ... -99999.9999, -10000, -100000, and -2147483648 and its neighbours in raw integers."""
+    """Heights that mean that nothing was measured: -99.9999 ... -99999.9999, -10000, -100000, and -2147483648 and its
+    neighbours in raw integers."""
     marks = np.zeros(z.shape, bool)
     for power in (2, 3, 4, 5):
         mark = (z > -(10.0**power)) & (z <= -(10.0**power) + 2.5e-3) | ((power > 3) & (z == -(10.0**power)))
@@ -247,7 +265,7 @@ def _empty(z: Floats) -> np.ndarray[Any, Any]:
     return marks | (z < -2.1e9)
 
 
-def _columns_of_heights(blocks: list[Block], header: tuple[str, ...], name: str) -> Profiles:
+def _columns_of_heights(blocks: list[NumberRows], header: tuple[str, ...], name: str) -> Profiles:
     """A column of x and one column of heights for each profile."""
     names = [_split(h) for h in header]
     x = [k for k, (n, _) in enumerate(names) if n in ("x", "x coordinate", "x coordinates", "x position")]
@@ -263,8 +281,8 @@ def _columns_of_heights(blocks: list[Block], header: tuple[str, ...], name: str)
 
 def _no_columns(name: str, header: tuple[str, ...]) -> str:
     return (
-        f"'{name}' has the columns {_listed(header)}: no x and z of profile points. Name them px_mm and pz_mm (or X [mm] and Z [mm]), "
-        f"for example {EXAMPLE}."
+        f"'{name}' has the columns {_listed(header)}: no x and z of profile points. Name them px_mm and pz_mm (or X"
+        f" [mm] and Z [mm]), for example {EXAMPLE}."
     )
 
 
@@ -277,12 +295,13 @@ def listed_columns(profiles: Profiles) -> str:
     return _listed(profiles.columns)
 
 
-def _bare(blocks: list[Block], name: str, pitch_mm: float | None) -> Profiles:
+def _bare(blocks: list[NumberRows], name: str, pitch_mm: float | None) -> Profiles:
     """Numbers without names: x z, x z intensity or x y z a row; a grid with a row or a column of x; heights alone."""
     width = blocks[0].table.shape[1]
     if any(b.table.shape[1] != width for b in blocks):
         raise InputError(
-            f"'{name}' has {width} numbers in its first row and {next(b.table.shape[1] for b in blocks if b.table.shape[1] != width)} in a later one."
+            f"'{name}' has {width} numbers in its first row and"
+            f" {next(b.table.shape[1] for b in blocks if b.table.shape[1] != width)} in a later one."
         )
     if 2 <= width <= 4:
         iz = _place_of_z(np.vstack([b.table for b in blocks]), name)
@@ -298,9 +317,12 @@ def _bare(blocks: list[Block], name: str, pitch_mm: float | None) -> Profiles:
             x = grid[0] * (_RAW_MM if raw else 1.0)
             points = tuple(np.column_stack([x, _height(z, raw)]) for z in grid[1:])
             return Profiles(
-                source=name, points=points, unit="mm" if raw else "", form=f"heights, a {what} a profile, x in the first {what}",
+                source=name,
+                points=points,
+                unit="mm" if raw else "",
+                form=f"heights, a {what} a profile, x in the first {what}",
                 columns=tuple(f"x = {v:g}" for v in x[:3]),
-            )  # fmt: skip
+            )
     if width < _FEWEST_COLUMNS:
         raise InputError(
             f"'{name}' has {width} numbers a row and no header: name its columns in a first row, for example {EXAMPLE}."
@@ -320,7 +342,8 @@ def _place_of_z(table: Floats, name: str) -> int:
     if whole and not bool((second == np.round(second)).all()):
         return 1
     raise InputError(
-        f"'{name}' has {table.shape[1]} numbers a row and no header: which one is z? Name the columns in a first row, for example X [mm];Z [mm]."
+        f"'{name}' has {table.shape[1]} numbers a row and no header: which one is z? Name the columns in a first row,"
+        " for example X [mm];Z [mm]."
     )
 
 
@@ -345,8 +368,8 @@ def _height(z: Floats, raw: bool) -> Floats:
 def _of_heights(heights: list[Floats], name: str, pitch_mm: float | None, form: str) -> Profiles:
     if pitch_mm is None:
         raise InputError(
-            f"'{name}' holds {len(heights)} profiles of {len(heights[0])} heights and no x. Give the distance of the points with --pitch MM (for "
-            "example --pitch 0.0125), or write the x of each column into a first row."
+            f"'{name}' holds {len(heights)} profiles of {len(heights[0])} heights and no x. Give the distance of the"
+            " points with --pitch MM (for example --pitch 0.0125), or write the x of each column into a first row."
         )
     if not 1e-6 < pitch_mm < 10.0:
         raise InputError(f"A distance of {pitch_mm:g} mm between points cannot be used; give --pitch in mm.")
@@ -416,7 +439,12 @@ def joined(parts: list[Profiles], name: str) -> Profiles:
         )
     times = [p.times for p in parts if p.times is not None]
     return replace(
-        parts[0], source=name, points=tuple(p.points[0] for p in parts), ids=tuple(Path(p.source).stem for p in parts), poses=None,
+        parts[0],
+        source=name,
+        points=tuple(p.points[0] for p in parts),
+        ids=tuple(Path(p.source).stem for p in parts),
+        poses=None,
         times=np.concatenate(times) if len(times) == len(parts) else None,
-        form=f"one file per profile, {parts[0].form}", single=False,
-    )  # fmt: skip
+        form=f"one file per profile, {parts[0].form}",
+        single=False,
+    )

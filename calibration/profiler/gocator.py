@@ -19,7 +19,8 @@ _START = re.compile(r"\A\ufeff?\s*Info\b[ ,]*\r?\n", re.IGNORECASE)
 
 @dataclass(frozen=True, eq=False)
 class GocatorProfiles:
-    """Profiles of one section: points [x, z] (m, 2) mm each, NaN where nothing was measured; names of the columns before the points."""
+    """Profiles of one section: points [x, z] (m, 2) mm each, NaN where nothing was measured; names of the columns
+    before the points."""
 
     section: str
     points: tuple[Floats, ...]
@@ -47,8 +48,8 @@ def gocator_profiles(text: str, name: str) -> GocatorProfiles:
             rows = sections[key]
             return _frames(rows, key, name) if "profile" in section.lower() else _surface(rows, key, name)
     raise InputError(
-        f"'{name}' is a Gocator export with the sections {', '.join(list(sections)[:10])}, none of {', '.join(SECTIONS)}. Record in the mode "
-        "Profile, and export the profiles as CSV."
+        f"'{name}' is a Gocator export with the sections {', '.join(list(sections)[:10])}, none of"
+        f" {', '.join(SECTIONS)}. Record in the mode Profile, and export the profiles as CSV."
     )
 
 
@@ -100,8 +101,8 @@ def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
     count = _column_count(rows)
     if section.lower() == "profile" and count not in (None, last):
         raise InputError(
-            f"The section {section} of '{name}' states {count} columns and names {last}: a decimal comma in its header, or a lost column. Export it "
-            "again with decimal points."
+            f"The section {section} of '{name}' states {count} columns and names {last}: a decimal comma in its header,"
+            " or a lost column. Export it again with decimal points."
         )
     even = len({len(row) for row in data}) == 1  # rows that all end with a comma
     place = {word: lower.index(word) for word in ("source", "time") if word in lower}
@@ -116,7 +117,8 @@ def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
             )
         if len(row) > len(header) or (size > len(header) and not even):
             raise InputError(
-                f"A row of the section {section} of '{name}' has {size} cells, and its header {len(header)}; export it again."
+                f"A row of the section {section} of '{name}' has {size} cells, and its header {len(header)}; export it"
+                " again."
             )
         frame = row[0]
         if frame not in frames:
@@ -139,7 +141,8 @@ def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
         x = rows_of.get("X")
         if z is None or (x is None and shared is None):
             raise InputError(
-                f"Frame {frame[:20]} of '{name}' has the rows {', '.join(rows_of)}; a profile needs {'X and Z' if shared is None else 'Z'}."
+                f"Frame {frame[:20]} of '{name}' has the rows {', '.join(rows_of)}; a profile needs"
+                f" {'X and Z' if shared is None else 'Z'}."
             )
         at = _values(x, axis, last, name) if x is not None else np.zeros(last) if shared is None else shared
         points.append(np.column_stack([at, _values(z, axis, last, name)]))

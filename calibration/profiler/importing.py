@@ -1,4 +1,5 @@
-"""Import profiles with flange poses: a table, an export with poses in a file beside it, or a folder with one file per profile."""
+"""Import profiles with flange poses: a table, an export with poses in a file beside it, or a folder with one file per
+profile."""
 
 import re
 from collections.abc import Sequence
@@ -36,7 +37,8 @@ class ImportedProfiles:
         profiles: points [x, z] (m, 2) of each profile, or None where the file holds poses only.
         readings: all readings of the flange poses X_BF (n, 4, 4), the usual one first.
         single: whether each profile is one point.
-        reading: how the file was understood: file, form and unit of the profiles and of the poses, and the rows left out.
+        reading: how the file was understood: file, form and unit of the profiles and of the poses, and the rows left
+            out.
     """
 
     profiles: tuple[Floats, ...] | None
@@ -94,7 +96,8 @@ def import_profiles(
 
 
 def _poses_only(path: Path) -> Listing | None:
-    """The poses of a file without profiles; None where it holds none, or numbers without names, which may be heights."""
+    """The poses of a file without profiles; None where it holds none, or numbers without names, which may be
+    heights."""
     try:
         if path.suffix.lower() in TABLES and any(not b.header for b in blocks_of(read_text(path), path.name)):
             return None
@@ -125,7 +128,8 @@ def profiles_of(path: Path, pitch_mm: float | None = None) -> tuple[Profiles, li
     if not groups:
         names = ", ".join(p.name for p in poses[:4]) or "no table"
         raise InputError(
-            f"'{path.name}' holds {names} and no profiles. Put one CSV for each profile into it, such as profile_01.csv."
+            f"'{path.name}' holds {names} and no profiles. Put one CSV for each profile into it, such as"
+            " profile_01.csv."
         )
     chosen = max(groups.values(), key=len)
     rest = [p for p in files if p not in set(chosen)]
@@ -141,7 +145,8 @@ def profiles_of(path: Path, pitch_mm: float | None = None) -> tuple[Profiles, li
     many = next((p for p in parts if len(p) != 1), None)
     if many is not None:
         raise InputError(
-            f"'{many.source}' holds {len(many)} profiles, and there are {len(parts)} such files; give one profile a file, or one file."
+            f"'{many.source}' holds {len(many)} profiles, and there are {len(parts)} such files; give one profile a"
+            " file, or one file."
         )
     whole = joined(parts, path.name)
     lists = [p.poses for p in parts if p.poses is not None]
@@ -165,9 +170,14 @@ def _beside(path: Path) -> list[Path]:
     """Files beside an export that may hold its poses: those that carry its name first."""
     try:
         others = [
-            p for p in path.parent.iterdir()
-            if p != path and p.is_file() and p.suffix.lower() in _POSE_ENDINGS and _POSE_NAME.search(p.stem) and not p.name.startswith(".")
-        ]  # fmt: skip
+            p
+            for p in path.parent.iterdir()
+            if p != path
+            and p.is_file()
+            and p.suffix.lower() in _POSE_ENDINGS
+            and _POSE_NAME.search(p.stem)
+            and not p.name.startswith(".")
+        ]
     except OSError:
         return []
     mine = [p for p in others if path.stem.lower() in p.stem.lower()]
@@ -199,7 +209,8 @@ def _poses(path: Path, found: Profiles, beside: Sequence[Path], stated: Path | N
             return fitting[0][1]
         if fitting:
             raise InputError(
-                f"{', '.join(p.name for p, _ in fitting)} each hold {len(found)} poses; name the file of the flange's with --poses FILE."
+                f"{', '.join(p.name for p, _ in fitting)} each hold {len(found)} poses; name the file of the flange's"
+                " with --poses FILE."
             )
     elif single:
         try:
@@ -215,9 +226,10 @@ def _no_poses(found: Profiles) -> str:
     columns = f" Its columns are {listed_columns(found)}." if found.columns else ""
     kind = f" ({found.form})" if found.form else ""
     return (
-        f"'{found.source}'{kind} holds {len(found)} profiles of {size} points and no flange pose.{columns} Write the flange's pose of each profile "
-        "into a file poses.csv beside it, a row each, with the columns x_mm,y_mm,z_mm,qw,qx,qy,qz (or x_mm,y_mm,z_mm,a_deg,b_deg,c_deg of a KUKA), "
-        "or name such a file with --poses FILE."
+        f"'{found.source}'{kind} holds {len(found)} profiles of {size} points and no flange pose.{columns} Write the"
+        " flange's pose of each profile into a file poses.csv beside it, a row each, with the columns"
+        " x_mm,y_mm,z_mm,qw,qx,qy,qz (or x_mm,y_mm,z_mm,a_deg,b_deg,c_deg of a KUKA), or name such a file with --poses"
+        " FILE."
     )
 
 
@@ -254,8 +266,8 @@ def _paired(listing: Listing, found: Profiles) -> tuple[np.ndarray, np.ndarray]:
         if common and len(common) == min(len(listing), len(found)):
             return np.array([numbers[0].index(k) for k in common]), np.array([numbers[1].index(k) for k in common])
     raise InputError(
-        f"'{listing.name}' holds {len(listing)} poses and '{found.source}' {len(found)} profiles; without numbers in a column id they pair in order, "
-        "one for one: remove what has no partner, or number both alike."
+        f"'{listing.name}' holds {len(listing)} poses and '{found.source}' {len(found)} profiles; without numbers in a"
+        " column id they pair in order, one for one: remove what has no partner, or number both alike."
     )
 
 

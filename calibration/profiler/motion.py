@@ -84,7 +84,8 @@ def rotation_groups(poses: FlangePoses) -> NDArray[np.intp]:
 
 
 def rotation_axes_spread(rotation: Floats) -> float:
-    """Second singular value over the first of the axes of all turns from the first orientation: 0 where all share one axis."""
+    """Second singular value over the first of the axes of all turns from the first orientation: 0 where all share one
+    axis."""
     turns = np.array([_axis_times_sine(rotation[0].T @ R) for R in rotation[1:]])
     if len(turns) < 2:
         return 0.0

@@ -40,7 +40,8 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class PosePlan:
-    """Indices of the candidates in the order of taking them, and the rms uncertainty (1 + len) m before and after each."""
+    """Indices of the candidates in the order of taking them, and the rms uncertainty (1 + len) m before and after
+    each."""
 
     chosen: tuple[int, ...]
     rms_m: Floats
@@ -140,7 +141,8 @@ def _greedy(known: Floats, gains: Floats, names: NDArray[np.intp], maps: Floats,
     """The best candidate at each step, by the mean trace of the mapped covariance of the sum."""
     if len(names) < count:
         raise InputError(
-            f"Of the candidate poses {len(names)} see the object in the field, fewer than the {count} asked for: give more."
+            f"Of the candidate poses {len(names)} see the object in the field, fewer than the {count} asked for: give"
+            " more."
         )
     H, left, chosen = known, list(range(len(names))), []
     unit = np.sqrt(np.diag(known + gains.sum(axis=0)))
@@ -164,7 +166,8 @@ def _rms(H: Floats, maps: Floats, unit: Floats) -> float:
 def sample_edge_poses(
     state: EdgeState, count: int, seed: int, field: Field | None = None, tilt_deg: float = 35.0
 ) -> FlangePoses:
-    """Flange poses from which the edge crosses the field of view, tilted and turned at random about looking down on it."""
+    """Flange poses from which the edge crosses the field of view, tilted and turned at random about looking down on
+    it."""
     f, rng = field or Field(), np.random.default_rng(seed)
     down = np.array([0.0, 0.0, -1.0])
     x = np.cross(state.direction, down)
@@ -177,9 +180,15 @@ def sample_edge_poses(
 
 
 def sample_sphere_poses(
-    rotation: Floats, translation: Floats, center: Floats, radius_m: float, count: int, seed: int,
-    field: Field | None = None, tilt_deg: float = 25.0,
-) -> FlangePoses:  # fmt: skip
+    rotation: Floats,
+    translation: Floats,
+    center: Floats,
+    radius_m: float,
+    count: int,
+    seed: int,
+    field: Field | None = None,
+    tilt_deg: float = 25.0,
+) -> FlangePoses:
     """Flange poses from which the scan plane cuts the sphere in the field of view, tilted and turned at random."""
     f, rng = field or Field(), np.random.default_rng(seed)
     base = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -190,16 +199,17 @@ def sample_sphere_poses(
 
 
 def _seen_at(
-    R_BF: Floats, rotation: Floats, translation: Floats, f: Field, rng: np.random.Generator,
-    y: Floats | float = 0.0, deeper: float = 0.0,
-) -> Floats:  # fmt: skip
+    R_BF: Floats,
+    rotation: Floats,
+    translation: Floats,
+    f: Field,
+    rng: np.random.Generator,
+    y: Floats | float = 0.0,
+    deeper: float = 0.0,
+) -> Floats:
     """Vectors (n, 3) in B from the flange to a random place of the field in the scanner."""
     n = len(R_BF)
     p_S = np.column_stack(
-        [
-            rng.uniform(-0.9, 0.9, n) * f.half_width_m,
-            np.broadcast_to(y, n),
-            rng.uniform(f.near_m, f.far_m, n) + deeper,
-        ]
+        [rng.uniform(-0.9, 0.9, n) * f.half_width_m, np.broadcast_to(y, n), rng.uniform(f.near_m, f.far_m, n) + deeper]
     )
     return np.asarray(np.einsum("nij,nj->ni", R_BF, p_S @ rotation.T + translation))

@@ -1,4 +1,5 @@
-"""Decide how the flange poses of profiles are to be read: the target of the calibration must be one sphere or one edge."""
+"""Decide how the flange poses of profiles are to be read: the target of the calibration must be one sphere or one
+edge."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,7 +29,8 @@ _SAME_M, _SAME_RAD = 0.1e-3, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ReadingFit:
-    """What a reading of the poses leaves: squared residual (n,) m^2 of each scan, numbers that each scan contributes, unknowns, R_FS and p_FS."""
+    """What a reading of the poses leaves: squared residual (n,) m^2 of each scan, numbers that each scan contributes,
+    unknowns, R_FS and p_FS."""
 
     square: Floats
     each: int
@@ -63,13 +65,14 @@ def flange_poses(reading: PoseReading) -> FlangePoses:
 def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tuple[int, str]:
     """Number of the reading under which the profiles show one target, and a sentence about it.
 
-    If a reading were right, its residual would exceed that of the best by more than the root of the quantile of F(dof, dof) with probability
-    CHANCE at most; readings beyond it are rejected.
+    If a reading were right, its residual would exceed that of the best by more than the root of the quantile of F(dof,
+    dof) with probability CHANCE at most; readings beyond it are rejected.
 
     Args:
         readings: the candidates, the usual one first.
-        fit: solves for the profiler's pose with the poses of a reading. It also fits a motion that leaves a direction open: such a
-            motion is no evidence against a reading. It raises WeldcalError for poses that cannot be fitted at all.
+        fit: solves for the profiler's pose with the poses of a reading. It also fits a motion that leaves a direction
+            open: such a motion is no evidence against a reading. It raises WeldcalError for poses that cannot be fitted
+            at all.
         what: the target, for messages: sphere or edge.
 
     Raises:
@@ -89,8 +92,9 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
     best = fits[order[0]]
     if best.rms_m > _LARGEST_M:
         raise InconsistentData(
-            f"No reading of the poses fits the profiles: the best of {len(readings)}, {readings[order[0]].words}, leaves {_mm(best)} of one {what}. "
-            "Check that each profile has its own pose and shows the target, or state the form with --robot-form."
+            f"No reading of the poses fits the profiles: the best of {len(readings)}, {readings[order[0]].words},"
+            f" leaves {_mm(best)} of one {what}. Check that each profile has its own pose and shows the target, or"
+            " state the form with --robot-form."
         )
     limit = float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * (len(readings) - 1)), best.dof, best.dof)))
     alive = [k for k in order if fits[k].rms_m <= limit * best.rms_m]
@@ -98,9 +102,10 @@ def choose_reading(readings: Sequence[PoseReading], fit: Fit, what: str) -> tupl
     if rivals:
         one, other = readings[order[0]], readings[rivals[0]]
         raise InconsistentData(
-            f"The profiles do not show how the poses are written: read as {one.words} they leave {_mm(best)} of one {what}, as {other.words} "
-            f"{_mm(fits[rivals[0]])}, and the results differ. State the right one with --robot-form {one.form} or --robot-form {other.form}, or "
-            "take more scans with the flange turned about other axes."
+            f"The profiles do not show how the poses are written: read as {one.words} they leave {_mm(best)} of one"
+            f" {what}, as {other.words} {_mm(fits[rivals[0]])}, and the results differ. State the right one with"
+            f" --robot-form {one.form} or --robot-form {other.form}, or take more scans with the flange turned about"
+            " other axes."
         )
     dead = [k for k in order if k not in alive]
     chosen = min(alive)  # the usual one of those that are the same

@@ -17,7 +17,7 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate
 from weldcal.calibration.profiler.sphere.model import corrected
-from weldcal.models.documents import Section, read_document
+from weldcal.models.documents import DocumentSection, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import require_whole, write_atomic
 
@@ -30,9 +30,11 @@ class ProfilerRecord:
     """Calibration that maps a profile point into the base frame, with its uncertainty.
 
     Attributes:
-        rotation (3, 3), translation (3,) m: X_FS; covariance (6, 6) [rotation in F; translation] or None (paper's methods).
+        rotation (3, 3), translation (3,) m: X_FS; covariance (6, 6) [rotation in F; translation] or None (paper's
+            methods).
         affine (3,), origin (2,) m: the sensor's correction; tip (3,) m in F or None.
-        arm: its table as it was found where joints were corrected, with offsets (4,) rad of joints 2 to 5 and sag (2,) rad/m.
+        arm: its table as it was found where joints were corrected, with offsets (4,) rad of joints 2 to 5 and sag (2,)
+            rad/m.
         figures: what the command reports of the fit; data_sha256: of the file it came from.
     """
 
@@ -55,8 +57,13 @@ class ProfilerRecord:
     ) -> ProfilerRecord:
         """Of an edge's or a sphere's estimate; arm, as it is drawn, only where its joints were corrected."""
         plain = ProfilerRecord(
-            method=method, rotation=e.rotation, translation=e.translation, covariance=e.covariance, figures=figures, data_sha256=data_sha256
-        )  # fmt: skip
+            method=method,
+            rotation=e.rotation,
+            translation=e.translation,
+            covariance=e.covariance,
+            figures=figures,
+            data_sha256=data_sha256,
+        )
         if not isinstance(e, SphereEstimate):
             return plain
         table, errors = None if arm is None else arm.changed(e.arm_errors.table), e.arm_errors
@@ -80,7 +87,8 @@ class ProfilerRecord:
             return poses
         if q is None:
             raise InputError(
-                "This calibration corrects the arm's joints: give the joints q with the scans, or calibrate without --model affine+joints."
+                "This calibration corrects the arm's joints: give the joints q with the scans, or calibrate without"
+                " --model affine+joints."
             )
         return self.arm.poses(q, self.offsets, self.sag, self.arm.loads(q))
 
@@ -109,9 +117,11 @@ def save_record(record: ProfilerRecord, folder: Path) -> tuple[Path, Path]:
         "covariance": covariance,
         "sensor": {"x_scale_z_scale_shear": record.affine.tolist(), "origin": record.origin.tolist()},
         "tip_F": None if record.tip is None else record.tip.tolist(),
-        "arm": None
-        if record.arm is None
-        else {"dh": record.arm.rows.tolist(), "offsets": record.offsets.tolist(), "sag": record.sag.tolist()},
+        "arm": (
+            None
+            if record.arm is None
+            else {"dh": record.arm.rows.tolist(), "offsets": record.offsets.tolist(), "sag": record.sag.tolist()}
+        ),
         "figures": record.figures,
         "data_sha256": record.data_sha256,
     }
@@ -137,7 +147,7 @@ def load_record(path: Path) -> ProfilerRecord:
     document = read_document(path)
     if not isinstance(document, dict) or document.get("schema") != 1 or "X_FS" not in document:
         raise InputError(f"'{path.name}' is no profiler's calibration: run 'weldcal profiler edge' or 'sphere' again.")
-    d = Section.of(path.name, document)
+    d = DocumentSection.of(path.name, document)
     M = d.section("X_FS").array("matrix", 4, 4)
     if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
         raise InputError(f"'{path.name}' was changed by hand: run 'weldcal profiler edge' or 'sphere' again.")

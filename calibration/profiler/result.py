@@ -24,8 +24,8 @@ class ProfilerEstimate:
         inliers: (n,) bool; rms_m: of the inliers' residuals; reduced_chi2: of the whitened ones, 1 where the stated
             sigmas are right.
         condition: least over largest singular value of the Jacobian with columns of unit length.
-        scans_chi2: reduced chi-square of what the points of a scan share, such as the robot's error: many points that agree within each
-            scan must not hide few scans that disagree.
+        scans_chi2: reduced chi-square of what the points of a scan share, such as the robot's error: many points that
+            agree within each scan must not hide few scans that disagree.
     """
 
     rotation: Floats
@@ -45,7 +45,8 @@ class ProfilerEstimate:
 
 
 def worst_direction(normal_matrix: Floats) -> str:
-    """Description of the direction that a motion determines least: the part of [rotation; translation] (6, 6, in F) with the least information."""
+    """Description of the direction that a motion determines least: the part of [rotation; translation] (6, 6, in F)
+    with the least information."""
     unit = np.diag([1.0 / LEVER_M] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(unit @ normal_matrix @ unit)
     v = vectors[:, int(np.argmin(values))]
@@ -56,7 +57,8 @@ def worst_direction(normal_matrix: Floats) -> str:
 
 
 def believed_covariance(estimate: ProfilerEstimate) -> Floats:
-    """Covariance (6, 6) of an estimate, scaled by the larger reduced chi-square where the residuals exceed the stated sigmas.
+    """Covariance (6, 6) of an estimate, scaled by the larger reduced chi-square where the residuals exceed the stated
+    sigmas.
 
     Raises:
         DegenerateMotion: a direction is so open that this is no calibration, though the motion is not quite degenerate.
@@ -69,7 +71,7 @@ def believed_covariance(estimate: ProfilerEstimate) -> Floats:
     if sigma > VAGUE_M:
         open_one = worst_direction(np.asarray(np.linalg.inv(covariance)))
         raise DegenerateMotion(
-            f"These scans leave the {open_one} almost open (one sigma {1e3 * sigma:.0f} mm): turn the flange about two different axes "
-            "between them, by more."
+            f"These scans leave the {open_one} almost open (one sigma {1e3 * sigma:.0f} mm): turn the flange about two"
+            " different axes between them, by more."
         )
     return covariance

@@ -16,7 +16,7 @@ _SAMPLE = 200  # lines that decide the separator
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class NumberRows:
     """Rows of numbers that follow each other.
 
     Attributes:
@@ -69,7 +69,7 @@ def number_in(cell: str) -> float | None:
         return float("nan") if cell.lower() in _NOTHING else None
 
 
-def blocks_of(text: str, name: str) -> list[Block]:
+def blocks_of(text: str, name: str) -> list[NumberRows]:
     """The blocks of a text: a blank line, a line of words or another header ends one.
 
     Raises:
@@ -77,7 +77,7 @@ def blocks_of(text: str, name: str) -> list[Block]:
     """
     lines = re.split(r"\r\n|\n|\r", text.lstrip("\ufeff"))
     separator = separator_of(lines)
-    found: list[Block] = []
+    found: list[NumberRows] = []
     header: tuple[str, ...] = ()
     caption = ""
     rows: list[list[float]] = []
@@ -92,11 +92,11 @@ def blocks_of(text: str, name: str) -> list[Block]:
             for k, row in enumerate(rows):
                 if len(row) > width and np.isfinite(row[width:]).any():
                     raise InputError(
-                        f"'{name}', line {first + k}: {len(row)} cells, and the header names {width} columns; decimal commas need "
-                        "semicolons or tabs between the columns."
+                        f"'{name}', line {first + k}: {len(row)} cells, and the header names {width} columns; decimal"
+                        " commas need semicolons or tabs between the columns."
                     )
                 table[k, : min(len(row), width)] = row[:width]
-            found.append(Block(header, caption, table, first))
+            found.append(NumberRows(header, caption, table, first))
             rows, caption = [], ""
 
     for number, line in enumerate(lines, start=1):

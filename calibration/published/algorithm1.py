@@ -57,8 +57,9 @@ COSTS = ("translation", "translation_and_rotation", "work_radius")
 
 
 def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST_AXES) -> Cost:
-    """The cost a scenario asks for: the translation; section 4.2's norm over the chosen ``axes`` of COST_AXES at the work radius
-    (``work_radius``); or a bound on the error at that radius (``translation_and_rotation``). Raises InputError."""
+    """The cost a scenario asks for: the translation; section 4.2's norm over the chosen ``axes`` of COST_AXES at the
+    work radius (``work_radius``); or a bound on the error at that radius (``translation_and_rotation``). Raises
+    InputError."""
     if name not in COSTS:
         raise InputError(f"calibration.cost must be {', '.join(COSTS[:-1])} or {COSTS[-1]}, not '{name}'.")
     if not work_radius_m >= 0.0:

@@ -24,8 +24,9 @@ COMPONENTS = (
 """Names of the six components of an error at the flange, [rotation; translation] in frame R."""
 
 UNOBSERVABLE_SHARE = 0.01
-"""A component is called unobservable where less than one point in a hundred speaks for it: the chamfers of a whole ISO 9409-1-50
-face hold one in six, at 45 degrees, and speak for a shift with 4 %; stray points at an edge make half a per cent."""
+"""A component is called unobservable where less than one point in a hundred speaks for it: the chamfers of a whole ISO
+9409-1-50 face hold one in six, at 45 degrees, and speak for a shift with 4 %; stray points at an edge make half a per
+cent."""
 
 
 def surface_normals(points_R: Array, standard: FlangeStandard) -> Array:
@@ -45,14 +46,15 @@ def surface_normals(points_R: Array, standard: FlangeStandard) -> Array:
 
 
 def information(points_R: Array, normals_R: Array) -> Array:
-    """Information matrix (6, 6), order [rotation; translation], about the origin of R, of points (n, 3) m that each measure
-    their distance along their normal (n, 3), in units of one measurement (1 for each point)."""
+    """Information matrix (6, 6), order [rotation; translation], about the origin of R, of points (n, 3) m that each
+    measure their distance along their normal (n, 3), in units of one measurement (1 for each point)."""
     J = np.hstack([np.cross(points_R, normals_R), normals_R])
     return np.asarray(J.T @ J)
 
 
 def sigmas(matrix: Array, noise_m: float) -> Array:
-    """Standard deviation (6,), rad and m, of each component, the others unknown as well; infinite where unobservable."""
+    """Standard deviation (6,), rad and m, of each component, the others unknown as well; infinite where
+    unobservable."""
     values, vectors = np.linalg.eigh(_scaled(matrix))
     variance = np.where(values > 1e-9 * max(float(values[-1]), 1e-30), 1.0 / np.maximum(values, 1e-30), np.inf)
     share = vectors**2
@@ -107,10 +109,10 @@ class VerificationError:
 
     ``value`` (6,): rotation vector (rad) and displacement of the flange centre (m), both in the axes of the feature
     frame R; all infinite where the registration failed. ``X_CpC`` is Eq. (21)'s e, camera in the calculated camera, or
-    None. ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance. ``unobservable`` names the
-    components (of COMPONENTS) for which nothing was seen that could show them: they count as zero in ``value`` and in
-    ``X_CpC``, and `components` gives no number for them. ``sigma`` (6,) rad and m is what noise alone does to each,
-    infinite where unobservable.
+    None. ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance. ``unobservable``
+    names the components (of COMPONENTS) for which nothing was seen that could show them: they count as zero in
+    ``value`` and in ``X_CpC``, and `components` gives no number for them. ``sigma`` (6,) rad and m is what noise alone
+    does to each, infinite where unobservable.
     """
 
     value: Array
@@ -127,8 +129,8 @@ class VerificationError:
 
     @property
     def components(self) -> tuple[tuple[str, float, bool], ...]:
-        """(name, value in rad or m, whether it could be seen) of each degree of freedom, at the flange centre; NaN where it
-        could not."""
+        """(name, value in rad or m, whether it could be seen) of each degree of freedom, at the flange centre; NaN
+        where it could not."""
         seen = [n not in self.unobservable for n in COMPONENTS]
         return tuple(
             (n, float(v) if s else float("nan"), s) for n, v, s in zip(COMPONENTS, self.value, seen, strict=True)
@@ -150,7 +152,8 @@ class Verifier(Protocol):
 class Verification:
     """A verification scan: face points (N, 3) m in C, the feature's pose X_BR, and the model in R (points, normals).
 
-    ``standard`` is what the model was made from; without it the unobservable components are judged by the model's normals.
+    ``standard`` is what the model was made from; without it the unobservable components are judged by the model's
+    normals.
     """
 
     points_C: Array
@@ -234,10 +237,10 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     Iterations and stop rule are Open3D's defaults (30, relative change 1e-6), as in the paper's code. A registration
     that matches less than 30 % of the points has failed: the error is then infinite, never the identity. The six
     numbers are taken at the flange centre, not at the camera origin, where rotation and translation mix over the
-    working distance. A component along which the matched surface does not change is named unobservable, from the information
-    that the points carry along its normals: the turn about the flange's axis always (the model is one of revolution but for
-    its holes), the plane of a face whose chamfers were not scanned. Point-to-point registration sees less than that:
-    `sight` measures how much.
+    working distance. A component along which the matched surface does not change is named unobservable, from the
+    information that the points carry along its normals: the turn about the flange's axis always (the model is one of
+    revolution but for its holes), the plane of a face whose chamfers were not scanned. Point-to-point registration sees
+    less than that: `sight` measures how much.
     """
     import open3d as o3d  # slow to import
 
@@ -274,7 +277,8 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
 
 
 def _without_last_digits(X: Array) -> RigidTransform:
-    """A pose (4, 4) to 1e-10 m and rad: Open3D's threads add up in any order, so that the last digits are others in each run."""
+    """A pose (4, 4) to 1e-10 m and rad: Open3D's threads add up in any order, so that the last digits are others in
+    each run."""
     R, p = np.round(X[:3, :3], 10), np.round(X[:3, 3], 10)
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
 

@@ -22,8 +22,10 @@ _BLOCK = 64  # circles judged at once: keeps the distances of a 20 000-point fac
 
 @dataclass(frozen=True)
 class CircleParameters:
-    """Section 3.2.2: R = 31 mm, e_d = 0.3 mm, e_r = 1 mm, k_max = 10 000; m. ``only_smaller`` is the authors' program, which
-    takes radii from R - e_r to R, where the text says a tolerance."""
+    """Section 3.2.2: R = 31 mm, e_d = 0.3 mm, e_r = 1 mm, k_max = 10 000; m.
+
+    ``only_smaller`` is the authors' program, which takes radii from R - e_r to R, where the text says a tolerance.
+    """
 
     R: float = 0.031
     e_d: float = 0.0003
@@ -38,7 +40,8 @@ class CircleParameters:
 
 @dataclass(frozen=True)
 class PublishedCircle:
-    """Centre (3,) m in C, radius m, points within e_d of it, and how many of the k_max triples passed the model check."""
+    """Centre (3,) m in C, radius m, points within e_d of it, and how many of the k_max triples passed the model
+    check."""
 
     center_C: Array
     radius: float
@@ -49,11 +52,11 @@ class PublishedCircle:
 def search_circle(points_C: Array, parameters: CircleParameters | None = None, *, seed: int = 0) -> PublishedCircle:
     """Circle through three random points of a segmented face (N, 3) m that has the most points at its radius.
 
-    Source: paper, section 2.1.4, second step, numbers of section 3.2.2. As published: no plane is fitted, "on the circle" is
-    a distance from the centre within e_d of the radius (a shell), the winner is not refined, and inner points of the face
-    draw as often as points of its edge. The authors' search has no seed: the centre it gives for the same cloud repeats
-    to a few tenths of a millimetre only, which ``seed`` hides but does not correct. Raises FlangeNotFound when no triple
-    passes the check of the radius.
+    Source: paper, section 2.1.4, second step, numbers of section 3.2.2. As published: no plane is fitted, "on the
+    circle" is a distance from the centre within e_d of the radius (a shell), the winner is not refined, and inner
+    points of the face draw as often as points of its edge. The authors' search has no seed: the centre it gives for the
+    same cloud repeats to a few tenths of a millimetre only, which ``seed`` hides but does not correct. Raises
+    FlangeNotFound when no triple passes the check of the radius.
     """
     p = parameters or CircleParameters()
     points = np.asarray(points_C, dtype=float).reshape(-1, 3)
@@ -104,9 +107,10 @@ Method = Literal["point_to_point", "point_to_plane"]
 class PublishedParameters:
     """Parameters of the pipeline: circle and registration.
 
-    Partners at most 1 mm apart, Open3D's iterations and its stop rule 1e-6 on numbers of ``unit_m`` (the authors' clouds
-    are in mm, the AUBO's in m, which stops a thousand times earlier) and the program's point-to-plane or the
-    point-to-point ICP that its figures for the AUBO agree with. The paper names no e_required; 0.28 mm is what it claims.
+    Partners at most 1 mm apart, Open3D's iterations and its stop rule 1e-6 on numbers of ``unit_m`` (the authors'
+    clouds are in mm, the AUBO's in m, which stops a thousand times earlier) and the program's point-to-plane or the
+    point-to-point ICP that its figures for the AUBO agree with. The paper names no e_required; 0.28 mm is what it
+    claims.
     """
 
     circle: CircleParameters = field(default_factory=CircleParameters)
@@ -120,7 +124,9 @@ class PublishedParameters:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PublishedVerification:
     """Eq. (13): measured verification face (n, 3) m in C, the robot's X_BF there, and a CAD without chamfers: points
-    (m, 3) m and normals (m, 3) in F. Called with X_BC it gives e_icp as the paper takes it, at the camera's origin in the camera's axes."""
+    (m, 3) m and normals (m, 3) in F. Called with X_BC it gives e_icp as the paper takes it, at the camera's origin in
+    the camera's axes.
+    """
 
     points_C: Array
     X_BF: RigidTransform
@@ -136,9 +142,9 @@ class PublishedVerification:
 
 
 def published_model(standard: FlangeStandard, n: int = 20_000, *, seed: int = 0) -> tuple[Array, Array]:
-    """The ground-true cloud of Fig. 6 in F: points (m, 3) m of a CAD model with sharp edges, sampled evenly over the face and
-    the first 2 mm of its walls, and normals (m, 3) estimated from 30 neighbours within 1 mm as in the authors' program
-    (which makes them lean at every edge)."""
+    """The ground-true cloud of Fig. 6 in F: points (m, 3) m of a CAD model with sharp edges, sampled evenly over the
+    face and the first 2 mm of its walls, and normals (m, 3) estimated from 30 neighbours within 1 mm as in the authors'
+    program (which makes them lean at every edge)."""
     import open3d as o3d  # slow to import
 
     mesh = flange_mesh(standard, chamfers=False)
@@ -150,12 +156,13 @@ def published_model(standard: FlangeStandard, n: int = 20_000, *, seed: int = 0)
 
 
 def published_icp(X_BC: RigidTransform, verification: PublishedVerification) -> VerificationError:
-    """Eq. (13): register the measured face to the CAD face that ``X_BC`` puts into the camera frame; e_icp = Cam'_Cam H.
+    """Eq. (13): register the measured face to the CAD face that ``X_BC`` puts into the camera frame; e_icp = Cam'_Cam
+    H.
 
-    ``value`` is (roll, pitch, yaw; x, y, z) of e_icp, rad and m, at the camera's origin: a turn about a flange 0.4 m away
-    enters the translation with that lever. Its failings are kept: partners within 1 mm only, no chamfer on the CAD, a
-    stop rule that depends on the unit. One is not, for the paper itself says so: without a match the error is infinite, where the
-    registration returns the identity.
+    ``value`` is (roll, pitch, yaw; x, y, z) of e_icp, rad and m, at the camera's origin: a turn about a flange 0.4 m
+    away enters the translation with that lever. Its failings are kept: partners within 1 mm only, no chamfer on the
+    CAD, a stop rule that depends on the unit. One is not, for the paper itself says so: without a match the error is
+    infinite, where the registration returns the identity.
     """
     import open3d as o3d  # slow to import
 
@@ -182,12 +189,11 @@ def published_icp(X_BC: RigidTransform, verification: PublishedVerification) -> 
 
 
 def find_centres(
-    clouds_C: Mapping[str, Array],
-    parameters: PublishedParameters | None = None,
-    *,
-    seed: int = 0,
+    clouds_C: Mapping[str, Array], parameters: PublishedParameters | None = None, *, seed: int = 0
 ) -> tuple[dict[str, PublishedCircle], dict[str, Array], tuple[tuple[str, str], ...]]:
-    """Circle and face points of each scan by id, and (id, reason) of those without. The clouds are faces: segmented scans.
+    """Circle and face points of each scan by id, and (id, reason) of those without.
+
+    The clouds are faces: segmented scans.
 
     Each scan draws from its own stream of ``seed``, so that adding one changes no other.
     """
@@ -207,7 +213,8 @@ def find_centres(
 
 
 def published_pairs(circles: Mapping[str, PublishedCircle], poses: Mapping[str, RigidTransform]) -> list[Observation]:
-    """Eq. (9): TCP of the controller and centre of the circle, scan by scan; the circle's centre is taken for the TCP."""
+    """Eq. (9): TCP of the controller and centre of the circle, scan by scan; the circle's centre is taken for the
+    TCP."""
     return [Observation(id, poses[id], circle.center_C) for id, circle in circles.items()]
 
 
@@ -217,8 +224,8 @@ def all_pairs(pairs: Sequence[Observation]) -> RigidTransform:
 
 
 def at_flange(error: VerificationError, X_BC: RigidTransform, X_BF: RigidTransform) -> Array:
-    """The paper's e_icp (camera origin) as (6,) rotation vector (rad) and displacement of the flange centre (m), both in
-    axes of F: the same transform without the lever of the working distance. Infinite where the ICP failed."""
+    """The paper's e_icp (camera origin) as (6,) rotation vector (rad) and displacement of the flange centre (m), both
+    in axes of F: the same transform without the lever of the working distance. Infinite where the ICP failed."""
     if error.X_CpC is None:
         return np.full(6, np.inf)
     X_FC = X_BF.InvertAndCompose(X_BC)

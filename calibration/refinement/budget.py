@@ -1,4 +1,5 @@
-"""The error budget of a calibration: what each source contributes to the error at the work point, and what to reduce next."""
+"""The error budget of a calibration: what each source contributes to the error at the work point, and what to reduce
+next."""
 
 from __future__ import annotations
 
@@ -23,8 +24,8 @@ _IT8 = 25.0  # tolerance units of grade 8 (ISO 286-1), which ISO 9409-1 asks of 
 
 @dataclass(frozen=True)
 class Contribution:
-    """One source: root mean square distance ``mm`` that it adds at the work point, what that rests on (measured, data sheet or assumed), and
-    what would reduce it, with the ``left`` share of it that then remains."""
+    """One source: root mean square distance ``mm`` that it adds at the work point, what that rests on (measured, data
+    sheet or assumed), and what would reduce it, with the ``left`` share of it that then remains."""
 
     source: str
     mm: float
@@ -35,8 +36,8 @@ class Contribution:
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Contributions at ``p_B_mm`` in the base, independent of each other; ``held_out_mm`` is the root mean square of the held-out errors, None
-    where there are too few."""
+    """Contributions at ``p_B_mm`` in the base, independent of each other; ``held_out_mm`` is the root mean square of
+    the held-out errors, None where there are too few."""
 
     p_B_mm: tuple[float, float, float]
     rows: tuple[Contribution, ...]
@@ -58,8 +59,8 @@ class ErrorBudget:
         n = self.next
         after = float(np.sqrt(max(self.total_mm**2 - (1.0 - n.left**2) * n.mm**2, 0.0)))
         return (
-            f"Reduce next: {n.source} ({n.mm:.3f} of {self.total_mm:.3f} mm rms, {n.basis}). {n.remedy} The total then falls to about "
-            f"{after:.3f} mm."
+            f"Reduce next: {n.source} ({n.mm:.3f} of {self.total_mm:.3f} mm rms, {n.basis}). {n.remedy} The total then"
+            f" falls to about {after:.3f} mm."
         )
 
     def document(self) -> dict[str, object]:
@@ -84,11 +85,11 @@ def error_budget(
 ) -> ErrorBudget:
     """The budget at the middle of the inlier ``observations`` (as corrected), whose estimate this is.
 
-    Measured: what is estimated (X_BC, correction) from its covariance, the part of the correction being what knowing it would take away;
-    the noise of a scan from the fits; and, as the rest of the held-out errors, the arm's kinematics with what the correction's model
-    lacks. ``repeatability_m``: the arm's data sheet; ``flange_m``: outer diameter; ``scale_error``: of a scanner that is not corrected, as the
-    robot's motion shows it (else the usual one); ``refined``: the refinement that was applied.
-    Derivation: docs/calibration.md, "Error budget".
+    Measured: what is estimated (X_BC, correction) from its covariance, the part of the correction being what knowing it
+    would take away; the noise of a scan from the fits; and, as the rest of the held-out errors, the arm's kinematics
+    with what the correction's model lacks. ``repeatability_m``: the arm's data sheet; ``flange_m``: outer diameter;
+    ``scale_error``: of a scanner that is not corrected, as the robot's motion shows it (else the usual one);
+    ``refined``: the refinement that was applied. Derivation: docs/calibration.md, "Error budget".
     """
     kept = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
     middle = np.mean([o.p_BR for o in kept], axis=0)
@@ -120,9 +121,11 @@ def error_budget(
             "distortion of the scanner",
             1e3 * float(np.sqrt(scanner2)),
             MEASURED if corrected or scale_error is not None else ASSUMED,
-            "Take twice as many scans, over the whole field of view and range."
-            if corrected
-            else "Show the hole circle in six scans and more, so that the correction can be estimated.",
+            (
+                "Take twice as many scans, over the whole field of view and range."
+                if corrected
+                else "Show the hole circle in six scans and more, so that the correction can be estimated."
+            ),
             float(np.sqrt(0.5)) if corrected else 0.3,
         ),
         Contribution(
@@ -170,7 +173,8 @@ _REFINE = "Use --refine joints with joint angles and turned poses, or --refine l
 
 
 def _estimated(estimate: CalibrationEstimate, p_B: Array) -> tuple[float, float]:
-    """Squared errors (m^2) of a point at p_B (3,) m from the pose with the scanner's factors known, and what not knowing them adds."""
+    """Squared errors (m^2) of a point at p_B (3,) m from the pose with the scanner's factors known, and what not
+    knowing them adds."""
     whole = float(np.trace(point_error_covariance(estimate, p_B)))
     if estimate.joint is None or estimate.scanner is None:
         return whole, 0.0
@@ -182,6 +186,7 @@ def _estimated(estimate: CalibrationEstimate, p_B: Array) -> tuple[float, float]
 
 
 def _tolerance(diameter_m: float) -> float:
-    """Width (m) of the tolerance of grade 8 at a diameter (ISO 286-1: 25 i, i = 0.45 D^(1/3) + 0.001 D in um, D in mm)."""
+    """Width (m) of the tolerance of grade 8 at a diameter (ISO 286-1: 25 i, i = 0.45 D^(1/3) + 0.001 D in um, D in
+    mm)."""
     D = 1e3 * diameter_m
     return float(1e-6 * _IT8 * (0.45 * D ** (1.0 / 3.0) + 1e-3 * D))

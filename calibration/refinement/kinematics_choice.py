@@ -47,8 +47,9 @@ _SHOWN = 0.8  # of the prior: below it the poses have said something
 
 @dataclass(frozen=True, eq=False)
 class KinematicsChoice:
-    """A fit and the errors of poses (n,) that neither it nor the plain calibration saw: ``plain_m`` and ``refined_m``, ``tilt_rad`` with the
-    fit, NaN where the others fix none. ``accepted``: the fit is applied; ``sentence``: why, and what it found."""
+    """A fit and the errors of poses (n,) that neither it nor the plain calibration saw: ``plain_m`` and ``refined_m``,
+    ``tilt_rad`` with the fit, NaN where the others fix none. ``accepted``: the fit is applied; ``sentence``: why, and
+    what it found."""
 
     fit: KinematicsFit
     plain_m: Array
@@ -69,11 +70,12 @@ def choose_kinematics(
     correct_scanner: bool = True,
     seed: int = 0,
 ) -> KinematicsChoice:
-    """Fit errors of the arm to n inlier observations at joint angles q (n, joints), from their plain estimate, and decide on them.
+    """Fit errors of the arm to n inlier observations at joint angles q (n, joints), from their plain estimate, and
+    decide on them.
 
-    In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if the mean falls by
-    5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The prior
-    is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more.
+    In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if
+    the mean falls by 5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The
+    prior is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more.
 
     Raises TooFewPoses below twelve, InputError for poses of one orientation or an unknown ``kind``.
     """
@@ -87,8 +89,9 @@ def choose_kinematics(
     turned = turn_deg([o.X_BR for o in observations])
     if turned < LEAST_TURN_DEG:
         raise InputError(
-            f"The orientation varies by {turned:.1f} degrees only: errors of the arm (--refine {kind}) cannot be told from the scanner's; turn "
-            f"and tilt the flange by {LEAST_TURN_DEG:.0f} degrees and more, or use --refine local."
+            f"The orientation varies by {turned:.1f} degrees only: errors of the arm (--refine {kind}) cannot be told"
+            f" from the scanner's; turn and tilt the flange by {LEAST_TURN_DEG:.0f} degrees and more, or use --refine"
+            " local."
         )
     factory = arm_errors(arm, kind)
     none = replace(factory, which=factory.which[:0], scale=factory.scale[:0], names=())
@@ -130,7 +133,10 @@ def choose_kinematics(
     # the same fit without errors of the arm: what the scanner's part of it gains is not theirs
     scanner = means[0]
     accepted = bool(after < GAIN * min(before, scanner))
-    said = f"mean held-out error {before:.3f} mm without, {after:.3f} mm with them ({scanner:.3f} mm with the scanner's part alone)"
+    said = (
+        f"mean held-out error {before:.3f} mm without, {after:.3f} mm with them ({scanner:.3f} mm with the scanner's"
+        " part alone)"
+    )
     if not accepted:
         return KinematicsChoice(
             fit,
@@ -144,10 +150,13 @@ def choose_kinematics(
     why = f" Not separable from the scanner's distortion: {', '.join(mixed)}." if mixed else ""
     if large:
         why += (
-            f" They are larger than a factory calibration leaves (a prior {WRONG_FILE:.0f} times as wide predicts the held-out poses better): the "
-            "kinematics are probably those of another robot."
+            f" They are larger than a factory calibration leaves (a prior {WRONG_FILE:.0f} times as wide predicts the"
+            " held-out poses better): the kinematics are probably those of another robot."
         )
-    sentence = f"Errors of the arm are applied ({_told(fit)}): {said}.{why} X_BC belongs to the arm with the kinematics of the file written beside it."
+    sentence = (
+        f"Errors of the arm are applied ({_told(fit)}): {said}.{why} X_BC belongs to the arm with the kinematics of the"
+        " file written beside it."
+    )
     return KinematicsChoice(fit, plain, refined, tilt, True, sentence)
 
 
@@ -181,7 +190,8 @@ def with_kinematics(
 
 
 def kinematics_text(fit: KinematicsFit, note: str) -> str:
-    """The arm's link transforms with the errors found, as a file of Universal Robots' schema (m, rad; load_arm reads it)."""
+    """The arm's link transforms with the errors found, as a file of Universal Robots' schema (m, rad; load_arm reads
+    it)."""
     links = {}
     for link, moved in zip(LINKS, fit.corrected_stack(), strict=True):
         rpy = RollPitchYaw(RotationMatrix.ProjectToRotationMatrix(moved[:3, :3])).vector()
@@ -211,9 +221,11 @@ def _told(fit: KinematicsFit) -> str:
         zip(fit.errors.names, fit.values, fit.sigma, strict=True), key=lambda row: -abs(float(row[1] / row[2]))
     )
     found = [
-        f"{name} {1e3 * v:+.2f} +- {1e3 * s:.2f} mm"
-        if "shift" in name
-        else f"{name} {np.degrees(v):+.3f} +- {np.degrees(s):.3f} deg"
+        (
+            f"{name} {1e3 * v:+.2f} +- {1e3 * s:.2f} mm"
+            if "shift" in name
+            else f"{name} {np.degrees(v):+.3f} +- {np.degrees(s):.3f} deg"
+        )
         for name, v, s in rows
         if abs(v) > 2.0 * s
     ]

@@ -29,7 +29,8 @@ _PARTS = ("turn x", "turn y", "offset", "shift x", "shift y", "shift z")
 
 @dataclass(frozen=True)
 class FactoryPrior:
-    """Standard deviations of what a maker's arm is off: zero of a joint, turn of its axis (rad), place of its axis (m)."""
+    """Standard deviations of what a maker's arm is off: zero of a joint, turn of its axis (rad), place of its axis
+    (m)."""
 
     offset_rad: float = float(np.radians(0.035))
     turn_rad: float = float(np.radians(0.02))
@@ -42,7 +43,8 @@ class FactoryPrior:
 
 @dataclass(frozen=True, eq=False)
 class ArmErrors:
-    """Errors of an arm that are sought: ``which`` (k,) of its 6 n numbers, their ``scale`` (k,) (prior, rad or m) and ``names``."""
+    """Errors of an arm that are sought: ``which`` (k,) of its 6 n numbers, their ``scale`` (k,) (prior, rad or m) and
+    ``names``."""
 
     arm: Chain
     which: NDArray[np.int64]
@@ -74,10 +76,11 @@ def unsought(arm: Chain, kind: str) -> ArmErrors | None:
 
 
 def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmErrors:
-    """Joint offsets (``kind`` "joints") or all errors of the links ("links") that a scanner beside the arm can tell from its own pose.
+    """Joint offsets (``kind`` "joints") or all errors of the links ("links") that a scanner beside the arm can tell
+    from its own pose.
 
-    All of the first joint moves the base as a whole, and the turn of the last one about its axis does not show on a flange: both are left
-    out.
+    All of the first joint moves the base as a whole, and the turn of the last one about its axis does not show on a
+    flange: both are left out.
     """
     prior = prior or FactoryPrior()
     each = np.array([prior.turn_rad, prior.turn_rad, prior.offset_rad, *[prior.length_m] * 3])
@@ -89,9 +92,10 @@ def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmE
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class KinematicsFit:
-    """Camera pose, correction and errors u (k,) in units of their prior; ``covariance`` (6 + K + k,) of all: rotation on the base side about
-    the camera's origin, its displacement, factors, u. The sigmas are the scatter per axis, ``redundancy`` the spare numbers of positions.
-    ``sigma_considered`` (k,): standard deviations of u where other errors of the arm were considered."""
+    """Camera pose, correction and errors u (k,) in units of their prior; ``covariance`` (6 + K + k,) of all: rotation
+    on the base side about the camera's origin, its displacement, factors, u. The sigmas are the scatter per axis,
+    ``redundancy`` the spare numbers of positions. ``sigma_considered`` (k,): standard deviations of u where other
+    errors of the arm were considered."""
 
     X_BC: RigidTransform
     correction: ScannerCorrection
@@ -139,13 +143,15 @@ class KinematicsFit:
         ]
 
     def sensitivity(self, observations: Sequence[Observation], q: Array) -> Array:
-        """Derivatives (n, 6, 6 + K + k) of each scan's position (m) and normal (rad) by everything that is estimated."""
+        """Derivatives (n, 6, 6 + K + k) of each scan's position (m) and normal (rad) by everything that is
+        estimated."""
         n = len(observations)
         J = _jacobian(self, _arrays(observations, self.errors, q), q)
         return np.concatenate([J[: 3 * n].reshape(n, 3, -1), J[3 * n :].reshape(n, 3, -1)], axis=1)
 
     def predicted(self, observations: Sequence[Observation], q: Array) -> Array:
-        """Covariance (n, 3, 3) m^2 of the position error at new poses: of everything estimated, and of the scan itself."""
+        """Covariance (n, 3, 3) m^2 of the position error at new poses: of everything estimated, and of the scan
+        itself."""
         data = _arrays(observations, self.errors, q)
         J = self.sensitivity(observations, q)[:, :3]
         R = self.X_BC.rotation().matrix()
@@ -173,12 +179,13 @@ def fit_kinematics(
     fixed_scanner: bool = False,
     considered: ArmErrors | None = None,
 ) -> KinematicsFit:
-    """Fit everything to observations (n) at joint angles q (n, joints), from a plain calibration; ``holes`` is what the hole circles say of
-    the scanner. ``fixed_scanner`` holds the correction.
+    """Fit everything to observations (n) at joint angles q (n, joints), from a plain calibration; ``holes`` is what the
+    hole circles say of the scanner. ``fixed_scanner`` holds the correction.
 
-    Gauss-Newton with derivatives by differences; maximum a posteriori (arm: ``errors``' prior; scanner: what scanners usually are off). The
-    scatters of positions and normals follow from the residuals (Helmert). ``considered``: errors that the arm may have besides, with their
-    prior; they are not fitted, but widen the standard deviations of those that are (consider covariance, Schmidt 1966).
+    Gauss-Newton with derivatives by differences; maximum a posteriori (arm: ``errors``' prior; scanner: what scanners
+    usually are off). The scatters of positions and normals follow from the residuals (Helmert). ``considered``: errors
+    that the arm may have besides, with their prior; they are not fitted, but widen the standard deviations of those
+    that are (consider covariance, Schmidt 1966).
     """
     data = _arrays(observations, errors, q)
     k, terms = len(errors.which), TERMS[correction.order if fixed_scanner else max(correction.order, _LEAST_ORDER)]
@@ -284,7 +291,8 @@ def _corrected(correction: ScannerCorrection, data: _Data) -> tuple[Array, Array
 
 
 def _residuals(f: KinematicsFit, data: _Data, X: Array) -> Array:
-    """Positions (3 n) m, then what the seen normals lie beside those of the reached poses X (n, 4, 4) (3 n) rad, in the base."""
+    """Positions (3 n) m, then what the seen normals lie beside those of the reached poses X (n, 4, 4) (3 n) rad, in the
+    base."""
     return _beside(*_seen(f, data), data, X)
 
 

@@ -1,4 +1,5 @@
-"""A field of what a calibration leaves at the flange: Gaussian process over the place and orientation of the robot's poses."""
+"""A field of what a calibration leaves at the flange: Gaussian process over the place and orientation of the robot's
+poses."""
 
 from __future__ import annotations
 
@@ -39,11 +40,13 @@ _STARTS_M = (0.08, 0.2, 0.5)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalField:
-    """Residuals (n, 3) m, in the base, at poses of the flange (``places`` (n, 3) m and ``turns`` (n, 3, 3)), and what lies between.
+    """Residuals (n, 3) m, in the base, at poses of the flange (``places`` (n, 3) m and ``turns`` (n, 3, 3)), and what
+    lies between.
 
-    The covariance of the field at two poses is ``sigma_field_m``^2 exp(-d^2 / 2 ``length_m``^2 - a^2 / 2 ``turn_rad``^2) for each axis, d
-    their distance and a the angle between them; every scan has ``sigma_scan_m`` (per axis) of its own. Far from all poses, or at another
-    orientation, the field is zero and its spread is ``sigma_field_m``. Source: Rasmussen and Williams 2006, 2.2 and 5.4.1.
+    The covariance of the field at two poses is ``sigma_field_m``^2 exp(-d^2 / 2 ``length_m``^2 - a^2 / 2
+    ``turn_rad``^2) for each axis, d their distance and a the angle between them; every scan has ``sigma_scan_m`` (per
+    axis) of its own. Far from all poses, or at another orientation, the field is zero and its spread is
+    ``sigma_field_m``. Source: Rasmussen and Williams 2006, 2.2 and 5.4.1.
     """
 
     places: Array
@@ -55,7 +58,8 @@ class LocalField:
     sigma_scan_m: float
 
     def at(self, X_BR: Sequence[RigidTransform]) -> tuple[Array, Array]:
-        """The field (m, 3) m at poses, and the standard deviation (m,) m per axis of what it and the scan itself leave."""
+        """The field (m, 3) m at poses, and the standard deviation (m,) m per axis of what it and the scan itself
+        leave."""
         places, turns = _poses(X_BR)
         k = _kernel(places, turns, self.places, self.turns, self._values)
         known = np.einsum("ij,jk,ik->i", k, self._inverse, k)
@@ -68,7 +72,8 @@ class LocalField:
         return np.asarray(k @ (self._inverse @ self.residuals))
 
     def applied(self, X_BC: RigidTransform, observations: Sequence[Observation]) -> list[Observation]:
-        """Observations whose centres (camera frame) are moved by the field, so that X_BC maps them to where it expects them."""
+        """Observations whose centres (camera frame) are moved by the field, so that X_BC maps them to where it expects
+        them."""
         if not observations:
             return []
         shift, _ = self.at([o.X_BR for o in observations])
@@ -98,7 +103,10 @@ class LocalField:
 
 
 def field_from_document(document: dict[str, Any] | None, file: str = "") -> LocalField | None:
-    """Read a field from its document, of the file of that name; None for None. Raises InputError where it is malformed."""
+    """Read a field from its document, of the file of that name; None for None.
+
+    Raises InputError where it is malformed.
+    """
     if document is None:
         return None
     try:
@@ -121,10 +129,11 @@ def field_from_document(document: dict[str, Any] | None, file: str = "") -> Loca
 
 
 def fit_field(X_BR: Sequence[RigidTransform], residuals: Array) -> LocalField:
-    """The field through residuals (n, 3) m at n poses; lengths and spreads maximise the marginal likelihood times a prior.
+    """The field through residuals (n, 3) m at n poses; lengths and spreads maximise the marginal likelihood times a
+    prior.
 
-    The prior is wide (a factor of 2 to 3) about what cells show: 0.2 m, 10 degrees, 0.15 mm of field and 0.1 mm of single scans. Where
-    the orientation does not vary, the 10 degrees are the prior's.
+    The prior is wide (a factor of 2 to 3) about what cells show: 0.2 m, 10 degrees, 0.15 mm of field and 0.1 mm of
+    single scans. Where the orientation does not vary, the 10 degrees are the prior's.
     """
     places, turns = _poses(X_BR)
     d, a = _distances(places, turns, places, turns)
@@ -182,9 +191,9 @@ _STARTS = 60
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalChoice:
-    """A field and the errors of poses (n,) that neither it nor the calibration saw: ``plain_m``, ``tilt_rad`` and ``local_m`` with it, NaN
-    where the others fix none; ``squares`` (n,): the squared error with the field in units of its stated variance (3 on average).
-    ``accepted``: the field is applied; ``sentence``: why."""
+    """A field and the errors of poses (n,) that neither it nor the calibration saw: ``plain_m``, ``tilt_rad`` and
+    ``local_m`` with it, NaN where the others fix none; ``squares`` (n,): the squared error with the field in units of
+    its stated variance (3 on average). ``accepted``: the field is applied; ``sentence``: why."""
 
     field: LocalField
     plain_m: Array
@@ -204,11 +213,12 @@ def choose_local(
     correct_scanner: bool = True,
     seed: int = 0,
 ) -> LocalChoice:
-    """Fit a field to the held-out residuals of a calibration (``X_BC`` with ``correction``) of n inlier observations, and decide on it.
+    """Fit a field to the held-out residuals of a calibration (``X_BC`` with ``correction``) of n inlier observations,
+    and decide on it.
 
-    For every held-out pose (20 folds at most) the whole is repeated without it: the choice of the scanner's correction, the held-out
-    residuals of the others, the field and its lengths. The field is accepted if the mean of these errors falls by 5 %. Raises
-    TooFewPoses below ten.
+    For every held-out pose (20 folds at most) the whole is repeated without it: the choice of the scanner's correction,
+    the held-out residuals of the others, the field and its lengths. The field is accepted if the mean of these errors
+    falls by 5 %. Raises TooFewPoses below ten.
     """
     n = len(observations)
     if n < LEAST:
@@ -241,8 +251,9 @@ def choose_local(
         said = f"A local field ({lengths}) does not help: {said}. The plain calibration is used."
     else:
         said = (
-            f"A local field is applied ({lengths}): {said}. It holds near the poses that were taken and at their orientation; elsewhere it "
-            "falls to zero and the stated region grows. X_BC and its exports are those of the plain calibration."
+            f"A local field is applied ({lengths}): {said}. It holds near the poses that were taken and at their"
+            " orientation; elsewhere it falls to zero and the stated region grows. X_BC and its exports are those of"
+            " the plain calibration."
         )
     return LocalChoice(
         field=field, plain_m=plain, tilt_rad=tilt, local_m=local, squares=squares, accepted=accepted, sentence=said
@@ -276,7 +287,8 @@ def held_out_residuals(
 def with_field(
     estimate: CalibrationEstimate, choice: LocalChoice, corrected: Sequence[Observation]
 ) -> tuple[CalibrationEstimate, list[Observation]]:
-    """The estimate with the nested held-out errors of the choice, and the observations with the field where it was accepted."""
+    """The estimate with the nested held-out errors of the choice, and the observations with the field where it was
+    accepted."""
     position, tilt = estimate.held_out.position_m.copy(), estimate.held_out.tilt_rad.copy()
     position[estimate.inliers] = choice.local_m if choice.accepted else choice.plain_m
     tilt[estimate.inliers] = choice.tilt_rad

@@ -19,10 +19,11 @@ _POSE_SIGMA, _FACTOR_SIGMA = (
 
 
 def informative_poses(arm: Chain, X_BC: RigidTransform, q: Array, n: int, kind: str = "links") -> NDArray[np.int64]:
-    """Indices (n,) of those joint angles q (m, joints) rad, of flange poses that the scanner sees, to scan for `--refine`.
+    """Indices (n,) of those joint angles q (m, joints) rad, of flange poses that the scanner sees, to scan for
+    `--refine`.
 
-    Greedy: each next pose lowers the expected squared position error over all m poses most (V-optimal design, Atkinson, Donev and Tobias
-    2007, 10.6). The first ones say most.
+    Greedy: each next pose lowers the expected squared position error over all m poses most (V-optimal design, Atkinson,
+    Donev and Tobias 2007, 10.6). The first ones say most.
     """
     stated = flange_poses(arm, q, np.zeros((arm.n, 6)))
     seen = inverse(np.asarray(X_BC.GetAsMatrix4())) @ stated

@@ -28,27 +28,30 @@ _SAME_M, _SAME_RAD = (
 def require_joint_angles(data: Dataset, ids: Sequence[str], arm: Chain, stated: Array) -> Array:
     """Joint angles (n, arm.n) rad that lead the arm to the stated flange poses (n, 4, 4).
 
-    Raises DatasetError without angles, InputError where they lead elsewhere: to another arm, or to one whose controller has a factory
-    calibration of its own.
+    Raises DatasetError without angles, InputError where they lead elsewhere: to another arm, or to one whose controller
+    has a factory calibration of its own.
     """
     q = joint_angles(data, ids, arm.n)
     if q is None:
         raise DatasetError(
-            f"poses.csv or pairs.csv in '{data.folder.name}' has no joint angles: add the columns q1 to q{arm.n} (radians), or omit --refine."
+            f"poses.csv or pairs.csv in '{data.folder.name}' has no joint angles: add the columns q1 to q{arm.n}"
+            " (radians), or omit --refine."
         )
     reached = flange_poses(arm, q, np.zeros((arm.n, 6)))
     off_m = float(np.linalg.norm(stated[:, :3, 3] - reached[:, :3, 3], axis=1).max())
     turn = log_rotation(np.swapaxes(reached[:, :3, :3], 1, 2) @ stated[:, :3, :3])
     if off_m > _SAME_M or float(np.linalg.norm(turn, axis=1).max()) > _SAME_RAD:
         raise InputError(
-            f"The joint angles lead this {arm.name} up to {1e3 * off_m:.2f} mm from the stated poses. A real controller computes with the "
-            "factory calibration of its arm: give that file (--kinematics). Else check the robot's name, radians, and that the TCP is zero."
+            f"The joint angles lead this {arm.name} up to {1e3 * off_m:.2f} mm from the stated poses. A real controller"
+            " computes with the factory calibration of its arm: give that file (--kinematics). Else check the robot's"
+            " name, radians, and that the TCP is zero."
         )
     return q
 
 
 def arm_document(fit: KinematicsFit) -> dict[str, Any]:
-    """The errors as plain types for calibration.yaml (rad, m), with the covariance of X_BC, scanner factors and errors / prior."""
+    """The errors as plain types for calibration.yaml (rad, m), with the covariance of X_BC, scanner factors and errors
+    / prior."""
     found = fit.errors
     return {
         "names": list(found.names),
@@ -67,7 +70,8 @@ def shared_error(
     observations: Sequence[Observation],
     q: Array,
 ) -> tuple[Array, Array] | None:
-    """Derivatives (n, 3, p) of positions of new scans by what the result estimated, and its covariance (p, p); None where it states none.
+    """Derivatives (n, 3, p) of positions of new scans by what the result estimated, and its covariance (p, p); None
+    where it states none.
 
     ``observations`` (n) as seen, with the poses that the arm of ``kinematics`` reaches at q (n, joints).
 

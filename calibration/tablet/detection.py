@@ -26,12 +26,13 @@ _GRID_ERROR = 0.08  # of the spacing: how far a landmark may lie from the grid's
 
 
 def find_landmarks(image: Grey, columns: int, rows: int, look: Look = "rings") -> Array:
-    """Image positions (rows * columns, 2) px of the page's landmarks, row by row from its first; centre of the first pixel
-    at (0, 0).
+    """Image positions (rows * columns, 2) px of the page's landmarks, row by row from its first; centre of the first
+    pixel at (0, 0).
 
-    ``image`` (h, w) or (h, w, 3), 8 bits. Rings: landmark 0 is the full disc, so the page may be turned in the image. Dots
-    are all alike: the page must stand upright in the image within 45 degrees. Centres are centroids of darkness; of an 8 mm
-    ring seen 30 degrees aslant from 0.3 m the centroid is 0.03 mm off its centre, of which nothing is corrected.
+    ``image`` (h, w) or (h, w, 3), 8 bits. Rings: landmark 0 is the full disc, so the page may be turned in the image.
+    Dots are all alike: the page must stand upright in the image within 45 degrees. Centres are centroids of darkness;
+    of an 8 mm ring seen 30 degrees aslant from 0.3 m the centroid is 0.03 mm off its centre, of which nothing is
+    corrected.
 
     Raises LandmarksNotFound: not all are seen, or what is seen is no such grid.
     """
@@ -39,20 +40,21 @@ def find_landmarks(image: Grey, columns: int, rows: int, look: Look = "rings") -
 
 
 def find_marks(image: Grey, most: int, look: Look = "rings") -> tuple[Array, Array | None]:
-    """Centres (k, 2) px of what looks like a landmark, of dots the `most` strongest and a few to spare; and how full the rings
-    are (k,), None for dots."""
+    """Centres (k, 2) px of what looks like a landmark, of dots the `most` strongest and a few to spare; and how full
+    the rings are (k,), None for dots."""
     grey: Grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image, dtype=np.uint8)
     return _rings(grey) if look == "rings" else (_dots(grey, most + _SPARE), None)
 
 
 def arrange(points: Array, full: Array | None, columns: int, rows: int) -> Array:
-    """The marks (k, 2) that make the page's grid, row by row from its first: (rows * columns, 2); see find_landmarks."""
+    """The marks (k, 2) that make the page's grid, row by row from its first: (rows * columns, 2); see
+    find_landmarks."""
     n = columns * rows
     mark = "dot" if full is None else "ring"
     if len(points) < n:
         raise LandmarksNotFound(
-            f"{len(points)} of {n} landmarks were found; show all of the page, in focus, without glare, and let no {mark} "
-            "touch the image's edge."
+            f"{len(points)} of {n} landmarks were found; show all of the page, in focus, without glare, and let no"
+            f" {mark} touch the image's edge."
         )
     grid = _as_grid(points, columns, rows)
     if grid is None:
@@ -65,7 +67,8 @@ def arrange(points: Array, full: Array | None, columns: int, rows: int) -> Array
     first = int(darkness.argmax())
     if darkness[first] - np.delete(darkness, first).max() < _FULLER:
         raise LandmarksNotFound(
-            "No landmark is clearly the full disc, which is the page's first; focus the camera or make the rings larger."
+            "No landmark is clearly the full disc, which is the page's first; focus the camera or make the rings"
+            " larger."
         )
     for turned in _turned(grid, columns, rows):
         if (turned[0] == grid[first]).all():

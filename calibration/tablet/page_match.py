@@ -1,4 +1,5 @@
-"""Compares touches with the landmarks they belong to, and names the mistake in the file where they contradict each other."""
+"""Compares touches with the landmarks they belong to, and names the mistake in the file where they contradict each
+other."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -18,13 +19,13 @@ def check_page_match(
 ) -> tuple[str, ...]:
     """Require that touches (n, 2) px lie at their landmarks (n, 2) px; sentences on single ones that do not.
 
-    A touch belongs to the landmark that is nearest, so it may miss by half of the least distance of two landmarks: that is
-    30 times the scatter of a person's aim on the usual page. Fit and report do not show a mistake here: touches alone fit a
-    page that is mirrored or shifted just as well, and the camera is then off by as much.
+    A touch belongs to the landmark that is nearest, so it may miss by half of the least distance of two landmarks: that
+    is 30 times the scatter of a person's aim on the usual page. Fit and report do not show a mistake here: touches
+    alone fit a page that is mirrored or shifted just as well, and the camera is then off by as much.
 
     Raises:
-        TabletDataError: a changed reading of the touches (axes swapped or mirrored, another unit, another origin, another
-            order) explains them, or most of them lie elsewhere.
+        TabletDataError: a changed reading of the touches (axes swapped or mirrored, another unit, another origin,
+            another order) explains them, or most of them lie elsewhere.
     """
     gap = _least_distance(landmark_px)
     off = np.linalg.norm(touched_px - landmark_px, axis=1)
@@ -33,8 +34,8 @@ def check_page_match(
         return ()
     worst = int(off.argmax())
     told = (
-        f"'{file}' contradicts itself: landmark {names[worst]} was touched {mm_per_px * off[worst]:.0f} mm from its place on "
-        "the page"
+        f"'{file}' contradicts itself: landmark {names[worst]} was touched {mm_per_px * off[worst]:.0f} mm from its"
+        " place on the page"
     )
     cause = _changed_reading(touched_px, landmark_px, mm_per_px, gap) or _other_order(
         touched_px, landmark_px, names, gap
@@ -43,12 +44,15 @@ def check_page_match(
         raise TabletDataError(f"{told}, because {cause}. Correct the file.")
     if 2 * int(far.sum()) > len(far):
         raise TabletDataError(
-            f"{told}, and so were {int(far.sum()) - 1} others. Check that touches and landmarks are of one page and in one unit."
+            f"{told}, and so were {int(far.sum()) - 1} others. Check that touches and landmarks are of one page and in"
+            " one unit."
         )
     which = ", ".join(name for name, f in zip(names, far, strict=True) if f)
     return (
-        f"Touched nearer to another landmark than to its own (up to {mm_per_px * off[worst]:.0f} mm away): landmark {which}. "
-        "Check its number in the file.",
+        (
+            f"Touched nearer to another landmark than to its own (up to {mm_per_px * off[worst]:.0f} mm away): landmark"
+            f" {which}. Check its number in the file."
+        ),
     )
 
 
@@ -89,8 +93,11 @@ def _said(swapped: bool, flips: tuple[int, int], scale: float, mm_per_px: float,
     if swapped and flips == (1, 1):
         causes.append("touch_x and touch_y are swapped")
     elif swapped:
-        causes.append("the touches' axes are turned by 90 deg against the landmarks'" if flips[0] != flips[1] else
-                      "touch_x and touch_y are swapped and both mirrored")  # fmt: skip
+        causes.append(
+            "the touches' axes are turned by 90 deg against the landmarks'"
+            if flips[0] != flips[1]
+            else "touch_x and touch_y are swapped and both mirrored"
+        )
     elif flips != (1, 1):
         which = " and ".join(n for n, f in zip(("touch_x", "touch_y"), flips, strict=True) if f < 0)
         causes.append(

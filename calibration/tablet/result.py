@@ -9,14 +9,8 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.results import (
-    export_ros2,
-    export_ur_pose,
-    export_urdf,
-    matrix4,
-    software_version,
-)
-from weldcal.models.documents import Section, as_number, read_document
+from weldcal.calibration.data.results import export_ros2, export_ur_pose, export_urdf, matrix4, software_version
+from weldcal.models.documents import DocumentSection, as_number, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER
 from weldcal.models.result_files import require_whole, write_atomic
@@ -30,10 +24,10 @@ PARENT, CHILD = "flange", "camera_optical_frame"
 class TabletResult:
     """Contents of tablet.yaml.
 
-    ``model``: closed_form, pnp, pnp_free_scale (planar, an upright pen) or wrist (full poses); ``parameters`` by name, m and
-    rad, and their ``covariance`` in that order. ``leave_one_out_mm`` is empty where nothing could be held out. Only for wrist:
-    ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the flange side about the camera's origin), ``p_FP_m`` and
-    its covariance (3, 3).
+    ``model``: closed_form, pnp, pnp_free_scale (planar, an upright pen) or wrist (full poses); ``parameters`` by name,
+    m and rad, and their ``covariance`` in that order. ``leave_one_out_mm`` is empty where nothing could be held out.
+    Only for wrist: ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the flange side about the camera's
+    origin), ``p_FP_m`` and its covariance (3, 3).
     """
 
     model: str
@@ -103,7 +97,7 @@ def load_tablet_result(path: Path) -> TabletResult:
     document = read_document(path)
     if not isinstance(document, dict) or (document.get("schema"), document.get("configuration")) != (1, _CONFIGURATION):
         raise InputError(f"'{path.name}' is not a tablet calibration of schema 1; run 'weldcal tablet calibrate'.")
-    d = Section.of(path.name, document)
+    d = DocumentSection.of(path.name, document)
     X_FC = None
     if d.has("X_FC"):
         M = d.section("X_FC").array("matrix", 4, 4)
@@ -132,7 +126,7 @@ def load_tablet_result(path: Path) -> TabletResult:
     )
 
 
-def _whole(d: Section, key: str) -> dict[str, float]:
+def _whole(d: DocumentSection, key: str) -> dict[str, float]:
     """Numbers by name under a key, none of which is missing."""
     found = d.section(key)
     return {str(name): found.number(name) for name in found.values}

@@ -21,9 +21,9 @@ class TabletTouches:
 
     ``uv_px`` (n, 2) landmark in the image, ``depth_m`` (n,) along the optical axis, ``hand_m`` (n, 2) hand in the base
     when the pen touched, ``theta_rad`` (n,) turn of the hand then, ``delta_px`` (n, 2) landmark minus touched point on
-    the tablet, ``landmark_px`` (n, 2) landmark on the tablet. ``pitch_m`` metres per tablet pixel; ``focal_px`` (2,) and
-    ``centre_px`` (2,) of the camera; ``hand_capture_m`` (3,) hand in the base when the image was taken (turn 0). The hand
-    at turn 0 has x along -x of the base and z down (Eq. 1: Ry(180)).
+    the tablet, ``landmark_px`` (n, 2) landmark on the tablet. ``pitch_m`` metres per tablet pixel; ``focal_px`` (2,)
+    and ``centre_px`` (2,) of the camera; ``hand_capture_m`` (3,) hand in the base when the image was taken (turn 0).
+    The hand at turn 0 has x along -x of the base and z down (Eq. 1: Ry(180)).
     """
 
     uv_px: Array
@@ -41,9 +41,16 @@ class TabletTouches:
         """Refuse shapes that do not fit and numbers that are none (TabletDataError)."""
         n = len(self.uv_px)
         shapes = {
-            "uv_px": (n, 2), "depth_m": (n,), "hand_m": (n, 2), "theta_rad": (n,), "delta_px": (n, 2),
-            "landmark_px": (n, 2), "focal_px": (2,), "centre_px": (2,), "hand_capture_m": (3,),
-        }  # fmt: skip
+            "uv_px": (n, 2),
+            "depth_m": (n,),
+            "hand_m": (n, 2),
+            "theta_rad": (n,),
+            "delta_px": (n, 2),
+            "landmark_px": (n, 2),
+            "focal_px": (2,),
+            "centre_px": (2,),
+            "hand_capture_m": (3,),
+        }
         for name, shape in shapes.items():
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != shape:
@@ -77,8 +84,12 @@ class TabletTouches:
             f: getattr(self, f)[keep] for f in ("uv_px", "depth_m", "hand_m", "theta_rad", "delta_px", "landmark_px")
         }
         return TabletTouches(
-            **rows, pitch_m=self.pitch_m, focal_px=self.focal_px, centre_px=self.centre_px, hand_capture_m=self.hand_capture_m
-        )  # fmt: skip
+            **rows,
+            pitch_m=self.pitch_m,
+            focal_px=self.focal_px,
+            centre_px=self.centre_px,
+            hand_capture_m=self.hand_capture_m,
+        )
 
 
 def check_touches(touches: TabletTouches) -> None:
@@ -96,8 +107,8 @@ def check_layout(landmarks: Array) -> None:
     n = int(same_landmark(landmarks).max(initial=-1)) + 1
     if n < MIN_LANDMARKS:
         raise TooFewLandmarks(
-            f"{n} landmarks are too few{' (a landmark counts once)' if n < len(landmarks) else ''}; touch at least {MIN_LANDMARKS}, "
-            "better all nine."
+            f"{n} landmarks are too few{' (a landmark counts once)' if n < len(landmarks) else ''}; touch at least"
+            f" {MIN_LANDMARKS}, better all nine."
         )
     spread = np.linalg.svd(landmarks - landmarks.mean(axis=0), compute_uv=False)
     if spread[1] <= _THIN * spread[0]:
@@ -117,6 +128,6 @@ def check_turns(theta_rad: Array) -> None:
     mean = np.exp(1j * theta_rad).mean()
     if np.sqrt(max(1.0 - abs(mean) ** 2, 0.0)) < _LEAST_TURN_RAD:
         raise EqualRotations(
-            "The hand's rotation is nearly the same at every touch, so pen and camera cannot be separated; turn the last "
-            "joint between touches, by 90 deg or more in all."
+            "The hand's rotation is nearly the same at every touch, so pen and camera cannot be separated; turn the"
+            " last joint between touches, by 90 deg or more in all."
         )

@@ -1,4 +1,5 @@
-"""What errors of the arm, unknown but as large as makers leave them, do to touches after a calibration that was made with the same arm."""
+"""What errors of the arm, unknown but as large as makers leave them, do to touches after a calibration that was made
+with the same arm."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ _USUAL_POSTURE = np.radians([-90.0, 110.0, -110.0, -90.0, 0.0])  # of the second
 def observed_document(
     observations: Sequence[Observation], X_FR: RigidTransform | None = None, joints: Sequence[Array] = ()
 ) -> dict[str, Any]:
-    """The poses that a calibration used, for CalibrationResult.observed: feature in the base, seen centre and normal, joints where known."""
+    """The poses that a calibration used, for CalibrationResult.observed: feature in the base, seen centre and normal,
+    joints where known."""
     X = X_FR or RigidTransform()
     return {
         "feature_xyz": [float(v) for v in X.translation()],
@@ -43,8 +45,11 @@ def observed_document(
 
 @dataclass(frozen=True, eq=False)
 class ArmEffect:
-    """``effect`` (n, 3, k) m: change of scanned minus touched by each error of the arm of one standard deviation. ``derivatives`` (n, 3, p) by
-    what was estimated and its ``covariance`` (p, p) from the scans' noise and the prior alone; ``noise``: share of the residuals' variance that is not the arm's."""
+    """``effect`` (n, 3, k) m: change of scanned minus touched by each error of the arm of one standard deviation.
+
+    ``derivatives`` (n, 3, p) by what was estimated and its ``covariance`` (p, p) from the scans' noise and the prior
+    alone; ``noise``: share of the residuals' variance that is not the arm's.
+    """
 
     effect: Array
     derivatives: Array
@@ -58,16 +63,17 @@ def arm_effect(
     X_BF: Sequence[RigidTransform],
     q_tips: Sequence[Array | None],
 ) -> ArmEffect | None:
-    """Changes of scanned minus touched at n tips (flange poses ``X_BF``, joint angles where known) by k errors of the arm, each of
-    one standard deviation of a maker's (FactoryPrior).
+    """Changes of scanned minus touched at n tips (flange poses ``X_BF``, joint angles where known) by k errors of the
+    arm, each of one standard deviation of a maker's (FactoryPrior).
 
-    The calibration has seen the same errors and bent to them: with e = A d + B u at its poses (d: camera pose and scanner correction, u: errors
-    of the arm) it finds d = -G u, G = (A' W A + P)^-1 A' W B, and a touch errs by (B_t - A_t G) u (consider covariance, Schmidt 1966). None
-    where the result does not hold its poses or its arm is not known.
+    The calibration has seen the same errors and bent to them: with e = A d + B u at its poses (d: camera pose and
+    scanner correction, u: errors of the arm) it finds d = -G u, G = (A' W A + P)^-1 A' W B, and a touch errs by (B_t -
+    A_t G) u (consider covariance, Schmidt 1966). None where the result does not hold its poses or its arm is not known.
 
-    The calibration's own residuals bound this: their variance s^2 holds the arm's share a^2 = mean |(B - A G) u|^2 / redundancy. Second: the
-    share of s^2 that is not the arm's, 1 - a^2 / s^2 (at least 5 %); where a^2 is larger than s^2 this arm is better than usual, and its
-    errors are taken as smaller by s / a. Raises InputError where they cannot be read.
+    The calibration's own residuals bound this: their variance s^2 holds the arm's share a^2 = mean |(B - A G) u|^2 /
+    redundancy. Second: the share of s^2 that is not the arm's, 1 - a^2 / s^2 (at least 5 %); where a^2 is larger than
+    s^2 this arm is better than usual, and its errors are taken as smaller by s / a. Raises InputError where they cannot
+    be read.
     """
     if result.observed is None or result.sigma_position_mm <= 0.0:
         return None
@@ -117,7 +123,8 @@ def arm_effect(
 
 
 def _joints(robot: str, X_BF: Sequence[RigidTransform], known: Sequence[Array | None]) -> Array | None:
-    """Joint angles (n, 6) rad at flange poses, all of one kind of posture: the known ones, else elbow up; None out of reach."""
+    """Joint angles (n, 6) rad at flange poses, all of one kind of posture: the known ones, else elbow up; None out of
+    reach."""
     arm = load_arm(robot)
     p = np.mean([X.translation() for X in X_BF], axis=0)
     near = np.append(np.arctan2(p[1], p[0]) + np.pi, _USUAL_POSTURE)

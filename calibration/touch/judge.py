@@ -1,4 +1,5 @@
-"""Compares touched points with what the calibration states: each error with its 95 % limit, and errors from point to point."""
+"""Compares touched points with what the calibration states: each error with its 95 % limit, and errors from point to
+point."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ FALSE_ALARM = 0.01
 """Of verifications of a calibration as good as it states in which more touches lie outside than the limit allows."""
 _PRIOR = FactoryPrior()
 USUAL_TILT_RAD = float(np.sqrt((6.0 * _PRIOR.offset_rad**2 + 12.0 * _PRIOR.turn_rad**2) / 3.0))
-"""Error per axis of the flange's orientation that a maker's calibration of six joints leaves: zeros and two turns of each axis."""
+"""Error per axis of the flange's orientation that a maker's calibration of six joints leaves: zeros and two turns of
+each axis."""
 _DRAWS, _SEED = 4000, 1
 _FIELD_LENGTH_M = 0.2  # over which what an arm leaves at another orientation is alike
 _LEAST_FREE = 3.0
@@ -45,10 +47,10 @@ _LEAST_FREE = 3.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TouchErrors:
-    """Touches (n) judged: ``error_m`` (n,) distance of touched from scanned (signed where it has one direction), ``limit_m`` (n,) of
-    the stated 95 % region in the direction of the error, ``inside`` (n,). ``relative_m`` (n,) is what is left of each error after the shift that
-    the other touches show, ``relative_limit_m`` its stated 95 % limit: NaN where the others show no shift. ``most_outside``: touches that may
-    lie outside by chance."""
+    """Touches (n) judged: ``error_m`` (n,) distance of touched from scanned (signed where it has one direction),
+    ``limit_m`` (n,) of the stated 95 % region in the direction of the error, ``inside`` (n,). ``relative_m`` (n,) is
+    what is left of each error after the shift that the other touches show, ``relative_limit_m`` its stated 95 % limit:
+    NaN where the others show no shift. ``most_outside``: touches that may lie outside by chance."""
 
     ids: tuple[str, ...]
     features: tuple[str, ...]
@@ -68,13 +70,14 @@ class TouchErrors:
 
 
 def judge_touches(result: CalibrationResult, touches: Sequence[Touch], kinematics: Path | None = None) -> TouchErrors:
-    """Judge a calibration by touches that it did not use; ``kinematics`` is the file of a result with refined kinematics.
+    """Judge a calibration by touches that it did not use; ``kinematics`` is the file of a result with refined
+    kinematics.
 
     The error of touch k in its directions D_k (all three for a point, the normal for a surface touched by a ball) is
-    e_k = D_k (touched - scanned) - clearance. Its stated covariance adds pose and scanner correction (and errors of the arm, where the
-    result states them), the spread of robot and scanner with what an arm usually leaves at another orientation, what it leaves of the
-    flange's orientation times the length of the tool, the scan, and place and
-    radius of the tip, which all touches share. The spread was estimated from few residuals, so the limit is that of F.
+    e_k = D_k (touched - scanned) - clearance. Its stated covariance adds pose and scanner correction (and errors of the
+    arm, where the result states them), the spread of robot and scanner with what an arm usually leaves at another
+    orientation, what it leaves of the flange's orientation times the length of the tool, the scan, and place and radius
+    of the tip, which all touches share. The spread was estimated from few residuals, so the limit is that of F.
     Derivation: docs/calibration.md, "A touch as the judge".
 
     Raises:
@@ -156,8 +159,8 @@ def _calibration_terms(
 def _spread(result: CalibrationResult, touches: Sequence[Touch], tips: list[Observation], arm_unknown: bool) -> Array:
     """Covariance (n, n) m^2, per axis, of the spread of robot and scanner between the touches.
 
-    Where nothing else says what the arm's errors do (``arm_unknown``): their usual size at another orientation, and the usual error of a
-    flange's orientation times the length of the tool, for the calibration is bent by as much.
+    Where nothing else says what the arm's errors do (``arm_unknown``): their usual size at another orientation, and the
+    usual error of a flange's orientation times the length of the tool, for the calibration is bent by as much.
     """
     n, own = len(tips), (1e-3 * result.sigma_position_mm) ** 2
     if not arm_unknown:
@@ -191,8 +194,8 @@ def _components(
         if t.feature == POINT:
             if t.radius > 0.0:
                 raise InputError(
-                    f"Touch '{t.id}': a ball cannot touch a point. Give tip_radius 0 for a pointed tip, or the plane, sphere or edge that it "
-                    "touches."
+                    f"Touch '{t.id}': a ball cannot touch a point. Give tip_radius 0 for a pointed tip, or the plane,"
+                    " sphere or edge that it touches."
                 )
             directions, clearance = np.eye(3), 0.0
         elif t.feature == SPHERE:
@@ -264,7 +267,8 @@ def _marginal(
 
 
 def _without_shift(rows: Array, owner: NDArray[np.int64]) -> Array:
-    """Matrix (m, m) that takes from each touch's errors the shift that the errors of the others show; zero where they show none."""
+    """Matrix (m, m) that takes from each touch's errors the shift that the errors of the others show; zero where they
+    show none."""
     m = len(owner)
     A = np.zeros((m, m))
     for k in np.unique(owner):
@@ -281,7 +285,8 @@ def _without_shift(rows: Array, owner: NDArray[np.int64]) -> Array:
 
 
 def _most_outside(C: Array, owner: NDArray[np.int64], n: int, free: float) -> int:
-    """Number of touches that lie outside in more than 1 - FALSE_ALARM of draws of errors as stated, all that is shared included."""
+    """Number of touches that lie outside in more than 1 - FALSE_ALARM of draws of errors as stated, all that is shared
+    included."""
     rng = np.random.default_rng(_SEED)
     values, vectors = np.linalg.eigh(0.5 * (C + C.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))

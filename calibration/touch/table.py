@@ -1,4 +1,5 @@
-"""Reads touches.csv: one row for each touch, metres and unit quaternions, with a feature's numbers or the cloud that shows it."""
+"""Reads touches.csv: one row for each touch, metres and unit quaternions, with a feature's numbers or the cloud that
+shows it."""
 
 import re
 from collections.abc import Sequence
@@ -33,21 +34,26 @@ _TUKEY = 4.685
 
 
 def around(points_C: Array, p_C: Array, within_m: float, name: str, least: int = LEAST_POINTS) -> Array:
-    """Points (n, 3) m of a cloud at most ``within_m`` from a place (3,) m. Raises InputError for fewer than ``least``."""
+    """Points (n, 3) m of a cloud at most ``within_m`` from a place (3,) m.
+
+    Raises InputError for fewer than ``least``.
+    """
     p = np.asarray(points_C, dtype=float).reshape(-1, 3)
     near: Array = p[np.linalg.norm(np.nan_to_num(p, nan=np.inf) - p_C, axis=1) <= within_m]
     if len(near) < least:
         raise InputError(
-            f"Touch '{name}': the cloud has {len(near)} points within {1e3 * within_m:.0f} mm of camera_x, camera_y, camera_z, and "
-            f"{least} are needed. Correct the place, or raise `within`."
+            f"Touch '{name}': the cloud has {len(near)} points within {1e3 * within_m:.0f} mm of camera_x, camera_y,"
+            f" camera_z, and {least} are needed. Correct the place, or raise `within`."
         )
     return np.asarray(near)
 
 
 def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
-    """Point (3,) m, unit normal (3,) towards the camera and its standard deviation (m) of the plane through points (n, 3).
+    """Point (3,) m, unit normal (3,) towards the camera and its standard deviation (m) of the plane through points (n,
+    3).
 
-    Total least squares with Tukey's weights, the scale from the median. The deviation is that of the plane's distance where the points are.
+    Total least squares with Tukey's weights, the scale from the median. The deviation is that of the plane's distance
+    where the points are.
     """
     w = np.ones(len(points_C))
     middle, n, scale = points_C.mean(axis=0), np.zeros(3), 0.0
@@ -64,10 +70,11 @@ def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
 def fit_touched_sphere(
     points_C: Array, radius_m: float, correction: ScannerCorrection | None = None
 ) -> tuple[Array, float]:
-    """Centre (3,) m, as the scanner gives it, and its standard deviation (m) of a sphere of known radius through points (n, 3) of its near side.
+    """Centre (3,) m, as the scanner gives it, and its standard deviation (m) of a sphere of known radius through points
+    (n, 3) of its near side.
 
-    Gauss-Newton on distances with Tukey's weights; the points are corrected first, because the radius is the true one, and the centre is
-    returned uncorrected. The deviation is the largest of the three axes.
+    Gauss-Newton on distances with Tukey's weights; the points are corrected first, because the radius is the true one,
+    and the centre is returned uncorrected. The deviation is the largest of the three axes.
     """
     p = points_C if correction is None else correction.points(points_C)
     middle = p.mean(axis=0)
@@ -140,13 +147,15 @@ def _touch(row: dict[str, str], path: Path, correction: ScannerCorrection | None
     name, feature = row["id"], row["feature"].lower()
     if feature not in FEATURES:
         raise DatasetError(
-            f"'{path.name}': the feature of '{name}' is '{row['feature'][:40]}'; write {', '.join(FEATURES[:-1])} or {FEATURES[-1]}."
+            f"'{path.name}': the feature of '{name}' is '{row['feature'][:40]}'; write {', '.join(FEATURES[:-1])} or"
+            f" {FEATURES[-1]}."
         )
     xyz, wxyz = np.split(np.array(row_numbers(row, POSE, path)), [3])
     *tip, radius = row_numbers(row, TIP, path)
     if float(np.linalg.norm(tip)) > _LONGEST_TIP_M or not 0.0 <= radius <= _LARGEST_RADIUS_M:
         raise DatasetError(
-            f"'{path.name}': the tip of '{name}' must be in metres on the flange, with a radius from 0 to {_LARGEST_RADIUS_M:g} m."
+            f"'{path.name}': the tip of '{name}' must be in metres on the flange, with a radius from 0 to"
+            f" {_LARGEST_RADIUS_M:g} m."
         )
     joints = tuple(sorted((c for c in row if re.fullmatch(r"q\d+", c) and row[c]), key=lambda c: int(c[1:])))
     touch = Touch(

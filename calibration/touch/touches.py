@@ -1,4 +1,5 @@
-"""Touches as a person or a job records them: the robot's pose, its tip, and the feature that the scanner measured there."""
+"""Touches as a person or a job records them: the robot's pose, its tip, and the feature that the scanner measured
+there."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,9 +24,10 @@ SIGMA_SCAN_M = 5e-5
 class Touch:
     """One touch.
 
-    ``X_BF``: flange pose by the robot; ``p_FT`` (3,) m: centre of the tip's ball on the flange, ``radius`` m of that ball (0: a point).
-    ``p_C`` (3,) m as the scanner gave it, not corrected: the point, a point of the plane or edge, or the sphere's centre; ``direction_C``
-    (3,): outward normal of a plane, direction of an edge, else None; ``feature_radius`` m of a sphere. ``q`` (n,) rad where known.
+    ``X_BF``: flange pose by the robot; ``p_FT`` (3,) m: centre of the tip's ball on the flange, ``radius`` m of that
+    ball (0: a point). ``p_C`` (3,) m as the scanner gave it, not corrected: the point, a point of the plane or edge, or
+    the sphere's centre; ``direction_C`` (3,): outward normal of a plane, direction of an edge, else None;
+    ``feature_radius`` m of a sphere. ``q`` (n,) rad where known.
     """
 
     id: str

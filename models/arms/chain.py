@@ -25,8 +25,8 @@ _MAX_STEP_RAD = 0.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Chain:
-    """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis; ``X_LF`` the
-    flange in the last joint's frame; limits (n,) rad and rad/s."""
+    """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis;
+    ``X_LF`` the flange in the last joint's frame; limits (n,) rad and rad/s."""
 
     name: str
     joint_names: tuple[str, ...]
@@ -53,7 +53,8 @@ def is_urdf(name: str) -> bool:
 
 
 def load_chain(name: str, kinematics: Path | None = None) -> Chain:
-    """The arm of that name, or of a URDF file, as a chain; ``kinematics``: the file of one Universal Robots arm (see load_arm).
+    """The arm of that name, or of a URDF file, as a chain; ``kinematics``: the file of one Universal Robots arm (see
+    load_arm).
 
     Raises InputError naming the known ones, where its file is not one, or for ``kinematics`` of another arm.
     """
@@ -124,7 +125,8 @@ def chain_poses(chain: Chain, q: Array) -> Array:
 
 
 def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
-    """Geometric Jacobian (6, n) of the flange: [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq. 3.30)."""
+    """Geometric Jacobian (6, n) of the flange: [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq.
+    3.30)."""
     X = chain_frames(chain, np.asarray(q, dtype=float))
     p = (X[-1] @ chain.X_LF)[:3, 3]
     z = X[:, :3, 2]
@@ -134,9 +136,10 @@ def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
 def chain_inverse(chain: Chain, X_BF: RigidTransform, near: ArrayLike | None = None, *, seed: int = 0) -> Array | None:
     """Joint angles (n,) rad within the limits that put the flange at X_BF, or None where none was found.
 
-    Damped least squares (Nakamura and Hanafusa 1986) from ``near`` and from seeded starts within the limits; an arm with more
-    than six joints has whole families of answers, of which this is one. None is no proof that there is none: the closed form of
-    inverse.inverse_kinematics is, for Universal Robots' arms. Raises InputError where X_BF is not finite.
+    Damped least squares (Nakamura and Hanafusa 1986) from ``near`` and from seeded starts within the limits; an arm
+    with more than six joints has whole families of answers, of which this is one. None is no proof that there is none:
+    the closed form of inverse.inverse_kinematics is, for Universal Robots' arms. Raises InputError where X_BF is not
+    finite.
     """
     goal = X_BF.GetAsMatrix4()
     if not np.isfinite(goal).all():

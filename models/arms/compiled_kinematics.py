@@ -1,4 +1,7 @@
-"""Kinematics of an arm for control ticks: those of `kinematics` in a tenth of the time. The machine code is loaded with the module."""
+"""Kinematics of an arm for control ticks: those of `kinematics` in a tenth of the time.
+
+The machine code is loaded with the module.
+"""
 
 import numpy as np
 from pydrake.math import RigidTransform

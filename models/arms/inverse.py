@@ -83,7 +83,8 @@ def nearest_solution(arm: ArmModel, X_BF: RigidTransform, q_near: ArrayLike) -> 
 def continued_solution(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array | None:
     """The joint angles (6,) rad for X_BF that Newton's steps reach from q_near (6,), which an arm moving there ends in.
 
-    Not wrapped, and not held within the limits. None where the steps do not get there: out of reach, or past a singularity.
+    Not wrapped, and not held within the limits. None where the steps do not get there: out of reach, or past a
+    singularity.
     """
     goal = X_BF.GetAsMatrix4()
     return _polish(arm, goal[:3, :3], goal[:3, 3], np.array(q_near, dtype=np.float64))

@@ -74,9 +74,9 @@ class ArmModel:
     stack is (6, 4, 4): the link transforms as homogeneous matrices, the one source of the kinematics. Limits are (6,)
     in rad, rad/s, rad/s^2, Nm (the acceleration limits are a model choice, see joint_limits.yaml). masses (6,) kg,
     centers_of_mass (6, 3) m in the link frames, inertias (6, 3, 3) kg m^2 about the centre of mass in link axes.
-    tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m), housings the radii
-    of the drawn body. calibration is the hash of the factory calibration in use ("" if its file names none), or None for the nominal numbers.
-    up (3,) is the unit vector against gravity in B: +z of an arm that stands.
+    tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m), housings the
+    radii of the drawn body. calibration is the hash of the factory calibration in use ("" if its file names none), or
+    None for the nominal numbers. up (3,) is the unit vector against gravity in B: +z of an arm that stands.
     """
 
     name: str
@@ -186,7 +186,8 @@ def with_link_transforms(arm: ArmModel, stack: Array, calibration: str | None, s
     """The same arm with a robot's own link transforms: (6, 4, 4), X_{i-1,i}(0), rad and m.
 
     As in `load_arm`, the link frames are slid along their own joint axes to where those of `arm` lie, which changes no
-    flange pose. `calibration` names the calibration (None: nominal), `source` says in an error whose kinematics these are.
+    flange pose. `calibration` names the calibration (None: nominal), `source` says in an error whose kinematics these
+    are.
 
     Raises:
         InputError: the transforms are another arm's.
@@ -331,9 +332,7 @@ _TENSOR_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def _tensor(t: Mapping[str, float]) -> Array:
-    return np.array(
-        [[t["ixx"], t["ixy"], t["ixz"]], [t["ixy"], t["iyy"], t["iyz"]], [t["ixz"], t["iyz"], t["izz"]]],
-    )
+    return np.array([[t["ixx"], t["ixy"], t["ixz"]], [t["ixy"], t["iyy"], t["iyz"]], [t["ixz"], t["iyz"], t["izz"]]])
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Array:
@@ -342,7 +341,8 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Array:
 
 @cache
 def _drake() -> Any:
-    """pydrake.math, imported at the first call: the process that supervises a robot has an ArmModel and no use for it."""
+    """pydrake.math, imported at the first call: the process that supervises a robot has an ArmModel and no use for
+    it."""
     return importlib.import_module("pydrake.math")
 
 

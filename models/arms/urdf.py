@@ -23,7 +23,8 @@ _CAP = (0.35, 0.45, 0.55)
 _SEAL = (0.13, 0.14, 0.15)
 _COLOR_NAMES = {_BODY: "light_grey", _CAP: "blue_grey", _SEAL: "charcoal"}
 
-# The lengths below are those of the UR10e's body, whose housings have these radii; another arm's grow with its own radii.
+# The lengths below are those of the UR10e's body, whose housings have these radii; another arm's grow with its own
+# radii.
 _BIG, _ELBOW, _WRIST = 0.076, 0.064, 0.0465
 _SEAL_LENGTH, _SEAL_INSET = 0.004, 0.001
 _DOME = 0.45  # height of a cap over its radius
@@ -104,7 +105,8 @@ def arm_urdf(arm: ArmModel, model_name: str | None = None) -> str:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Radii of an arm's housings, and its size by joint relative to the UR10e: lengths of housings grow with their radii."""
+    """Radii of an arm's housings, and its size by joint relative to the UR10e: lengths of housings grow with their
+    radii."""
 
     big: float
     mid: float

@@ -15,14 +15,15 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, read_text
 
 BASES, FLANGES = ("base", "base_link"), ("tool0", "flange", "ee_link", "link_ee", "hand", "tool_link")
-"""Names of links that are taken for base and flange, the first that is there; otherwise the root, and the end of the chain."""
+"""Names of links that are taken for base and flange, the first that is there; otherwise the root, and the end of the
+chain."""
 UNLIMITED_RAD = 2.0 * np.pi  # of a continuous joint
 _PICTURES = ("visual", "collision")
 
 
 class UrdfChain(NamedTuple):
-    """Joints from base to flange: names, ``stack`` (n, 4, 4) pose of each in its parent at zero (its z the axis), flange in the last
-    joint's frame (4, 4), limits (n,) rad and rad/s."""
+    """Joints from base to flange: names, ``stack`` (n, 4, 4) pose of each in its parent at zero (its z the axis),
+    flange in the last joint's frame (4, 4), limits (n,) rad and rad/s."""
 
     joint_names: tuple[str, ...]
     stack: Array
@@ -35,8 +36,8 @@ class UrdfChain(NamedTuple):
 def read_urdf_chain(path: Path) -> UrdfChain:
     """The chain of a URDF file; meshes are not needed.
 
-    The base is a link named `base` (as a UR controller means it) or `base_link`, else the root; the flange is `tool0` or `flange`
-    (z out of it), else the last link.
+    The base is a link named `base` (as a UR controller means it) or `base_link`, else the root; the flange is `tool0`
+    or `flange` (z out of it), else the last link.
 
     Raises:
         InputError: the file cannot be read, or is no serial arm of revolute joints.
@@ -102,8 +103,8 @@ def _flange(path: Path, bodies: dict[str, RigidBody], above: dict[str, Joint]) -
     ends = [name for name in bodies if name not in parents]
     if len(ends) != 1:
         raise InputError(
-            f"'{path.name}' has {len(ends)} ends ({', '.join(ends[:4])}) and none is called {' or '.join(FLANGES[:2])}: name the "
-            "link of the flange tool0, z out of its face."
+            f"'{path.name}' has {len(ends)} ends ({', '.join(ends[:4])}) and none is called {' or '.join(FLANGES[:2])}:"
+            " name the link of the flange tool0, z out of its face."
         )
     return ends[0]
 

@@ -1,4 +1,5 @@
-"""The file that `weldcal finger calibrate` writes, and pictures rectified by it: those of a pinhole camera without distortion."""
+"""The file that `weldcal finger calibrate` writes, and pictures rectified by it: those of a pinhole camera without
+distortion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ SCHEMA = 1
 
 @dataclass(frozen=True, eq=False)
 class FingerFile:
-    """Picture size, K (3, 3) px, OpenCV's distortion coefficients, and the tag's measured side in m (None: not measured)."""
+    """Picture size, K (3, 3) px, OpenCV's distortion coefficients, and the tag's measured side in m (None: not
+    measured)."""
 
     width: int
     height: int

@@ -88,7 +88,10 @@ class TagPart:
 
 @dataclass(kw_only=True)
 class ShapePart:
-    """A body of the tool: drawn, seen by the scanner, and kept clear of the table and of the line of sight. One kind of a shape."""
+    """A body of the tool: drawn, seen by the scanner, and kept clear of the table and of the line of sight.
+
+    One kind of a shape.
+    """
 
     name: str = ""
     box_mm: Triple | None = None  # along x, y, z of its own frame
@@ -142,8 +145,8 @@ _SIZES = ("box_mm", "cylinder_mm", "capsule_mm", "sphere_mm", "mesh")
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
 class LoadedTool:
-    """A tool of a file: the tool, its camera's picture size and focal length, its finger calibration's path ("" without), and the
-    pose X_FW of the torch (z along the wire)."""
+    """A tool of a file: the tool, its camera's picture size and focal length, its finger calibration's path (""
+    without), and the pose X_FW of the torch (z along the wire)."""
 
     name: str
     file: Path
@@ -248,7 +251,8 @@ def check_sight(loaded: LoadedTool) -> Array:
     facing = float(-X_KM.rotation().matrix()[2, 2])
     if X_KM.translation()[2] <= 0.0:
         raise InputError(
-            f"'{file}': the tag is behind the finger camera: check finger_camera.rpy_deg (z along the view) and tag.xyz_mm."
+            f"'{file}': the tag is behind the finger camera: check finger_camera.rpy_deg (z along the view) and"
+            " tag.xyz_mm."
         )
     if facing < np.cos(np.deg2rad(60.0)):
         raise InputError(
@@ -260,8 +264,8 @@ def check_sight(loaded: LoadedTool) -> Array:
     pixels: Array = (p_K @ camera.camera_matrix.T)[:, :2] / p_K[:, 2:]
     if pixels.min() < 0.0 or (pixels > [camera.width - 1, camera.height - 1]).any():
         raise InputError(
-            f"'{file}': the tag is not whole in the finger camera's picture of {camera.width} x {camera.height} px: move the camera "
-            "back, make the tag smaller, or correct focal_px and the poses."
+            f"'{file}': the tag is not whole in the finger camera's picture of {camera.width} x {camera.height} px:"
+            " move the camera back, make the tag smaller, or correct focal_px and the poses."
         )
     return pixels
 
@@ -315,15 +319,16 @@ def _check_sizes(file: str, part: ToolPart) -> None:
 
 
 def _tip_frame(file: str, part: ToolPart) -> tuple[RotationMatrix, float, float]:
-    """R_FT (z_T against the finger's axis, x_T from the torch to the tip), and the torch point (-chord, 0, height) in T, m."""
+    """R_FT (z_T against the finger's axis, x_T from the torch to the tip), and the torch point (-chord, 0, height) in
+    T, m."""
     z = -_unit(part.tip.axis)
     to_tip = (np.array(part.tip.xyz_mm) - np.array(part.torch.xyz_mm)) / 1e3
     level = to_tip - (to_tip @ z) * z
     chord = round(float(np.linalg.norm(level)), 12)
     if chord < LEAST_CHORD_M:
         raise InputError(
-            f"'{file}': the torch must trail the tip by {1e3 * LEAST_CHORD_M:.0f} mm or more across the finger, and it is "
-            f"{1e3 * chord:.1f} mm away: correct torch.xyz_mm or tip.xyz_mm."
+            f"'{file}': the torch must trail the tip by {1e3 * LEAST_CHORD_M:.0f} mm or more across the finger, and it"
+            f" is {1e3 * chord:.1f} mm away: correct torch.xyz_mm or tip.xyz_mm."
         )
     x = level / np.linalg.norm(level)
     R = RotationMatrix(np.column_stack([x, np.cross(z, x), z]))

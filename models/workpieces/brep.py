@@ -1,4 +1,5 @@
-"""Faces and solids, OpenCascade's own or regions of a closed mesh: normals, nearest points and what is inside; lengths in mm."""
+"""Faces and solids, OpenCascade's own or regions of a closed mesh: normals, nearest points and what is inside; lengths
+in mm."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ CHORDS, NEWTON = 64, 6  # of a bent edge; steps from the nearest chord to the ne
 RAYS = np.array([(0.5257, 0.3411, 0.7793), (-0.2113, 0.8271, -0.5208)])  # along no direction that parts are drawn in
 
 
-class Face:
+class SolidFace:
     """A face with its surface, box and normal."""
 
     def __init__(self, face: Any) -> None:
@@ -120,7 +121,8 @@ class Face:
         return None
 
     def foot(self, p: Floats) -> Floats:
-        """The point of the face that is nearest to a point; of a bent face one at which the distance is least in its vicinity."""
+        """The point of the face that is nearest to a point; of a bent face one at which the distance is least in its
+        vicinity."""
         if (over := self._over(p)) is not None:
             return over
         curves, starts, chords, parameters, of = self._border
@@ -139,19 +141,19 @@ class Face:
         return array_of(curve.Value(t))
 
 
-class Body:
+class Solid:
     """A solid with its faces and with what answers whether a point is inside."""
 
     def __init__(self, solid: Any) -> None:
         self.solid = solid
-        self.faces = [Face(TopoDS.Face(face)) for face in parts_of(solid, TopAbs_ShapeEnum.TopAbs_FACE)]
+        self.faces = [SolidFace(TopoDS.Face(face)) for face in parts_of(solid, TopAbs_ShapeEnum.TopAbs_FACE)]
         self.low, self.high = _box(solid)
         self._classifier = BRepClass3d_SolidClassifier(solid)
         self._rays = IntCurvesFace_ShapeIntersector()
         self._rays.Load(solid, 1e-6)
 
     @cached_property
-    def edges(self) -> list[tuple[Any, list[Face]]]:
+    def edges(self) -> list[tuple[Any, list[SolidFace]]]:
         """Its edges, each with the faces that meet there."""
         return faces_at(self.solid, self.faces)
 
@@ -180,11 +182,12 @@ class Body:
         return min(hits), max(hits)
 
 
-class MeshFace(Face):
+class MeshFace(SolidFace):
     """A region of a closed mesh that is a plane or a cylinder; any other has no surface."""
 
     def __init__(self, triangles: Floats, fit: tuple[Floats, Floats, float] | None) -> None:
-        """Take its triangles (M,3,3) with their normals out of the material, and its plane or cylinder (see `mesh_files.regions`)."""
+        """Take its triangles (M,3,3) with their normals out of the material, and its plane or cylinder (see
+        `mesh_files.regions`)."""
         self.triangles, self.fit = triangles, fit
         self.low, self.high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         self.edges: list[Any] = []  # the body adds them
@@ -243,11 +246,11 @@ class MeshFace(Face):
         return p + found[nearest], nearest
 
 
-class MeshBody(Body):
+class MeshBody(Solid):
     """A closed shell of triangles (M,3,3), with its regions as faces and their borders as edges."""
 
     def __init__(self, triangles: Floats, faces: list[MeshFace], borders: list[tuple[Floats, list[int]]]) -> None:
-        self.faces = list[Face](faces)
+        self.faces = list[SolidFace](faces)
         self.low, self.high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         self._triangles = triangles
         self.edges = [(_edge_along(line), [self.faces[k] for k in met]) for line, met in borders]
@@ -323,7 +326,7 @@ def parts_of(shape: Any, kind: Any) -> list[Any]:
     return found
 
 
-def faces_at(shape: Any, faces: list[Face]) -> list[tuple[Any, list[Face]]]:
+def faces_at(shape: Any, faces: list[SolidFace]) -> list[tuple[Any, list[SolidFace]]]:
     """The edges of a shape in the file's order, each with those of its faces that meet there; none within one face."""
     faces_of, found, known = EdgeFaces(), [], Shapes()
     at = {known.Add(face.face): face for face in faces}
@@ -371,7 +374,7 @@ def unit(v: Floats) -> Floats:
     return np.asarray(v / np.linalg.norm(v))
 
 
-def _end_of(face: Face, edge: Any) -> tuple[Floats, Floats, Floats] | None:
+def _end_of(face: SolidFace, edge: Any) -> tuple[Floats, Floats, Floats] | None:
     """Middle of a straight or round edge, the face's normal there, and the way out of the face in its plane."""
     curve = BRepAdaptor_Curve(edge)
     straight = curve.GetType() == GeomAbs_CurveType.GeomAbs_Line

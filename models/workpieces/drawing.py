@@ -154,8 +154,8 @@ def _fitted(mesh: TriMesh, points: Floats, t: Floats, ups: Floats | None, joint:
     if (trimmed > _TRIMMED_M or holes > 0.1 * n * SPACING_M + 2e-3) and not (closed and trimmed <= holes):
         at_mm = 1e3 * SPACING_M * int(np.argmin(good))
         raise InputError(
-            f"Along {1e3 * SPACING_M * (~good).sum():.1f} mm of the seam (the first at {at_mm:.1f} mm) the part has no {joint} "
-            f"joint within {1e3 * FARTHEST_M:.0f} mm of the line: check the line, its unit and the joint."
+            f"Along {1e3 * SPACING_M * (~good).sum():.1f} mm of the seam (the first at {at_mm:.1f} mm) the part has no"
+            f" {joint} joint within {1e3 * FARTHEST_M:.0f} mm of the line: check the line, its unit and the joint."
         )
     keep = slice(first, last + 1)
     s = np.arange(n)[keep]
@@ -183,7 +183,8 @@ def _start(sections: list[Section], ups: Floats | None, joint: str) -> Floats:
             return section.space(found[0].middle)
         if len(found) > 1 and i > len(sections) // 2:
             raise InputError(
-                f"The line lies at {len(found)} joints at once: give the direction of the tool as nx, ny, nz in the seam's file."
+                f"The line lies at {len(found)} joints at once: give the direction of the tool as nx, ny, nz in the"
+                " seam's file."
             )
     return sections[0].up
 
@@ -195,7 +196,8 @@ def _fits(opening: Opening, joint: str) -> bool:
 
 
 def _chosen(section: Section, joint: str, wanted: Floats) -> tuple[Opening, Floats, float] | None:
-    """The joint's opening that points most nearly as wanted, its root (2,), and a butt joint's gap; None without one."""
+    """The joint's opening that points most nearly as wanted, its root (2,), and a butt joint's gap; None without
+    one."""
     aim = np.array([wanted @ section.right, wanted @ section.up])
     for radius in PROBES_M:
         found = [o for o in openings(section, radius) if _fits(o, joint) and o.middle @ aim > 0.3]
@@ -300,8 +302,8 @@ def _nothing(sections: list[Section], joint: str, points: Floats) -> str:
     if not seen:
         return f"The seam's line does not run along an edge of the part: {where} it meets no two walls within 4 mm."
     return (
-        f"The line does not run along a {joint} joint: the free space {where} opens {np.median(seen):.0f} deg, and a {joint} has "
-        f"{low:.0f} to {high:.0f} deg."
+        f"The line does not run along a {joint} joint: the free space {where} opens {np.median(seen):.0f} deg, and a"
+        f" {joint} has {low:.0f} to {high:.0f} deg."
     )
 
 

@@ -21,8 +21,8 @@ from weldcal.models.workpieces.brep import (
     BRIDGED_MM,
     EXACT_MM,
     IN_MM,
-    Body,
-    Face,
+    Solid,
+    SolidFace,
     array_of,
     length_of,
     middle_of,
@@ -71,14 +71,15 @@ class Piece:
 
 def joints_of(shape: Any) -> list[list[Piece]]:
     """The joints of a shape: see `joints_between`."""
-    return joints_between([Body(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)])
+    return joints_between([Solid(solid) for solid in parts_of(shape, TopAbs_ShapeEnum.TopAbs_SOLID)])
 
 
-def joints_between(bodies: Sequence[Body]) -> list[list[Piece]]:
-    """The joints between bodies, and where there are none those inside each of them, each as its pieces in the order of travel.
+def joints_between(bodies: Sequence[Solid]) -> list[list[Piece]]:
+    """The joints between bodies, and where there are none those inside each of them, each as its pieces in the order of
+    travel.
 
-    Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece may
-    end; each stretch between two crossings is a joint or is none.
+    Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece
+    may end; each stretch between two crossings is a joint or is none.
     """
     found: list[list[Piece]] = []
     for i, j in combinations(range(len(bodies)), 2):
@@ -99,7 +100,7 @@ def joints_between(bodies: Sequence[Body]) -> list[list[Piece]]:
     return [_named(chain, found) for chain in found]
 
 
-def _within(bodies: Sequence[Body], k: int) -> Iterable[Piece]:
+def _within(bodies: Sequence[Solid], k: int) -> Iterable[Piece]:
     """The pieces along the concave edges of one body."""
     for edge, met in bodies[k].edges:
         if len(met) != 2:
@@ -133,11 +134,11 @@ def _named(chain: list[Piece], all_of_them: list[list[Piece]]) -> list[Piece]:
     return [replace(piece, side="left" if left else "right") for piece in chain]
 
 
-def _far(a: Face | Body, b: Face | Body) -> bool:
+def _far(a: SolidFace | Solid, b: SolidFace | Solid) -> bool:
     return bool((np.maximum(a.low, b.low) > np.minimum(a.high, b.high) + GAP_MM).any())
 
 
-def _met(bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
+def _met(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidFace) -> Iterable[Piece]:
     """The pieces along which two faces meet in a concave joint."""
     if f.surface is None or g.surface is None:
         return
@@ -170,7 +171,7 @@ def _met(bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face) -> Ite
 
 
 def _between(
-    bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face, curve: Any, begin: float, end: float
+    bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidFace, curve: Any, begin: float, end: float
 ) -> dict[str, Any] | None:
     """The joint of two faces along a stretch of their curve; None where they form none.
 
@@ -185,7 +186,7 @@ def _between(
 
 
 def _breaks(
-    bodies: Sequence[Body], curve: Any, low: Floats, high: Floats, own: tuple[Face, Face]
+    bodies: Sequence[Solid], curve: Any, low: Floats, high: Floats, own: tuple[SolidFace, SolidFace]
 ) -> tuple[list[float], bool]:
     """Ascending parameters between which a curve is a joint as a whole or not at all, and whether it is closed."""
     closed = bool(curve.IsClosed())
@@ -229,10 +230,10 @@ def _breaks(
 
 
 def _cut(
-    bodies: Sequence[Body],
+    bodies: Sequence[Solid],
     pair: tuple[int, int],
-    f: Face,
-    g: Face,
+    f: SolidFace,
+    g: SolidFace,
     x: Floats,
     t: Floats,
     length: float,
@@ -300,12 +301,12 @@ def _cut(
     return {"up": up, "type": kind, "angle": angle, "gap": gap, "side": side, "walls": walls, "pipe": pipe}
 
 
-def _coaxial(a: Face, b: Face, angle_rad: float) -> bool:
+def _coaxial(a: SolidFace, b: SolidFace, angle_rad: float) -> bool:
     """Whether two cylinders have one axis, also where these point against each other."""
     return any(a.axis.IsCoaxial(axis, angle_rad, GAP_MM) for axis in (b.axis, b.axis.Reversed()))
 
 
-def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[Body, Body]) -> str:
+def _of_pipe(f: SolidFace, g: SolidFace, t: Floats, two: tuple[Solid, Solid]) -> str:
     """The joint of a pipe, "" for none: along a cylinder's axis it is as between plates."""
     axes = [(face, face.axis) for face in (f, g) if face.round]
     if len(axes) == 2:
@@ -317,7 +318,7 @@ def _of_pipe(f: Face, g: Face, t: Floats, two: tuple[Body, Body]) -> str:
     return "flange on pipe" if coaxial else "pipe on plate"
 
 
-def _flush(bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face) -> Iterable[Piece]:
+def _flush(bodies: Sequence[Solid], pair: tuple[int, int], f: SolidFace, g: SolidFace) -> Iterable[Piece]:
     """The pieces along which two faces go on in each other: a square butt, the outside of a corner, an edge joint."""
     two = bodies[pair[0]], bodies[pair[1]]
     if f.flat != g.flat or f.round != g.round or not (f.flat or f.round):
@@ -356,7 +357,7 @@ def _flush(bodies: Sequence[Body], pair: tuple[int, int], f: Face, g: Face) -> I
             )
 
 
-def _facing(two: tuple[Body, Body], x: Floats, n: Floats, m: Floats, gap: float, depth: float) -> bool:
+def _facing(two: tuple[Solid, Solid], x: Floats, n: Floats, m: Floats, gap: float, depth: float) -> bool:
     """Whether both bodies are as near to each other below the flush faces: a groove is wider there."""
     down = x - min(1.0, 0.5 * depth) * n
     return all(two[k].holds(down + s * (0.5 * abs(gap) + 0.3) * m) for k, s in ((0, -1.0), (1, 1.0)))

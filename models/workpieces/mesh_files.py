@@ -70,7 +70,8 @@ def _shared(mesh: TriMesh) -> tuple[Ints, Ints]:
 
 
 def _chained(vertices: Floats, pairs: Ints, turn: Floats) -> list[tuple[Floats, float]]:
-    """Lines (N,3) through edges that follow each other without a corner, with the median angle between the faces' normals."""
+    """Lines (N,3) through edges that follow each other without a corner, with the median angle between the faces'
+    normals."""
     around: dict[int, list[int]] = {}
     for k, (a, b) in enumerate(pairs.tolist()):
         around.setdefault(a, []).append(k)
@@ -140,7 +141,8 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
     mesh, body = _bodies(read_surface(path, unit_m))
     if not mesh.watertight():
         raise InputError(
-            f"'{path.name}' is not a closed surface (a hole, or triangles that face different ways): close it to a solid."
+            f"'{path.name}' is not a closed surface (a hole, or triangles that face different ways): close it to a"
+            " solid."
         )
     if mesh.volume < 0.0:
         mesh = mesh.flipped()
@@ -155,10 +157,11 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
 
 
 def _bodies(mesh: TriMesh) -> tuple[TriMesh, Ints]:
-    """The mesh with corners of its own for each body, and the body (M,) of each triangle: bodies that touch share no corner.
+    """The mesh with corners of its own for each body, and the body (M,) of each triangle: bodies that touch share no
+    corner.
 
-    Most programs write one body after another: each ends where all the edges since its beginning are met from both sides.
-    A body that is written twice counts once.
+    Most programs write one body after another: each ends where all the edges since its beginning are met from both
+    sides. A body that is written twice counts once.
     """
     t, n = mesh.triangles, len(mesh.vertices)
     edges = t[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -187,7 +190,8 @@ def _bodies(mesh: TriMesh) -> tuple[TriMesh, Ints]:
 
 
 def _apart(mesh: TriMesh) -> Ints:
-    """The body (M,) of each triangle where bodies may touch in an edge: two of more triangles at it bound the same material."""
+    """The body (M,) of each triangle where bodies may touch in an edge: two of more triangles at it bound the same
+    material."""
     t, n = mesh.triangles, len(mesh.vertices)
     edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
     apex, owner = np.concatenate([t[:, 2], t[:, 0], t[:, 1]]), np.tile(np.arange(len(t)), 3)
@@ -259,7 +263,8 @@ def regions(mesh: TriMesh) -> tuple[Ints, list[tuple[Floats, Floats, float] | No
     """The planes and cylinders of a closed mesh, mm.
 
     Returns:
-        The region (M,) of each triangle, and of each region a point, the normal or the axis, and 0 or the radius, negative of a
+        The region (M,) of each triangle, and of each region a point, the normal or the axis, and 0 or the radius,
+            negative of a
         hole; None of a region that is neither.
     """
     corners, n, area = mesh.vertices[mesh.triangles], mesh.normals, np.linalg.norm(mesh.area_vectors, axis=1)
@@ -317,7 +322,8 @@ def regions(mesh: TriMesh) -> tuple[Ints, list[tuple[Floats, Floats, float] | No
 def _cylinder(
     seed: int, other: int, points: list[Floats], middle: list[Floats], near: list[set[int]], taken: Ints
 ) -> tuple[list[int], tuple[Floats, Floats, float]] | None:
-    """The patches around two that lie on one cylinder, and that: a point, its axis and its radius; None for fewer than four."""
+    """The patches around two that lie on one cylinder, and that: a point, its axis and its radius; None for fewer than
+    four."""
     along = np.cross(middle[seed], middle[other])
     if np.linalg.norm(along) < 1e-6:
         return None
@@ -346,7 +352,8 @@ def _cylinder(
 
 
 def _fitted(points: Floats, along: Floats, steps: int) -> tuple[Floats, Floats, float] | None:
-    """The cylinder through points (N,3): a point, its axis and its radius, by least squares in so many steps from a rough axis."""
+    """The cylinder through points (N,3): a point, its axis and its radius, by least squares in so many steps from a
+    rough axis."""
     x = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
     x /= np.linalg.norm(x)
     y, middle = np.cross(along, x), points.mean(axis=0)

@@ -17,12 +17,12 @@ from weldcal.models.workpieces.drawing import goes_on
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.models.workpieces.seat import (
-    Entry,
     JointNotWeldable,
     JointSection,
     Press,
     Seated,
-    Tip,
+    SeatedTip,
+    TipApproach,
     check_weldable,
     hard_height,
     press_for,
@@ -38,8 +38,8 @@ SEEN_EDGE_M, FELT_EDGE_M = 0.012, 0.003  # longest edges: over 150 mm their midd
 def bend(workpiece: Workpiece, radius_m: float) -> Workpiece:
     """The workpiece rolled over a cylinder of that radius (at its top face) whose axis lies along -y below its middle.
 
-    Lengths along x stay what they are in the top face; (x, y, z) comes to ((r + z) sin(x/r), y, (r + z) cos(x/r) - r). The
-    groove's walls keep their angle to the surface to within depth / radius.
+    Lengths along x stay what they are in the top face; (x, y, z) comes to ((r + z) sin(x/r), y, (r + z) cos(x/r) - r).
+    The groove's walls keep their angle to the surface to within depth / radius.
 
     Raises:
         InputError: a radius below 100 mm, or a plate that would be bent by more than 60 degrees to either side.
@@ -126,8 +126,8 @@ BESIDE_M = 0.0017  # between the joint's mouth and the tip's centre as it lands 
 class WeldPart(Protocol):
     """What a weld needs to know of a workpiece in its frame P, m: a grooved plate or a part from a file.
 
-    mesh is what a scanner sees, groove_mesh what the tip feels; seam_P, tangents_P (N,3) the root line, up_P (N,3) or (1,3)
-    the bisector of its walls, depth_m from their upper end to the root.
+    mesh is what a scanner sees, groove_mesh what the tip feels; seam_P, tangents_P (N,3) the root line, up_P (N,3) or
+    (1,3) the bisector of its walls, depth_m from their upper end to the root.
     """
 
     @property
@@ -154,19 +154,22 @@ class WeldPart(Protocol):
     def end_window_m(self) -> float:
         """How far from the drawn end the seam may end."""
 
-    def seated(self, tip: Tip, press: Press) -> Seated:
+    def seated(self, tip: SeatedTip, press: Press) -> Seated:
         """Where the centre of the loaded tip rests, from the root."""
 
-    def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
+    def press(self, tip: SeatedTip, axial_m: float | None, lateral_m: float | None) -> Press:
         """How hard the tip is pressed; a value that is given is kept."""
 
-    def entry(self, tip: Tip, seated: Seated) -> Entry:
+    def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
         """How the tip is brought into the joint in which it then rests."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part in its frame P (that of its file) with a seam, and others that are welded before or after it, m. See WeldPart."""
+    """A part in its frame P (that of its file) with a seam, and others that are welded before or after it, m.
+
+    See WeldPart.
+    """
 
     shape: PartShape
     seam: DrawnSeam
@@ -233,28 +236,31 @@ class Part:
 
     @property
     def depth_m(self) -> float:
-        """From the end of the lower wall to the root, along the bisector; of a gap 0, for its root is level with the faces."""
+        """From the end of the lower wall to the root, along the bisector; of a gap 0, for its root is level with the
+        faces."""
         return min(self.section.left_m, self.section.right_m) * math.cos(self.half_angle_rad)
 
     @cached_property
     def end_window_m(self) -> float:
-        """See WeldPart: hardly any where the joint goes on beyond the drawn end, for then the end is chosen, not felt."""
+        """See WeldPart: hardly any where the joint goes on beyond the drawn end, for then the end is chosen, not
+        felt."""
         return CHOSEN_END_M if goes_on(self.mesh, self.seam) else FELT_END_M
 
-    def felt_by(self, tip: Tip) -> bool:
-        """Whether the tip is used on this seam: as the seam's `feel` says, else not where level plates leave too narrow a gap."""
+    def felt_by(self, tip: SeatedTip) -> bool:
+        """Whether the tip is used on this seam: as the seam's `feel` says, else not where level plates leave too narrow
+        a gap."""
         if self.seam.feel is not None or self.seam.joint != "butt" or self.seam.gap_m > UNFELT_GAP_M:
             return self.seam.feel is not False
         return feels(self.section, tip)
 
-    def seated(self, tip: Tip, press: Press) -> Seated:
+    def seated(self, tip: SeatedTip, press: Press) -> Seated:
         """See WeldPart; a tip that is not used hangs HOVER_M clear of the walls."""
         if not self.felt_by(tip):
             clear = tip.tip_radius_m + HOVER_M
             return Seated(0.0, clear if self.section.gap_m > 0.0 else hard_height(self.section, clear))
         return seat(self.section, tip, press)
 
-    def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
+    def press(self, tip: SeatedTip, axial_m: float | None, lateral_m: float | None) -> Press:
         """See WeldPart: of the first of its seams that is felt; raises JointNotWeldable."""
         felt = next((p for k in range(seam_count(self)) if is_felt(p := numbered(self, k), tip)), None)
         if not isinstance(felt, Part):
@@ -266,18 +272,19 @@ class Part:
             advice = "Or write feel: false with the seam: it is then followed from the scan and the drawing."
             raise JointNotWeldable(f"{error} {advice}") from error
 
-    def entry(self, tip: Tip, seated: Seated) -> Entry:
-        """See WeldPart: a wide joint guides the tip in from above; beside a narrow one it lands on the face and searches."""
+    def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
+        """See WeldPart: a wide joint guides the tip in from above; beside a narrow one it lands on the face and
+        searches."""
         section = self.section
         if not self.felt_by(tip):
-            return Entry(0.0, GUIDED_DROP_M)
+            return TipApproach(0.0, GUIDED_DROP_M)
         if section.gap_m == 0.0 and section.half_angle_rad >= SELF_GUIDING_RAD:
-            return Entry(0.0, GUIDED_DROP_M)
+            return TipApproach(0.0, GUIDED_DROP_M)
         mouth = 0.5 * section.gap_m if section.gap_m else section.right_m * math.sin(section.half_angle_rad)
-        return Entry(-(mouth + BESIDE_M), self.depth_m + tip.tip_radius_m - seated.above_m)
+        return TipApproach(-(mouth + BESIDE_M), self.depth_m + tip.tip_radius_m - seated.above_m)
 
 
-def feels(section: JointSection, tip: Tip) -> bool:
+def feels(section: JointSection, tip: SeatedTip) -> bool:
     """Whether a ball can feel a joint."""
     try:
         check_weldable(section, tip.tip_radius_m)
@@ -287,7 +294,7 @@ def feels(section: JointSection, tip: Tip) -> bool:
     return True
 
 
-def is_felt(part: WeldPart, tip: Tip) -> bool:
+def is_felt(part: WeldPart, tip: SeatedTip) -> bool:
     """Whether the tip is used on the part's seam; on a grooved plate it is."""
     return not isinstance(part, Part) or part.felt_by(tip)
 
@@ -317,7 +324,8 @@ def about(mesh: TriMesh, points: Floats, reach_m: float) -> TriMesh:
 
 
 def bowed(part: Part, amplitude_m: float, direction: Floats) -> Part:
-    """The part as made, bowed by an amplitude at its middle in a direction (3,): its seam is not where the drawing has it.
+    """The part as made, bowed by an amplitude at its middle in a direction (3,): its seam is not where the drawing has
+    it.
 
     A point moves by amplitude cos(pi x) along the direction, x from -1/2 to 1/2 along the seam's chord; the ends stay.
 

@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, grid, merge, plane_mesh, triangulate_polygon
-from weldcal.models.workpieces.seat import Entry, JointSection, Press, Seated, Tip, seat
+from weldcal.models.workpieces.seat import JointSection, Press, Seated, SeatedTip, TipApproach, seat
 
 Floats = npt.NDArray[np.float64]
 
@@ -141,11 +141,11 @@ class Workpiece:
         wall = self.depth_m / math.cos(self.half_angle_rad)
         return JointSection(self.half_angle_rad, wall, wall)
 
-    def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
+    def press(self, tip: SeatedTip, axial_m: float | None, lateral_m: float | None) -> Press:
         """How hard the tip is pressed into the groove, m; a value that is given is kept."""
         return Press(PRESS_AXIAL_M if axial_m is None else axial_m, PRESS_LATERAL_M if lateral_m is None else lateral_m)
 
-    def seated(self, tip: Tip, press: Press) -> Seated:
+    def seated(self, tip: SeatedTip, press: Press) -> Seated:
         """Where the centre of the loaded tip rests, from the root.
 
         Raises:
@@ -154,9 +154,9 @@ class Workpiece:
         self.tip_height(tip.tip_radius_m)
         return seat(self.section, tip, press)
 
-    def entry(self, tip: Tip, seated: Seated) -> Entry:
+    def entry(self, tip: SeatedTip, seated: Seated) -> TipApproach:
         """How the tip is brought into the groove in which it then rests: it lands on the face beside it."""
-        return Entry(-BESIDE_GROOVE_M, self.depth_m + tip.tip_radius_m - seated.above_m)
+        return TipApproach(-BESIDE_GROOVE_M, self.depth_m + tip.tip_radius_m - seated.above_m)
 
     def tip_line_P(self, tip_radius_m: float) -> Floats:
         """(N,3) where the centre of a seated ball of that radius runs, m."""

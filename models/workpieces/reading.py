@@ -30,7 +30,8 @@ def read_shape(path: Path, units: str | None = None) -> PartShape:
         units: mm, m or inch. A STEP file states its own, which must agree; a mesh has none, and without this it is mm.
 
     Raises:
-        InputError: a file that is missing, empty, malformed or no solid; an unknown unit; a size that no weld cell holds.
+        InputError: a file that is missing, empty, malformed or no solid; an unknown unit; a size that no weld cell
+            holds.
     """
     if units is not None and units not in UNITS_M:
         raise InputError(f"units must be {', '.join(UNITS_M)}, not '{units}'.")
@@ -45,7 +46,7 @@ def _stamp(file: Path) -> tuple[Path, int, int]:
 
 @lru_cache(maxsize=1)
 def _read(path: Path, units: str | None, written: tuple[tuple[Path, int, int], ...]) -> PartShape:
-    """Read a part once while its files, with their times and sizes, stay as they are: each seam that is planned asks for it."""
+    """Read a part once while its files, with their times and sizes, stay as they are; each plan asks for it."""
     size = sum(written_size for _, _, written_size in written)
     shape = _bounded(path, units) if size > LARGE_BYTES else _parsed(path, units)
     _check_size(path, shape)
@@ -79,8 +80,8 @@ def _bounded(path: Path, units: str | None) -> PartShape:
         raise found
     if not isinstance(found, PartShape):
         raise InputError(
-            f"'{path.name}' cannot be read within {MOST_S} s of processor time: it has too many faces, or damaged ones. "
-            "Export only the bodies that are welded, without threads, holes and purchased parts."
+            f"'{path.name}' cannot be read within {MOST_S} s of processor time: it has too many faces, or damaged "
+            "ones. Export only the bodies that are welded, without threads, holes and purchased parts."
         )
     return found
 

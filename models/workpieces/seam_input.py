@@ -1,4 +1,5 @@
-"""Reads what a user says of a seam: a polyline in a CSV file or numbered edges of the part, its direction and its ends."""
+"""Reads what a user says of a seam: a polyline in a CSV file or numbered edges of the part, its direction and its
+ends."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ MOST_SEAM_POINTS = 200_000
 
 @dataclass(frozen=True)
 class SeamSource:
-    """Where a seam comes from: `polyline`, a CSV file, or `edges`, numbers of the part; its direction and its ends, m."""
+    """Where a seam comes from: `polyline`, a CSV file, or `edges`, numbers of the part; its direction and its ends,
+    m."""
 
     polyline: Path | None = None
     edges: tuple[int, ...] = ()
@@ -67,7 +69,8 @@ def seam_of(shape: PartShape, source: SeamSource, joint: str) -> DrawnSeam:
         drawn = drawn.reversed()
     if source.end_m < 0.0 and not (drawn.closed and source.end_m >= -drawn.length_m):
         raise InputError(
-            "A seam's end_mm is cut off its end: give 0 or more. Below 0, at most once around, a closed seam goes on over its start."
+            "A seam's end_mm is cut off its end: give 0 or more. Below 0, at most once around, a closed seam "
+            "goes on over its start."
         )
     if source.start_m or source.end_m:
         drawn = drawn.between(source.start_m, drawn.length_m - source.end_m)
@@ -90,7 +93,8 @@ def chained(shape: PartShape, ids: Sequence[int]) -> tuple[Floats, bool]:
         gap = _apart(line[-1], piece)
         if gap > CHAINED_M:
             raise InputError(
-                f"Edge {ids[k]} does not follow edge {ids[k - 1]}: their ends are {1e3 * gap:.2f} mm apart; give the edges in order."
+                f"Edge {ids[k]} does not follow edge {ids[k - 1]}: their ends are {1e3 * gap:.2f} mm apart; give the"
+                " edges in order."
             )
         if np.linalg.norm(piece[-1] - line[-1]) < np.linalg.norm(piece[0] - line[-1]):
             piece = piece[::-1]
@@ -105,8 +109,8 @@ def _apart(point: Floats, piece: Floats) -> float:
 def read_polyline(path: Path) -> tuple[Floats, Floats | None]:
     """Points (N,3) in the file's unit, and the directions (N,3) out of the joint where the file has them.
 
-    Rows x, y, z or x, y, z, nx, ny, nz, separated by commas, semicolons or spaces; one header line is allowed; # starts a
-    comment.
+    Rows x, y, z or x, y, z, nx, ny, nz, separated by commas, semicolons or spaces; one header line is allowed; # starts
+    a comment.
 
     Raises:
         InputError: naming the line that is at fault.

@@ -23,14 +23,12 @@ class DrawnSeam:
 
     points_P      (N,3) the root line, evenly spaced (0.5 mm): where the two walls meet; of a butt joint with a gap the
                   middle of the gap, level with the plates' faces
-    up_P          (N,3) the bisector of the walls, out of the joint towards the tool
-    wall_left_P   (N,3) outward normal of the wall on the left of the travel direction; wall_right_P of the one on the right.
+    up_P          (N,3) the bisector of the walls, out of the joint towards the tool wall_left_P   (N,3) outward normal
+    of the wall on the left of the travel direction; wall_right_P of the one on the right.
                   Of a butt joint with a gap both are the normal of the plates' faces
-    joint         v_groove, butt, fillet or lap
-    wall_height_m (left, right) usable extent of each wall, from the root line; of a butt joint with a gap the gap's depth
-    gap_m         width of the gap of a butt joint, else 0
-    closed        the last point continues into the first
-    feel          whether the tip feels it; None: where a ball can
+    joint         v_groove, butt, fillet or lap wall_height_m (left, right) usable extent of each wall, from the root
+    line; of a butt joint with a gap the gap's depth gap_m         width of the gap of a butt joint, else 0 closed
+    the last point continues into the first feel          whether the tip feels it; None: where a ball can
     """
 
     points_P: Floats
@@ -113,7 +111,8 @@ class DrawnSeam:
         keep = (s >= start_m - 1e-9) & (s <= end_m + 1e-9)
         if keep.sum() < 4:
             raise InputError(
-                f"Nothing is left of a seam of {1e3 * self.length_m:.1f} mm between {1e3 * start_m:.1f} and {1e3 * end_m:.1f} mm."
+                f"Nothing is left of a seam of {1e3 * self.length_m:.1f} mm between {1e3 * start_m:.1f} and"
+                f" {1e3 * end_m:.1f} mm."
             )
         whole, rows = bool(keep.all()), rows[keep]
         return replace(

@@ -1,7 +1,7 @@
 """Computes where the soft ball of the tip rests in a joint: pressed by springs against the walls it feels.
 
-The joint is cut square to the seam: x to the left of the travel, y along the bisector of the walls, the origin at the root.
-Derivation in docs/parts.md.
+The joint is cut square to the seam: x to the left of the travel, y along the bisector of the walls, the origin at the
+root. Derivation in docs/parts.md.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ HELD_SHARE = 0.5  # of the sideways force that would lift the ball off its other
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
 
-class Tip(Protocol):
+class SeatedTip(Protocol):
     """The numbers of the soft tip that its seat depends on; weldcal.models.tool.WeldingTool has them."""
 
     @property
@@ -53,9 +53,9 @@ class Press(NamedTuple):
     lateral_m: float
 
 
-class Entry(NamedTuple):
-    """How the tip is brought into a joint, m: how far to the left of the root it comes down (negative: to the right), and
-    how much lower it then rests in the joint than where it lands."""
+class TipApproach(NamedTuple):
+    """How the tip is brought into a joint, m: how far to the left of the root it comes down (negative: to the right),
+    and how much lower it then rests in the joint than where it lands."""
 
     aside_m: float
     drop_m: float
@@ -101,7 +101,8 @@ def contact_angle(section: JointSection, radius_m: float) -> float:
 
 
 def hard_height(section: JointSection, radius_m: float) -> float:
-    """Height of a hard ball's centre above the root, m: radius / sin(half angle), over a gap sqrt(radius^2 - (gap/2)^2)."""
+    """Height of a hard ball's centre above the root, m: radius / sin(half angle), over a gap sqrt(radius^2 -
+    (gap/2)^2)."""
     if section.gap_m > 0.0:
         return math.sqrt(max(0.0, radius_m**2 - (0.5 * section.gap_m) ** 2))
     return radius_m / math.sin(section.half_angle_rad)
@@ -111,21 +112,21 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
     """Check that a ball of this radius sits on both walls of the joint.
 
     Raises:
-        JointNotWeldable: the ball falls through the gap or is too large, a wall ends below the ball, or the walls open too
-            far or too little.
+        JointNotWeldable: the ball falls through the gap or is too large, a wall ends below the ball, or the walls open
+            too far or too little.
     """
     r, mm = radius_m, 1e3
     if section.gap_m > 0.0:
         if section.gap_m > WIDEST_GAP * r:
             raise JointNotWeldable(
-                f"A tip of radius {mm * r:.3g} mm falls through a gap of {mm * section.gap_m:.3g} mm: use a larger tip or close "
-                f"the gap to {mm * WIDEST_GAP * r:.2g} mm or less."
+                f"A tip of radius {mm * r:.3g} mm falls through a gap of {mm * section.gap_m:.3g} mm: use a larger tip"
+                f" or close the gap to {mm * WIDEST_GAP * r:.2g} mm or less."
             )
         sinks = r - math.sqrt(r**2 - 0.25 * section.gap_m**2)
         if min(section.left_m, section.right_m) < sinks + MARGIN_M:
             raise JointNotWeldable(
-                f"A tip of radius {mm * r:.3g} mm stands on the ground: the plates are thinner than the {mm * sinks:.2g} mm that "
-                f"it sinks into a gap of {mm * section.gap_m:.3g} mm."
+                f"A tip of radius {mm * r:.3g} mm stands on the ground: the plates are thinner than the"
+                f" {mm * sinks:.2g} mm that it sinks into a gap of {mm * section.gap_m:.3g} mm."
             )
     elif section.half_angle_rad > 0.5 * math.radians(176.0):
         raise JointNotWeldable("The plates meet without a gap: there is nothing the tip could feel; leave a gap.")
@@ -138,7 +139,8 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
         )
     if opening < NARROWEST_RAD:
         raise JointNotWeldable(
-            f"The joint opens only {math.degrees(opening):.0f} deg: the tip needs at least {math.degrees(NARROWEST_RAD):.0f} deg."
+            f"The joint opens only {math.degrees(opening):.0f} deg: the tip needs at least"
+            f" {math.degrees(NARROWEST_RAD):.0f} deg."
         )
     if section.gap_m > 0.0:
         return
@@ -146,12 +148,14 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
     for side, extent in (("left", section.left_m), ("right", section.right_m)):
         if extent < needed:
             raise JointNotWeldable(
-                f"A tip of radius {mm * r:.3g} mm is too large for this joint: it touches {mm * (needed - MARGIN_M):.2g} mm from the "
-                f"root, and the {side} wall ends at {mm * extent:.2g} mm."
+                f"A tip of radius {mm * r:.3g} mm is too large for this joint: it touches"
+                f" {mm * (needed - MARGIN_M):.2g} mm from the root, and the {side} wall ends at {mm * extent:.2g} mm."
             )
 
 
-def press_for(section: JointSection, tip: Tip, axial_m: float | None = None, lateral_m: float | None = None) -> Press:
+def press_for(
+    section: JointSection, tip: SeatedTip, axial_m: float | None = None, lateral_m: float | None = None
+) -> Press:
     """How hard the tip is pressed into this joint, m; a value that is given is kept.
 
     Pressed sideways by more than cot(half angle) of the downward force the ball would climb its wall; half of that is
@@ -173,22 +177,22 @@ def press_for(section: JointSection, tip: Tip, axial_m: float | None = None, lat
     lateral = min(0.002, HELD_SHARE * most) if lateral_m is None else lateral_m
     if lateral >= most:
         raise JointNotWeldable(
-            f"A tip pressed {1e3 * lateral:.1f} mm aside and {1e3 * axial:.1f} mm down climbs out of its joint: take less "
-            "welding.deflection_mm or more welding.axial_deflection_mm."
+            f"A tip pressed {1e3 * lateral:.1f} mm aside and {1e3 * axial:.1f} mm down climbs out of its joint: take"
+            " less welding.deflection_mm or more welding.axial_deflection_mm."
         )
     if lateral < LEAST_LEAN_M:
         raise JointNotWeldable(
-            f"The tip could lean only {1e3 * lateral:.2f} mm against the wall of this joint before it climbs out, which is too "
-            "little to be felt: use a smaller tip or a wider gap."
+            f"The tip could lean only {1e3 * lateral:.2f} mm against the wall of this joint before it climbs out, which"
+            " is too little to be felt: use a smaller tip or a wider gap."
         )
     return Press(axial, lateral)
 
 
-def seat(section: JointSection, tip: Tip, press: Press) -> Seated:
+def seat(section: JointSection, tip: SeatedTip, press: Press) -> Seated:
     """Where the ball of the tip rests, pressed left and down by its springs.
 
-    The pressure in the soft ball grows linearly from its surface to the modulus at its centre (Elandt et al., IROS 2019);
-    each rigid face answers with its integral over what it cuts out of the ball, along its own normal.
+    The pressure in the soft ball grows linearly from its surface to the modulus at its centre (Elandt et al., IROS
+    2019); each rigid face answers with its integral over what it cuts out of the ball, along its own normal.
 
     Raises:
         JointNotWeldable: no such place: the ball climbs out.

@@ -41,7 +41,8 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """The free space between two walls, seen from one point of a cut: angles from x towards y, rad, and the walls' normals."""
+    """The free space between two walls, seen from one point of a cut: angles from x towards y, rad, and the walls'
+    normals."""
 
     low_rad: float
     high_rad: float
@@ -133,7 +134,8 @@ def crossings(section: Section, centre: Floats, radius: float) -> tuple[Floats, 
 def openings(section: Section, radius: float, centre: Floats | None = None) -> list[Opening]:
     """Every free space about a point of the cut (the seam's own where None), between walls met at this distance.
 
-    Material is counted by its surfaces, so bodies may touch or overlap: between two bodies' common faces nothing is free.
+    Material is counted by its surfaces, so bodies may touch or overlap: between two bodies' common faces nothing is
+    free.
     """
     middle = np.zeros(2) if centre is None else centre
     angle, points, normals, enters = crossings(section, middle, radius)
@@ -149,14 +151,7 @@ def openings(section: Section, radius: float, centre: Floats | None = None) -> l
     for k in np.flatnonzero(free):
         after = (k + 1) % len(angle)
         found.append(
-            Opening(
-                float(angle[k]),
-                float(angle[k] + width[k]),
-                normals[k],
-                normals[after],
-                points[k],
-                points[after],
-            )
+            Opening(float(angle[k]), float(angle[k] + width[k]), normals[k], normals[after], points[k], points[after])
         )
     return found
 
@@ -171,7 +166,8 @@ def opening_angle(opening: Opening) -> float:
 def wall_extent(section: Section, root: Floats, direction: Floats, normal: Floats, tolerance_m: float = 4e-4) -> float:
     """How far a wall continues from a point of the cut along its direction, m, at most the cut's reach.
 
-    Segments belong to it that face the same way (15 deg) and lie within a tolerance that grows by a tenth of the distance.
+    Segments belong to it that face the same way (15 deg) and lie within a tolerance that grows by a tenth of the
+    distance.
     """
     same = section.normals @ normal > math.cos(math.radians(15.0))
     along = (section.segments - root) @ direction

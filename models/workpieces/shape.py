@@ -20,8 +20,8 @@ KINDS = ("concave", "flush", "convex", "smooth", "boundary")
 class PartEdge:
     """An edge of a part in its frame P.
 
-    id        the number by which a scenario names it, from 1
-    kind      concave: the free space between the faces is less than pi; flush: the faces of two bodies lie in one plane;
+    id        the number by which a scenario names it, from 1 kind      concave: the free space between the faces is
+    less than pi; flush: the faces of two bodies lie in one plane;
               convex; smooth: the faces are tangent; boundary: only one face ends here
     points_P  (N,3) m, N >= 2, along the edge; a closed edge repeats its first point
     angle_rad between the two faces: through the free space of a concave edge, through the material of a convex one;
@@ -76,7 +76,8 @@ class PartJoint:
 
 @dataclass(frozen=True, eq=False)
 class PartShape:
-    """A part in its frame P, m: its mesh, its edges by ascending id, the file's unit in m, its bodies and its joints."""
+    """A part in its frame P, m: its mesh, its edges by ascending id, the file's unit in m, its bodies and its
+    joints."""
 
     name: str
     mesh: TriMesh
@@ -94,6 +95,7 @@ class PartShape:
         found = next((e for e in self.edges if e.id == id), None)
         if found is None:
             raise InputError(
-                f"'{self.name}' has no edge {id}: its edges are 1 to {len(self.edges)}; weldcal part {self.name} lists them."
+                f"'{self.name}' has no edge {id}: its edges are 1 to {len(self.edges)}; weldcal part {self.name} lists"
+                " them."
             )
         return found

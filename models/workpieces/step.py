@@ -16,7 +16,7 @@ from weldcal.models.mesh import TriMesh, merge
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
 
 if TYPE_CHECKING:
-    from weldcal.models.workpieces.brep import Face
+    from weldcal.models.workpieces.brep import SolidFace
     from weldcal.models.workpieces.joints import Piece
 
 Floats = npt.NDArray[np.float64]
@@ -67,7 +67,8 @@ def referenced(path: Path) -> list[Path]:
             other = path.parent / Path(name.decode(errors="replace").replace("\\", "/")).name
             if not other.is_file():
                 raise InputError(
-                    f"'{one.name}' takes a body from '{other.name}': put that file beside it, or export the assembly as one file."
+                    f"'{one.name}' takes a body from '{other.name}': put that file beside it, or export the assembly as"
+                    " one file."
                 )
             if other not in (path, *found):
                 found.append(other)
@@ -194,9 +195,9 @@ def _edges(shape: Any) -> tuple[PartEdge, ...]:
     from OCP.TopAbs import TopAbs_ShapeEnum
     from OCP.TopoDS import TopoDS
 
-    from weldcal.models.workpieces.brep import Face, faces_at, length_of, parts_of, sampled
+    from weldcal.models.workpieces.brep import SolidFace, faces_at, length_of, parts_of, sampled
 
-    faces = [Face(TopoDS.Face(face)) for face in parts_of(shape, TopAbs_ShapeEnum.TopAbs_FACE)]
+    faces = [SolidFace(TopoDS.Face(face)) for face in parts_of(shape, TopAbs_ShapeEnum.TopAbs_FACE)]
     found: list[PartEdge] = []
     for edge, met in faces_at(shape, faces):
         curve = BRepAdaptor_Curve(edge)
@@ -210,7 +211,7 @@ def _edges(shape: Any) -> tuple[PartEdge, ...]:
     return tuple(found)
 
 
-def _met(curve: Any, edge: Any, first: Face, second: Face) -> tuple[str, float]:
+def _met(curve: Any, edge: Any, first: SolidFace, second: SolidFace) -> tuple[str, float]:
     """Kind of an edge between two faces, and the angle between these, rad."""
     from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum
 

@@ -12,8 +12,9 @@ def textured_board(
 ) -> Mesh:
     """A rectangle centred on the origin in the x-y plane, facing +z, x to the right of the picture and y up.
 
-    `picture` is (h, w) grey or (h, w, 3) BGR uint8. Renderers interpolate between its pixels, so its edges are smooth, as in
-    a camera's picture of a print. `glows`: a viewer shows it as bright from every side of the light. Edges of geometry would be aliased.
+    `picture` is (h, w) grey or (h, w, 3) BGR uint8. Renderers interpolate between its pixels, so its edges are smooth,
+    as in a camera's picture of a print. `glows`: a viewer shows it as bright from every side of the light. Edges of
+    geometry would be aliased.
     """
     w, h = 0.5 * width_m, 0.5 * height_m
     obj = (

@@ -47,13 +47,14 @@ TABLE = (0.36, 0.38, 0.40, 1.0)
 SURROUNDINGS = (0.55, 0.50, 0.42, 1.0)
 COLOURS = {"dark": DARK, "steel": STEEL, "copper": COPPER, "soft": SOFT, "white": (1.0, 1.0, 1.0, 1.0)}
 CELL_PX = 32  # texels of a tag cell: more than those of the camera's picture of it
-# A camera pixel integrates light over its area through a lens; a renderer samples one point of it. The blur of lens and pixel,
-# in texels, is applied to the print. Without it, edges parallel to the pixel rows would be off by a tenth of a pixel.
+# A camera pixel integrates light over its area through a lens; a renderer samples one point of it. The blur of lens and
+# pixel, in texels, is applied to the print. Without it, edges parallel to the pixel rows would be off by a tenth of a
+# pixel.
 BLUR_TEXELS = 1.2
 TAG_PLATE_DEPTH_M = 0.00005  # of its face below the print
 TIP_FRICTION = 0.2  # soft tip on steel
-# The contact model approximates a sphere by an inscribed polyhedron with this share of its volume (at a resolution of half the
-# radius). The requested sphere is larger by the same factor, so that the polyhedron has the tip's volume.
+# The contact model approximates a sphere by an inscribed polyhedron with this share of its volume (at a resolution of
+# half the radius). The requested sphere is larger by the same factor, so that the polyhedron has the tip's volume.
 CONTACT_MESH_VOLUME = 0.9114
 
 
@@ -131,7 +132,8 @@ def add_tool(
     for body_shape in tool.drawn():
         show(plant, plate, body_shape.place.pose, drake_shape(body_shape), body_shape.name, COLOURS[body_shape.colour])
 
-    # Three prismatic joints in series carry the tip; the springs are implicit PD controllers, stable at 2 ms with a mass of grams.
+    # Three prismatic joints in series carry the tip; the springs are implicit PD controllers, stable at 2 ms with a
+    # mass of grams.
     parent = plant.AddFrame(_fixed_offset(plant, "tip_rest", plate, tool.X_FT))
     small = SpatialInertia(tool.tip_mass_kg / 3, np.zeros(3), UnitInertia.SolidSphere(0.01))
     joints: list[PrismaticJoint] = []

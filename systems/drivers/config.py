@@ -1,4 +1,5 @@
-"""Base classes of driver configurations: the devices that a driver supports, and whether it needs the simulated world."""
+"""Base classes of driver configurations: the devices that a driver supports, and whether it needs the simulated
+world."""
 
 import dataclasses as dc
 from abc import ABC, abstractmethod
@@ -15,10 +16,11 @@ DEVICES = ("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digi
 
 
 class DriverConfig:
-    """Base class of the dataclass that a driver module defines; its name is the tag in the scenario, such as `!SimulatedUr`.
+    """Base class of the dataclass that a driver module defines; its name is the tag in the scenario, such as
+    `!SimulatedUr`.
 
-    The module also defines `ApplyDriverConfig(config, build)`. A robot driver may define `PrepareRobot(config, nominal)`, and
-    any sensor's driver `preflight(config) -> Sensed`, which looks at the device and causes no motion.
+    The module also defines `ApplyDriverConfig(config, build)`. A robot driver may define `PrepareRobot(config,
+    nominal)`, and any sensor's driver `preflight(config) -> Sensed`, which looks at the device and causes no motion.
     """
 
     FOR: ClassVar[tuple[str, ...]] = ()  # some of DEVICES
@@ -30,7 +32,8 @@ class DriverConfig:
         return arm
 
     def torch_delay_s(self) -> float:
-        """How long a robot's driver waits from the command of the torch to the torch, s, such as for the shielding gas."""
+        """How long a robot's driver waits from the command of the torch to the torch, s, such as for the shielding
+        gas."""
         return 0.0
 
 
@@ -52,7 +55,8 @@ class ScannerConfig(DriverConfig, ABC):
         """Intrinsics, range and noise, used by pose planning."""
 
     def stream_delay_s(self) -> float | None:
-        """Nominal time from capture to arrival, s, of a scanner that streams; None for one that scans when it is asked."""
+        """Nominal time from capture to arrival, s, of a scanner that streams; None for one that scans when it is
+        asked."""
         return None
 
 

@@ -1,4 +1,5 @@
-"""The interface between drivers and the station builder: the DiagramBuilder, the station's parts and the ports to export."""
+"""The interface between drivers and the station builder: the DiagramBuilder, the station's parts and the ports to
+export."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,9 +26,9 @@ class Closable(Protocol):
 class PreparedRobot:
     """The state of the robot before the station is built, as the driver's `PrepareRobot` returns it.
 
-    `q_start` (6,) rad is the arm's present configuration. `clock` paces the Diagram by the wall clock; None: the Diagram may run
-    as fast as possible. `waits`: the robot is emulated, and its time waits for this computer. `transport`: a sentence about the
-    connection to its controller.
+    `q_start` (6,) rad is the arm's present configuration. `clock` paces the Diagram by the wall clock; None: the
+    Diagram may run as fast as possible. `waits`: the robot is emulated, and its time waits for this computer.
+    `transport`: a sentence about the connection to its controller.
     """
 
     arm: ArmModel
@@ -58,8 +59,8 @@ class StationBuild:
     """Collects the ports that drivers add; `make_station` exports them under fixed names. `q_start` (6,) rad: the arm's
     present configuration.
 
-    `parts` are further objects of the station, looked up by type: the simulated world, and the parts of a job's furnishing.
-    `closables` are closed with the station.
+    `parts` are further objects of the station, looked up by type: the simulated world, and the parts of a job's
+    furnishing. `closables` are closed with the station.
     """
 
     builder: DiagramBuilder
@@ -75,9 +76,11 @@ class StationBuild:
 
     @property
     def may_wait(self) -> bool:
-        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait for it.
+        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait
+        for it.
 
-        Nor while it follows a robot that waits for it: a device of that robot's world may need the robot's time to go on.
+        Nor while it follows a robot that waits for it: a device of that robot's world may need the robot's time to go
+        on.
         """
         clock = None if self.robot is None else self.robot.clock
         return clock is None or (self.robot is not None and self.robot.waits and not clock.follows)

@@ -162,7 +162,8 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def read(self, *optional: str, **ports: Any) -> None:
-        """Declare further input ports under the inputs' names, each with a value of its type (a number: a vector of one).
+        """Declare further input ports under the inputs' names, each with a value of its type (a number: a vector of
+        one).
 
         A port among `optional` may stay open: then its value is the one given here.
         """
@@ -291,7 +292,10 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
         return (s if s.slowed else replace(s, slowed=SLOWED)), found.q_dot
 
     def watched(self, s: StateOf, now: InputsOf, arm: ArmModel, p_FP: Array, q_dot: Array) -> tuple[StateOf, Array]:
-        """A joint velocity (6,) rad/s along a planned path. Its time is fixed: the guard holds it and does not slow it."""
+        """A joint velocity (6,) rad/s along a planned path.
+
+        Its time is fixed: the guard holds it and does not slow it.
+        """
         limit = SPEED_SHARE * arm.velocity_limit
         J = jacobian(arm, now.q, p_FP)
         found = guarded_joint_velocity(J, J @ q_dot, limit, GUARD)
@@ -317,8 +321,8 @@ class Procedure(LeafSystem, Generic[StateOf, InputsOf]):
             return f"The operator ended the job in phase '{self.where(s)}'."
         if now.time > self._maximum_time_s:
             return (
-                f"The job took longer than its {self._maximum_time_s:.0f} s, in the phase '{self.where(s)}': allow more "
-                f"with {self.maximum_time_key}."
+                f"The job took longer than its {self._maximum_time_s:.0f} s, in the phase '{self.where(s)}': allow more"
+                f" with {self.maximum_time_key}."
             )
         return ""
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
-from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, path_clearance
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
@@ -23,13 +23,14 @@ def stands_at(q: NDArray[np.float64], q_home: NDArray[np.float64]) -> bool:
 Joints = NDArray[np.float64]
 
 
-def station_bodies(station: Station) -> list[Body]:
+def station_bodies(station: Station) -> list[LinkCapsule]:
     """The bodies of the clearance checks: the arm's links and its tool."""
     return arm_bodies(station.arm, () if station.tool is None else station.tool.capsules())
 
 
-def clear_move(scenario: Scenario, station: Station, bodies: list[Body], q_a: Joints, q_b: Joints) -> bool:
-    """Whether a straight move in joint space stays above the table, clear of the surroundings and of the arm itself; (6,) rad."""
+def clear_move(scenario: Scenario, station: Station, bodies: list[LinkCapsule], q_a: Joints, q_b: Joints) -> bool:
+    """Whether a straight move in joint space stays above the table, clear of the surroundings and of the arm itself;
+    (6,) rad."""
     if station.surroundings.touched_on_path(station.arm, bodies, q_a, q_b):
         return False
     lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)
@@ -50,13 +51,13 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
     stands = ", ".join(f"{angle:.0f}" for angle in np.rad2deg(station.q_start))
     wanted = ", ".join(f"{angle:.0f}" for angle in scenario.home_deg)
     raise InputError(
-        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table, the surroundings or the arm itself: "
-        f"move it by hand near home_deg [{wanted}] first."
+        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table, the"
+        f" surroundings or the arm itself: move it by hand near home_deg [{wanted}] first."
     )
 
 
 def clear_poses(
-    scenario: Scenario, station: Station, poses: Sequence[PlannedPose], bodies: list[Body]
+    scenario: Scenario, station: Station, poses: Sequence[PlannedPose], bodies: list[LinkCapsule]
 ) -> tuple[PlannedPose, ...]:
     """The poses that the FlangeMover can reach from the previous one and with a free move home, in their order.
 
@@ -74,7 +75,7 @@ def clear_poses(
     needed = 1 + c.maximum_scans + c.verification_scans
     if len(kept) < needed:
         raise UnreachableScanner(
-            f"Only {len(kept)} of {needed} calibration poses can be reached without contact of the arm with the table, the surroundings or itself; "
-            "choose another home_deg or fewer maximum_scans."
+            f"Only {len(kept)} of {needed} calibration poses can be reached without contact of the arm with the table,"
+            " the surroundings or itself; choose another home_deg or fewer maximum_scans."
         )
     return tuple(kept)

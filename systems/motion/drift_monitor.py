@@ -38,9 +38,10 @@ _ROUNDS = 8
 class RunClock:
     """A device time and the robot's time then (s), and the robot's rate over the device's.
 
-    ``learnt``: frames in motion have shown it. Until then it is what the calibration's clock says (``known``), which is of another
-    run and another start of the robot's clock, or what the earliest arrival says, wrong by what that frame came late. ``waiting``
-    are the frames that could not be used yet; ``late_since``: the arrival (s) of the first of those that come very late now.
+    ``learnt``: frames in motion have shown it. Until then it is what the calibration's clock says (``known``), which is
+    of another run and another start of the robot's clock, or what the earliest arrival says, wrong by what that frame
+    came late. ``waiting`` are the frames that could not be used yet; ``late_since``: the arrival (s) of the first of
+    those that come very late now.
     """
 
     device_s: float
@@ -58,7 +59,8 @@ class RunClock:
 
 @dc.dataclass(frozen=True, eq=False)
 class Seen:
-    """What a clock is learnt with: the calibration, the arm and where the feature is on its flange, and the arm's recent motion."""
+    """What a clock is learnt with: the calibration, the arm and where the feature is on its flange, and the arm's
+    recent motion."""
 
     X_BC: RigidTransform
     correction: ScannerCorrection
@@ -83,8 +85,8 @@ def followed(
 ) -> RunClock | None:
     """The clock with a new frame's times. ``known`` is the calibration's clock. None where a frame has no device time.
 
-    No frame comes before its time, so that a clock that is not learnt yet moves to the earliest. One that was set anew is learnt
-    again: at once where a frame is too early for it, or later than any frame is, else where frames stay late.
+    No frame comes before its time, so that a clock that is not learnt yet moves to the earliest. One that was set anew
+    is learnt again: at once where a frame is too early for it, or later than any frame is, else where frames stay late.
     """
     device, arrival = estimate.device_time, estimate.arrival_time
     if device is None or not np.isfinite(arrival):
@@ -108,9 +110,9 @@ def followed(
 
 
 def with_frame(clock: RunClock, estimate: FlangeEstimate, seen: Seen) -> tuple[RunClock, tuple[FlangeEstimate, ...]]:
-    """The clock after a frame with a fit, and the frames that can be used now: at rest each at once, because no time is wrong there;
-    in motion those that waited, once they show the clock. One that has left the history is given up. By a clock that is learnt
-    only a very late frame waits, for the next: then it was late, and the clock is right."""
+    """The clock after a frame with a fit, and the frames that can be used now: at rest each at once, because no time is
+    wrong there; in motion those that waited, once they show the clock. One that has left the history is given up. By a
+    clock that is learnt only a very late frame waits, for the next: then it was late, and the clock is right."""
     assert estimate.device_time is not None
     if clock.learnt and clock.late_since is not None:
         return dc.replace(clock, waiting=(*clock.waiting, estimate)), ()
@@ -134,8 +136,8 @@ def with_frame(clock: RunClock, estimate: FlangeEstimate, seen: Seen) -> tuple[R
 def _shift(clock: RunClock, frames: list[FlangeEstimate], seen: Seen) -> float | None:
     """By how much (s) the robot's time is later than the clock says; None where the frames do not show it.
 
-    The least squares of e_k = X_BC p_C,k - p_BR(t_k + shift) - o, whose common part o takes out a scanner that was moved
-    before: first over steps of _STEP_S, then by Gauss-Newton.
+    The least squares of e_k = X_BC p_C,k - p_BR(t_k + shift) - o, whose common part o takes out a scanner that was
+    moved before: first over steps of _STEP_S, then by Gauss-Newton.
     """
     times = np.array([clock.time(f.device_time) for f in frames if f.device_time is not None])
     centers = np.array([f.fit.center_C for f in frames if f.fit is not None])
@@ -170,8 +172,8 @@ _RECENT = 400  # frames that the view shows
 
 @dc.dataclass(frozen=True, eq=False)
 class MonitoredCalibration:
-    """What is watched: X_BC with its covariance (6, 6) [rotation; translation] about the camera's origin, the scanner's correction
-    and its clock. Without a clock a streamed frame was captured ``delay_s`` before its arrival."""
+    """What is watched: X_BC with its covariance (6, 6) [rotation; translation] about the camera's origin, the scanner's
+    correction and its clock. Without a clock a streamed frame was captured ``delay_s`` before its arrival."""
 
     X_BC: RigidTransform
     covariance: Array
@@ -182,7 +184,8 @@ class MonitoredCalibration:
 
     @staticmethod
     def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> "MonitoredCalibration":
-        """What a result says; ``delay_s`` is the usual delay of the scanner, where the result does not know its clock."""
+        """What a result says; ``delay_s`` is the usual delay of the scanner, where the result does not know its
+        clock."""
         clock = result.clock
         sigma = None if clock is None or clock.offset_s is None else clock.sigma_s
         spread = 1e-3 * result.sigma_position_mm
@@ -202,10 +205,12 @@ class MonitoredCalibration:
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
 class DriftStatus(Message):
-    """The state of the watch after its newest frame. ``recent`` (n, 6): time s, error (3) m at the time by the clock, offset of the clock s, test statistic.
+    """The state of the watch after its newest frame.
 
-    ``X_BC`` with its ``covariance`` (6, 6) is the scanner's pose by all frames since the last change: the recalibration.
-    ``alarmed``: a change is being measured; ``events``: those that were measured.
+    ``recent`` (n, 6): time s, error (3) m at the time by the clock, offset of the clock s, test statistic.
+
+    ``X_BC`` with its ``covariance`` (6, 6) is the scanner's pose by all frames since the last change: the
+    recalibration. ``alarmed``: a change is being measured; ``events``: those that were measured.
     """
 
     sequence: int = 0
@@ -232,7 +237,10 @@ class DriftStatus(Message):
         if moves:
             e = moves[-1]
             size, angle = 1e3 * np.linalg.norm(e.translation_m), np.degrees(np.linalg.norm(e.rotation_rad))
-            return f"The scanner's pose changed by {size:.2f} mm and {angle:.3f} degrees at {e.time_s:.1f} s ({e.cause}); calibrate again."
+            return (
+                f"The scanner's pose changed by {size:.2f} mm and {angle:.3f} degrees at {e.time_s:.1f} s ({e.cause});"
+                " calibrate again."
+            )
         if self.alarmed:
             return "The scanner's pose has changed; how far is being measured. Calibrate again."
         return ""
@@ -265,16 +273,21 @@ class DriftMonitor(LeafSystem):
         - drift
         - moved
 
-    `drift` is a `DriftStatus`; `moved` (1) is 1 from an alarm on. When `recalibrate` (1, may stay open) rises, the pose that the
-    frames since the last change show becomes the calibration that is watched. Without a ``calibration`` the one on
-    `calibration_status` (may stay open) is watched from when it is done; a streamed frame is then expected ``delay_s`` after its capture.
-    All state is in the Context. Theory: docs/drift.md.
+    `drift` is a `DriftStatus`; `moved` (1) is 1 from an alarm on. When `recalibrate` (1, may stay open) rises, the pose
+    that the frames since the last change show becomes the calibration that is watched. Without a ``calibration`` the
+    one on `calibration_status` (may stay open) is watched from when it is done; a streamed frame is then expected
+    ``delay_s`` after its capture. All state is in the Context. Theory: docs/drift.md.
     """
 
     def __init__(
-        self, arm: ArmModel, X_FR: RigidTransform, calibration: MonitoredCalibration | None, config: DriftConfig | None = None,
-        period_s: float = 0.02, delay_s: float = 0.0,
-    ) -> None:  # fmt: skip
+        self,
+        arm: ArmModel,
+        X_FR: RigidTransform,
+        calibration: MonitoredCalibration | None,
+        config: DriftConfig | None = None,
+        period_s: float = 0.02,
+        delay_s: float = 0.0,
+    ) -> None:
         super().__init__()
         self._arm, self._X_FR, self._config, self._delay_s = arm, X_FR, config, delay_s
         self._estimate = self.DeclareAbstractInputPort("flange_estimate", AbstractValue.Make(FlangeEstimate()))
@@ -325,8 +338,13 @@ def _begun(calibration: MonitoredCalibration | None) -> _Watch:
 
 
 def watched_frame(
-    watch: _Watch, estimate: FlangeEstimate, history: PoseHistory, arm: ArmModel, X_FR: RigidTransform, config: DriftConfig | None
-) -> _Watch:  # fmt: skip
+    watch: _Watch,
+    estimate: FlangeEstimate,
+    history: PoseHistory,
+    arm: ArmModel,
+    X_FR: RigidTransform,
+    config: DriftConfig | None,
+) -> _Watch:
     """The watch after one more estimate; a frame without a fit, a time or a pose of the arm is counted as dropped.
 
     Frames in motion with a device time wait until they show the scanner's clock in this run.
@@ -361,9 +379,16 @@ def _tested(watch: _Watch, c: MonitoredCalibration, frames: list[TrackedFrame], 
     recent = np.column_stack([rows.times, errors, np.full(n, test.clock_s), np.full(n, test.statistic)])
     status = watch.status
     status = dc.replace(
-        status, frames=status.frames + n, recent=np.vstack([status.recent, recent])[-_RECENT:], statistic=test.statistic,
-        threshold=test.threshold, alarmed=test.alarmed, events=(*status.events, *events), X_BC=X, covariance=covariance,
-    )  # fmt: skip
+        status,
+        frames=status.frames + n,
+        recent=np.vstack([status.recent, recent])[-_RECENT:],
+        statistic=test.statistic,
+        threshold=test.threshold,
+        alarmed=test.alarmed,
+        events=(*status.events, *events),
+        X_BC=X,
+        covariance=covariance,
+    )
     return dc.replace(watch, status=status, test=test, pivot=pivot)
 
 

@@ -61,9 +61,10 @@ class FlangeMover(LeafSystem):
         - velocity
         - settled_goal
 
-    `velocity` (6) rad/s; `settled_goal` (1) is the id of the newest goal at which the arm has come to rest: by its measured velocity, or, where
-    that is noisier than SETTLED_RAD_S, by how little the joints have turned in REST_WINDOW_S. The path is straight in joint space: every goal
-    of the cell is a checked configuration, and the channel is joint velocity.
+    `velocity` (6) rad/s; `settled_goal` (1) is the id of the newest goal at which the arm has come to rest: by its
+    measured velocity, or, where that is noisier than SETTLED_RAD_S, by how little the joints have turned in
+    REST_WINDOW_S. The path is straight in joint space: every goal of the cell is a checked configuration, and the
+    channel is joint velocity.
     """
 
     def __init__(self, speed: float = 1.0, acceleration: float = 2.5, period_s: float = 0.008) -> None:

@@ -12,7 +12,8 @@ from weldcal.systems.messages import FlangeEstimate, Message, ScanStream, Stream
 
 @dc.dataclass(frozen=True, eq=False)
 class Queue(Message):
-    """The frame that the reader has, those that wait, oldest first, the number of the newest frame that came, and those dropped."""
+    """The frame that the reader has, those that wait, oldest first, the number of the newest frame that came, and those
+    dropped."""
 
     served: StreamedScan = dc.field(default_factory=StreamedScan)
     waiting: tuple[StreamedScan, ...] = ()
@@ -22,8 +23,10 @@ class Queue(Message):
 
 
 def advance(queue: Queue, arrived: tuple[StreamedScan, ...], done: int, capacity: int) -> Queue:
-    """The queue after frames arrived and the reader finished those up to number ``done``. A frame that never came counts as
-    dropped, too."""
+    """The queue after frames arrived and the reader finished those up to number ``done``.
+
+    A frame that never came counts as dropped, too.
+    """
     new = tuple(f for f in arrived if f.sequence > queue.newest)
     waiting, dropped, taken, served = (*queue.waiting, *new), queue.dropped, queue.taken, queue.served
     newest = new[-1].sequence if new else queue.newest
@@ -53,8 +56,8 @@ class FrameQueue(LeafSystem):
         - scan
         - counts
 
-    `scan` is the frame to be worked on until the estimate with its number is there; then the next one follows. `counts` (3): frames
-    handed on, frames dropped, frames waiting.
+    `scan` is the frame to be worked on until the estimate with its number is there; then the next one follows. `counts`
+    (3): frames handed on, frames dropped, frames waiting.
     """
 
     def __init__(self, capacity: int = 2, period_s: float = 0.004) -> None:

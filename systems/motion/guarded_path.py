@@ -58,7 +58,8 @@ class GuardedMotion:
 
 
 class Followed(NamedTuple):
-    """How the arm follows a motion: joints (n, 6) rad, their places (n,) m, the least singular value and share of the speed."""
+    """How the arm follows a motion: joints (n, 6) rad, their places (n,) m, the least singular value and share of the
+    speed."""
 
     q: Array
     along: Array
@@ -79,8 +80,8 @@ def straight(
 def check_path(arm: ArmModel, q_start: Array, motions: Sequence[GuardedMotion]) -> list[Followed]:
     """Follow motions one after the other on the branch of q_start (6,) rad, as the guard would.
 
-    At every place the pose is reached by Newton's steps from the place before, the joints are within their limits, no joint changes its
-    branch, and the guard allows `least_share` of the commanded speed.
+    At every place the pose is reached by Newton's steps from the place before, the joints are within their limits, no
+    joint changes its branch, and the guard allows `least_share` of the commanded speed.
 
     Raises:
         InfeasiblePath: with the first place and the joint.
@@ -103,8 +104,8 @@ def check_joints(arm: ArmModel, q: Array, where: str) -> None:
     if over[k] > -LIMIT_MARGIN_RAD:
         limits = np.degrees([arm.position_lower[k], arm.position_upper[k]])
         raise InfeasiblePath(
-            f"The arm cannot follow {where}: the {joint_name(arm, k)} would be at {np.degrees(q[k]):.0f} deg, and its limits are "
-            f"{limits[0]:.0f} to {limits[1]:.0f} deg"
+            f"The arm cannot follow {where}: the {joint_name(arm, k)} would be at {np.degrees(q[k]):.0f} deg, and its"
+            f" limits are {limits[0]:.0f} to {limits[1]:.0f} deg"
         )
 
 

@@ -1,4 +1,5 @@
-"""PoseRecorder: stores recent joint positions, so that a sensor's datum is paired with the arm's pose at its capture time."""
+"""PoseRecorder: stores recent joint positions, so that a sensor's datum is paired with the arm's pose at its capture
+time."""
 
 from dataclasses import dataclass, field
 
@@ -24,7 +25,8 @@ class PoseHistory(Message):
     positions: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
 
     def joints_at(self, time: float) -> NDArray[np.float64] | None:
-        """Joint positions (6,) rad interpolated to `time` s; None where `time` is more than one sample outside the history."""
+        """Joint positions (6,) rad interpolated to `time` s; None where `time` is more than one sample outside the
+        history."""
         t = self.times
         if t.size < 2 or not t[0] <= time <= t[-1] + (t[-1] - t[-2]):
             return None

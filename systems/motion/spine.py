@@ -1,4 +1,5 @@
-"""Builds the spine shared by all jobs: pose recorder, mover, arbiter and limiter for each arm, operator hold, process switch."""
+"""Builds the spine shared by all jobs: pose recorder, mover, arbiter and limiter for each arm, operator hold, process
+switch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -35,9 +36,9 @@ class OperatorPanel(LeafSystem):
         - end
         - pace
 
-    `hold` (1) is 1.0 while a person holds the run. `end` (1) is 1.0 once a person has ended it, for good. `pace` (1) is the
-    requested real-time rate, 0 to 3; other values are ignored. A click of the viewer's button holds the run. Any page of this computer's
-    browsers can reach the viewer, so that nothing there may let it go on.
+    `hold` (1) is 1.0 while a person holds the run. `end` (1) is 1.0 once a person has ended it, for good. `pace` (1) is
+    the requested real-time rate, 0 to 3; other values are ignored. A click of the viewer's button holds the run. Any
+    page of this computer's browsers can reach the viewer, so that nothing there may let it go on.
     """
 
     def __init__(self, person: Person, meshcat: Meshcat | None = None, period_s: float = PERIOD_S) -> None:
@@ -93,12 +94,12 @@ class ProcessSwitch(LeafSystem):
         - process_on
         - arm_stopped
 
-    `torch_wanted` (1) of the servo; `margin` (2) of the SingularityGuard, whose second number is 1 while it stops the arm;
-    `hold` (1) of the operator. `process_on` (1) follows all inputs without delay. The arm's command passes through the
-    arbiter and the slew limiter, so the torch is off no later than the first tick in which the arm is commanded to stop.
-    A burning torch that the robot's status or the guard turned off stays off for the rest of that weld; after a person's hold
-    the servo asks for it anew, when it is let go and has gone back. `arm_stopped` (1): the guard turned it off; the JobSequencer
-    then holds the job.
+    `torch_wanted` (1) of the servo; `margin` (2) of the SingularityGuard, whose second number is 1 while it stops the
+    arm; `hold` (1) of the operator. `process_on` (1) follows all inputs without delay. The arm's command passes through
+    the arbiter and the slew limiter, so the torch is off no later than the first tick in which the arm is commanded to
+    stop. A burning torch that the robot's status or the guard turned off stays off for the rest of that weld; after a
+    person's hold the servo asks for it anew, when it is let go and has gone back. `arm_stopped` (1): the guard turned
+    it off; the JobSequencer then holds the job.
     """
 
     def __init__(self, period_s: float = 0.002) -> None:
@@ -214,8 +215,9 @@ class JobPorts:
     """The output ports of a job that the spine, the log and the run loop read.
 
     `commands`: a JobCommand for each arm. `velocity` (6) rad/s drives the first arm while its command's mode is `weld`.
-    `torch_wanted` (1) and `margin` (2) go to the ProcessSwitch. `logged`: vector ports by their name in the log. `results`:
-    ports whose values a recording keeps, by name. `shown`: ports with messages that the dashboard shows, by name.
+    `torch_wanted` (1) and `margin` (2) go to the ProcessSwitch. `logged`: vector ports by their name in the log.
+    `results`: ports whose values a recording keeps, by name. `shown`: ports with messages that the dashboard shows, by
+    name.
     """
 
     commands: tuple[OutputPort, ...]
@@ -248,8 +250,8 @@ class SpineArm:
 
 @dataclass(frozen=True, eq=False)
 class Spine:
-    """The shared systems: `hold` (1) is 1.0 while a person holds the run, `end` (1) once a person has ended it; `switch` outputs
-    `process_on` and `arm_stopped`."""
+    """The shared systems: `hold` (1) is 1.0 while a person holds the run, `end` (1) once a person has ended it;
+    `switch` outputs `process_on` and `arm_stopped`."""
 
     wiring: Wiring
     arms: tuple[SpineArm, ...]

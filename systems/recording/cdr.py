@@ -22,7 +22,8 @@ int32 sec
 uint32 nanosec
 """
 SCHEMAS: Final = {
-    POINT_CLOUD: f"""std_msgs/Header header
+    POINT_CLOUD: (
+        f"""std_msgs/Header header
 uint32 height
 uint32 width
 sensor_msgs/PointField[] fields
@@ -45,15 +46,18 @@ string name
 uint32 offset
 uint8 datatype
 uint32 count
-""",
-    IMAGE: f"""std_msgs/Header header
+"""
+    ),
+    IMAGE: (
+        f"""std_msgs/Header header
 uint32 height
 uint32 width
 string encoding
 uint8 is_bigendian
 uint32 step
 uint8[] data
-{_HEADER}""",
+{_HEADER}"""
+    ),
 }
 _FLOATS: Final[dict[np.dtype[Any], int]] = {np.dtype(np.float32): 7, np.dtype(np.float64): 8}
 
@@ -117,7 +121,8 @@ class _In:
 
 
 def write_cloud(points: np.ndarray, time_ns: int, frame: str) -> bytearray:
-    """An organised cloud (H, W, 3) of float32 or float64, NaN where there is no point, as sensor_msgs/msg/PointCloud2."""
+    """An organised cloud (H, W, 3) of float32 or float64, NaN where there is no point, as
+    sensor_msgs/msg/PointCloud2."""
     out, kind = _Out(), _FLOATS[points.dtype]
     step = 3 * points.dtype.itemsize
     out.header(time_ns, frame)

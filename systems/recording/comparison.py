@@ -16,7 +16,8 @@ from weldcal.systems.recording.writer import LISTED
 
 @dataclass(frozen=True)
 class Difference:
-    """A value that is another one than in the recording: its port and field, the time s, and the number of its message."""
+    """A value that is another one than in the recording: its port and field, the time s, and the number of its
+    message."""
 
     name: str
     time_s: float
@@ -30,7 +31,8 @@ class Difference:
 
 
 class Comparison:
-    """A CellSink that compares with a recording up to its newest complete tick, and keeps the first difference of each port."""
+    """A CellSink that compares with a recording up to its newest complete tick, and keeps the first difference of each
+    port."""
 
     def __init__(self, recording: Recording, sizes: Mapping[str, int]) -> None:
         self._recording, self._sizes = recording, sizes

@@ -1,4 +1,5 @@
-"""PortPlayer: outputs what a recording holds of a station's ports, each value at the moment of a tick at which it was seen."""
+"""PortPlayer: outputs what a recording holds of a station's ports, each value at the moment of a tick at which it was
+seen."""
 
 from __future__ import annotations
 
@@ -20,7 +21,10 @@ from weldcal.systems.recording.port_recorder import BEFORE, PERIOD_S, STAGES, UP
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The values of one port: at keys (rising) the values that it had from there on. The first holds before its key, too."""
+    """The values of one port: at keys (rising) the values that it had from there on.
+
+    The first holds before its key, too.
+    """
 
     keys: Sequence[int]
     values: Sequence[Any]
@@ -28,7 +32,8 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Playback:
-    """What a station plays back: tracks of its output ports, sizes of its input ports, and looks by question (answers.py)."""
+    """What a station plays back: tracks of its output ports, sizes of its input ports, and looks by question
+    (answers.py)."""
 
     tracks: Mapping[str, Track]
     inputs: Mapping[str, int]
@@ -42,8 +47,8 @@ class PortPlayer(LeafSystem):
 
         name: PortPlayer
 
-    It has an input port for each port that the recorded cell drove, and an output port for each that it read. The inputs are not
-    used. The state is the key up to which updates have played the recording.
+    It has an input port for each port that the recorded cell drove, and an output port for each that it read. The
+    inputs are not used. The state is the key up to which updates have played the recording.
     """
 
     def __init__(self, tracks: Mapping[str, Track], inputs: Mapping[str, int]) -> None:

@@ -1,4 +1,5 @@
-"""PortRecorder: gives every change of the ports that a cell reads and drives to a sink, in the order in which Drake made it."""
+"""PortRecorder: gives every change of the ports that a cell reads and drives to a sink, in the order in which Drake
+made it."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from weldcal.systems.leaf_system import LeafSystem
 
 PERIOD_S = 0.002  # of the systems that are updated most often
 UPDATE_TICKS = 4  # unrestricted updates are made at each fourth tick, 8 ms
-# Publishing and unrestricted updates see a tick's ports as they were before it; discrete updates see them after the unrestricted ones.
+# Publishing and unrestricted updates see a tick's ports as they were before it; discrete updates see them after the
+# unrestricted ones.
 BEFORE, UPDATED = 0, 1
 STAGES = 2
 ENTERED, LEFT, BOTH = "entered", "left", "both"
@@ -28,7 +30,8 @@ class PortSink(Protocol):
     def changed(self, key: int, row: np.ndarray | None, entered: Mapping[str, Any], left: Mapping[str, Any]) -> None:
         """Take what changed: a row of the vector ports, messages and poses by port.
 
-        At BEFORE the row holds all that entered and then all that left, at UPDATED only what entered; None where that is as it was.
+        At BEFORE the row holds all that entered and then all that left, at UPDATED only what entered; None where that
+        is as it was.
         """
 
 
@@ -48,9 +51,10 @@ class PortRecorder(LeafSystem):
         - both
 
     Each recorded port with a message has an input port of its own besides, named "in." or "out." and its name.
-    `entered` holds all vector ports of what entered in a row, `both` holds them and those that left, of the given sizes. `both` is
-    looked at before the updates of each tick, and what entered once more between the unrestricted updates (each 8 ms) and the discrete
-    ones. Messages change with unrestricted updates: they are looked at each 8 ms, those in `quick` at each tick.
+    `entered` holds all vector ports of what entered in a row, `both` holds them and those that left, of the given
+    sizes. `both` is looked at before the updates of each tick, and what entered once more between the unrestricted
+    updates (each 8 ms) and the discrete ones. Messages change with unrestricted updates: they are looked at each 8 ms,
+    those in `quick` at each tick.
     """
 
     def __init__(

@@ -33,7 +33,8 @@ _PLAYED = {
 
 @dataclass(frozen=True)
 class Left:
-    """What left the cell: one value (as JSON) of one port or result, the key at which it did, and its number in the file."""
+    """What left the cell: one value (as JSON) of one port or result, the key at which it did, and its number in the
+    file."""
 
     number: int
     key: int
@@ -44,10 +45,10 @@ class Left:
 class Recording:
     """A recording in memory.
 
-    about: versions, seed and what else the file says of the run; files: by name. entered: what the station's ports showed.
-    left: messages by the name of the port or result, in order. rows: number in the file, key and values of all vector ports of
-    a side. answers: looks by the number of the question. end: what is said of the
-    end of the run; None where the file was cut off. last_key: of the newest message.
+    about: versions, seed and what else the file says of the run; files: by name. entered: what the station's ports
+    showed. left: messages by the name of the port or result, in order. rows: number in the file, key and values of all
+    vector ports of a side. answers: looks by the number of the question. end: what is said of the end of the run; None
+    where the file was cut off. last_key: of the newest message.
     """
 
     about: dict[str, str] = field(default_factory=dict)
@@ -101,8 +102,8 @@ def read_recording(path: Path) -> Recording:
         raise InputError(f"'{path}' is no recording of weldcal: give a recording.mcap that --record has written.")
     if found.about.get("format") not in READS:
         raise InputError(
-            f"'{path}' has the format {found.about.get('format')}, and this weldcal reads {' and '.join(READS)}: use the version that wrote it "
-            f"({found.about.get('version', 'unknown')})."
+            f"'{path}' has the format {found.about.get('format')}, and this weldcal reads {' and '.join(READS)}: use"
+            f" the version that wrote it ({found.about.get('version', 'unknown')})."
         )
     sizes = json.loads(found.about["sizes"])
     _split(found.rows.get(ENTERED, []), sizes[ENTERED], rising)
@@ -123,11 +124,7 @@ def _split(
 
 
 def _take(
-    found: Recording,
-    rising: dict[str, tuple[list[int], list[Any]]],
-    topic: str,
-    data: bytes,
-    body: np.ndarray | None,
+    found: Recording, rising: dict[str, tuple[list[int], list[Any]]], topic: str, data: bytes, body: np.ndarray | None
 ) -> np.ndarray | None:
     """Add a message; returns the cloud or image that the next message belongs to."""
     if topic == "/scanner/points":
@@ -157,7 +154,10 @@ def _take(
 
 
 def _add_rows(found: Recording, given: list[Any]) -> None:
-    """Add the rows of a message, in the order of their keys. In a recording of format 1 each has an entry of its own."""
+    """Add the rows of a message, in the order of their keys.
+
+    In a recording of format 1 each has an entry of its own.
+    """
     rows: dict[str, list[tuple[int, np.ndarray]]] = {}
     for keys, side, data in given:
         values = np.frombuffer(b64decode(data))

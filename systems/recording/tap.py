@@ -19,7 +19,7 @@ QUICK = ".status"  # of an arm: read at each tick
 
 
 @dataclass(frozen=True)
-class Layout:
+class PortLayout:
     """The sizes of the vector ports in a row of values, by name and in order: what entered the cell, what left it.
 
     The ports that left and that are inputs of the station are `drives`, with their sizes.
@@ -37,7 +37,7 @@ class CellSink(PortSink, Protocol):
         """Take how often a question was looked at before its answer was there."""
 
 
-OpenSink = Callable[[Station, Layout], CellSink]
+OpenSink = Callable[[Station, PortLayout], CellSink]
 """Opens a sink for a station."""
 
 
@@ -48,7 +48,7 @@ def add_recorder(wiring: Wiring, results: Mapping[str, OutputPort], open_sink: O
     rows = _vectors(entered), _vectors(left)
     sizes = [{name: port.size() for name, port in side.items()} for side in rows]
     drives = {name: port.size() for name, port in wiring.driven.items()}
-    sink = open_sink(wiring.station, Layout(sizes[0], sizes[1], drives))
+    sink = open_sink(wiring.station, PortLayout(sizes[0], sizes[1], drives))
     messages = _messages(entered), _messages(left)
     totals = (sum(sizes[0].values()), sum(sizes[1].values()))
     quick = tuple(name for name in messages[0] if name.endswith(QUICK))

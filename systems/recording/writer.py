@@ -69,7 +69,8 @@ class RecordingFailed(WeldcalError):
 class RecordingWriter:
     """A CellSink that writes to a file in a thread of its own: an update of the Diagram waits for no disk.
 
-    `about` goes into the file's metadata, `files` are attached by name, `sizes` are those of the ports in the rows of each side.
+    `about` goes into the file's metadata, `files` are attached by name, `sizes` are those of the ports in the rows of
+    each side.
     """
 
     def __init__(
@@ -146,7 +147,8 @@ class RecordingWriter:
                 self._failed = self._failed or error
         if self._failed is not None:
             raise RecordingFailed(
-                f"The recording '{self._path}' is incomplete ({self._failed}): free some space on the disk and record again."
+                f"The recording '{self._path}' is incomplete ({self._failed}): free some space on the disk and record"
+                " again."
             ) from self._failed
 
     def _work(self) -> None:

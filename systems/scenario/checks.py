@@ -59,16 +59,29 @@ LENGTHS = {
 
 
 LARGEST = {
-    "width": 4096, "height": 4096, "samples": 8192, "recording_fps": 60, "cloud_points": 1_000_000, "maximum_scans": 200,
-    "minimum_scans": 200, "verification_scans": 200, "scans": 500, "held_out": 500, "touches": 500, "passes": 50, "columns": 100,
-    "rows": 100, "length_mm": 3000, "seam_length_mm": 3000, "maximum_time_s": 86_400, "rate_hz": 1000, "focal_px": 100_000,
-    "hole_from_mm": 3000, "theta_max_deg": 89, "speed_mm_s": 500, "control_period_s": 1, "exposure_s": 60, "latency_s": 10,
+    "width": 4096, "height": 4096, "samples": 8192, "recording_fps": 60, "cloud_points": 1_000_000,
+    "maximum_scans": 200,
+    "minimum_scans": 200, "verification_scans": 200, "scans": 500, "held_out": 500, "touches": 500, "passes": 50,
+    "columns": 100,
+    "rows": 100, "length_mm": 3000, "seam_length_mm": 3000, "maximum_time_s": 86_400, "rate_hz": 1000,
+    "focal_px": 100_000,
+    "hole_from_mm": 3000, "theta_max_deg": 89, "speed_mm_s": 500, "control_period_s": 1, "exposure_s": 60,
+    "latency_s": 10,
 }  # fmt: skip
 """Largest value of a key, in any part of a scenario."""
 LARGEST_OF_UNIT = {
-    "_mm": 100_000, "_m": 100, "_deg": 36_000, "_rad": 1000, "_s": 1_000_000, "_px": 100_000, "_mm_s": 10_000, "_kg": 10_000,
-    "_per_m": 1e9, "_Hz": 10_000, "_hz": 10_000,
-}  # fmt: skip
+    "_mm": 100_000,
+    "_m": 100,
+    "_deg": 36_000,
+    "_rad": 1000,
+    "_s": 1_000_000,
+    "_px": 100_000,
+    "_mm_s": 10_000,
+    "_kg": 10_000,
+    "_per_m": 1e9,
+    "_Hz": 10_000,
+    "_hz": 10_000,
+}
 """Largest size of any other key that names its unit; the longest unit counts."""
 LARGEST_AT_ALL = 1e9
 """Largest size of any number."""
@@ -108,7 +121,8 @@ def check_numbers(config: Any, place: str = "") -> None:
 
 
 def _check_type(key: str, kind: Any, value: Any) -> None:
-    """Refuses a word where a number belongs: Drake's YAML reader converts plain types, and leaves an optional one as it was."""
+    """Refuses a word where a number belongs: Drake's YAML reader converts plain types, and leaves an optional one as it
+    was."""
     kinds = get_args(kind) if isinstance(kind, UnionType) else (kind,)
     if value is None and NoneType not in kinds:
         raise InputError(f"{key} has no value; write one, or omit the key.")
@@ -146,8 +160,8 @@ def check_home(home_deg: list[float], arm: str, key: str = "home_deg") -> None:
     for joint, (angle, (low, high)) in enumerate(zip(home_deg, limits, strict=True), start=1):
         if not low <= angle <= high:
             raise InputError(
-                f"{key} puts joint {joint} of the {arm} at {angle:g} deg, and its limits are {low:g} to {high:g} deg: give an angle "
-                "between them."
+                f"{key} puts joint {joint} of the {arm} at {angle:g} deg, and its limits are {low:g} to {high:g} deg:"
+                " give an angle between them."
             )
 
 
@@ -164,26 +178,28 @@ def check_arm(scenario: Scenario) -> None:
     """
     if scenario.arm not in known_arms():
         raise InputError(
-            f"A cell runs with an arm of Universal Robots: {', '.join(known_arms())}; '{scenario.arm}' is none of them. "
-            "Other arms, and a URDF, serve recorded data: weldcal calibrate DATASET and weldcal hand-eye --robot my_arm.urdf."
+            f"A cell runs with an arm of Universal Robots: {', '.join(known_arms())}; '{scenario.arm}' is none of them."
+            " Other arms, and a URDF, serve recorded data: weldcal calibrate DATASET and weldcal hand-eye --robot"
+            " my_arm.urdf."
         )
     payload, robot = get_robot(scenario.arm).payload_kg, scenario.robot
     told = getattr(robot, "payload_kg", None)
     if told is not None and told > payload:
         raise InputError(
-            f"robot.payload_kg is {told:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger arm or a "
-            "lighter tool."
+            f"robot.payload_kg is {told:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger"
+            " arm or a lighter tool."
         )
     loaded = scenario.loaded_tool()
     mass = 0.0 if loaded is None else loaded.tool.mass_kg
     if isinstance(scenario.tool, ToolFile) and told is not None and abs(told - mass) > MASS_TOLERANCE_KG:
         raise InputError(
-            f"robot.payload_kg is {told:g} kg, and the tool of {scenario.tool.file} weighs {mass:g} kg: make them equal."
+            f"robot.payload_kg is {told:g} kg, and the tool of {scenario.tool.file} weighs {mass:g} kg: make them"
+            " equal."
         )
     if mass > payload:
         raise InputError(
-            f"The tool weighs {mass:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger arm or a "
-            "lighter tool."
+            f"The tool weighs {mass:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger arm"
+            " or a lighter tool."
         )
 
 
@@ -219,8 +235,8 @@ def check_refinement(scenario: Scenario) -> None:
     least = {PLAIN: 0, "local": LEAST_OF_FIELD}.get(c.refine, LEAST_OF_ARM)
     if c.minimum_scans < least:
         raise InputError(
-            f"calibration.refine: {c.refine} needs {least} scans and more: raise calibration.minimum_scans ({c.minimum_scans}) to {least}, "
-            "and maximum_scans with it."
+            f"calibration.refine: {c.refine} needs {least} scans and more: raise calibration.minimum_scans"
+            f" ({c.minimum_scans}) to {least}, and maximum_scans with it."
         )
 
 
@@ -239,8 +255,8 @@ def check_scenario(scenario: Scenario) -> None:
     check_inputs(scenario)
     if found.key and scenario.base != PoseConfig():
         raise InputError(
-            f"A {found.key} job runs with the robot's base upright at the world's origin only: leave out base, or calibrate with "
-            "the default job (job.weld: false)."
+            f"A {found.key} job runs with the robot's base upright at the world's origin only: leave out base, or"
+            " calibrate with the default job (job.weld: false)."
         )
     for job in jobs():
         job.check(scenario)
@@ -287,8 +303,8 @@ def check_scenario(scenario: Scenario) -> None:
     beyond = farthest if workpiece is None or workpiece.file is None else farthest + LARGEST_SIZE_M
     if workpiece is not None and math.hypot(*workpiece.pose_guess.xyz_m) > beyond:
         raise InputError(
-            f"workpiece.pose_guess.xyz_m is {math.hypot(*workpiece.pose_guess.xyz_m):.3g} m from the robot; a {scenario.arm} with "
-            f"its torch does not reach beyond {farthest:.3g} m."
+            f"workpiece.pose_guess.xyz_m is {math.hypot(*workpiece.pose_guess.xyz_m):.3g} m from the robot; a"
+            f" {scenario.arm} with its torch does not reach beyond {farthest:.3g} m."
         )
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")

@@ -146,7 +146,8 @@ class PlanningConfig:
 
     method: str = "cad"  # cad: the CAD is registered to the scan; cloud: the groove is found in the scan without CAD
     search: str = "guess"  # search for the CAD: guess, near workpiece.pose_guess; anywhere, in the whole scan
-    # joints from which a scanner on the flange scans the part, six angles each; one plan is made from all scans; empty: from home
+    # joints from which a scanner on the flange scans the part, six angles each; one plan is made from all scans; empty:
+    # from home
     scan_poses_deg: list[list[float]] = dc.field(default_factory=list)
     start_m: list[float] | None = None  # a cloud's seam starts at the end nearest to this; null: nearest to the robot
 
@@ -204,8 +205,8 @@ class VisualizationConfig:
 class Scenario:
     """One cell: arm, devices, calibration, workpiece, welding and job.
 
-    The class that the YAML is loaded into (see loading.scenario_class) narrows each device to the installed drivers, and
-    adds a key for each kind of job.
+    The class that the YAML is loaded into (see loading.scenario_class) narrows each device to the installed drivers,
+    and adds a key for each kind of job.
     """
 
     description: str = ""

@@ -42,8 +42,8 @@ def check_workpiece(spec: WorkpieceConfig) -> None:
         raise InputError(f"workpiece.joint {said}: write {', '.join(JOINTS[:-1])} or {JOINTS[-1]}.")
     if not spec.seams:
         raise InputError(
-            f"workpiece.seams is missing: write seams: [{{edges: [1]}}] with a number from weldcal part {Path(spec.file).name}, or "
-            "seams: [{polyline: seam.csv}]."
+            "workpiece.seams is missing: write seams: [{edges: [1]}] with a number from weldcal part"
+            f" {Path(spec.file).name}, or seams: [{{polyline: seam.csv}}]."
         )
     for seam in spec.seams:
         source(seam)
@@ -77,7 +77,8 @@ def part_of(spec: WorkpieceConfig) -> Part:
 
 
 def legs(shape: PartShape, source: SeamSource, joint: str) -> list[DrawnSeam]:
-    """A seam as drawn, or its legs between sharp outside corners, as those of a square tube: across one, tip and torch cannot both follow.
+    """A seam as drawn, or its legs between sharp outside corners, as those of a square tube: across one, tip and torch
+    cannot both follow.
 
     Raises:
         InputError: as seam_of.

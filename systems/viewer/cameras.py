@@ -1,4 +1,7 @@
-"""The 3D view's cameras: cell, scanner's eye and seam. They follow the phase until the user moves the camera or picks one."""
+"""The 3D view's cameras: cell, scanner's eye and seam.
+
+They follow the phase until the user moves the camera or picks one.
+"""
 
 from collections import deque
 from collections.abc import Mapping
@@ -39,14 +42,15 @@ PERIOD_S = 0.1
 MOVED_M, STEP_M = 0.01, 0.002
 """Farther than this from where it was put, the user has moved it; the seam's camera moves by such steps."""
 START_M = np.array([(0.0, -3.0, 1.0), (3.0, 0.0, 1.0), (0.0, 0.0, 0.0)])
-"""Where a page's camera is until Meshcat's own values reach it, (n, 3) m: a page that reports one has just been opened or reloaded."""
+"""Where a page's camera is until Meshcat's own values reach it, (n, 3) m: a page that reports one has just been opened
+or reloaded."""
 SEAM_VIEW_M = 0.17  # of the seam's camera from what it looks at
 _EYE_M, _LOOKS_M = 0.12, 0.75  # along the scanner's axis: in front of its drawn axes, and where it looks
 _LEAN = 0.05  # off a vertical axis, which a viewer cannot look along
 _PLACES = 40  # remembered: a browser answers late
 
 
-class Place(NamedTuple):
+class CameraPlace(NamedTuple):
     """From `time` s on camera `view` stands at `eye` and looks at `target`, (3,) m in the world."""
 
     time: float
@@ -56,13 +60,16 @@ class Place(NamedTuple):
 
 
 class Views:
-    """Which camera the user wants and which one shows; one thread directs, others read and pick. Both are single assignments."""
+    """Which camera the user wants and which one shows; one thread directs, others read and pick.
+
+    Both are single assignments.
+    """
 
     def __init__(self) -> None:
         self.wanted = FOLLOW
         self.showing = CELL
         self.known: tuple[str, ...] = (CELL,)
-        self.places: list[Place] = []
+        self.places: list[CameraPlace] = []
 
     def pick(self, name: str) -> bool:
         """Pick a camera, or FOLLOW; False where there is none of that name."""
@@ -81,8 +88,9 @@ class CameraDirector(LeafSystem):
         input_ports:
         - job
 
-    Each of `shown` has an input port of its own besides; `calibration_status`, `planned_seam` and `servo_report` are read.
-    Everything is computed in B; `X_WB` is the base in the viewer's world. `X_BC_guess` None: there is no scanner's eye.
+    Each of `shown` has an input port of its own besides; `calibration_status`, `planned_seam` and `servo_report` are
+    read. Everything is computed in B; `X_WB` is the base in the viewer's world. `X_BC_guess` None: there is no
+    scanner's eye.
     """
 
     def __init__(
@@ -137,7 +145,8 @@ class CameraDirector(LeafSystem):
         self._last, self._views.showing = (view, eye, target), view
 
     def _report(self) -> Array | None:
-        """The camera (3,) m of the browser that changed last; None where no browser has reported since the last call."""
+        """The camera (3,) m of the browser that changed last; None where no browser has reported since the last
+        call."""
         X_WCamera = self._meshcat.GetTrackedCameraPose()
         if X_WCamera is None:
             return None
@@ -152,7 +161,8 @@ class CameraDirector(LeafSystem):
         return bool(self._put) and float(np.linalg.norm([*self._put, *START_M] - p, axis=1).min()) > MOVED_M
 
     def _reloaded(self, p: Array) -> bool:
-        """Whether the only browser shows a camera at `p` (3,) m that Meshcat gave it: its page was reloaded after it was moved."""
+        """Whether the only browser shows a camera at `p` (3,) m that Meshcat gave it: its page was reloaded after it
+        was moved."""
         given = [*START_M, *([self._put[-1]] if self._put else [])]
         only = self._meshcat.GetNumActiveConnections() <= 1
         return only and float(np.linalg.norm(given - p, axis=1).min()) < 1e-3
@@ -161,7 +171,7 @@ class CameraDirector(LeafSystem):
         """Keep the followed camera for the recording."""
         places = self._views.places
         if not places or places[-1].view != view or np.linalg.norm(target - np.array(places[-1].target)) > 5 * STEP_M:
-            places.append(Place(time, view, tuple(eye.round(4).tolist()), tuple(target.round(4).tolist())))
+            places.append(CameraPlace(time, view, tuple(eye.round(4).tolist()), tuple(target.round(4).tolist())))
 
     def _place(self, view: str, shown: Mapping[str, Any]) -> tuple[Array, Array]:
         """Eye and target (3,) m of a camera in the world."""
@@ -192,7 +202,8 @@ def scanner_view(X_BC: RigidTransform) -> tuple[Array, Array]:
 
 
 def seam_view(seam: SeamCurve | None, at: Array | None, work_B: Array) -> tuple[Array, Array]:
-    """Eye and target (3,) m in B of the camera at the seam: square to its chord, on the side away from the robot, above it.
+    """Eye and target (3,) m in B of the camera at the seam: square to its chord, on the side away from the robot, above
+    it.
 
     Before there is a seam it looks at `work_B`; before the tool is at the seam (`at` None), at the seam's middle.
     """
@@ -212,7 +223,8 @@ def seam_view(seam: SeamCurve | None, at: Array | None, work_B: Array) -> tuple[
 
 
 def add_cameras(wiring: Wiring, ports: JobPorts, cell: tuple[Array, Array], views: Views) -> CameraDirector:
-    """Add the director of the viewer's camera; the scanner's eye where it is fixed in the base, the seam's camera where one is welded."""
+    """Add the director of the viewer's camera; the scanner's eye where it is fixed in the base, the seam's camera where
+    one is welded."""
     assert wiring.meshcat is not None
     station, scenario = wiring.station, wiring.scenario
     models = {name: port.Allocate() for name, port in ports.shown.items()}

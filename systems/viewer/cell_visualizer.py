@@ -1,4 +1,5 @@
-"""CellVisualizer: shows the weld job's estimates in Meshcat: view cone, clouds by residual, circles, uncertainty, seams, torch."""
+"""CellVisualizer: shows the weld job's estimates in Meshcat: view cone, clouds by residual, circles, uncertainty,
+seams, torch."""
 
 from dataclasses import dataclass, field
 
@@ -19,24 +20,8 @@ from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, PlannedSeam, Scan
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.viewer.kept import keep
-from weldcal.systems.viewer.scene import (
-    CIRCLE,
-    CLOUD,
-    CONE,
-    RESIDUAL_MM,
-    UNCERTAINTY,
-    WELDING_PHASES,
-    uncertainty_at,
-)
-from weldcal.systems.viewer.shapes import (
-    R_SIGN,
-    coloured,
-    diverging,
-    draw_ring,
-    draw_sign,
-    draw_triad,
-    draw_view_cone,
-)
+from weldcal.systems.viewer.scene import CIRCLE, CLOUD, CONE, RESIDUAL_MM, UNCERTAINTY, WELDING_PHASES, uncertainty_at
+from weldcal.systems.viewer.shapes import R_SIGN, coloured, diverging, draw_ring, draw_sign, draw_triad, draw_view_cone
 from weldcal.systems.viewer.weld_view import WeldView
 from weldcal.systems.wiring import Wiring
 
@@ -87,8 +72,9 @@ class CellVisualizer(LeafSystem):
         - planned_seam
         - servo_report
 
-    What was seen stands below the estimate in Meshcat's tree, so that it moves with each better estimate. An item that appears during
-    the job is hidden in the recording before that time. `work_B` (3,) m is where the calibration's error is shown.
+    What was seen stands below the estimate in Meshcat's tree, so that it moves with each better estimate. An item that
+    appears during the job is hidden in the recording before that time. `work_B` (3,) m is where the calibration's error
+    is shown.
     """
 
     def __init__(
@@ -308,11 +294,7 @@ def _circle_pose(fit: FlangeFit, status: CalibrationStatus) -> RigidTransform:
 
 
 def add_visualizer(
-    wiring: Wiring,
-    circle_radius_m: float,
-    X_BC_guess: RigidTransform,
-    work_B: Array,
-    ports: dict[str, OutputPort],
+    wiring: Wiring, circle_radius_m: float, X_BC_guess: RigidTransform, work_B: Array, ports: dict[str, OutputPort]
 ) -> CellVisualizer:
     """Add the CellVisualizer to the builder; the cell itself draws the bodies."""
     assert wiring.meshcat is not None

@@ -1,4 +1,5 @@
-"""LiveView: what the dashboard shows of a running cell; a thin system writes it, other threads read it without a lock."""
+"""LiveView: what the dashboard shows of a running cell; a thin system writes it, other threads read it without a
+lock."""
 
 import math
 from collections.abc import Mapping
@@ -24,8 +25,8 @@ ACTIVE = ("TRACK", "COAST", "FINISH", "HELD", "BACK")
 
 
 class WeldRow(NamedTuple):
-    """One row of the weld's plots: time s, torch and tip along the seam m, the felt seam to the left of the planned one m, deflection m, torch
-    speed m/s, whether the torch is on; NaN where there is no value."""
+    """One row of the weld's plots: time s, torch and tip along the seam m, the felt seam to the left of the planned one
+    m, deflection m, torch speed m/s, whether the torch is on; NaN where there is no value."""
 
     time: float
     s_torch: float
@@ -46,8 +47,8 @@ class ScanRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """The values of one moment: Diagram time s, the job's command, its shown messages by name, and the arm's least singular value
-    (NaN where the job has none)."""
+    """The values of one moment: Diagram time s, the job's command, its shown messages by name, and the arm's least
+    singular value (NaN where the job has none)."""
 
     time: float = 0.0
     command: JobCommand = field(default_factory=JobCommand)
@@ -56,8 +57,11 @@ class Moment:
 
 
 class LiveView:
-    """The newest moment and the rows of the plots. One thread writes; readers take `moment` and slices of the lists, which only grow.
-    `scan_times`: when the rows of `scans` came, s. `views`: the cameras of the 3D view, which readers may pick."""
+    """The newest moment and the rows of the plots.
+
+    One thread writes; readers take `moment` and slices of the lists, which only grow. `scan_times`: when the rows of
+    `scans` came, s. `views`: the cameras of the 3D view, which readers may pick.
+    """
 
     def __init__(self) -> None:
         self.moment = Moment()
@@ -77,8 +81,8 @@ class LiveWriter(LeafSystem):
         - job
         - margin
 
-    The job's `state` and each message that it shows have input ports of their own besides. `margin` (2) of the SingularityGuard
-    may stay open. `p_TW` (3,) m is the torch in the tool's frame; None: the job has no torch.
+    The job's `state` and each message that it shows have input ports of their own besides. `margin` (2) of the
+    SingularityGuard may stay open. `p_TW` (3,) m is the torch in the tool's frame; None: the job has no torch.
     """
 
     def __init__(self, view: LiveView, shown: Mapping[str, AbstractValue], p_TW: Array | None) -> None:

@@ -1,4 +1,5 @@
-"""What the 3D view's colours mean and how it is scaled: one place for the scene itself and for the legends beside it."""
+"""What the 3D view's colours mean and how it is scaled: one place for the scene itself and for the legends beside
+it."""
 
 from typing import NamedTuple
 
@@ -21,8 +22,8 @@ WELDING_PHASES = ("approach_above", "approach", "weld", "retract")
 
 
 class Uncertainty(NamedTuple):
-    """The 3-sigma ellipsoid of a scanned point: half axes (3,) m, their directions (3, 3) in B as columns, and the magnification
-    at which it is drawn."""
+    """The 3-sigma ellipsoid of a scanned point: half axes (3,) m, their directions (3, 3) in B as columns, and the
+    magnification at which it is drawn."""
 
     half_axes: Array
     R_BE: Array
@@ -39,7 +40,7 @@ def uncertainty_at(estimate: CalibrationEstimate, p_BQ: Array) -> Uncertainty:
     return Uncertainty(half, vectors, times)
 
 
-class Key(NamedTuple):
+class LegendKey(NamedTuple):
     """One entry of the legend: CSS colour, how it is drawn (solid, dashed, area), and its meaning."""
 
     colour: str
@@ -47,26 +48,26 @@ class Key(NamedTuple):
     text: str
 
 
-def legend(phase: str, magnification: int | None = None) -> list[Key]:
-    """The legend of a phase of the weld job; `magnification` of the drawn uncertainty, 0 where it is written beside it, None
-    where there is none yet."""
+def legend(phase: str, magnification: int | None = None) -> list[LegendKey]:
+    """The legend of a phase of the weld job; `magnification` of the drawn uncertainty, 0 where it is written beside it,
+    None where there is none yet."""
     if phase in WELDING_PHASES:
         return [
-            Key(_css(PLANNED), "dashed", "planned seam"),
-            Key(_css(FELT), "solid", "felt by the tip"),
-            Key(_css(WELDED), "solid", "welded"),
-            Key(_css(DEFLECTION), "solid", f"deflection of the tip, x {DEFLECTION_SCALE:g}"),
+            LegendKey(_css(PLANNED), "dashed", "planned seam"),
+            LegendKey(_css(FELT), "solid", "felt by the tip"),
+            LegendKey(_css(WELDED), "solid", "welded"),
+            LegendKey(_css(DEFLECTION), "solid", f"deflection of the tip, x {DEFLECTION_SCALE:g}"),
         ]
     if phase in ("start", "park", "home", "done", "held"):
         return []
     found = [
-        Key(_css(CONE), "area", "what the scanner sees"),
-        Key(_css(CIRCLE), "solid", "flange found; the number of its scan"),
-        Key(_css(CIRCLE), "dashed", "refused"),
+        LegendKey(_css(CONE), "area", "what the scanner sees"),
+        LegendKey(_css(CIRCLE), "solid", "flange found; the number of its scan"),
+        LegendKey(_css(CIRCLE), "dashed", "refused"),
     ]
     if magnification is not None:
         times = f", x {magnification}" if magnification > 1 else "" if magnification else ", magnified as written"
-        found.append(Key(_css(UNCERTAINTY), "area", f"error at the work point, 3 sigma{times}"))
+        found.append(LegendKey(_css(UNCERTAINTY), "area", f"error at the work point, 3 sigma{times}"))
     return found
 
 

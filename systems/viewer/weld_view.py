@@ -1,4 +1,5 @@
-"""Draws the weld's progress in Meshcat: CAD edges, planned, felt and welded seam, an arrow beside the tip for its deflection."""
+"""Draws the weld's progress in Meshcat: CAD edges, planned, felt and welded seam, an arrow beside the tip for its
+deflection."""
 
 import math
 
@@ -19,7 +20,8 @@ Floats = npt.NDArray[np.float64]
 
 
 def outline(mesh: TriMesh, least_angle_rad: float = math.radians(20.0)) -> tuple[Floats, Floats]:
-    """Starts and ends (N,3) m of the edges whose two faces turn by more than the least angle, or that have one face only.
+    """Starts and ends (N,3) m of the edges whose two faces turn by more than the least angle, or that have one face
+    only.
 
     Args:
         mesh: faces that meet share their vertices (as TriMesh's makers do).
@@ -124,8 +126,7 @@ class WeldView:
                 self._make_arrow(path)
             self._show(path, time)
         X_BArrow = RigidTransform(
-            RotationMatrix.MakeFromOneVector(-measurement.delta, 2),
-            np.asarray(servo.X_BT.translation()) + self._aside,
+            RotationMatrix.MakeFromOneVector(-measurement.delta, 2), np.asarray(servo.X_BT.translation()) + self._aside
         )
         self._meshcat.SetTransform(f"{path}/arrow", X_BArrow, time)
         self._meshcat.SetProperty(f"{path}/arrow/unit", "scale", [1.0, 1.0, DEFLECTION_SCALE * length], time)

@@ -22,7 +22,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools import console
 from weldcal.tools.cli.app import app
 from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 
 HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
 
@@ -275,7 +275,7 @@ def test_json_says_that_it_opens_no_page(
 
 def test_a_runs_page_shows_its_result_before_it_closes() -> None:
     happened: list[str] = []
-    first = FirstScreen(Findings(unseen=8), Expected("error", "0.2 mm", "8 poses"), Next("Verify it."))
+    first = FirstScreen(Findings(unseen=8), ExpectedError("error", "0.2 mm", "8 poses"), Next("Verify it."))
 
     def show(what: FirstScreen | None, folder: Path | None) -> None:
         happened.append(f"shown {what is first}")
@@ -291,7 +291,7 @@ def test_a_runs_page_shows_its_result_before_it_closes() -> None:
 
 def test_what_no_scan_can_show_and_the_pose_does_not_need_is_no_row(capsys: pytest.CaptureFixture[str]) -> None:
     summary = {"state": "done", "unobservable": ["A rotation of the flange about its own axis."]}
-    first = FirstScreen(Findings(unseen=8), Expected("error", "0.2 mm", "8 poses"), Next("Verify it."))
+    first = FirstScreen(Findings(unseen=8), ExpectedError("error", "0.2 mm", "8 poses"), Next("Verify it."))
     report("calibrate", Outcome(summary, first=first), Call("calibrate", {}, ExitStack()))
     assert "unobservable" not in capsys.readouterr().out
     report("calibrate", Outcome(summary, first=first), Call("calibrate", {"json": True}, ExitStack()))

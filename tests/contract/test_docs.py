@@ -62,7 +62,8 @@ def program() -> Any:
 
 
 def leaves(command: Any, name: str = "") -> Iterator[str]:
-    """Every command that the help lists and that does something, with its full name after `weldcal`; old names are hidden."""
+    """Every command that the help lists and that does something, with its full name after `weldcal`; old names are
+    hidden."""
     if hasattr(command, "commands"):
         for word, child in command.commands.items():
             yield from leaves(child, f"{name} {word}".strip())

@@ -89,7 +89,8 @@ def forgotten() -> Iterator[None]:
 
 
 def of_the_truth(tree: ast.Module) -> set[str]:
-    """What the file says of the simulation's truth: attributes and types with `truth` in them, and ports called `cheat`."""
+    """What the file says of the simulation's truth: attributes and types with `truth` in them, and ports called
+    `cheat`."""
     attributes = {node.attr for node in nodes(tree) if isinstance(node, ast.Attribute)}
     texts = {node.value for node in nodes(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     types = names(tree) | {node.name for node in nodes(tree) if isinstance(node, ast.ClassDef)}

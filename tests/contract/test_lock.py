@@ -1,4 +1,5 @@
-"""Each lock pins its direct dependencies within their bounds, by hash, for every Python; the users' lock has no developers' tools."""
+"""Each lock pins its direct dependencies within their bounds, by hash, for every Python; the users' lock has no
+developers' tools."""
 
 from __future__ import annotations
 

@@ -18,14 +18,24 @@ MUTATIONS = read_mutations(LIST.read_text())
 TWO_SIDED = {
     "flange: centre": "calibration/flange/test_forms.py::test_the_stated_covariance_is_that_of_the_errors",
     "flange: half a face": "calibration/flange/test_covariance.py::test_half_a_face_is_as_far_off_in_it_as_stated",
-    "flange: height and normal": "calibration/flange/test_covariance.py::test_a_whole_face_is_as_high_and_as_level_as_stated",
-    "flange: turn by its holes": "calibration/flange/test_covariance.py::test_holes_off_their_places_say_how_well_they_know_the_turn",
+    "flange: height and normal": (
+        "calibration/flange/test_covariance.py::test_a_whole_face_is_as_high_and_as_level_as_stated"
+    ),
+    "flange: turn by its holes": (
+        "calibration/flange/test_covariance.py::test_holes_off_their_places_say_how_well_they_know_the_turn"
+    ),
     "eye on base": "calibration/eye_on_base/test_solve.py::test_covariance_predicts_the_error",
-    "eye on base: four and five scans": "calibration/eye_on_base/test_coverage.py::test_the_region_of_few_scans_holds_the_truth_in_95_of_100",
-    "eye on base: one to three scans": "calibration/eye_on_base/test_coverage.py::test_whole_poses_of_usual_cells_err_as_stated",
+    "eye on base: four and five scans": (
+        "calibration/eye_on_base/test_coverage.py::test_the_region_of_few_scans_holds_the_truth_in_95_of_100"
+    ),
+    "eye on base: one to three scans": (
+        "calibration/eye_on_base/test_coverage.py::test_whole_poses_of_usual_cells_err_as_stated"
+    ),
     "hand-eye: covariance": "calibration/hand_eye/test_region.py::test_the_covariance_is_that_of_the_errors",
     "hand-eye: region": "calibration/hand_eye/test_region.py::test_half_of_the_truths_lie_in_the_region_of_half",
-    "drift: pose after a move": "calibration/motion/test_drift_covariance.py::test_the_pose_after_a_move_is_as_far_off_as_stated",
+    "drift: pose after a move": (
+        "calibration/motion/test_drift_covariance.py::test_the_pose_after_a_move_is_as_far_off_as_stated"
+    ),
     "drift: move": "calibration/motion/test_drift_covariance.py::test_the_move_is_as_far_off_as_stated",
     "profiler: edge": "calibration/profiler/test_edge.py::test_its_covariance_is_what_it_scatters_by_and_the_bound",
     "profiler: sphere": "calibration/profiler/test_sphere.py::test_its_covariance_is_what_it_scatters_by",
@@ -60,7 +70,8 @@ def test_a_text_that_is_gone_fails_with_one_sentence() -> None:
 
 
 def test_a_copy_is_changed_and_the_project_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A project of one module and one test: one mutation is noticed, the other is not, and the files stay as they are."""
+    """A project of one module and one test: one mutation is noticed, the other is not, and the files stay as they
+    are."""
     root = tmp_path / "weldcal"
     (root / "tests").mkdir(parents=True)
     (root / "half.py").write_text("def half(x):\n    return x / 2\n\n\nUNUSED = 1\n")

@@ -32,7 +32,8 @@ class Built:
 
 
 def source_files() -> set[str]:
-    """Every file of the package that must arrive: Python, YAML, CSV, URScript, templates, styles, scripts of pages, type markers."""
+    """Every file of the package that must arrive: Python, YAML, CSV, URScript, templates, styles, scripts of pages,
+    type markers."""
     return set(ROOT_FILES) | {
         path.relative_to(ROOT).as_posix()
         for folder in FOLDERS

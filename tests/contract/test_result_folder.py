@@ -1,4 +1,5 @@
-"""A result folder belongs to one command at a time, and an earlier result is written over only where that is asked for."""
+"""A result folder belongs to one command at a time, and an earlier result is written over only where that is asked
+for."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ LIBRARIES = {
     "libidn2.so.0": "libidn2-0",
 }
 
-# Stands in for a Python: logs how it is called; `-m venv` copies it; pip fails while a file `no-network` is there, and the
-# environment's own pip is missing while `no-ensurepip` is.
+# Stands in for a Python: logs how it is called; `-m venv` copies it; pip fails while a file `no-network` is there, and
+# the environment's own pip is missing while `no-ensurepip` is.
 FAKE_PYTHON = """#!/bin/sh
 case "$*" in
   *"-m venv"*)

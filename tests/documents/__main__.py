@@ -1,4 +1,5 @@
-"""`./tools/run docs --check [PAGE...]`: executes the blocks of the pages in order and reports what share of them ran."""
+"""`./tools/run docs --check [PAGE...]`: executes the blocks of the pages in order and reports what share of them
+ran."""
 
 from __future__ import annotations
 

@@ -24,10 +24,7 @@ CHEAP = (
 # They run until they are interrupted.
 SERVERS = ("emulate-cell", "emulate-ur", "tablet serve")
 # Executed by another command than a check of these pages.
-ELSEWHERE = {
-    "test": "the test suite itself",
-    "docs": "the build of these pages itself",
-}
+ELSEWHERE = {"test": "the test suite itself", "docs": "the build of these pages itself"}
 # What is long is shortened: a pattern of the line, and its short form. The long form runs with `--full`.
 SHORT = (
     (r"^demo( s_groove| straight_groove)?$", r"demo --scenario short.yaml"),

@@ -29,7 +29,8 @@ LARGEST_TIME_S = 3600.0
 
 @dataclass(frozen=True)
 class Executed:
-    """One command line, or one block of another kind: where it is, how it was executed, and what it said if it failed."""
+    """One command line, or one block of another kind: where it is, how it was executed, and what it said if it
+    failed."""
 
     page: str
     line: int
@@ -41,8 +42,9 @@ class Executed:
 
 @dataclass(frozen=True)
 class Check:
-    """How pages are checked: nothing shortened or what is long, without the lines that `omits` names, and without executing twice
-    what an earlier page has executed (`done`: how, by its words) and leaves nothing for its own page."""
+    """How pages are checked: nothing shortened or what is long, without the lines that `omits` names, and without
+    executing twice what an earlier page has executed (`done`: how, by its words) and leaves nothing for its own
+    page."""
 
     full: bool = False
     omits: Callable[[str], bool] = lambda _: False
@@ -50,7 +52,8 @@ class Check:
 
 
 class Page:
-    """A reader of one page: a folder of their own, what runs beside, and the names that earlier Python blocks have defined."""
+    """A reader of one page: a folder of their own, what runs beside, and the names that earlier Python blocks have
+    defined."""
 
     def __init__(self, folder: Path, entry_points: str, check: Check | None = None) -> None:
         self.folder, self.entry_points, self.check = folder, entry_points, check or Check()
@@ -106,7 +109,8 @@ class Page:
         return how
 
     def _emulated_robot(self, bare: bool) -> None:
-        """Start the emulated robot that takes the place of the real one, once for the page; a person has entered the payload."""
+        """Start the emulated robot that takes the place of the real one, once for the page; a person has entered the
+        payload."""
         if "robot" not in self.names:
             self.names["robot"] = EMULATED
             self._serve(["emulate-ur", "--host", EMULATED, "--control-port", "30091"])

@@ -1,4 +1,5 @@
-"""Scans of a flange from simple geometry: a dataset that calibrates, in a tenth of a second and without a rendered cell."""
+"""Scans of a flange from simple geometry: a dataset that calibrates, in a tenth of a second and without a rendered
+cell."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ WINDOW_PX = 260
 
 
 def flange_scan(X_CF: RigidTransform, rng: np.random.Generator) -> Floats:
-    """The face of a flange at a pose, seen by a pinhole camera: points (H, W, 3) m in the camera's frame, NaN beside it."""
+    """The face of a flange at a pose, seen by a pinhole camera: points (H, W, 3) m in the camera's frame, NaN beside
+    it."""
     standard = get_flange(FLANGE)
     p, R = X_CF.translation(), X_CF.rotation().matrix()
     offset = np.arange(WINDOW_PX) - 0.5 * (WINDOW_PX - 1)
@@ -87,7 +89,8 @@ WRIST_POSES = (  # joints, degrees, from which a scanner on the wrist sees the f
 
 
 def write_wrist_scans(folder: Path, scale: float = 1.0) -> Path:
-    """A dataset of a scanner on the wrist, at X_FC, that sees the foot of a UR10e; it measures ``scale`` times what is true."""
+    """A dataset of a scanner on the wrist, at X_FC, that sees the foot of a UR10e; it measures ``scale`` times what is
+    true."""
     arm = load_arm("ur10e")
     poses = {f"pose{k + 1:02d}": forward_kinematics(arm, np.radians(q)) for k, q in enumerate(WRIST_POSES)}
     header = DatasetHeader(schema=1, robot="ur10e", flange=FLANGE, scanner="phoxi_m", configuration="eye_in_hand")

@@ -1,4 +1,5 @@
-"""Every block of README and docs: YAML loads, Python runs, and commands without a simulation are executed as written."""
+"""Every block of README and docs: YAML loads, Python runs, and commands without a simulation are executed as
+written."""
 
 from __future__ import annotations
 

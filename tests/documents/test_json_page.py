@@ -13,7 +13,7 @@ from tests.documents.props import lay_out, needs_data
 from tests.places import ROOT, SHARED_DATA, require_data
 from tests.short_job import ShortJobs
 from weldcal.tools.cli.app import app
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 
 PAGE = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
 EVERYWHERE = {"state", "first_screen"}
@@ -91,7 +91,7 @@ def test_a_demo_prints_the_keys_of_its_table(short_jobs: ShortJobs) -> None:
 
 def test_the_first_screen_has_the_keys_of_its_table() -> None:
     always, sometimes = keys_of("The first screen")
-    screen = FirstScreen(Findings(), Expected("error", "1 mm", "by nothing"), Next("Verify."))
+    screen = FirstScreen(Findings(), ExpectedError("error", "1 mm", "by nothing"), Next("Verify."))
     assert always | sometimes == set(screen.document())
 
 

@@ -51,7 +51,10 @@ def test_a_search_without_a_network_finds_the_page_that_explains_a_word(site: Pa
     browser.open(site / "search.html")
     browser.run("location.search = '?q=charuco'")
     # the results come one after the other
-    found = "[...document.querySelectorAll('#search-results li a')].some(link => link.href.split('?')[0].endsWith('/sensors.html'))"
+    found = (
+        "[...document.querySelectorAll('#search-results li a')].some(link =>"
+        " link.href.split('?')[0].endsWith('/sensors.html'))"
+    )
     browser.wait(found, 60)
     assert [name for name in browser.outside_addresses() if not name.startswith("file:")] == []
 

@@ -1,7 +1,8 @@
-"""The option --controller of these tests; and one process beside all cells with a robot, because each takes seconds to start.
+"""The option --controller of these tests; and one process beside all cells with a robot, because each takes seconds to
+start.
 
-`./tools/run test tests/hardware --controller ADDRESS` runs the tests that hold for every UR controller against the one at that
-address. All others are skipped, and say why.
+`./tools/run test tests/hardware --controller ADDRESS` runs the tests that hold for every UR controller against the one
+at that address. All others are skipped, and say why.
 """
 
 from __future__ import annotations

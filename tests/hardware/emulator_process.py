@@ -21,8 +21,10 @@ def emulator() -> Iterator[Emulator]:
 
 
 def run_client(host: str, script: str, limit_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-    """Runs Python text that uses ur_rtde's classes in a process of its own: they hold the GIL and may crash. The text finds
-    `host` in sys.argv[1]."""
+    """Runs Python text that uses ur_rtde's classes in a process of its own: they hold the GIL and may crash.
+
+    The text finds `host` in sys.argv[1].
+    """
     return subprocess.run(
         [sys.executable, "-c", script, host], capture_output=True, text=True, timeout=limit_s, check=False
     )

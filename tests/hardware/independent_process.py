@@ -65,7 +65,8 @@ class Controller:
 def independent_controller(
     host: str | None = None, q: Sequence[float] | None = None, *, own_computer: bool = True
 ) -> Iterator[Controller]:
-    """A controller at a loopback address of this process's own; `own_computer`: with real-time priority, where that is allowed."""
+    """A controller at a loopback address of this process's own; `own_computer`: with real-time priority, where that is
+    allowed."""
     host = host or f"127.40.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
     command = [sys.executable, "-m", "tests.hardware.independent", "--host", host]
     command += [] if q is None else ["--q", *(f"{x:.6f}" for x in q)]
@@ -107,7 +108,8 @@ def session(controller: Controller, **settings: Any) -> Iterator[UrLink]:
 
 
 def move(link: UrLink, seconds: float, *, process: bool = False) -> str | None:
-    """Command a velocity of one joint, turning back each 0.8 s, until this time or a fault; returns the fault's sentence."""
+    """Command a velocity of one joint, turning back each 0.8 s, until this time or a fault; returns the fault's
+    sentence."""
     began, velocity = time.monotonic(), np.zeros(6)
     while (t := time.monotonic() - began) < seconds:
         velocity[JOINT] = SPEED * np.sin(2.0 * np.pi * t / 1.6)

@@ -1,6 +1,7 @@
 """What weldcal relies on at every UR controller, emulated, simulated or real. The last tests turn wrist 3 by a degree.
 
-`./tools/run test tests/hardware --controller ADDRESS` runs them at a controller that is switched on, in Remote Control and at rest.
+`./tools/run test tests/hardware --controller ADDRESS` runs them at a controller that is switched on, in Remote Control
+and at rest.
 """
 
 from __future__ import annotations

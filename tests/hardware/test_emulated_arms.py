@@ -1,4 +1,5 @@
-"""The emulated controller of every arm says which arm it is, and the pre-flight refuses another arm than the scenario's."""
+"""The emulated controller of every arm says which arm it is, and the pre-flight refuses another arm than the
+scenario's."""
 
 from __future__ import annotations
 

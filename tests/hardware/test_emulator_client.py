@@ -116,8 +116,8 @@ print(json.dumps(out), flush=True)
     assert out["arrived"] == pytest.approx(goal, abs=1e-12)
     assert out["line_error"] < 1e-9
     assert out["speed_j"] == pytest.approx([0.2, 0, 0, 0, 0, -0.2], abs=1e-9)
-    # A first-order chase moves by the integral of its distance from the target over its time constant, which is the look-ahead,
-    # 0.05 s. Integrated over the robot's time, however late the client looks.
+    # A first-order chase moves by the integral of its distance from the target over its time constant, which is the
+    # look-ahead, 0.05 s. Integrated over the robot's time, however late the client looks.
     t, target, q = np.array(out["chase"]).T
     moved = q[-1] - q[0]
     assert moved > 0.01
@@ -174,7 +174,8 @@ def test_a_protective_stop_pauses_the_program_and_the_checker_sees_it_go_on(emul
 
 
 def lose_connection(emulator: Emulator, fault: str) -> tuple[Any, float] | None:
-    """A streaming client loses its connection: itself and when, once the arm moves again; None if it crashed or hung."""
+    """A streaming client loses its connection: itself and when, once the arm moves again; None if it crashed or
+    hung."""
     client = moving_client(emulator, watchdog=20.0)
     lost = emulator.fault(fault)
     until = time.monotonic() + 3.0

@@ -1,4 +1,5 @@
-"""URScript's values and motions beyond the guard's own: texts, lists, structs, arcs, as the script manual describes them."""
+"""URScript's values and motions beyond the guard's own: texts, lists, structs, arcs, as the script manual describes
+them."""
 
 from __future__ import annotations
 

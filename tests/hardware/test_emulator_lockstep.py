@@ -22,7 +22,7 @@ from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, STREAM_PACKAGES, Lockstep
 from weldcal.tools.emulators.ur.wire.net import LinkFaults
-from weldcal.tools.worlds.robot.bench import Bench, Stream
+from weldcal.tools.worlds.robot.bench import Bench, CommandThread
 
 BOUND_S = 0.5
 FRAME_S = 0.002
@@ -161,7 +161,7 @@ def test_a_cell_that_is_late_finds_the_arm_where_it_left_it(bench: Bench) -> Non
     config = UrRtde(host=bench.host, lockstep=True)
     bench.emulator.do("reset_checker")
     link = UrLink.start(bench.host, bench.arm, config.limits(bench.arm), payload_kg=config.payload_kg)
-    stream = Stream(link, bench.arm, bench.home)
+    stream = CommandThread(link, bench.arm, bench.home)
     stream.start()
     until = time.monotonic() + 8.0
     while not stream.cruising:

@@ -69,16 +69,27 @@ end
 """
 SMALL = (
     'def talk():\n  x = str_cat("a", 1)\n  popup(x, title="Title", blocking=False)\n  textmsg(x, [1, 2, x])\nend\n',
-    "def lists():\n  m = [[1, 2, 3], [4, 5, 6]]\n  v = m * [1, 0, 1]\n  m[1][2] = v[0]\n  l = make_list(3, 0)\n"
-    "  l.append(7)\n  s = struct(a=m, b=l)\n  textmsg(s.a, transpose(m))\n  while length(l) > 0:\n    l.remove(0)\n  end\nend\n",
-    "def moves():\n  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n  movel(pose_trans(get_actual_tcp_pose(), p[0.02, 0, 0, 0, 0, 0.1]), 1.2, 0.2)\n"
-    "  movec(pose_add(get_actual_tcp_pose(), p[0.01, 0.01, 0, 0, 0, 0]), p[0.4, 0.1, 0.5, 0, 3, 0], a=1, v=0.1)\n"
-    "  force_mode(p[0,0,0,0,0,0], [0, 0, 1, 0, 0, 0], [0, 0, -5, 0, 0, 0], 2, [0.1, 0.1, 0.1, 0.1, 0.1, 0.1])\n"
-    "  sleep(0.02)\n  end_force_mode()\n  stopl(2.0)\nend\n",
-    'def wires():\n  ok = socket_open("127.0.0.1", 9, "s")\n  if not ok:\n    set_standard_digital_out(2, True)\n  end\n'
-    '  socket_send_line("x", "s")\n  a = socket_read_byte_list(4, "s", 0.01)\n  set_standard_analog_out(0, 0.5)\nend\n',
-    "def deep(a=1, b=[2, 3]):\n  def again(n):\n    if n > 0:\n      return again(n - 1) + 1\n    end\n    return 0\n  end\n"
-    "  x = again(20)\n  y = binary_list_to_integer(integer_to_binary_list(x))\n  z = pow(2, y) % 7\n  halt\nend\n",
+    (
+        "def lists():\n  m = [[1, 2, 3], [4, 5, 6]]\n  v = m * [1, 0, 1]\n  m[1][2] = v[0]\n  l = make_list(3, 0)\n "
+        " l.append(7)\n  s = struct(a=m, b=l)\n  textmsg(s.a, transpose(m))\n  while length(l) > 0:\n    l.remove(0)\n "
+        " end\nend\n"
+    ),
+    (
+        "def moves():\n  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n  movel(pose_trans(get_actual_tcp_pose(), p[0.02, 0, 0, 0, 0,"
+        " 0.1]), 1.2, 0.2)\n  movec(pose_add(get_actual_tcp_pose(), p[0.01, 0.01, 0, 0, 0, 0]), p[0.4, 0.1, 0.5, 0, 3,"
+        " 0], a=1, v=0.1)\n  force_mode(p[0,0,0,0,0,0], [0, 0, 1, 0, 0, 0], [0, 0, -5, 0, 0, 0], 2, [0.1, 0.1, 0.1,"
+        " 0.1, 0.1, 0.1])\n  sleep(0.02)\n  end_force_mode()\n  stopl(2.0)\nend\n"
+    ),
+    (
+        'def wires():\n  ok = socket_open("127.0.0.1", 9, "s")\n  if not ok:\n    set_standard_digital_out(2, True)\n '
+        ' end\n  socket_send_line("x", "s")\n  a = socket_read_byte_list(4, "s", 0.01)\n  set_standard_analog_out(0,'
+        " 0.5)\nend\n"
+    ),
+    (
+        "def deep(a=1, b=[2, 3]):\n  def again(n):\n    if n > 0:\n      return again(n - 1) + 1\n    end\n    return"
+        " 0\n  end\n  x = again(20)\n  y = binary_list_to_integer(integer_to_binary_list(x))\n  z = pow(2, y) % 7\n "
+        " halt\nend\n"
+    ),
     "sec beside():\n  set_tool_voltage(24)\n  set_payload(1.5, [0, 0, 0.1])\n  textmsg(to_num(to_str(1.5)))\nend\n",
 )
 WORDS = (
@@ -275,10 +286,7 @@ STOPPED = {  # while they run
     ),
     "appending for ever": (body("x = [1]", "while True:", "x.append(1)", "end"), "too much behind"),
     "calculating with long lists": (body("x = make_list(90000, 1.0)", *["x = x + x"] * 500), "too much behind"),
-    "a product of large matrices": (
-        body("x = make_list(300, make_list(300, 1.0))", "x = x * x"),
-        "too much behind",
-    ),
+    "a product of large matrices": (body("x = make_list(300, make_list(300, 1.0))", "x = x * x"), "too much behind"),
     "a number that squares": (body("x = 10", "while True:", "x = x * x", "end"), "64 bits"),
     "a number of a text": (body(f'x = to_num("{"9" * 4000}")'), "64 bits"),
     "a power": (body("x = pow(10, 1000000000)"), "math range error"),

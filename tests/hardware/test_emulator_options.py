@@ -64,7 +64,8 @@ def test_start_pose_limits_and_mode_are_reported_by_the_ports() -> None:
             dashboard.flush()
             assert dashboard.readline().strip() == "MANUAL"
     found = parts(data)
-    # UR's client library, ConfigurationData: for each joint its lower and its upper limit, then speeds and accelerations
+    # UR's client library, ConfigurationData: for each joint its lower and its upper limit, then speeds and
+    # accelerations
     limits = np.rad2deg(struct.unpack_from(">12d", found[CONFIGURATION])).reshape(6, 2)
     np.testing.assert_allclose(limits, DEGREES, atol=1e-9)
     assert len(found[CONFIGURATION]) == 8 * (12 + 12 + 5 + 24) + 4 * 4

@@ -1,4 +1,5 @@
-"""What the robot link does when something fails: the arm stops within 0.3 s, stays, says why, and starts again when asked."""
+"""What the robot link does when something fails: the arm stops within 0.3 s, stays, says why, and starts again when
+asked."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.wire.transport import NATIVE, UR_RTDE
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.worlds.robot.bench import Bench
-from weldcal.tools.worlds.robot.cases import AT_START, GO, REFUSE, RUNNING, STOP, Case
+from weldcal.tools.worlds.robot.cases import AT_START, GO, REFUSE, RUNNING, STOP, FaultCase
 from weldcal.tools.worlds.robot.fault_run import recover, run_case
 from weldcal.tools.worlds.robot.sequences import run_sequence
 
@@ -27,7 +28,7 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_fault_is_answered(bench: Bench, case: Case) -> None:
+def test_a_fault_is_answered(bench: Bench, case: FaultCase) -> None:
     outcome = run_case(bench, case, hasty=True, attempts=1)
     assert outcome.problems == ()
 
@@ -77,7 +78,7 @@ def test_every_way_of_failing_is_in_the_matrix() -> None:
 
 def test_the_checker_would_see_an_arm_that_does_not_stop(bench: Bench) -> None:
     # nothing is done to it, and it is said to have to stop
-    calm = Case(
+    calm = FaultCase(
         name="nothing", throw=lambda b: b.emulator.ask(ask="state")["time"], must=STOP, faults=RUNNING[-1].faults
     )
     outcome = run_case(bench, calm, hasty=True)

@@ -1,4 +1,5 @@
-"""The robot link with a controller that was written from UR's documents only: a second opinion beside the emulator's."""
+"""The robot link with a controller that was written from UR's documents only: a second opinion beside the
+emulator's."""
 
 from __future__ import annotations
 
@@ -112,14 +113,18 @@ def run(text: str, frames: int = 50) -> Machine:
 
 
 def test_speedj_turns_the_joint_as_its_manual_says() -> None:
-    # 0.2 rad/s with 1 rad/s^2: 0.2 s to the speed; after 0.5 s the area under the ramp is 0.2 * 0.5 - 0.2^2 / 2 = 0.08 rad
+    # 0.2 rad/s with 1 rad/s^2: 0.2 s to the speed; after 0.5 s the area under the ramp is 0.2 * 0.5 - 0.2^2 / 2 = 0.08
+    # rad
     machine = run("def p():\n speedj([0.2, 0, 0, 0, 0, 0], 1.0, 0.5)\n while True:\n sync()\n end\nend\n", 250)
     assert machine.q[0] == pytest.approx(0.08, abs=0.2 * 0.002)
     assert machine.state == PLAYING
 
 
 def test_a_program_without_packages_is_stopped_by_its_watchdog() -> None:
-    text = 'def p():\n rtde_set_watchdog("input_int_register_24", 5, "stop")\n while True:\n  speedj([0.1,0,0,0,0,0], 1.0, 0.002)\n end\nend\n'
+    text = (
+        'def p():\n rtde_set_watchdog("input_int_register_24", 5, "stop")\n while True:\n  speedj([0.1,0,0,0,0,0], 1.0,'
+        " 0.002)\n end\nend\n"
+    )
     assert run(text, 100).state == PLAYING
     stopped = run(text, 160)
     assert stopped.state == STOPPED

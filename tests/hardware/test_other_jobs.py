@@ -1,4 +1,5 @@
-"""Another job on an emulated controller: mounting finds what it finds in simulation, over the same link (the profiler: test_wired_profiler)."""
+"""Another job on an emulated controller: mounting finds what it finds in simulation, over the same link (the profiler:
+test_wired_profiler)."""
 
 from __future__ import annotations
 

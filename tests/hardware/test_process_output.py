@@ -1,4 +1,5 @@
-"""The torch at a digital output of the controller: on only while somebody asks for it, off before whatever stops the arm."""
+"""The torch at a digital output of the controller: on only while somebody asks for it, off before whatever stops the
+arm."""
 
 from __future__ import annotations
 
@@ -215,7 +216,8 @@ def test_the_output_is_written_in_every_frame() -> None:
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
-    """One controller for all that happens over the wire, and a link with a torch, its set points and the inputs of its arc."""
+    """One controller for all that happens over the wire, and a link with a torch, its set points and the inputs of its
+    arc."""
     torch = {"arc_input": ARC, "arc_fault_input": ARC_FAULT, "levels": (FEED, VOLTAGE)}
     with emulator_process(lockstep=LOCKSTEP_S) as emulator:
         yield Bench(emulator, OUTPUT, torch)
@@ -249,8 +251,9 @@ def answer_of(bench: Bench, at: float) -> dict[str, float | bool | None]:
 
 
 FAULTS: dict[str, tuple[Callable[[Bench], float], float]] = {
-    # what happens, and how long after it the torch may burn: one pass of the worker after the controller's own report, the
-    # deadman's 40 ms, or the 50 ms after which the worker calls a silent cell late; each with what a busy computer adds
+    # what happens, and how long after it the torch may burn: one pass of the worker after the controller's own report,
+    # the deadman's 40 ms, or the 50 ms after which the worker calls a silent cell late; each with what a busy computer
+    # adds
     "the cell wants it off": (lambda b: (setattr(b.stream, "process", False), time.monotonic())[1], 0.05),
     "the cell falls silent": (lambda b: b.send(lambda qd: None, 1e9), 0.12),
     "numbers 60 ms late": (lambda b: b.emulator.fault("mute_input", seconds=0.06), 0.06),

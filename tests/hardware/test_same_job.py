@@ -22,8 +22,8 @@ from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_pr
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions
 
-# Both arms stand at the same planned poses, so the same picture is fitted twice: what may differ is a few pixels at the edge of
-# the flange, 0.02 mm of the fit (test_cell). The weld on a controller is test_wired_cell's.
+# Both arms stand at the same planned poses, so the same picture is fitted twice: what may differ is a few pixels at the
+# edge of the flange, 0.02 mm of the fit (test_cell). The weld on a controller is test_wired_cell's.
 SAME_MM = {"X_BC_error_mm": 0.02, "X_BC_error_at_work_mm": 0.02}
 JOB_PACE = 1.0  # in lockstep: a busy machine only takes longer
 PACE = 0.5  # a faster one leaves the link less time than a busy machine of two cores may take
@@ -71,7 +71,8 @@ def test_a_run_under_a_clock_reports_how_well_it_kept_to_it(emulated_job: DemoRe
 
 @pytest.fixture(scope="module")
 def controller(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
-    """A controller with a factory calibration of its own (the forearm 0.4 mm longer), its arm a little off the cell's home."""
+    """A controller with a factory calibration of its own (the forearm 0.4 mm longer), its arm a little off the cell's
+    home."""
     text = NOMINAL.read_text()
     assert "x: -0.6127" in text
     path = tmp_path_factory.mktemp("robot") / "calibration.yaml"

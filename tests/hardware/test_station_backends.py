@@ -1,4 +1,5 @@
-"""A station is the same to the cell whatever its robot is: the same ports, and the same answers to what a cell may do wrong."""
+"""A station is the same to the cell whatever its robot is: the same ports, and the same answers to what a cell may do
+wrong."""
 
 from __future__ import annotations
 
@@ -174,8 +175,8 @@ def test_a_velocity_is_followed_and_the_sample_carries_its_own_time(drive: Paced
     lost_before = drive.lost_s
     drive.run(0.4)
     after, t_after = drive.get("arm.position_measured"), drive.get("arm.sample_time")[0]
-    # A busy machine's late commands slow the arm along its path (`time_scale`), and delay a sample's arrival; what it loses
-    # the arm goes on for.
+    # A busy machine's late commands slow the arm along its path (`time_scale`), and delay a sample's arrival; what it
+    # loses the arm goes on for.
     moved = (after - before) / (t_after - t_before)
     kept = float(moved @ SLOWLY / (SLOWLY @ SLOWLY))
     assert moved == pytest.approx(kept * SLOWLY, abs=2e-3)

@@ -1,4 +1,5 @@
-"""A whole job by wire: the world is another process, its truth is in a file, and a device that is gone ends the job by name."""
+"""A whole job by wire: the world is another process, its truth is in a file, and a device that is gone ends the job by
+name."""
 
 from __future__ import annotations
 
@@ -70,7 +71,8 @@ SET_POINTS = """  wire_feed: {output: 0, unit: V, at_zero: 1.0, at_full: 22.0, v
 
 @dataclass
 class Played:
-    """A world that plays a cell's devices: its process, those of its devices, the cell's scenario and the truth file."""
+    """A world that plays a cell's devices: its process, those of its devices, the cell's scenario and the truth
+    file."""
 
     process: subprocess.Popen[str]
     children: list[int]
@@ -140,8 +142,11 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
 
 @pytest.fixture(scope="module")
 def welded(played: Played, tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoResult, dict[str, Any]]:
-    """The job without its calibration, on a short seam, and the truth as it is when the job has ended. Somebody sets the computer's clock
-    back by an hour when the workpiece is scanned, and forward by two in the middle of the weld."""
+    """The job without its calibration, on a short seam, and the truth as it is when the job has ended.
+
+    Somebody sets the computer's clock back by an hour when the workpiece is scanned, and forward by two in the middle
+    of the weld.
+    """
     options = RunOptions(
         scenario="a test's own", out=tmp_path_factory.mktemp("job") / "run", seed=SEED, recording=False
     )
@@ -235,12 +240,7 @@ def test_the_wired_cell_is_the_simulated_one_but_for_the_stations_inside(
 ) -> None:
     simulated = build_cell(load_scenario("straight_groove", WELD_ONLY), 0)
     try:
-        torch = {
-            "process_on",
-            "arc_established",
-            "arm.process_on",
-            "arm.arc_established",
-        }  # wired to a real one only
+        torch = {"process_on", "arc_established", "arm.process_on", "arm.arc_established"}  # wired to a real one only
         wired, rendered = (structure(cell.diagram, torch) for cell in (welded[0].run.cell, simulated))
         assert rendered == wired
         assert len(wired[0]) > 10

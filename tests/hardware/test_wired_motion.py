@@ -1,4 +1,5 @@
-"""A streaming scanner by wire, with a clock of its own: X_BC and clock against the world's truth, and a knock that the monitor finds."""
+"""A streaming scanner by wire, with a clock of its own: X_BC and clock against the world's truth, and a knock that the
+monitor finds."""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ def test_pose_and_clock_are_those_of_the_truth_file(wired: tuple[Played, str, Pa
     X_BC, p = RigidTransform(np.array(truth["X_BC"])), np.array([0.65, 0.0, 0.30])
     assert 1e3 * np.linalg.norm(e.X_BC @ (X_BC.inverse() @ p) - p) < 0.2
     assert e.clock.kind == "device"
-    # the scanner's clock counts the world's time; the Diagram's is less by a constant and what it has lost, as device times are here
+    # the scanner's clock counts the world's time; the Diagram's is less by a constant and what it has lost, as device
+    # times are here
     clock, ticks, run = truth["scanner_clock"], calibrated.run.clock, calibrated.run
     assert ticks is not None
     assert run.held is False

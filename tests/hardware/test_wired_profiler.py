@@ -1,4 +1,5 @@
-"""A laser profiler and a touch probe by wire: what edge and sphere find, against the truth that stays in the world; a probe that fails."""
+"""A laser profiler and a touch probe by wire: what edge and sphere find, against the truth that stays in the world; a
+probe that fails."""
 
 from __future__ import annotations
 
@@ -84,7 +85,8 @@ def wired(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Wired]:
 
 
 def errors(e: EdgeEstimate | SphereEstimate, truth: dict[str, Any]) -> tuple[float, float, float]:
-    """The estimate's error against the truth's X_FS: mm, degrees, and the largest of its six parts in sigmas of the prediction."""
+    """The estimate's error against the truth's X_FS: mm, degrees, and the largest of its six parts in sigmas of the
+    prediction."""
     found = RigidTransform(RotationMatrix.ProjectToRotationMatrix(e.rotation), e.translation)
     true = RigidTransform(np.array(truth["X_FS"]))
     turn = RotationMatrix(true.rotation().multiply(found.rotation().inverse()))

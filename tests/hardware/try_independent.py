@@ -1,8 +1,8 @@
 """Whole jobs with the independent controller, in real time: `python -m tests.hardware.try_independent jobs`.
 
-`jobs` runs scenarios that ship with their robot at the controller's address, each by the command line in a process of its own, and
-prints a table. The controller has ordinary priority, unless --own-computer is given. `faults` breaks a moving session in every way
-that the control channel knows, or a whole job with --job.
+`jobs` runs scenarios that ship with their robot at the controller's address, each by the command line in a process of
+its own, and prints a table. The controller has ordinary priority, unless --own-computer is given. `faults` breaks a
+moving session in every way that the control channel knows, or a whole job with --job.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ class Broken:
 
 
 def break_session(controller: Controller, fault: Fault, **settings: Any) -> Broken:
-    """Move, make the fault, wait for its name and for rest, repair, press Play, and measure what the arm then travels."""
+    """Move, make the fault, wait for its name and for rest, repair, press Play, and measure what the arm then
+    travels."""
     process = settings.get("process_output") is not None
     slips = controller.state()["late"]["slips"]
     with session(controller, **settings) as link:
@@ -165,9 +166,9 @@ def print_job(job: dict[str, Any]) -> None:
     mean, most = job.get("torch_mean_mm"), job.get("torch_max_mm")
     torch = "-" if mean is None else f"{mean:.3f} / {most:.3f}"
     print(
-        f"{job['groove']:16s} {job['by']:8s} seed {job['seed']:<3d} {job.get('state', 'no result'):8s} torch {torch:15s} mm"
-        f"  {job['wall_s']:5.0f} s  load {job['load']:4.1f}  late {job.get('late_ms')}"
-        f"  controller slipped {job['slips']:.0f} times, {job['slipped_ms']:.0f} ms",
+        f"{job['groove']:16s} {job['by']:8s} seed {job['seed']:<3d} {job.get('state', 'no result'):8s} torch"
+        f" {torch:15s} mm  {job['wall_s']:5.0f} s  load {job['load']:4.1f}  late {job.get('late_ms')}  controller"
+        f" slipped {job['slips']:.0f} times, {job['slipped_ms']:.0f} ms",
         flush=True,
     )
     if job.get("state") != "done":
@@ -215,8 +216,9 @@ def faults(host: str | None, job: str | None, own_computer: bool, transport: str
             right = fault.word in found.named and found.rests_s <= fault.rests_s and found.resumed_rad < 1e-6
             failed += not right
             print(
-                f"{'ok ' if right else 'BAD'} {fault.name:24s} rest after {1e3 * found.rests_s:4.0f} ms, then {found.resumed_rad:.6f} rad"
-                f"  load {os.getloadavg()[0]:.1f}{' (late)' if found.late else ''}  {found.named}",
+                f"{'ok ' if right else 'BAD'} {fault.name:24s} rest after {1e3 * found.rests_s:4.0f} ms, then"
+                f" {found.resumed_rad:.6f} rad  load {os.getloadavg()[0]:.1f}{' (late)' if found.late else ''} "
+                f" {found.named}",
                 flush=True,
             )
     return failed

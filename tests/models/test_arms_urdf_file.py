@@ -1,4 +1,5 @@
-"""A URDF as an arm: the chain of our own URDF is the arm's, meshes and grippers do not matter, and what is no arm is refused."""
+"""A URDF as an arm: the chain of our own URDF is the arm's, meshes and grippers do not matter, and what is no arm is
+refused."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_chain
 
-# an arm with axes along x, -y and z, a mesh that does not exist, a base turned in the world, a gripper beside the flange
+# an arm with axes along x, -y and z, a mesh that does not exist, a base turned in the world, a gripper beside the
+# flange
 SMALL = """
 <robot name="small">
   <link name="stand"/>

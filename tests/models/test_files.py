@@ -1,4 +1,5 @@
-"""Only regular files of bounded size are read, and whatever else a person hands in is refused in a sentence, at once."""
+"""Only regular files of bounded size are read, and whatever else a person hands in is refused in a sentence, at
+once."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.array_files import read_grey_image, read_npy, read_npz
-from weldcal.models.documents import Section, parse_document, read_document
+from weldcal.models.documents import DocumentSection, parse_document, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_bytes, read_text, sha256
 from weldcal.tools.worlds.binary_damage import _bomb, _objects
@@ -181,7 +182,7 @@ def test_a_document_without_end_or_with_two_answers_is_refused(text: str, kind: 
 
 
 def test_a_value_of_the_wrong_kind_is_named_with_file_and_key() -> None:
-    d = Section.of("f.yaml", {"a": {"n": "x", "big": 10**400, "list": [1, [2]], "yes": 1}, "s": [1]})
+    d = DocumentSection.of("f.yaml", {"a": {"n": "x", "big": 10**400, "list": [1, [2]], "yes": 1}, "s": [1]})
     a = d.section("a")
     for get, key in (
         (lambda: a.number("n"), "a.n must be a finite number"),

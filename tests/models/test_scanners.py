@@ -25,14 +25,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from weldcal.models.depth_noise import DepthNoise, device_warp, incidence_cosine, noisy_depth
 from weldcal.models.errors import InputError
-from weldcal.models.scanners import (
-    SCANNERS,
-    ScannerPreset,
-    apply_noise,
-    depth_to_points,
-    drake_intrinsics,
-    get_scanner,
-)
+from weldcal.models.scanners import SCANNERS, ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
 
 
 def _plain(noise: DepthNoise, width: int = 400, height: int = 300) -> ScannerPreset:

@@ -1,4 +1,5 @@
-"""`weldcal calibrate` on a rendered recording of a scanner on the arm in motion: X_FC, target and clock against the truth."""
+"""`weldcal calibrate` on a rendered recording of a scanner on the arm in motion: X_FC, target and clock against the
+truth."""
 
 from __future__ import annotations
 
@@ -41,13 +42,10 @@ Truth = tuple[Path, RigidTransform, RigidTransform]
 
 
 def hand_moves(
-    rng: np.random.Generator,
-    *,
-    lean_deg: float = 25.0,
-    spread_m: float = 0.08,
-    waypoints: int = 6,
+    rng: np.random.Generator, *, lean_deg: float = 25.0, spread_m: float = 0.08, waypoints: int = 6
 ) -> tuple[Moves, RigidTransform, RigidTransform]:
-    """Moves of a UR10e with a scanner on its flange about a fixed target, X_FC and X_BT; the target stays near the middle of the view."""
+    """Moves of a UR10e with a scanner on its flange about a fixed target, X_FC and X_BT; the target stays near the
+    middle of the view."""
     chain = load_chain(ROBOT)
     X_FC = RigidTransform(
         RotationMatrix(

@@ -1,4 +1,5 @@
-"""The offline calibration on real scans and real pairs: every cloud accounted for, errors held out, bad data refused."""
+"""The offline calibration on real scans and real pairs: every cloud accounted for, errors held out, bad data
+refused."""
 
 from __future__ import annotations
 
@@ -59,7 +60,8 @@ def test_the_scanner_of_the_aubo_is_corrected_as_its_hole_circle_and_the_robot_b
     aubo: CalibrationReport,
 ) -> None:
     c = aubo.summary()["scanner_correction"]
-    # from other people's fits of this set: 0.16 to 0.21 % short, 0.13 to 0.15 % per 100 mm along x, each to 0.02 to 0.04
+    # from other people's fits of this set: 0.16 to 0.21 % short, 0.13 to 0.15 % per 100 mm along x, each to 0.02 to
+    # 0.04
     assert c["scale"] == pytest.approx(1.0018, abs=6e-4)
     assert c["gradient_per_m"][0] == pytest.approx(0.014, abs=5e-3)
     assert abs(c["gradient_per_m"][1]) < 6e-3
@@ -228,10 +230,7 @@ def _emptied(folder: Path) -> None:
     (folder / "clouds" / "pose04.pcd").write_bytes(b"")
 
 
-@pytest.mark.parametrize(
-    ("spoil", "reason"),
-    [(_part, ""), (_emptied, "is empty")],
-)
+@pytest.mark.parametrize(("spoil", "reason"), [(_part, ""), (_emptied, "is empty")])
 def test_one_bad_cloud_among_good_ones_is_refused_by_name(
     tmp_path: Path, spoil: Callable[[Path], None], reason: str
 ) -> None:
@@ -289,7 +288,8 @@ def test_one_to_three_scans_calibrate_and_say_what_their_figures_rest_on(
     assert f"From {'one scan' if n == 1 else f'{n} scans'} only" in report.result.warnings[0]
     assert np.isfinite(report.result.held_out_mm["median"]) == (n == 3)
     assert load_result(tmp_path / "out").covariance.shape == (6, 6)
-    # other people's fits of this set: 0.44 mm from one scan, 0.24 to 0.33 from two and three, medians over draws; this is one draw
+    # other people's fits of this set: 0.44 mm from one scan, 0.24 to 0.33 from two and three, medians over draws; this
+    # is one draw
     seen = {o.id for o in report.observations}
     rest = [o for o in _as_seen(aubo) if o.id not in seen]
     assert 1e3 * float(np.median(position_errors(report.result.X_BC, rest))) < limit_mm
@@ -310,7 +310,8 @@ def _as_seen(aubo: CalibrationReport) -> list[Observation]:
 
 
 def _list_of_pairs(folder: Path, seed: int, n: int, gross: dict[int, float], *, unit: str, turned: bool) -> None:
-    """Pairs of the UR10e as another program might write them: drawn anew, columns in another order, rows ``gross`` off by so much (m)."""
+    """Pairs of the UR10e as another program might write them: drawn anew, columns in another order, rows ``gross`` off
+    by so much (m)."""
     rng = np.random.default_rng(seed)
     with (UR10E / "pairs.csv").open() as stream:
         rows = [row for row in csv.DictReader(stream) if row["id"] != "34"]  # the one gross outlier of the set itself

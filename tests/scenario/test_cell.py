@@ -1,4 +1,5 @@
-"""The whole Diagram, simulated: it calibrates, feels a short seam and welds it; and when it cannot, it holds and says why."""
+"""The whole Diagram, simulated: it calibrates, feels a short seam and welds it; and when it cannot, it holds and says
+why."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ job: {calibrate: false, X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -
 
 
 NEAR = 10  # a seed whose first poses lie near each other
-# Four times as fast as usual, so that the torch, which comes on when the tip is 60 mm ahead of where it felt the start, is on sooner.
+# Four times as fast as usual, so that the torch, which comes on when the tip is 60 mm ahead of where it felt the start,
+# is on sooner.
 FAST = "welding: {speed_mm_s: 32.0}"
 
 
@@ -98,8 +100,9 @@ def test_the_torch_keeps_to_a_seam_that_the_plan_got_wrong(short_job: DemoResult
 def test_what_the_tip_felt_is_the_seam_to_hundredths(short_job: DemoResult) -> None:
     found = figures(short_job, "s_groove", "guarded", 5, 1.0)
     assert found.completed
-    # The targets of `weldcal reproduce cell`; the offsets are small because the seat is derived and the tag zeroed, not because
-    # anything was fitted to this groove: the tag's picture is half a percent too large, 0.01 mm of 2 mm and 0.03 mm of 40 mm less.
+    # The targets of `weldcal reproduce cell`; the offsets are small because the seat is derived and the tag zeroed, not
+    # because anything was fitted to this groove: the tag's picture is half a percent too large, 0.01 mm of 2 mm and
+    # 0.03 mm of 40 mm less.
     assert found.point_sd_mm <= 0.02
     assert found.torch_mean_mm <= 0.1
     assert found.torch_max_mm <= 0.3
@@ -131,7 +134,8 @@ def test_the_scans_of_a_run_give_the_same_calibration_again(short_job: DemoResul
     report = calibrate_dataset(short_job.folder / "scans", tmp_path / "again")
     assert short_job.status.estimate is not None
     again = calibration_error(report.estimate.X_BC, short_job.status.estimate.X_BC, np.array([0.65, 0.0, 0.02]))
-    # The search for the flange starts from another guess, so the edge pixels may differ by a few; the noise floor is 20 um.
+    # The search for the flange starts from another guess, so the edge pixels may differ by a few; the noise floor is 20
+    # um.
     assert again.at_work_m < 0.02e-3
 
 
@@ -156,7 +160,10 @@ def live_calibration(shortest_calibration: Path, tmp_path_factory: pytest.TempPa
 
 def test_a_live_calibration_reports_what_the_offline_one_does(live_calibration: FinishedRun) -> None:
     assert live_calibration.returncode == 0, live_calibration.stderr
-    keys = "state n_used refused X_BC covariance scanner_correction held_out_mm tilt_deg outliers warnings unobservable seconds"
+    keys = (
+        "state n_used refused X_BC covariance scanner_correction held_out_mm tilt_deg outliers warnings unobservable"
+        " seconds"
+    )
     assert set(keys.split()) <= set(live_calibration.summary)
     assert live_calibration.summary["n_scans"] == 6
     assert "joints [" in live_calibration.summary["next_pose"]  # a pose that was planned and not visited

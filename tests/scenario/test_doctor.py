@@ -1,4 +1,5 @@
-"""`weldcal doctor` on results, datasets and refused calibrations: the cause that was put in is named, and real data have none."""
+"""`weldcal doctor` on results, datasets and refused calibrations: the cause that was put in is named, and real data
+have none."""
 
 from __future__ import annotations
 

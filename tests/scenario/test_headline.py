@@ -27,7 +27,8 @@ def bounds(repository: Path) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
-    """The demo on 30 mm of its seam, nothing else changed: scale, gradient and warp of the scanner, errors of the arm's links."""
+    """The demo on 30 mm of its seam, nothing else changed: scale, gradient and warp of the scanner, errors of the arm's
+    links."""
     scenario = load_scenario("s_groove", "welding: {seam_length_mm: 30.0}")
     out = tmp_path_factory.mktemp("headline") / "demo"
     return run_scenario(scenario, RunOptions(scenario="s_groove", out=out, seed=SEED, recording=False))
@@ -37,7 +38,8 @@ def test_a_scanned_point_is_where_the_arm_reports_it(run: DemoResult, bounds: tu
     found = run.summary()
     assert found["state"] == "done", found.get("reason")
     assert 0.0 < found["X_BC_error_at_work_mm"] <= bounds[0]  # type: ignore[operator]
-    # the errors are those of the headline: without its correction the scanner shifts the point by more than a millimetre
+    # the errors are those of the headline: without its correction the scanner shifts the point by more than a
+    # millimetre
     assert run.status.estimate is not None
     assert run.status.estimate.scanner is not None
     assert abs(run.status.estimate.scanner.scale - 1.0) > 1e-3

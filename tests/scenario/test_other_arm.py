@@ -1,4 +1,7 @@
-"""Another arm that hangs from the ceiling, with a tool of its own: it welds as the demo's does. Every arm's scaled demo loads."""
+"""Another arm that hangs from the ceiling, with a tool of its own: it welds as the demo's does.
+
+Every arm's scaled demo loads.
+"""
 
 from __future__ import annotations
 

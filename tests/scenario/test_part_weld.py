@@ -17,13 +17,13 @@ from weldcal.models.mesh import extrude, merge
 from weldcal.models.workpieces.part import Part
 from weldcal.systems import station
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS, MadePart, assembly, box
 
 
 def test_two_fillets_are_welded_one_after_the_other_from_a_step_file(tmp_path: Path) -> None:
     """Both sides of a T, the ends cut off; between them the arm goes home and the part is looked at again."""
-    trial = Trial(located_by="drawing", translation_mm=1.0, rotation_deg=0.3, bow_mm=0.3)
+    trial = PartTrial(located_by="drawing", translation_mm=1.0, rotation_deg=0.3, bow_mm=0.3)
     cell = write_cell(PARTS["straight_web"](), tmp_path, trial)
     (tmp_path / "far.csv").write_text("-100,5,0\n100,5,0\n")
     one = "{polyline: straight_web.csv"
@@ -55,7 +55,7 @@ def test_two_plates_without_a_gap_are_welded_and_the_tip_stays_off(tmp_path: Pat
     )  # the block tells the ends apart
     line = np.array([[0.0, 0.0, 0.0], [220.0, 0.0, 0.0]])
     part = MadePart(name="plates", shape=plates, joint="butt", line_mm=line, length_mm=220.0, opening_deg=180.0)
-    cell = write_cell(part, tmp_path, Trial(bow_mm=0.0, arm_mm=0.0))
+    cell = write_cell(part, tmp_path, PartTrial(bow_mm=0.0, arm_mm=0.0))
     text = cell.read_text().replace("plates.csv}", "plates.csv, start_mm: 80, end_mm: 100}")
     text = text.replace("welding: {", "job: {X_BC_sigma_mm: 0.05}\nwelding: {speed_mm_s: 20.0, ")
     cell.write_text(text)
@@ -77,7 +77,8 @@ def test_two_plates_without_a_gap_are_welded_and_the_tip_stays_off(tmp_path: Pat
 
 
 def test_a_nut_beside_the_seam_is_passed_by_lifting_the_tip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A web on a plate with a nut that the drawing does not have: refused, and with pass_obstacles welded before and after it."""
+    """A web on a plate with a nut that the drawing does not have: refused, and with pass_obstacles welded before and
+    after it."""
     nut = extrude(0.006 * np.column_stack([f(np.arange(6) * np.pi / 3.0) for f in (np.cos, np.sin)]), 0.0, 0.006)
     nut = nut.transformed(RigidTransform([-0.02, -0.0075, 0.0]))
 
@@ -86,7 +87,7 @@ def test_a_nut_beside_the_seam_is_passed_by_lifting_the_tip(tmp_path: Path, monk
 
     monkeypatch.setattr(station, "made", as_made)
     cell = write_cell(
-        PARTS["straight_web"](), tmp_path, Trial(translation_mm=1.0, rotation_deg=0.3, bow_mm=0.0, arm_mm=0.0)
+        PARTS["straight_web"](), tmp_path, PartTrial(translation_mm=1.0, rotation_deg=0.3, bow_mm=0.0, arm_mm=0.0)
     )
     text = cell.read_text().replace("welding: {", "welding: {speed_mm_s: 16.0, ")
 

@@ -1,4 +1,5 @@
-"""The profiler's cell in short: edge scanned, sphere scanned and touched, groove scanned, and the torch taken along it."""
+"""The profiler's cell in short: edge scanned, sphere scanned and touched, groove scanned, and the torch taken along
+it."""
 
 from __future__ import annotations
 

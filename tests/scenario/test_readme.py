@@ -15,7 +15,8 @@ from tests.browser import Browser, colours
 from tests.short_job import ShortJob
 from weldcal.tools.cli.app import app
 
-# Each command of the README and the test that runs it, here or in another file (with a short job, where the job is long).
+# Each command of the README and the test that runs it, here or in another file (with a short job, where the job is
+# long).
 RUN_BY = {
     "./tools/run demo": "test_the_demo_ends_done_and_leaves_the_files_that_the_readme_names",
     "./tools/run test": "test_the_commands_of_the_readme_are_run",

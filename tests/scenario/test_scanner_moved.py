@@ -27,7 +27,8 @@ def write_pairs(folder: Path, observations: list[Observation]) -> Path:
         rows.append(",".join([o.id, *(f"{v:.9f}" for v in (*o.p_BR, *q, *o.p_CR))]))
     (folder / "pairs.csv").write_text("\n".join(rows) + "\n")
     (folder / "dataset.yaml").write_text(
-        "schema: 1\nrobot: ur10e\nflange: iso9409-1-50-4-m6\nscanner: any\nconfiguration: eye_on_base\nunits: {clouds: m, poses: m}\n"
+        "schema: 1\nrobot: ur10e\nflange: iso9409-1-50-4-m6\nscanner: any\nconfiguration: eye_on_base\nunits: {clouds:"
+        " m, poses: m}\n"
     )
     return folder
 

@@ -1,4 +1,5 @@
-"""A visit to the tablet in the station, from the first look to the last touch: the pen meets the glass, and camera and pen are found."""
+"""A visit to the tablet in the station, from the first look to the last touch: the pen meets the glass, and camera and
+pen are found."""
 
 from __future__ import annotations
 

@@ -82,7 +82,8 @@ def test_scans_the_calibration_never_saw_are_hit_to_a_fifth_of_a_millimetre(veri
     assert d["limit_mm"] == pytest.approx(verified.result.held_out_mm["p95"])
     assert d["position_error_mm"]["median"] < 0.6 * d["limit_mm"]
     assert len(d["per_pose"]) == 9
-    # nine scans: the paper's method leaves 0.63 on poses it did not use, good centres 0.29, and a corrected scanner 0.16
+    # nine scans: the paper's method leaves 0.63 on poses it did not use, good centres 0.29, and a corrected scanner
+    # 0.16
     assert d["position_error_mm"]["median"] < 0.2
     assert d["position_error_mm"]["max"] < 0.4
     assert d["tilt_deg"]["median"] < 0.12

@@ -25,9 +25,9 @@ SMALL_IDEAL_SCANNER = (
     " mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0}"
 )
 EXACT_PLATE = (
-    "workpiece: {shape: straight, length_mm: 200.0,"
-    " pose_guess: {xyz_m: [0.65, 0.0, 0.02], rpy_deg: [0.0, 0.0, 90.0]},"
-    " placement_error: {translation_mm: 0.0, rotation_deg: 0.0}, groove_error: {translation_mm: 0.0, rotation_deg: 0.0}}"
+    "workpiece: {shape: straight, length_mm: 200.0, pose_guess: {xyz_m: [0.65, 0.0, 0.02], rpy_deg: [0.0, 0.0, 90.0]},"
+    " placement_error: {translation_mm: 0.0, rotation_deg: 0.0}, groove_error: {translation_mm: 0.0, rotation_deg:"
+    " 0.0}}"
 )
 
 
@@ -99,7 +99,8 @@ class Drive:
             yield self.time
 
     def place_arm(self, q: np.ndarray, deflection_T: np.ndarray | None = None) -> None:
-        """Put the arm at rest at q, its servo's reference with it, and the soft tip off its rest by deflection_T (3,) m."""
+        """Put the arm at rest at q, its servo's reference with it, and the soft tip off its rest by deflection_T (3,)
+        m."""
         world = self.station.world
         world.plant.SetPositions(self.plant, world.arm, q)
         world.plant.SetVelocities(self.plant, world.arm, np.zeros(6))
@@ -111,6 +112,7 @@ class Drive:
 
 
 def place_servo(context: Context, q: np.ndarray, time: float = 0.0, fault: float = 0.0) -> None:
-    """Set the state of a SpeedJointServo: its reference and what it measured at rest at q, at that time, and its fault."""
+    """Set the state of a SpeedJointServo: its reference and what it measured at rest at q, at that time, and its
+    fault."""
     for group, value in enumerate((np.concatenate([q, np.zeros(6)]), q, np.zeros(6), [time], [fault])):
         context.SetDiscreteState(group, value)

@@ -1,4 +1,5 @@
-"""Random placements of part, tool and arm: whether the path check accepts them, and how the arm then follows the seam."""
+"""Random placements of part, tool and arm: whether the path check accepts them, and how the arm then follows the
+seam."""
 
 import math
 import sys
@@ -25,7 +26,7 @@ from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.servo.guards import GUARD, SPEED_SHARE, SlewLimits, guarded_joint_velocity, slew_limit
-from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchOnConfig
 from weldcal.welding.servo.state import Phase
 
 ARMS = ("ur3e", "ur5e", "ur7e", "ur10e", "ur12e", "ur16e", "ur20")
@@ -102,7 +103,7 @@ def draw(seed: int) -> Placement:
     seam = TrueSeam("placed", points @ R.T + p, R[:, 2])
     config = ServoConfig(
         tool=ToolGeometry(torch_offset_m=chord_m, torch_height_m=tool.torch_height_m),
-        touch=TouchConfig(zero_frames=10),
+        touch=TouchOnConfig(zero_frames=10),
         weld_speed_m_s=float(rng.uniform(0.010, 0.020)),
     )
     pan = (angle + rng.uniform(-0.8, 0.8) + math.pi) % (2.0 * math.pi) - math.pi
@@ -123,10 +124,12 @@ def _seam(rng: np.random.Generator) -> Array:
 
 
 def placed(seed: int, drive: bool = True) -> dict[str, Any]:
-    """Check one placement and drive it, a refused one only where its seed is even: what the check says, and how the drive ends.
+    """Check one placement and drive it, a refused one only where its seed is even: what the check says, and how the
+    drive ends.
 
-    `state` is accepted, refused, or unsuitable (the seam itself cannot be welded in one go). `end` is done, guard (stopped, or slowed to
-    a standstill), joint limit, slowed (below LEAST_SHARE of the speed), fault (of the servo), or no start (no pose above the seam).
+    `state` is accepted, refused, or unsuitable (the seam itself cannot be welded in one go). `end` is done, guard
+    (stopped, or slowed to a standstill), joint limit, slowed (below LEAST_SHARE of the speed), fault (of the servo), or
+    no start (no pose above the seam).
     """
     placement = draw(seed)
     welder, plan = placement.welder, placement.plan
@@ -175,7 +178,8 @@ def offered(seed: int) -> str:
 
 
 def main(first: int, last: int) -> None:
-    """Print how many placements of the seeds first to last - 1 are accepted and refused, how the drives end, and what disagrees."""
+    """Print how many placements of the seeds first to last - 1 are accepted and refused, how the drives end, and what
+    disagrees."""
     ends: Counter[tuple[str, str]] = Counter()
     for seed in range(first, last):
         row = placed(seed)

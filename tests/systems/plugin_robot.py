@@ -1,4 +1,5 @@
-"""A robot driver that simulates nothing but joint angles: it stands in for an arm whose world weldcal cannot see into."""
+"""A robot driver that simulates nothing but joint angles: it stands in for an arm whose world weldcal cannot see
+into."""
 
 from __future__ import annotations
 

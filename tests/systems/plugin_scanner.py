@@ -1,4 +1,5 @@
-"""A scanner driver as a stranger would ship it in a package of their own: it computes where rays meet a flange and nothing else."""
+"""A scanner driver as a stranger would ship it in a package of their own: it computes where rays meet a flange and
+nothing else."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from weldcal.systems.addresses import AddressError, controller_address, is_loopback, loopback_address, own_address
-from weldcal.systems.drivers.ur.wire.line import Line
+from weldcal.systems.drivers.ur.wire.line import SocketLine
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.run import chosen_robot
@@ -64,7 +64,7 @@ def test_an_address_or_a_host_name_is_taken_as_it_is(text: str) -> None:
 
 def test_a_connection_a_run_and_the_check_refuse_before_any_work() -> None:
     with pytest.raises(AddressError, match="is not an IPv4 address"):
-        Line("192.168.1", 29999, "Dashboard", 0.1)
+        SocketLine("192.168.1", 29999, "Dashboard", 0.1)
     scenario = load_scenario("straight_groove")
     with pytest.raises(AddressError, match="has a port"), chosen_robot("192.168.1.5:29999", scenario):
         pass

@@ -1,4 +1,5 @@
-"""A cell's memory is freed after its run: no callback and no attribute keeps a system, its Diagram, plants and renderers alive."""
+"""A cell's memory is freed after its run: no callback and no attribute keeps a system, its Diagram, plants and
+renderers alive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Every system has exactly the ports that its docstring shows, of the size and kind that the rest of the cell counts on."""
+"""Every system has exactly the ports that its docstring shows, of the size and kind that the rest of the cell counts
+on."""
 
 from __future__ import annotations
 
@@ -78,7 +79,7 @@ from weldcal.systems.jobs.weld.iterative_calibrator import (
     CalibrationPosePlanner,
     CalibratorConfig,
     IterativeCalibrator,
-    NextPose,
+    PoseRequest,
 )
 from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobPlan, JobSequencer, JobState
@@ -373,7 +374,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "history": PoseHistory,
         "calibration_status": CalibrationStatus,
     },
-    CalibrationPosePlanner: {"calibration_status": CalibrationStatus, "next_pose": NextPose},
+    CalibrationPosePlanner: {"calibration_status": CalibrationStatus, "next_pose": PoseRequest},
     SeamPlanner: {
         "scan": Scan,
         "job": JobCommand,
@@ -428,13 +429,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "servo_velocity": 6,
         "velocity_wanted": 6,
     },
-    FlangeMover: {
-        "job": JobCommand,
-        "position_measured": 6,
-        "velocity_measured": 6,
-        "velocity": 6,
-        "settled_goal": 1,
-    },
+    FlangeMover: {"job": JobCommand, "position_measured": 6, "velocity_measured": 6, "velocity": 6, "settled_goal": 1},
     DriftView: {"drift": DriftStatus, "flange_estimate": FlangeEstimate},
     DriftMonitor: {
         "flange_estimate": FlangeEstimate,
@@ -449,7 +444,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "robot_status": UrStatus,
         "settled_goal": 1,
         "position_measured": 6,
-        "next_pose": NextPose,
+        "next_pose": PoseRequest,
         "calibration_status": CalibrationStatus,
         "planned_seam": PlannedSeam,
         "servo_report": ServoReport,

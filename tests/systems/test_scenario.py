@@ -379,7 +379,10 @@ def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
         ("home_deg: [.nan, 0, 0, 0, 0, 0]", "home_deg must be finite"),
         (
             "home_deg: [0.0, -80.0, 200.0, -120.0, -90.0, 0.0]",
-            "home_deg puts joint 3 of the ur10e at 200 deg, and its limits are -180 to 180 deg: give an angle between them.",
+            (
+                "home_deg puts joint 3 of the ur10e at 200 deg, and its limits are -180 to 180 deg: give an angle"
+                " between them."
+            ),
         ),
         ("calibration: {work_point_m: [1, 2]}", "calibration.work_point_m must hold 3 numbers, not 2"),
         ("robot: !UrRtde {payload_cog_m: [1, 2]}", "robot.payload_cog_m must hold 3 numbers, not 2"),
@@ -461,10 +464,7 @@ def test_a_mistake_is_answered_with_one_sentence_that_names_it(overrides: str, n
         ("job: {calibrate: false}", "without calibrating first needs job.X_BC"),
         ("robot: !NoDevice {}", "A cell needs a robot"),
         ("scanner: !NoDevice {}", "This job needs a scanner"),
-        (
-            "scanner: !NoDevice {}\njob: {calibrate: false, X_BC: {xyz_m: [0.0, 0.0, 1.0]}}",
-            "This job needs a scanner",
-        ),
+        ("scanner: !NoDevice {}\njob: {calibrate: false, X_BC: {xyz_m: [0.0, 0.0, 1.0]}}", "This job needs a scanner"),
     ],
 )
 def test_two_settings_that_contradict_each_other_are_refused(overrides: str, said: str) -> None:

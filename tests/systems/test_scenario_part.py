@@ -17,14 +17,14 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import ErrorConfig, Scenario, SeamConfig, WorkpieceConfig
 from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, less, write_step
 
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The path of a scenario that welds a fillet, beside its STEP file and its seam."""
-    return write_cell(PARTS["straight_web"](), tmp_path_factory.mktemp("cell"), Trial(located_by="drawing"))
+    return write_cell(PARTS["straight_web"](), tmp_path_factory.mktemp("cell"), PartTrial(located_by="drawing"))
 
 
 def test_its_paths_are_relative_to_the_scenarios_file(
@@ -123,7 +123,8 @@ def test_a_press_that_climbs_out_is_refused(cell: Path) -> None:
 
 
 def test_a_square_tube_is_welded_leg_by_leg(tmp_path: Path) -> None:
-    """Across a sharp outside corner tip and torch cannot both follow; a rectangle that is drawn on a plate's edge is closed."""
+    """Across a sharp outside corner tip and torch cannot both follow; a rectangle that is drawn on a plate's edge is
+    closed."""
     tube = less(box((-30, -20, 0), (60, 40, 50)), box((-26, -16, -1), (52, 32, 60)))
     write_step(assembly(box((-90, -90, -10), (180, 180, 10)), tube), tmp_path / "tube.step")
     shape = read_shape(tmp_path / "tube.step")

@@ -1,4 +1,5 @@
-"""The station is what the scenario says, its ports have fixed names, and what differs from the drawing comes from the seed."""
+"""The station is what the scenario says, its ports have fixed names, and what differs from the drawing comes from the
+seed."""
 
 from __future__ import annotations
 
@@ -231,7 +232,8 @@ def test_cheating_shows_where_tip_and_torch_truly_are() -> None:
 
 
 def test_the_drawings_ring_and_tag_are_where_the_bodies_carry_them() -> None:
-    # The ring's face looks up when the tool points down, 8 mm above the plate; the tag looks back at the camera, 40 mm away.
+    # The ring's face looks up when the tool points down, 8 mm above the plate; the tag looks back at the camera, 40 mm
+    # away.
     X_BF = forward_kinematics(the_arm(), Q_HOME)
     assert (X_BF @ TOOL.X_FR).rotation().matrix()[2, 2] == pytest.approx(1.0, abs=0.01)
     assert np.linalg.norm(TOOL.X_KM_rest.translation()) == pytest.approx(TOOL.camera_distance_m)

@@ -1,4 +1,5 @@
-"""A scenario with a tool of one's own: found beside the scenario, used by every part of the cell, refused where it cannot work."""
+"""A scenario with a tool of one's own: found beside the scenario, used by every part of the cell, refused where it
+cannot work."""
 
 from __future__ import annotations
 

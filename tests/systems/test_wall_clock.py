@@ -1,4 +1,5 @@
-"""The Diagram keeps to the wall clock, waits where it is ahead, slows the path where the computer is late, and counts it."""
+"""The Diagram keeps to the wall clock, waits where it is ahead, slows the path where the computer is late, and counts
+it."""
 
 from __future__ import annotations
 

@@ -37,7 +37,10 @@ def test_nothing_is_kept_where_no_folder_is_given(tmp_path: Path, monkeypatch: p
 
 
 def test_importing_weldcal_loads_nothing_else_and_shows_its_functions() -> None:
-    script = "import sys, weldcal; assert 'pydrake' not in sys.modules; print(*[n for n in dir(weldcal) if n in weldcal.__all__])"
+    script = (
+        "import sys, weldcal; assert 'pydrake' not in sys.modules; print(*[n for n in dir(weldcal) if n in"
+        " weldcal.__all__])"
+    )
     finished = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True)
     assert finished.stdout.split() == sorted(weldcal.__all__)
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):

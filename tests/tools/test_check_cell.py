@@ -133,5 +133,6 @@ def test_the_width_of_an_edge_grows_with_its_blur(sigma: float) -> None:
     picture[30:70, 30:70] = 200
     blurred = cv2.GaussianBlur(picture, (0, 0), sigma)
     found = edge_width_px(blurred, np.array([[30.0, 30.0], [69.0, 69.0]]))
-    # the steepest slope of a Gaussian edge is its contrast over sigma times the root of 2 pi; the Sobel filter blurs it further
+    # the steepest slope of a Gaussian edge is its contrast over sigma times the root of 2 pi; the Sobel filter blurs it
+    # further
     assert found == pytest.approx(2.507 * np.sqrt(sigma**2 + 1.0 / 3.0), rel=0.2)

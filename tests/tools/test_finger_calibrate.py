@@ -1,4 +1,5 @@
-"""The finger is calibrated from pictures drawn ray by ray through a lens with distortion, with a tag that is not as large as it says."""
+"""The finger is calibrated from pictures drawn ray by ray through a lens with distortion, with a tag that is not as
+large as it says."""
 
 from __future__ import annotations
 
@@ -19,14 +20,14 @@ from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamer
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.cell.board import Board, board_sheet, write_board
+from weldcal.tools.commands.cell.board import CharucoBoard, board_sheet, write_board
 from weldcal.welding.finger.calibration import calibrate_tip
 from weldcal.welding.finger.deformation import TagModel, detect_tag, tag_cells
 
 SIZE = (400, 300)
 K = np.array([[443.7, 0.0, 203.9], [0.0, 446.2, 144.6], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([-0.11, 0.06, 8e-4, -6e-4])
-BOARD = Board()
+BOARD = CharucoBoard()
 TRUE_TAG_M = 0.00963
 TOOL = WeldingTool()
 SEAT = np.array([0.0, 0.0, 1.2e-4])
@@ -47,7 +48,8 @@ def rays(samples: int = 3) -> np.ndarray:
 
 
 def drawn(texture: np.ndarray, pixels_per_m: float, X_KP: RigidTransform, number: int) -> np.ndarray:
-    """What the camera sees of a plane's print; `texture` has its first pixel's corner at the plane's origin, x right, y down."""
+    """What the camera sees of a plane's print; `texture` has its first pixel's corner at the plane's origin, x right, y
+    down."""
     R, p = X_KP.rotation().matrix(), X_KP.translation()
     t = (R[:, 2] @ p) / (rays() @ R[:, 2])
     on = (rays() * t[..., None] - p) @ R

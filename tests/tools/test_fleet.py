@@ -33,20 +33,23 @@ def calibrated(mm: float = 0.2, **given: Any) -> dict[str, Any]:
 
 
 def history(*errors_mm: float, refuted: int = 0, newest: dict[str, Any] | None = None) -> tuple[Checked, ...]:
-    """Datasets with these errors of the first calibration; the last ``refuted`` verifications say that it must not be used."""
+    """Datasets with these errors of the first calibration; the last ``refuted`` verifications say that it must not be
+    used."""
     n = len(errors_mm)
     return tuple(
         Checked(
             f"2026-{k + 1:02d}",
             newest if newest is not None and k == n - 1 else calibrated(),
-            None
-            if k == 0
-            else {
-                "state": "done",
-                "verdict": "do not use" if k >= n - refuted else "use it",
-                "reason": "why",
-                "position_error_mm": {"median": mm},
-            },
+            (
+                None
+                if k == 0
+                else {
+                    "state": "done",
+                    "verdict": "do not use" if k >= n - refuted else "use it",
+                    "reason": "why",
+                    "position_error_mm": {"median": mm},
+                }
+            ),
             None,
             None,
         )

@@ -1,4 +1,5 @@
-"""`weldcal monitor` on a recording: the contract's keys, a knock with its time and size, a report, a recalibrated result."""
+"""`weldcal monitor` on a recording: the contract's keys, a knock with its time and size, a report, a recalibrated
+result."""
 
 import json
 from pathlib import Path

@@ -37,7 +37,8 @@ def room(X_WC: RigidTransform, rng: np.random.Generator) -> Array:
 
 
 def recording(folder: Path, moved: str) -> Path:
-    """A recording in which the scanner, or the robot's base, jumps by the same change of the scanner's pose in the base."""
+    """A recording in which the scanner, or the robot's base, jumps by the same change of the scanner's pose in the
+    base."""
     rng = np.random.default_rng(1)
     t = np.arange(999.0, 1008.0, 0.004)
     capture = 1000.0 + np.arange(FRAMES) / RATE

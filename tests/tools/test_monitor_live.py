@@ -1,4 +1,5 @@
-"""`weldcal monitor` live: the scanner's stand is knocked in the simulated world, found in the cell, shown, and reported at the end."""
+"""`weldcal monitor` live: the scanner's stand is knocked in the simulated world, found in the cell, shown, and reported
+at the end."""
 
 import json
 import re
@@ -41,7 +42,10 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
         ),
         folder / "calibration",
     )
-    words = f"monitor {scenario} --calibration {folder}/calibration --frames 100 --seed {SEED} --recalibrate --out {folder}/out --json"
+    words = (
+        f"monitor {scenario} --calibration {folder}/calibration --frames 100 --seed {SEED} --recalibrate --out"
+        f" {folder}/out --json"
+    )
     found = CliRunner().invoke(app, words.split())
     assert found.exit_code == 0, found.output
     return folder, json.loads(found.stdout.strip().splitlines()[-1])

@@ -158,7 +158,7 @@ def test_where_the_whole_is_refused_a_piece_is_taken_and_named(tmp_path: Path, m
 
 
 def test_a_ring_that_the_arm_cannot_turn_around_is_halved(tmp_path: Path) -> None:
-    """Both halves together cover a circle of 100 mm and overlap by 5 mm at either end; the arm welds them in one place."""
+    """Both halves together cover a circle of 100 mm and overlap by 5 mm at either end."""
     pipe = less(cylinder((0, 0, 0), 100, 50), cylinder((0, 0, -1), 94, 60))
     write_step(assembly(box((-220, -220, -10), (440, 440, 10)), pipe), tmp_path / "pipe.step")
     path, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "pipe.step"))

@@ -1,4 +1,5 @@
-"""`weldcal plan-motion`: larger cubes and leans tell more; a recorded program that shows nothing is said to; nothing is invented."""
+"""`weldcal plan-motion`: larger cubes and leans tell more; a recorded program that shows nothing is said to; nothing is
+invented."""
 
 import json
 from pathlib import Path

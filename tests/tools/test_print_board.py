@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from weldcal.calibration.hand_eye.pictures.boards import find_board, parse_board
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.cell.board import PAPERS, Board, board_sheet, described_sheet, tag_sheet
+from weldcal.tools.commands.cell.board import PAPERS, CharucoBoard, board_sheet, described_sheet, tag_sheet
 from weldcal.welding.finger.deformation import TagModel
 
 DPI = 600
@@ -84,13 +84,13 @@ class Page:
 @pytest.mark.parametrize(
     ("board", "paper"),
     [
-        (Board(), "A4"),
-        (Board(11, 8, 15.0, 11.0, "5X5_50"), "A4"),
-        (Board(5, 7, 30.0, 22.5), "A3"),
-        (Board(7, 6, 7.3, 5.1), "A5"),
+        (CharucoBoard(), "A4"),
+        (CharucoBoard(11, 8, 15.0, 11.0, "5X5_50"), "A4"),
+        (CharucoBoard(5, 7, 30.0, 22.5), "A3"),
+        (CharucoBoard(7, 6, 7.3, 5.1), "A5"),
     ],
 )
-def test_the_squares_of_a_board_have_their_size(board: Board, paper: str) -> None:
+def test_the_squares_of_a_board_have_their_size(board: CharucoBoard, paper: str) -> None:
     page = Page(board_sheet(board, paper).pdf())
     assert (page.width_mm, page.height_mm) == pytest.approx(PAPERS[paper], abs=0.01)
     corners, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv()).detectBoard(page.picture)
@@ -129,7 +129,7 @@ def test_a_tag_has_its_size_and_its_number() -> None:
 
 
 def test_the_line_to_measure_is_100_mm_long_and_says_so() -> None:
-    page = Page(board_sheet(Board(), "A4").pdf())
+    page = Page(board_sheet(CharucoBoard(), "A4").pdf())
     lengths = [np.hypot(x1 - x0, y1 - y0) for x0, y0, x1, y1 in page.lines]
     assert max(lengths) == pytest.approx(100.0, abs=1e-3)
     assert "This line is 100 mm long" in page.text
@@ -139,13 +139,13 @@ def test_the_line_to_measure_is_100_mm_long_and_says_so() -> None:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: board_sheet(Board(20, 20, 15.0, 10.0, "4X4_100"), "A4"), "has 100 markers"),
+        (lambda: board_sheet(CharucoBoard(20, 20, 15.0, 10.0, "4X4_100"), "A4"), "has 100 markers"),
         (
-            lambda: board_sheet(Board(8, 6, 40.0, 30.0), "A4"),
+            lambda: board_sheet(CharucoBoard(8, 6, 40.0, 30.0), "A4"),
             "320 x 240 mm do not fit on A4, which has room for 186 x 239 mm",
         ),
-        (lambda: Board(8, 6, 4.0, 4.0), "smaller than its squares"),
-        (lambda: board_sheet(Board(), "B5"), "There is no paper 'B5'"),
+        (lambda: CharucoBoard(8, 6, 4.0, 4.0), "smaller than its squares"),
+        (lambda: board_sheet(CharucoBoard(), "B5"), "There is no paper 'B5'"),
         (lambda: tag_sheet([TagModel("4X4_50", 7, 0.3)], "A4"), "do not fit on A4"),
     ],
 )

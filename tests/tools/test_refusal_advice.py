@@ -1,4 +1,5 @@
-"""Refusals of `calibrate` name the doctor's first cause, and their advice, followed literally, leads to a calibration."""
+"""Refusals of `calibrate` name the doctor's first cause, and their advice, followed literally, leads to a
+calibration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Recordings: a run is replayed bit for bit, a change of an algorithm is named, and a file can be read wherever it was cut off."""
+"""Recordings: a run is replayed bit for bit, a change of an algorithm is named, and a file can be read wherever it was
+cut off."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The tablet's page in a real browser: where a finger, a pen or a mouse touched is what it writes down, at any pixel ratio."""
+"""The tablet's page in a real browser: where a finger, a pen or a mouse touched is what it writes down, at any pixel
+ratio."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def opened(browser: Browser, ratio: float, target: Path | str = PAGE) -> None:
 
 
 def enter(browser: Browser) -> np.ndarray:
-    """Goes to the landmarks (without full screen, which would undo the pretended pixel ratio); returns them in CSS pixels."""
+    """Goes to the landmarks (without full screen, which would undo the pretended pixel ratio); returns them in CSS
+    pixels."""
     browser.run("document.documentElement.requestFullscreen = undefined; document.getElementById('touch').click()")
     return np.array(browser.run("return layout().points"))
 
@@ -158,14 +160,15 @@ def test_landmarks_that_do_not_fit_cannot_be_shown(browser: Browser) -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (768, 1024)])
 def test_on_a_full_screen_no_button_lies_over_a_landmark(browser: Browser, width: int, height: int) -> None:
-    """A pen that pressed Back instead of the last landmark would end the visit; a ring at the frame is none to the camera."""
+    """A pen that pressed Back instead of the last landmark would end the visit; a ring at the frame is none to the
+    camera."""
     opened(browser, 1.0)
     browser.devtools(
         "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
     )
     browser.run(
-        "const [a, d] = layout().most; document.getElementById('across').value = a; document.getElementById('down').value = d;"
-        "document.getElementById('across').dispatchEvent(new Event('input'))"
+        "const [a, d] = layout().most; document.getElementById('across').value = a;"
+        " document.getElementById('down').value = d;document.getElementById('across').dispatchEvent(new Event('input'))"
     )
     assert "9 landmarks fit" in browser.text()
     assert browser.run("return document.documentElement.scrollWidth") == width

@@ -36,7 +36,8 @@ def _pose(vector: Array, p: Array) -> Array:
 
 
 def pairs(n: int, seed: int, X: Array, noise: float = 1.0) -> tuple[Array, Array, Array]:
-    """Robot poses, camera poses of a target half a metre away, and the target's pose: A X B = Y up to the noise of B."""
+    """Robot poses, camera poses of a target half a metre away, and the target's pose: A X B = Y up to the noise of
+    B."""
     rng = np.random.default_rng(seed)
     B = _pose(0.3 * rng.normal(size=(n, 3)), [0.0, 0.0, 0.5] + 0.05 * rng.normal(size=(n, 3)))
     Y = _pose(rng.normal(size=3), 0.5 * rng.normal(size=3))
@@ -222,7 +223,8 @@ def test_kalibr_states_the_body_in_the_camera_and_the_inverse_is_named(tmp_path:
 
 
 def test_a_result_is_judged_on_pictures_of_a_board(tmp_path: Path) -> None:
-    """Rendered pictures: the true pose is used; one that is 6 mm off is not, and the command that solves anew runs as printed."""
+    """Rendered pictures: the true pose is used; one that is 6 mm off is not, and the command that solves anew runs as
+    printed."""
     drawing = draw.draw_chessboard(9, 6, 20)
     world = draw.world(drawing, 7, 12)
     shots = tmp_path / "shots"
@@ -241,7 +243,8 @@ def test_a_result_is_judged_on_pictures_of_a_board(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("form", ["URDF", "quaternion wxyz first", "matrix txt"])
 def test_a_pose_of_any_file_is_judged_on_scans(form: str, tmp_path: Path) -> None:
-    """The errors at the flange are those of the written pose: none beyond the noise where it is the truth, and 5 mm where it is that far off."""
+    """The errors at the flange are those of the written pose: none beyond the noise where it is the truth, and 5 mm
+    where it is that far off."""
     data = write_scans(tmp_path / "scans", 4, 0)
     medians = {}
     for mm in (0.0, 5.0):

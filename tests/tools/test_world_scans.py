@@ -1,4 +1,5 @@
-"""The world's triggered scanner: on a slow computer the world waits for its scan, and not for a scanner that has stopped."""
+"""The world's triggered scanner: on a slow computer the world waits for its scan, and not for a scanner that has
+stopped."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ from weldcal.tools.emulators.cell.scans import DONE, FRAME_WAITS_S, POSE, SCAN_S
 
 
 class Scanner:
-    """The scanner's end of the pipe: what it says next, what it was told, and for how long (s) the world waited for it."""
+    """The scanner's end of the pipe: what it says next, what it was told, and for how long (s) the world waited for
+    it."""
 
     def __init__(self) -> None:
         self.says: list[str] = []

@@ -1,4 +1,5 @@
-"""The world's streaming scanner: its frames are exposed at its own rate, stamped by its own clock, and arrive after their delay."""
+"""The world's streaming scanner: its frames are exposed at its own rate, stamped by its own clock, and arrive after
+their delay."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Finds the commands: every function under `@command(...)` in the modules of tools/commands and tools/studies.
 
-A module is imported when its command is called. Until then only the text of its decorator is read, so that `weldcal --help` is fast.
+A module is imported when its command is called. Until then only the text of its decorator is read, so that `weldcal
+--help` is fast.
 """
 
 import ast
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from weldcal.tools.cli.options import Command
+from weldcal.tools.cli.options import CliCommand
 
 PACKAGES = ("weldcal.tools.commands", "weldcal.tools.studies", "weldcal.tools.cli")
 """Packages whose modules, at any depth, may hold commands."""
@@ -28,10 +29,10 @@ class Entry:
     hidden: bool
     module: str
 
-    def load(self) -> Command:
+    def load(self) -> CliCommand:
         """The command; imports its module."""
         for value in vars(importlib.import_module(self.module)).values():
-            if isinstance(value, Command) and value.title == self.title:
+            if isinstance(value, CliCommand) and value.title == self.title:
                 return value
         raise LookupError(f"{self.module} does not hold the command '{self.title}' under a name of its own.")
 
@@ -68,7 +69,7 @@ def _known() -> dict[str, Entry]:
     return find_commands()
 
 
-def other_command(title: str) -> Command:
+def other_command(title: str) -> CliCommand:
     """Find a command by its full name, for a command that hands its work on; imports its module.
 
     Raises:

@@ -102,7 +102,8 @@ LIVE = ("browser", "share", "realtime", "robot", *MOTION)
 FARM = ("workers", "scheduler")
 RESULT = ("out", "overwrite", "seed", "json", "debug")
 LOOK = ("json", "debug")
-"""Groups of common options: of arm motion, of a live run, of a study of many tasks, of a command that writes a result, of one that only reads."""
+"""Groups of common options: of arm motion, of a live run, of a study of many tasks, of a command that writes a result,
+of one that only reads."""
 
 
 @dataclass(frozen=True)
@@ -198,11 +199,12 @@ class Call:
 
 
 @dataclass(frozen=True)
-class Command:
+class CliCommand:
     """A command: its full name ("benchmark cell"), the function as Typer takes it, and its body.
 
     Attributes:
-        body: the work as it is written, body(call, own parameters ...) -> Outcome, for a command that hands its work on.
+        body: the work as it is written, body(call, own parameters ...) -> Outcome, for a command that hands its work
+            on.
     """
 
     title: str
@@ -235,17 +237,18 @@ def command(
     options: tuple[str, ...] = (),
     common: tuple[str, ...] = RESULT,
     defaults: Mapping[str, object] | None = None,
-) -> Callable[[Body], Command]:
+) -> Callable[[Body], CliCommand]:
     """Makes a command of a function body(call, own parameters ...) that returns an Outcome, a summary or None.
 
-    The body gets the common options ``options`` and ``common`` through its Call. It runs inside console.boundary, with a
-    progress bar where it reports progress. Its outcome is printed, as JSON if --json is given. The title, ``short_help`` and
-    ``hidden`` are literals: `find_commands` reads them from the module's text. ``short_help`` has at most 56 characters.
+    The body gets the common options ``options`` and ``common`` through its Call. It runs inside console.boundary, with
+    a progress bar where it reports progress. Its outcome is printed, as JSON if --json is given. The title,
+    ``short_help`` and ``hidden`` are literals: `find_commands` reads them from the module's text. ``short_help`` has at
+    most 56 characters.
     """
     names = (*options, *common)
     preset = {name: (defaults or {}).get(name, COMMON[name][1]) for name in names}
 
-    def decorate(body: Body) -> Command:
+    def decorate(body: Body) -> CliCommand:
         def run(**given: Any) -> None:
             _check_numbers(given)
             shared = {name: given.pop(name) for name in names}
@@ -268,7 +271,7 @@ def command(
         parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + shared
         run.__doc__ = body.__doc__
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        return Command(title, run, body)
+        return CliCommand(title, run, body)
 
     return decorate
 

@@ -24,7 +24,8 @@ _PATIENCE_S = 1.0  # for the number of a process that has just created its file
 def claimed(folder: Path, *, overwrite: bool = False, resumes: bool = False) -> Iterator[None]:
     """Keep a result folder for this process within the block.
 
-    A folder of a run that was killed (it holds UNFINISHED) may be written again. Nothing is left of a block that writes nothing.
+    A folder of a run that was killed (it holds UNFINISHED) may be written again. Nothing is left of a block that writes
+    nothing.
 
     Args:
         folder: where the result is written.
@@ -54,7 +55,8 @@ def _require_no_result(folder: Path) -> None:
     found = next((name for name in RESULTS if (folder / name).exists()), None)
     if found is not None:
         raise InputError(
-            f"'{folder}' already holds a result ({found}). Give another folder with --out, or add --overwrite to write over it."
+            f"'{folder}' already holds a result ({found}). Give another folder with --out, or add --overwrite to write"
+            " over it."
         )
 
 
@@ -74,7 +76,8 @@ def _take(mark: Path, folder: Path) -> bool:
                 return False
             if process is not None and _runs(process):
                 raise InputError(
-                    f"Another weldcal (process {process}) writes into '{folder}'. Wait until it has ended, or give another folder with --out."
+                    f"Another weldcal (process {process}) writes into '{folder}'. Wait until it has ended, or give"
+                    " another folder with --out."
                 ) from None
             mark.unlink(missing_ok=True)  # of a process that was killed
             continue

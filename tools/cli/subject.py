@@ -1,4 +1,5 @@
-"""Makes one command of several studies of a subject: `--what WORD` chooses, and each old command stays as a hidden one."""
+"""Makes one command of several studies of a subject: `--what WORD` chooses, and each old command stays as a hidden
+one."""
 
 import copy
 import inspect
@@ -9,7 +10,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin
 import typer
 from typer.models import ArgumentInfo, OptionInfo
 
-from weldcal.tools.cli.options import Body, Call, Command, Outcome, option
+from weldcal.tools.cli.options import Body, Call, CliCommand, Outcome, option
 
 
 class _Parameter(NamedTuple):
@@ -24,7 +25,7 @@ class _Parameter(NamedTuple):
         return "" if isinstance(self.info, ArgumentInfo) else str((self.info.param_decls or (self.info.default,))[0])
 
 
-def one_of(first: str, **studies: Command) -> Callable[[Body], Body]:
+def one_of(first: str, **studies: CliCommand) -> Callable[[Body], Body]:
     """Give a body the options of all its studies, and --what, which chooses one of them:
 
         @command("benchmark doctor", short_help="Measure the doctor.", options=FARM)
@@ -32,8 +33,8 @@ def one_of(first: str, **studies: Command) -> Callable[[Body], Body]:
         def doctor(call: Call) -> None:
             \"\"\"Measure which causes the doctor names.\"\"\"
 
-    Each study is a command of the same module, hidden under its old name. An option of several studies has one type, and
-    the default and the bounds of the chosen study.
+    Each study is a command of the same module, hidden under its old name. An option of several studies has one type,
+    and the default and the bounds of the chosen study.
 
     Args:
         first: the word of the study that runs without --what.

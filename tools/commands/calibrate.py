@@ -61,11 +61,7 @@ _CONFIRMING = 3  # hole circles without which the robot's motion alone does not 
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 
 
-@command(
-    "calibrate",
-    options=(*MOTION, "record"),
-    short_help="Calibrate a scanner from scans, or live in a scenario.",
-)
+@command("calibrate", options=(*MOTION, "record"), short_help="Calibrate a scanner from scans, or live in a scenario.")
 def calibrate(
     call: Call,
     dataset: Annotated[
@@ -80,7 +76,8 @@ def calibrate(
         option(
             "--robot",
             "NAME",
-            "For a dataset: the arm, if dataset.yaml does not name it. Live: simulated, emulated or a controller's address.",
+            "For a dataset: the arm, if dataset.yaml does not name it. Live: simulated, emulated or a controller's"
+            " address.",
         ),
     ] = None,
     flange: FlangeOption = None,
@@ -97,7 +94,8 @@ def calibrate(
         option(
             "--refine",
             "KIND",
-            "Of a dataset: local (a field of what the calibration leaves), joints or links (errors of the arm; needs its joint angles).",
+            "Of a dataset: local (a field of what the calibration leaves), joints or links (errors of the arm; needs"
+            " its joint angles).",
         ),
     ] = None,
     kinematics: Annotated[
@@ -136,14 +134,16 @@ def calibrate(
     if is_motion(dataset):
         if poses is not None or axis_turn is not None or refine is not None or compare:
             raise typer.BadParameter(
-                "--poses, --refine, --axis-turn and --compare are for scans at rest; omit them with a recording in motion"
+                "--poses, --refine, --axis-turn and --compare are for scans at rest; omit them with a recording in"
+                " motion"
             )
         moving = other_command("calibrate-motion").body
         return moving(call, dataset, robot=robot, flange=flange, centres=centres, limit_mm=limit_mm)
     if is_carried(dataset):
         if axis_turn is not None or refine is not None or compare or centres or not scanner_correction:
             raise typer.BadParameter(
-                "--refine, --axis-turn, --compare, --centres and --no-scanner-correction are for a scanner beside the robot; omit them"
+                "--refine, --axis-turn, --compare, --centres and --no-scanner-correction are for a scanner beside the"
+                " robot; omit them"
             )
         carried = other_command("calibrate-carried").body
         return carried(call, dataset, robot=robot, flange=flange, poses=poses, limit_mm=limit_mm)
@@ -193,14 +193,15 @@ def calibrate_dataset(
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
-    ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, uncorrected).
-    ``correct_scanner``: estimate and apply a scanner correction. ``axis_turn_deg``: rotation of the hole pattern about the
-    flange axis; with it, one to three scans that show the holes are enough. ``poses`` ("FROM:TO", ids, either may be left
-    out) takes the scans from one id to another, in the order of the dataset. ``refine``: "local" adds a field of what the calibration
-    leaves, "joints" or "links" errors of the arm (beyond its factory calibration ``kinematics``), each applied where nested held-out
-    errors fall. ``compare`` runs the published method on the
-    same scans, for the report. A cloud that cannot be used is refused and reported, as long as enough remain. Where five scans or more contradict each other only
-    observations.csv is written, for `weldcal doctor`. ``limit_mm`` is the error, at 95 %, that the job allows.
+    ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres,
+    uncorrected). ``correct_scanner``: estimate and apply a scanner correction. ``axis_turn_deg``: rotation of the hole
+    pattern about the flange axis; with it, one to three scans that show the holes are enough. ``poses`` ("FROM:TO",
+    ids, either may be left out) takes the scans from one id to another, in the order of the dataset. ``refine``:
+    "local" adds a field of what the calibration leaves, "joints" or "links" errors of the arm (beyond its factory
+    calibration ``kinematics``), each applied where nested held-out errors fall. ``compare`` runs the published method
+    on the same scans, for the report. A cloud that cannot be used is refused and reported, as long as enough remain.
+    Where five scans or more contradict each other only observations.csv is written, for `weldcal doctor`. ``limit_mm``
+    is the error, at 95 %, that the job allows.
 
     Raises:
         InputError: the data cannot be used; TooFewPoses: too few scans can be used.
@@ -273,14 +274,16 @@ def calibrate_dataset(
         )
     elif turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
         warnings.append(
-            "The poses hardly differ in orientation, so they cannot show a TCP that is set at the robot: it would shift X_BC by its own "
-            "length, and no figure here would tell. Check that the TCP is zero, or tilt the flange in some poses."
+            "The poses hardly differ in orientation, so they cannot show a TCP that is set at the robot: it would shift"
+            " X_BC by its own length, and no figure here would tell. Check that the TCP is zero, or tilt the flange in"
+            " some poses."
         )
     loose = [id for id, fit in fits.items() if not fit.on_grid]
     if loose:
         warnings.append(
-            f"{len(loose)} of {len(fits)} clouds have no pixel grid that could be rebuilt ({', '.join(loose[:3])}): fused, thinned, or not in "
-            "the scanner's frame. Their centres are two to three times less precise; export single scans as the scanner takes them."
+            f"{len(loose)} of {len(fits)} clouds have no pixel grid that could be rebuilt ({', '.join(loose[:3])}):"
+            " fused, thinned, or not in the scanner's frame. Their centres are two to three times less precise; export"
+            " single scans as the scanner takes them."
         )
     if agreement:
         warnings.append(agreement)
@@ -311,12 +314,16 @@ def calibrate_dataset(
         joint_covariance=estimate.joint,
         axis_turn_deg=_axis_turn(inliers, seen.patterns, found.X_rigid) if axis_turn_deg is None else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
-        orientations=orientations_of(inliers, None if data.pairs else data.X_FR)
-        if not data.pairs or all(p.has_orientation for p in data.pairs)
-        else None,
-        observed=observed_document(inliers, RigidTransform() if data.pairs else data.X_FR, _angles(data, inliers))
-        if not data.pairs or all(p.has_orientation for p in data.pairs)
-        else None,
+        orientations=(
+            orientations_of(inliers, None if data.pairs else data.X_FR)
+            if not data.pairs or all(p.has_orientation for p in data.pairs)
+            else None
+        ),
+        observed=(
+            observed_document(inliers, RigidTransform() if data.pairs else data.X_FR, _angles(data, inliers))
+            if not data.pairs or all(p.has_orientation for p in data.pairs)
+            else None
+        ),
         arm_errors=None if refined is None else refined.arm,
         kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
         software=software_version(),
@@ -364,8 +371,8 @@ def _refinement(
         return replace(steps, refine=kind)
     if robot not in known_arms():
         raise InputError(
-            f"Errors of the arm (--refine {kind}) are written as Universal Robots' kinematics: name one of {', '.join(known_arms())} with "
-            "--robot, or use --refine local."
+            f"Errors of the arm (--refine {kind}) are written as Universal Robots' kinematics: name one of"
+            f" {', '.join(known_arms())} with --robot, or use --refine local."
         )
     arm = load_chain(robot, kinematics)
     ids = [o.id for o in observations]
@@ -376,15 +383,16 @@ def _refinement(
 
 
 def _unconfirmed(inliers: list[Observation], seed: int) -> list[str]:
-    """A sentence where the robot's motion alone asks for a correction of the scanner: many programs could not apply it, and without it
-    X_BC would be off by what it takes over."""
+    """A sentence where the robot's motion alone asks for a correction of the scanner: many programs could not apply it,
+    and without it X_BC would be off by what it takes over."""
     asked, verdict = estimate_jointly(inliers, config=SolveConfig(seed=seed, allow_coplanar=True))
     if verdict is None or verdict.accepted is None:
         return []
     left = 1e3 * float(np.nanmean(asked.held_out.position_m))
     return [
-        f"The scanner is not corrected: the robot's motion asks for a scale of {1e2 * (verdict.accepted.scale - 1.0):+.2f} %, with which the "
-        f"held-out errors would be {left:.3f} mm (mean), but fewer than {_CONFIRMING} scans show the flange's hole circle to confirm it."
+        "The scanner is not corrected: the robot's motion asks for a scale of"
+        f" {1e2 * (verdict.accepted.scale - 1.0):+.2f} %, with which the held-out errors would be {left:.3f} mm (mean),"
+        f" but fewer than {_CONFIRMING} scans show the flange's hole circle to confirm it."
     ]
 
 
@@ -398,7 +406,8 @@ def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]], start: ArmStart | None) -> None:
-    """Requires one usable scan; where others were refused, four (then more can be taken), or two that the visible arm confirms.
+    """Requires one usable scan; where others were refused, four (then more can be taken), or two that the visible arm
+    confirms.
 
     Raises:
         InputError, TooFewPoses: there are fewer.
@@ -420,8 +429,9 @@ def _enough(observations: list[Observation], refused: list[tuple[str, str]], sta
 def _axis_turn(
     inliers: list[Observation], patterns: dict[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float] | None:
-    """Rotation of the hole pattern about the flange axis and its spread over the scans (deg), for later use as axis_turn_deg;
-    None where fewer than four scans show it. From uncorrected scans, as in a calibration from one scan."""
+    """Rotation of the hole pattern about the flange axis and its spread over the scans (deg), for later use as
+    axis_turn_deg; None where fewer than four scans show it. From uncorrected scans, as in a calibration from one
+    scan."""
     seen = [o for o in inliers if o.id in patterns and patterns[o.id].turn_known]
     if len(seen) < ENOUGH:
         return None
@@ -447,9 +457,11 @@ def _pose_records(
                 used=bool(estimate.inliers[k]),
                 reason=reasons.pop(o.id, ""),
                 residual_mm=float(1e3 * estimate.position_residuals_m[k]),
-                held_out_mm=float(1e3 * estimate.held_out.position_m[k])
-                if np.isfinite(estimate.held_out.position_m[k])
-                else None,
+                held_out_mm=(
+                    float(1e3 * estimate.held_out.position_m[k])
+                    if np.isfinite(estimate.held_out.position_m[k])
+                    else None
+                ),
                 tilt_deg=tilt if np.isfinite(tilt) else None,
                 held_out_tilt_deg=held_tilt if np.isfinite(held_tilt) else None,
             )

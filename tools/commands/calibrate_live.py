@@ -14,10 +14,7 @@ from weldcal.tools.commands.weld import run_calibration_live
 
 
 @command(
-    "calibrate-live",
-    hidden=True,
-    options=(*MOTION, "record"),
-    short_help="Calibrate a scanner live in a scenario.",
+    "calibrate-live", hidden=True, options=(*MOTION, "record"), short_help="Calibrate a scanner live in a scenario."
 )
 def calibrate_live(
     call: Call,

@@ -1,4 +1,5 @@
-"""`weldcal calibrate DATASET` on a recording in motion: estimates X_BC and the scanner's clock, writes exports and a report."""
+"""`weldcal calibrate DATASET` on a recording in motion: estimates X_BC and the scanner's clock, writes exports and a
+report."""
 
 import time
 from dataclasses import replace
@@ -66,11 +67,12 @@ def calibrate_motion(
     limit_mm: float | None = None,
 ) -> MotionReport:
     """Calibrate from a recording in motion, of a scanner beside the robot that sees the flange or of one on the flange
-    (eye_in_hand) that sees a fixed target of the flange's shape, and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
+    (eye_in_hand) that sees a fixed target of the flange's shape, and write ``calibration.yaml``, exports and
+    ``report.html`` to ``out``.
 
-    ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, with the capture time).
-    A frame that cannot be used is refused and reported. No scanner correction is estimated: a stream through a few places cannot
-    tell it from the clock. Nothing is written unless the calibration succeeded.
+    ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, with the
+    capture time). A frame that cannot be used is refused and reported. No scanner correction is estimated: a stream
+    through a few places cannot tell it from the clock. Nothing is written unless the calibration succeeded.
 
     Raises:
         InputError: the data cannot be used, or the motion leaves X_BC open; TooFewPoses: too few frames can be used.
@@ -98,8 +100,8 @@ def calibrate_motion(
     shown = data.stream.poses[:: max(1, len(data.stream.poses) // _MOST_TURNED)]
     if not data.in_hand and turn_deg([RigidTransform(X) for X in shown]) < _TURN_DEG:
         warnings.append(
-            "The orientation hardly changes, so the motion cannot show a TCP that is set at the robot: it would shift X_BC by its own "
-            "length. Check that the TCP is zero, or tilt the flange on the way."
+            "The orientation hardly changes, so the motion cannot show a TCP that is set at the robot: it would shift"
+            " X_BC by its own length. Check that the TCP is zero, or tilt the flange on the way."
         )
     used = estimate.inliers
     result = CalibrationResult(
@@ -157,9 +159,11 @@ def _reasons(frames: ObservedFrames, estimate: MotionEstimate) -> list[tuple[str
     return [
         (
             id,
-            f"It disagrees by {1e3 * r:.1f} mm with the other frames; it is not used."
-            if np.isfinite(r)
-            else "The robot's stream has no data for its time; it is not used.",
+            (
+                f"It disagrees by {1e3 * r:.1f} mm with the other frames; it is not used."
+                if np.isfinite(r)
+                else "The robot's stream has no data for its time; it is not used."
+            ),
         )
         for id, keep, r in zip(frames.ids, estimate.inliers, estimate.residual_m, strict=True)
         if not keep

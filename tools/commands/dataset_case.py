@@ -1,4 +1,5 @@
-"""Makes the doctor's case of a dataset, the poses as stated and what the scans show of the flange, and writes it beside a result."""
+"""Makes the doctor's case of a dataset, the poses as stated and what the scans show of the flange, and writes it beside
+a result."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.calibration.doctor.readings import FEWEST
 from weldcal.calibration.doctor.record import NAME, case_of, case_text
@@ -23,7 +24,7 @@ _NAMED_ALREADY = ("scanner moved", "TCP set at the controller", "unexplained", "
 """Causes that the solver names itself, or that are none."""
 
 
-def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> Case:
+def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> DoctorCase:
     """What a dataset shows of the flange, as the doctor examines it."""
     X_BC, guess = data.X_BC_guess, data.header.scanner_guess
     try:
@@ -46,7 +47,7 @@ def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard
     )
 
 
-def write_case(folder: Path, case: Case) -> None:
+def write_case(folder: Path, case: DoctorCase) -> None:
     """Write what was seen of the flange beside a result, for `weldcal doctor`."""
     write_apart(folder / NAME, case_text(case))
 
@@ -55,9 +56,11 @@ def write_case(folder: Path, case: Case) -> None:
 def examined_where_refused(
     out: Path, data: Dataset, seen: FlangeObservations, standard: FlangeStandard, seed: int
 ) -> Iterator[None]:
-    """Writes the case to ``out`` where the block refuses five scans or more, and lets the error go on, with the doctor's first cause.
+    """Writes the case to ``out`` where the block refuses five scans or more, and lets the error go on, with the
+    doctor's first cause.
 
-    Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be wrong.
+    Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be
+    wrong.
     """
     try:
         yield
@@ -72,13 +75,16 @@ def examined_where_refused(
         raise
 
 
-def _name_cause(problem: WeldcalError, case: Case) -> None:
+def _name_cause(problem: WeldcalError, case: DoctorCase) -> None:
     """Adds the doctor's first cause to the sentence, with its evidence and remedy, unless the sentence names it."""
     causes = worded("", diagnose(case), most=1).causes
     if not causes or causes[0].name in _NAMED_ALREADY:
         return
     cause = causes[0]
     problem.args = (
-        f"{problem} The likely cause is: {cause.name} ({100.0 * cause.confidence:.0f} %). {cause.evidence} {cause.next}",
+        (
+            f"{problem} The likely cause is: {cause.name} ({100.0 * cause.confidence:.0f} %). {cause.evidence}"
+            f" {cause.next}"
+        ),
         *problem.args[1:],
     )

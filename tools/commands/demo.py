@@ -10,13 +10,7 @@ from weldcal.systems.jobs.discovery import job_of
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import (
-    Call,
-    Outcome,
-    ScenarioArgument,
-    ScenarioOption,
-    command,
-)
+from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
 from weldcal.tools.commands.motion_live import run_motion_live
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.profiler.live import run_profiler_live
@@ -32,7 +26,8 @@ DEMO_SCENARIO = "s_groove"
 
 @command("demo", options=RECORDED, short_help="Run the complete job in simulation and write a report.")
 def demo(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = DEMO_SCENARIO) -> Outcome:
-    """Run the complete job: calibrate, verify, scan the workpiece, plan, weld, retract. A report is written at the end."""
+    """Run the complete job: calibrate, verify, scan the workpiece, plan, weld, retract. A report is written at the
+    end."""
     options = run_options(call, "demo", named_once(name, scenario, DEMO_SCENARIO))
     found = run_procedure(options, call.progress)
     return Outcome(found.summary(), first=getattr(found, "first", None))
@@ -69,7 +64,8 @@ def run_procedure(options: RunOptions, progress: Progress) -> RunResult:
     """Run a scenario's job; for a job without a command, only its state and a recording are written.
 
     Raises:
-        InputError, UnreachableScanner, RobotRefused: the scenario or the options cannot be run; nothing has been written.
+        InputError, UnreachableScanner, RobotRefused: the scenario or the options cannot be run; nothing has been
+            written.
     """
     scenario = load_scenario(options.scenario)
     return RUNNERS.get(kind_of(scenario), run_any)(scenario, options, progress)

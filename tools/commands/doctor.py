@@ -1,4 +1,5 @@
-"""`weldcal doctor`: names what disturbs a calibration or a weld, with the evidence and the next step, from a result, a recording or a dataset."""
+"""`weldcal doctor`: names what disturbs a calibration or a weld, with the evidence and the next step, from a result, a
+recording or a dataset."""
 
 import json
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.doctor.diagnose import Cause, Diagnosis, diagnose
 from weldcal.calibration.doctor.record import NAME, read_case
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
@@ -53,7 +54,8 @@ def doctor(
 
 
 def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: Progress = no_progress) -> DoctorReport:
-    """Name the causes in a result folder (or its calibration.yaml), a recording.mcap or a dataset folder; nothing is written.
+    """Name the causes in a result folder (or its calibration.yaml), a recording.mcap or a dataset folder; nothing is
+    written.
 
     Raises:
         InputError: nothing there can be examined.
@@ -77,7 +79,8 @@ def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: P
         return worded("result", Diagnosis(of_weld, 0, float("nan")))
     if (folder / CALIBRATION).is_file():
         raise InputError(
-            f"'{folder}' was written before results kept what was seen of the flange. Calibrate again, or give the dataset's folder."
+            f"'{folder}' was written before results kept what was seen of the flange. Calibrate again, or give the"
+            " dataset's folder."
         )
     return worded("dataset", diagnose_dataset(folder, flange, seed, progress))
 
@@ -130,7 +133,7 @@ def _found_in(data: Dataset, ids: Sequence[str], standard: FlangeStandard) -> li
 
 def _recorded(path: Path, progress: Progress) -> Diagnosis:
     """Replay a recording, and examine what its calibration saw and its weld felt."""
-    cases: list[Case] = []
+    cases: list[DoctorCase] = []
     reasons: list[str] = []
 
     def look(cell: Cell[Any], root: Context) -> None:
@@ -156,7 +159,8 @@ def _both(found: Diagnosis, more: tuple[Cause, ...]) -> Diagnosis:
 
 
 def weld_causes(record: WeldRecord | None, reason: str) -> tuple[Cause, ...]:
-    """A hidden tag and a worn tip, from the log; another reason of a hold as it was given ("": the run was not held)."""
+    """A hidden tag and a worn tip, from the log; another reason of a hold as it was given ("": the run was not
+    held)."""
     causes = []
     blind = 0.0 if record is None else blind_s(record)
     if "Tag hidden" in reason or (not reason and blind > PICTURE_S):

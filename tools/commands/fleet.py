@@ -15,7 +15,7 @@ from weldcal.tools.commands.verify import verify_dataset
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.first_screen import CARE
-from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Cell, Checked, FleetReport, fleet_report, held_out_mm
+from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, FleetCell, FleetReport, fleet_report, held_out_mm
 from weldcal.tools.report.render import write_atomic
 
 HEADER = "dataset.yaml"
@@ -40,8 +40,8 @@ def fleet(
         ),
     ] = None,
 ) -> Outcome:
-    """Calibrate every dataset, verify each cell's first calibration on its later datasets, and write one page: which cells
-    drift, and which need a visit."""
+    """Calibrate every dataset, verify each cell's first calibration on its later datasets, and write one page: which
+    cells drift, and which need a visit."""
     find_cells(folder)
     out = call.folder("fleet", folder.resolve().name)
     report = run_fleet(folder, Farm.of(out, call.given, call.progress), limit_mm=limit_mm, seed=call.seed)
@@ -56,11 +56,12 @@ def fleet(
 
 
 def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: int = 0) -> FleetReport:
-    """Calibrate every dataset and verify each cell's first calibration on its later datasets; write report.html and fleet.json.
+    """Calibrate every dataset and verify each cell's first calibration on its later datasets; write report.html and
+    fleet.json.
 
-    A folder with dataset.yaml is a dataset. Datasets in one folder below ``folder`` are of one cell, the oldest first by
-    name; a dataset directly in ``folder`` is a cell by itself. A second run with the same output folder does only what is
-    missing.
+    A folder with dataset.yaml is a dataset. Datasets in one folder below ``folder`` are of one cell, the oldest first
+    by name; a dataset directly in ``folder`` is a cell by itself. A second run with the same output folder does only
+    what is missing.
 
     Raises:
         InputError: no dataset is there.
@@ -82,8 +83,12 @@ def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: 
             first = out / "calibrations" / cell / made[0]
             into = out / "verifications" / cell / name
             tasks[_key(cell, name)] = {
-                "result": str(first), "dataset": str(datasets[name]), "out": str(into), "limit_mm": limit_mm, "seed": seed,
-            }  # fmt: skip
+                "result": str(first),
+                "dataset": str(datasets[name]),
+                "out": str(into),
+                "limit_mm": limit_mm,
+                "seed": seed,
+            }
     verifications = _step(farm, "verifications").run(verify_one, tasks) if tasks else {}
     checked = {
         cell: [_checked(cell, name, calibrations, verifications) for name in datasets]
@@ -96,7 +101,8 @@ def run_fleet(folder: Path, farm: Farm, *, limit_mm: float | None = None, seed: 
 
 
 def find_cells(folder: Path) -> dict[str, dict[str, Path]]:
-    """Datasets by cell and name, sorted: a cell is the folder that holds its datasets, or a dataset directly in ``folder``.
+    """Datasets by cell and name, sorted: a cell is the folder that holds its datasets, or a dataset directly in
+    ``folder``.
 
     Raises:
         InputError: there is none, or ``folder`` is one dataset itself.
@@ -167,7 +173,7 @@ def judge_fleet(cells: Mapping[str, Sequence[Checked]], out: Path) -> FleetRepor
     return FleetReport(tuple(judged), out)
 
 
-def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> Cell:
+def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> FleetCell:
     """Judge a cell by its newest dataset, its history, and the fleet's usual held-out error (mm)."""
     newest = datasets[-1]
     since = _refuted_since(datasets)
@@ -194,7 +200,7 @@ def judge_cell(name: str, datasets: tuple[Checked, ...], usual_mm: float) -> Cel
     else:
         reason, then = _smaller_signs(newest, usual_mm)
         state = LOOK if reason else FINE
-    return Cell(name=name, datasets=datasets, state=state, reason=reason, next=then, since=since, trend=trend)
+    return FleetCell(name=name, datasets=datasets, state=state, reason=reason, next=then, since=since, trend=trend)
 
 
 def _smaller_signs(newest: Checked, usual_mm: float) -> tuple[str, str]:

@@ -30,8 +30,8 @@ from weldcal.calibration.hand_eye.pictures.sets import PictureSet, read_pictures
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult, solve_pictures
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.motion.pose_streams import Synchronised, are_trajectories, is_stream_file, synchronise_lists
-from weldcal.calibration.planning.next_pose import View, next_pose, view_of
+from weldcal.calibration.motion.pose_streams import ClockOffset, are_trajectories, is_stream_file, synchronise_lists
+from weldcal.calibration.planning.next_pose import VisibleVolume, next_pose, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
@@ -86,7 +86,8 @@ BoardOption = Annotated[
     option(
         "--board",
         "BOARD",
-        f"Calibrate from pictures of this board, lengths in mm: {', '.join(FORMS.values())}. COLSxROWS of a chessboard are inner corners.",
+        f"Calibrate from pictures of this board, lengths in mm: {', '.join(FORMS.values())}. COLSxROWS of a chessboard"
+        " are inner corners.",
     ),
 ]
 IntrinsicsOption = Annotated[
@@ -219,13 +220,15 @@ def run_hand_eye(
     intrinsics: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> HandEyeReport:
-    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved. Writes report.html besides the exports.
+    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved. Writes report.html
+    besides the exports.
 
-    ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the scanner, for
-    the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and robot errors is applied:
-    the robot's errors are sought in the poses that the corners left); ``kinematics``: file of that robot's own kinematics, whose poses
-    at the joint angles replace the stated ones. ``limit_mm`` is the held-out error at the target, 95 %, that the job allows. ``board``: the board in
-    the pictures of the folder ``file``, see ``parse_board``; ``intrinsics``: the file that states their camera.
+    ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the
+    scanner, for the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and
+    robot errors is applied: the robot's errors are sought in the poses that the corners left); ``kinematics``: file of
+    that robot's own kinematics, whose poses at the joint angles replace the stated ones. ``limit_mm`` is the held-out
+    error at the target, 95 %, that the job allows. ``board``: the board in the pictures of the folder ``file``, see
+    ``parse_board``; ``intrinsics``: the file that states their camera.
 
     Raises:
         InputError, WeldcalError: the file or the options cannot be used. Where the poses contradict each other, the
@@ -341,7 +344,7 @@ def run_hand_eye(
     return report
 
 
-def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> Synchronised | None:
+def _trajectories(path: Path, mounting: str | None, stated: StatedForms) -> ClockOffset | None:
     """The pairs of two recordings in motion of a folder; None where it holds none."""
     if not path.is_dir() or (path / "pairs.npz").exists():
         return None
@@ -381,9 +384,12 @@ def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, option
     return refined
 
 
-def _no_advice(view: View, arm: Chain | None) -> str:
+def _no_advice(view: VisibleVolume, arm: Chain | None) -> str:
     reach = "" if arm is None else f" and within reach of {arm.name}"
-    return f"No further pose near those so far is visible{reach} (view: {view.source}). Move to a region with a better view."
+    return (
+        f"No further pose near those so far is visible{reach} (view: {view.source}). Move to a region with a better"
+        " view."
+    )
 
 
 def digest(path: Path) -> str:
@@ -404,7 +410,8 @@ def understood(pairs: PosePairs) -> list[str]:
         out = len(found["left_out"])  # type: ignore[arg-type]
         left = f", {out} left out" if out else ""
         lines.append(
-            f"{who:<7}{found['file']}: {found['rows']} poses{left}, {found['form']}, read as {found['reading']} in {found['unit']}"
+            f"{who:<7}{found['file']}: {found['rows']} poses{left}, {found['form']}, read as {found['reading']} in"
+            f" {found['unit']}"
         )
     return [*lines, *pairs.notes]
 
@@ -453,7 +460,8 @@ def solve_arrays(
     far = float(np.median(np.linalg.norm(robot[:, :3, 3], axis=1)))
     if far > FARTHEST_M:
         raise InputError(
-            f"The robot's positions have a median of {far:.4g} from the base: they must be metres. Divide millimetres by 1000."
+            f"The robot's positions have a median of {far:.4g} from the base: they must be metres. Divide millimetres"
+            " by 1000."
         )
     stated = replace(stated_forms(None, None, robot_form, camera_form), unit="m")
     lists = [listing_of_array(name, X) for name, X in (("robot", robot), ("camera", camera))]

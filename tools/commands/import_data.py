@@ -1,4 +1,5 @@
-"""`weldcal import SOURCE... --out FOLDER`: writes poses, pairs or scans of any form as a dataset in weldcal's own form."""
+"""`weldcal import SOURCE... --out FOLDER`: writes poses, pairs or scans of any form as a dataset in weldcal's own
+form."""
 
 import os
 import shutil
@@ -44,7 +45,8 @@ _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True)
 class Imported:
-    """What was written and understood: `kind` (pairs or scans), `count`, the four lines, the files, and how each list was read."""
+    """What was written and understood: `kind` (pairs or scans), `count`, the four lines, the files, and how each list
+    was read."""
 
     kind: str
     count: int
@@ -73,7 +75,10 @@ def import_(
         list[Path],
         typer.Argument(
             metavar="SOURCE...",
-            help="A file or folder with both lists of poses, two files (robot's and camera's), or a folder with scans (docs/datasets.md).",
+            help=(
+                "A file or folder with both lists of poses, two files (robot's and camera's), or a folder with scans"
+                " (docs/datasets.md)."
+            ),
             show_default=False,
         ),
     ],
@@ -134,7 +139,8 @@ def import_pose_pairs(
         who: f"{found['file']}: {found['form']}, {found['rows']} poses in {found['unit']}, read as {found['reading']}"
         for who, found in pairs.reading.items()
     }
-    left = [f"{who} {why}" for who, found in pairs.reading.items() for why in found["left_out"]]  # type: ignore[attr-defined]
+    readings = pairs.reading.items()
+    left = [f"{who} {why}" for who, found in readings for why in found["left_out"]]  # type: ignore[attr-defined]
     lines["pairs"] = f"{len(ids)}, {pairs.mode if known else 'mounting not stated'}"
     lines["left out"] = _some(left)
     if pairs.notes:
@@ -143,7 +149,8 @@ def import_pose_pairs(
 
 
 def _read(sources: list[Path], mounting: str | None, unit: str | None, stated: StatedForms) -> tuple[PosePairs, bool]:
-    """The pairs, and whether their mounting is known; without one the reading must be the same in both mountings that agree."""
+    """The pairs, and whether their mounting is known; without one the reading must be the same in both mountings that
+    agree."""
 
     def read(mode: str | None) -> PosePairs:
         if len(sources) == 1:
@@ -188,7 +195,8 @@ def _read(sources: list[Path], mounting: str | None, unit: str | None, stated: S
 
 
 def import_scans(source: Path, out: Path, *, flange: str | None = None, mounting: str | None = None) -> Imported:
-    """Write scans of a flange with their poses as dataset.yaml, poses.csv and clouds/ (linked where possible, else copied).
+    """Write scans of a flange with their poses as dataset.yaml, poses.csv and clouds/ (linked where possible, else
+    copied).
 
     Raises:
         InputError: they cannot be read; with poses in several possible readings, the flange is not known.
@@ -202,7 +210,8 @@ def import_scans(source: Path, out: Path, *, flange: str | None = None, mounting
     if len(data.readings) > 1:
         if not name:
             raise InputError(
-                "The poses can be read in several ways, and the scans choose. Name the flange: --flange iso9409-1-50-4-m6."
+                "The poses can be read in several ways, and the scans choose. Name the flange: --flange"
+                " iso9409-1-50-4-m6."
             )
         data = see_flanges(data, get_flange(name), holes=False).data or data
     header = replace(

@@ -1,4 +1,5 @@
-"""`weldcal monitor FOLDER --calibration RESULT`: tracks the flange through a recording in motion and tests for drift."""
+"""`weldcal monitor FOLDER --calibration RESULT`: tracks the flange through a recording in motion and tests for
+drift."""
 
 import json
 import time
@@ -17,7 +18,7 @@ from weldcal.calibration.data.results import CalibrationResult, export_all, load
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.motion.drift.background import background_move
 from weldcal.calibration.motion.drift.sequential import MOVED, DriftConfig, DriftEvent
-from weldcal.calibration.motion.drift.watch import Watched, watch
+from weldcal.calibration.motion.drift.watch import DriftHistory, watch
 from weldcal.calibration.motion.frames import observed_frames, see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
@@ -34,7 +35,7 @@ from weldcal.tools.cli.options import LIVE, Call, FlangeOption, Outcome, command
 from weldcal.tools.commands.monitor_body import see_link
 from weldcal.tools.commands.run import JobRun, run_job, run_options
 from weldcal.tools.console import Progress
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
 from weldcal.tools.report.monitor import MonitorReport, drift_document, monitor_page
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
@@ -51,8 +52,11 @@ def monitor(
         str,
         typer.Argument(
             metavar="FOLDER",
-            help="A recording in motion: dataset.yaml (mode: motion), stream.csv, frames.csv, clouds/. Or a scenario whose scanner "
-            "streams, by name or YAML file: it is watched live.",
+            help=(
+                "A recording in motion: dataset.yaml (mode: motion), stream.csv, frames.csv, clouds/. Or a scenario"
+                " whose scanner "
+                "streams, by name or YAML file: it is watched live."
+            ),
         ),
     ],
     calibration: Annotated[
@@ -76,9 +80,11 @@ def monitor(
     ] = None,
     record: Annotated[bool, switch("--record", "Live: also write what streams as a recording.")] = False,
 ) -> Outcome:
-    """Track the flange through a recording, or live, and test the calibration: has the scanner moved, when, by how much, which way.
+    """Track the flange through a recording, or live, and test the calibration: has the scanner moved, when, by how
+    much, which way.
 
-    Times are on the robot's clock. Translation and rotation are those of the scanner about its own origin, in the robot's base.
+    Times are on the robot's clock. Translation and rotation are those of the scanner about its own origin, in the
+    robot's base.
     """
 
     if _is_scenario(recording):
@@ -122,7 +128,9 @@ def _outcome(summary: dict[str, Any], moves: Sequence[Any], first: FirstScreen) 
     shown = ("verdict", "cause", "rms_mm", "rms_before_synchronisation_mm", "frames", "dropped", "delay_ms")
     values = {key: summary[key] for key in shown if key in summary}
     rows = {
-        f"{e.kind} at {e.time_s:.2f} s": f"{d['translation_mm']:.3f} mm, {d['rotation_deg']:.4f} deg, found at {e.found_s:.2f} s"
+        f"{e.kind} at {e.time_s:.2f} s": (
+            f"{d['translation_mm']:.3f} mm, {d['rotation_deg']:.4f} deg, found at {e.found_s:.2f} s"
+        )
         for e, d in zip(moves, summary["drift"], strict=True)
     }
     return Outcome(summary, values=values, rows=rows, first=first)
@@ -141,12 +149,14 @@ def monitor_recording(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> MonitorReport:
-    """Watch a calibration (its folder or calibration.yaml) over a recording in motion; write report.html and monitor.json.
+    """Watch a calibration (its folder or calibration.yaml) over a recording in motion; write report.html and
+    monitor.json.
 
-    The clock's offset is estimated from the recording itself; the calibration's is used where the recording does not show it.
-    ``flange`` overrides dataset.yaml. ``body`` is a link that is tracked instead of the flange, by its mesh or, with ``fused``, by a
-    model made from the first scans. With ``recalibrate`` the pose that the frames since the last change show is written to
-    ``out``/recalibrated. Raises InputError: the result or the recording cannot be used; TooFewPoses: no frames show the flange.
+    The clock's offset is estimated from the recording itself; the calibration's is used where the recording does not
+    show it. ``flange`` overrides dataset.yaml. ``body`` is a link that is tracked instead of the flange, by its mesh
+    or, with ``fused``, by a model made from the first scans. With ``recalibrate`` the pose that the frames since the
+    last change show is written to ``out``/recalibrated. Raises InputError: the result or the recording cannot be used;
+    TooFewPoses: no frames show the flange.
     """
     started = time.monotonic()
     tell: Progress = progress or (lambda stage, fraction: None)
@@ -219,9 +229,10 @@ def rate_checked(false_alarms_per_hour: float) -> None:
 
 
 def recalibrated_result(
-    result: CalibrationResult, watched: Watched, hashes: dict[str, str], flange: str, seed: int
+    result: CalibrationResult, watched: DriftHistory, hashes: dict[str, str], flange: str, seed: int
 ) -> CalibrationResult:
-    """The calibration as it is at the end of a watch, from all frames since the last change and the calibration before it."""
+    """The calibration as it is at the end of a watch, from all frames since the last change and the calibration before
+    it."""
     held = 1e3 * np.linalg.norm(watched.after[~watched.gross & (watched.rows.times >= watched.since_s)], axis=1)
     errors = {"median": float(np.median(held)), "mean": float(held.mean()), "p95": float(np.percentile(held, 95.0))}
     return replace(
@@ -241,7 +252,7 @@ def recalibrated_result(
     )
 
 
-def told_apart(e: DriftEvent, watched: Watched, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
+def told_apart(e: DriftEvent, watched: DriftHistory, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
     """The event with its cause, where what stands still in the scans before and after it tells."""
     if e.kind != MOVED or e.since_start:
         return e
@@ -262,12 +273,14 @@ def told_apart(e: DriftEvent, watched: Watched, data: MotionDataset, result: Cal
     return e if found is None or found.cause is None else replace(e, cause=found.cause)
 
 
-def causes(watched: Watched) -> str:
+def causes(watched: DriftHistory) -> str:
     """What the data tell of the cause, over all events."""
     return "; ".join(dict.fromkeys(e.cause for e in watched.events))
 
 
-def _warnings(result: CalibrationResult, data: MotionDataset, watched: Watched, refused: int, flange: str) -> list[str]:
+def _warnings(
+    result: CalibrationResult, data: MotionDataset, watched: DriftHistory, refused: int, flange: str
+) -> list[str]:
     h, out = data.header, []
     for what, was, now in (
         ("robot", result.robot, h.robot),
@@ -316,7 +329,7 @@ class LiveMonitor:
             found = Findings(against=held or ["No frame showed the flange."], unseen=0)
             after = Next("See that the scanner streams and sees the flange, then watch again.")
             return FirstScreen(
-                found, Expected("error of the tracked flange, 95 %", "not known", "no frame showed it"), after
+                found, ExpectedError("error of the tracked flange, 95 %", "not known", "no frame showed it"), after
             )
         first = self.report.first
         if not held:
@@ -364,8 +377,8 @@ def monitored_scenario(name: str, calibration: Path, frames: int | None, false_a
     scanner = scenario.scanner_config()
     if scanner is None or scanner.stream_delay_s() is None:
         raise InputError(
-            f"The scanner of '{name}' does not stream, so that nothing can be watched: write scanner: !StreamingScanner {{}} in the scenario, "
-            "or give a recording."
+            f"The scanner of '{name}' does not stream, so that nothing can be watched: write scanner: !StreamingScanner"
+            " {} in the scenario, or give a recording."
         )
     job = scenario.part(MotionJob) or MotionJob()
     scenario.motion = job  # type: ignore[attr-defined]
@@ -387,11 +400,12 @@ def monitor_live(
     recalibrate: bool = False,
     record: bool = False,
 ) -> LiveMonitor:
-    """Watch a calibration while the arm moves through the scenario's cube; write report.html, monitor.json and the 3D recording.
+    """Watch a calibration while the arm moves through the scenario's cube; write report.html, monitor.json and the 3D
+    recording.
 
-    The DriftMonitor in the cell tests every frame as it comes. At the end all frames are tested again with the clock that they
-    show together, as on a recording. ``record`` also writes what streamed as a recording, by whose still background a moved
-    base is told from a moved scanner. Raises as run_job and load_result; nothing has moved.
+    The DriftMonitor in the cell tests every frame as it comes. At the end all frames are tested again with the clock
+    that they show together, as on a recording. ``record`` also writes what streamed as a recording, by whose still
+    background a moved base is told from a moved scanner. Raises as run_job and load_result; nothing has moved.
     """
     started = time.monotonic()
     result = load_result(calibration)
@@ -441,7 +455,9 @@ def monitor_live(
     return outcome
 
 
-def watched_record(result: CalibrationResult, record: MotionRecord, finished: JobRun, config: DriftConfig) -> Watched:
+def watched_record(
+    result: CalibrationResult, record: MotionRecord, finished: JobRun, config: DriftConfig
+) -> DriftHistory:
     """What all frames of a run say together."""
     cell, root = finished.cell, finished.run.root
     added: AddedMotion = cell.job

@@ -1,4 +1,5 @@
-"""Watches a link of the arm instead of its flange: by the mesh of its description, or by a model fused from the scans."""
+"""Watches a link of the arm instead of its flange: by the mesh of its description, or by a model fused from the
+scans."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,13 +30,20 @@ _MARGIN_M = 0.005
 
 
 def see_link(
-    data: MotionDataset, result: CalibrationResult, standard: FlangeStandard, link: str, *, fused: bool, seed: int,
+    data: MotionDataset,
+    result: CalibrationResult,
+    standard: FlangeStandard,
+    link: str,
+    *,
+    fused: bool,
+    seed: int,
     tell: Callable[[float], None],
-) -> tuple[ObservedFrames, ContinuousMotion, RigidTransform, list[tuple[str, str]]]:  # fmt: skip
+) -> tuple[ObservedFrames, ContinuousMotion, RigidTransform, list[tuple[str, str]]]:
     """Observations of a link, its motion by the robot, the place of the observed point on it, and frames without it.
 
-    With ``fused`` the surface is made from the first frames with the robot's own poses, at the times that the flange tells.
-    Raises InputError: the arm or its link is not known, its stream does not say where the link is, or the link does not show.
+    With ``fused`` the surface is made from the first frames with the robot's own poses, at the times that the flange
+    tells. Raises InputError: the arm or its link is not known, its stream does not say where the link is, or the link
+    does not show.
     """
     robot = data.header.robot or result.robot
     if robot not in known_arms():
@@ -55,9 +63,14 @@ def see_link(
 
 
 def _fused(
-    data: MotionDataset, result: CalibrationResult, standard: FlangeStandard, arm: ArmModel, index: int,
-    motion: ContinuousMotion, seed: int,
-) -> tuple[BodyModel, float]:  # fmt: skip
+    data: MotionDataset,
+    result: CalibrationResult,
+    standard: FlangeStandard,
+    arm: ArmModel,
+    index: int,
+    motion: ContinuousMotion,
+    seed: int,
+) -> tuple[BodyModel, float]:
     """The link's model from the first frames, and the delay of those."""
     first = replace(data, frames=data.frames[:_FUSED])
     flange = ContinuousMotion(data.stream)

@@ -1,4 +1,5 @@
-"""Runs the motion job: calibrates a streaming scanner and its clock live, writes the result, and compares it with the truth."""
+"""Runs the motion job: calibrates a streaming scanner and its clock live, writes the result, and compares it with the
+truth."""
 
 import json
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.calibration import error_summary
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, after_hold
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
 from weldcal.tools.report.motion_calibration import motion_screen
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
@@ -44,7 +45,8 @@ class MotionOutcome:
         return self.options.out
 
     def true_captures(self) -> dict[int, float]:
-        """True capture times (s) of the frames by number, on the clock of the robot's stream; empty where no simulation knows them.
+        """True capture times (s) of the frames by number, on the clock of the robot's stream; empty where no simulation
+        knows them.
 
         A drawn arm that follows an emulated controller is behind it: a frame then shows where that arm was before.
         """
@@ -67,15 +69,21 @@ class MotionOutcome:
         e, run = self.estimate, self.run
         against = [run.reason or "The job was held."] if run.held else []
         if e is None:
-            expected = Expected("error in the middle of the frames, 95 %", "not known", "there is no calibration")
+            expected = ExpectedError("error in the middle of the frames, 95 %", "not known", "there is no calibration")
             found = Findings(against=against or ["There is no calibration."], unseen=0)
             return FirstScreen(found, expected, after_hold(run.ended_by_operator), more={"pose": "none was found"})
         seen = self.record.seen
         p_C = np.array([fit.center_C for _, fit in seen])
         return motion_screen(
-            calibration_result(self, e), e, p_C, self.record.refused, self.folder, None, against,
+            calibration_result(self, e),
+            e,
+            p_C,
+            self.record.refused,
+            self.folder,
+            None,
+            against,
             "No scenario key states the error that is allowed: compare it with what your job allows.",
-        )  # fmt: skip
+        )
 
     def truth(self) -> dict[str, object]:
         """Errors against the simulation: X_BC at the cube's centre, and the clock's offset (mean over the frames)."""
@@ -106,24 +114,31 @@ class MotionOutcome:
         run, e = self.run, self.estimate
         taken, dropped = run.cell.job.counts(run.root)
         found: dict[str, object] = {
-            "state": "held" if run.held else "done", "mode": "motion", "scenario": self.options.scenario,
-            "seed": self.options.seed, "robot": self.finished.robot, "frames": taken, "dropped": dropped,
+            "state": "held" if run.held else "done",
+            "mode": "motion",
+            "scenario": self.options.scenario,
+            "seed": self.options.seed,
+            "robot": self.finished.robot,
+            "frames": taken,
+            "dropped": dropped,
             "n_seen": len(self.record.seen),
             "refused": [{"id": i, "reason": t} for i, t in self.record.refused],
             "wait_ms": {"median": _ms(self.record.waits_s, 50), "p95": _ms(self.record.waits_s, 95)},
-        }  # fmt: skip
+        }
         if run.reason:
             found["reason"] = run.reason
         if e is not None:
             c = e.clock
             found |= {
-                "X_BC": e.X_BC.GetAsMatrix4().tolist(), "covariance": e.covariance.tolist(), "clock": c.kind,
+                "X_BC": e.X_BC.GetAsMatrix4().tolist(),
+                "covariance": e.covariance.tolist(),
+                "clock": c.kind,
                 "clock_offset_ms": None if c.offset_s is None else 1e3 * c.offset_s,
                 "clock_offset_sigma_ms": None if c.sigma_s is None else 1e3 * c.sigma_s,
                 "held_out_mm": error_summary(1e3 * e.held_out_m[e.inliers]),
                 "rms_mm": 1e3 * float(np.sqrt(np.mean(e.residual_m[e.inliers] ** 2))),
                 "truth": self.truth(),
-            }  # fmt: skip
+            }
         return found | run.timing()
 
 
@@ -132,7 +147,8 @@ def _ms(values: tuple[float, ...], percentile: float) -> float | None:
 
 
 def follower_delay(t: Array, joints: Array, record: MotionRecord) -> float:
-    """How long (s) after the robot's stream an arm (n, 6) rad at times (n,) s is where that says, from all joints in motion."""
+    """How long (s) after the robot's stream an arm (n, 6) rad at times (n,) s is where that says, from all joints in
+    motion."""
     stream = record.stream("")
     assert stream.joints is not None
     inside = (t > stream.time[0]) & (t < stream.time[-1])
@@ -142,7 +158,8 @@ def follower_delay(t: Array, joints: Array, record: MotionRecord) -> float:
 
 
 def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MotionOutcome:
-    """Run the job; write calibration.yaml with its exports, report.html, run.json and the recordings. Raises as run_job."""
+    """Run the job; write calibration.yaml with its exports, report.html, run.json and the recordings. Raises as
+    run_job."""
     job = scenario.part(MotionJob)
     if job is not None and job.record:
         job.recording_folder = str(options.out / "recording")
@@ -161,10 +178,14 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
         assert scanner is not None
         added.recorder.finish(stream, scenario.arm, scenario.flange_name(), scanner.scanner())
     page = render(
-        "motion_live.html.j2", first=outcome.first, scenario=options.scenario, description=scenario.description,
-        rows=[(k, str(v)) for k, v in console_rows(outcome.summary()).items() if v], recording=finished.meshcat is not None,
+        "motion_live.html.j2",
+        first=outcome.first,
+        scenario=options.scenario,
+        description=scenario.description,
+        rows=[(k, str(v)) for k, v in console_rows(outcome.summary()).items() if v],
+        recording=finished.meshcat is not None,
         **robot_timing(finished.run),
-    )  # fmt: skip
+    )
     write_atomic(options.out / "report.html", page)
     write_atomic(options.out / "run.json", json.dumps(outcome.summary(), indent=1) + "\n")
     finished.write_recording(options.out)

@@ -107,8 +107,8 @@ def run_mounting_live(scenario: Scenario, options: RunOptions, progress: Progres
 
 
 def write_mounting(report: MountingReport, finished: JobRun | None = None) -> None:
-    """Write hand_eye.yaml with its exports, sightings.csv, summary.txt and report.html; of a live run also scenario.yaml, scans/ (a dataset
-    for `weldcal calibrate`), station.png and recording.html."""
+    """Write hand_eye.yaml with its exports, sightings.csv, summary.txt and report.html; of a live run also
+    scenario.yaml, scans/ (a dataset for `weldcal calibrate`), station.png and recording.html."""
     folder, picture = report.folder, None
     source, text = "dataset.yaml", ""
     if report.run is not None:
@@ -169,7 +169,8 @@ def calibrate_carried(
     limit_mm: float | None = None,
     progress: Progress = no_progress,
 ) -> RecordedMounting:
-    """Calibrate a scanner that an arm carries from a dataset with scans at rest, as the live job does, and write the result to ``out``.
+    """Calibrate a scanner that an arm carries from a dataset with scans at rest, as the live job does, and write the
+    result to ``out``.
 
     ``robot``, ``flange`` override dataset.yaml; ``poses``, ``limit_mm``: see calibrate_dataset.
 
@@ -204,9 +205,15 @@ def calibrate_carried(
         raise TooFewPoses(_too_few(data, scene, joints, circle, len(seen), refused))
     progress("cross-validating", 0.8)
     report = recorded_report(
-        scene, seen, tuple(refused.items()), limit_mm=limit_mm, started=started, folder=out,
-        source=Path(folder).name, digest=json.dumps(data.hashes, sort_keys=True),
-    )  # fmt: skip
+        scene,
+        seen,
+        tuple(refused.items()),
+        limit_mm=limit_mm,
+        started=started,
+        folder=out,
+        source=Path(folder).name,
+        digest=json.dumps(data.hashes, sort_keys=True),
+    )
     write_mounting(report)
     return report
 
@@ -226,13 +233,14 @@ def _too_few(
             found = see_circle(data.cloud(id), scene, id, *joints[id], replace(circle, guess_radius_m=_WIDER_M))
             off, turn = off_prediction(scene, found, None)
             return (
-                f"{begin} In '{id}' a circle lies {1e3 * off:.0f} mm and {np.degrees(turn):.0f} degrees from where dataset.yaml "
-                f"expects it. Correct scanner_guess or configuration, or write radius_m: {_WIDER_M} in scanner_guess."
+                f"{begin} In '{id}' a circle lies {1e3 * off:.0f} mm and {np.degrees(turn):.0f} degrees from where"
+                f" dataset.yaml expects it. Correct scanner_guess or configuration, or write radius_m: {_WIDER_M} in"
+                " scanner_guess."
             )
     why = "; ".join(f"{id}: {text}" for id, text in list(refused.items())[:3])
     return (
-        f"{begin} {f'Refused: {why}' if why else ''} Record more scans that show the whole circle, or check configuration and "
-        "scanner_guess in dataset.yaml."
+        f"{begin} {f'Refused: {why}' if why else ''} Record more scans that show the whole circle, or check"
+        " configuration and scanner_guess in dataset.yaml."
     )
 
 
@@ -249,12 +257,24 @@ def recorded_report(
     result = solve_mounting(scene, seen, folds=5)
     sigma, within = expected_error(scene, result)
     status = MountingStatus(
-        sequence=len(seen) + len(refused), seen=tuple(seen), refused=refused, result=result, sigma_work_m=sigma, error_95_m=within
-    )  # fmt: skip
+        sequence=len(seen) + len(refused),
+        seen=tuple(seen),
+        refused=refused,
+        result=result,
+        sigma_work_m=sigma,
+        error_95_m=within,
+    )
     seconds = 0.0 if started is None else time.monotonic() - started
     return RecordedMounting(
-        run=None, result=result, seconds=seconds, robot="recorded", recorded=status, place=scene, limit_mm=limit_mm, **more
-    )  # fmt: skip
+        run=None,
+        result=result,
+        seconds=seconds,
+        robot="recorded",
+        recorded=status,
+        place=scene,
+        limit_mm=limit_mm,
+        **more,
+    )
 
 
 def recorded_scene(data: Dataset, robot: str, flange: str) -> tuple[MountingScene, Circle]:
@@ -262,11 +282,13 @@ def recorded_scene(data: Dataset, robot: str, flange: str) -> tuple[MountingScen
     header, guess = data.header, data.X_BC_guess
     if robot not in known_arms():
         raise InputError(
-            f"The arm '{robot}' is not known. Name one of {', '.join(known_arms())} as robot in dataset.yaml, or with --robot."
+            f"The arm '{robot}' is not known. Name one of {', '.join(known_arms())} as robot in dataset.yaml, or with"
+            " --robot."
         )
     if guess is None or header.scanner_guess is None:
         raise InputError(
-            "dataset.yaml has no scanner_guess: measure the scanner's pose on what carries it, to 15 mm and 2 degrees, and add it."
+            "dataset.yaml has no scanner_guess: measure the scanner's pose on what carries it, to 15 mm and 2 degrees,"
+            " and add it."
         )
     on_arm = header.configuration.startswith("eye_on_arm")
     if on_arm and header.scanner_link not in LINKS[:-1]:
@@ -275,8 +297,9 @@ def recorded_scene(data: Dataset, robot: str, flange: str) -> tuple[MountingScen
         )
     if header.scanner_link and not on_arm:
         raise InputError(
-            f"dataset.yaml has scanner_link: {header.scanner_link}, but with the configuration {header.configuration} the "
-            f"flange carries the scanner. Remove scanner_link, or write a configuration that begins with eye_on_arm."
+            f"dataset.yaml has scanner_link: {header.scanner_link}, but with the configuration {header.configuration}"
+            " the flange carries the scanner. Remove scanner_link, or write a configuration that begins with"
+            " eye_on_arm."
         )
     second = header.second_robot
     if (second is not None) != (header.configuration == "co_manipulation"):
@@ -302,13 +325,15 @@ def recorded_scene(data: Dataset, robot: str, flange: str) -> tuple[MountingScen
 
 
 def recorded_joints(data: Dataset, scene: MountingScene) -> dict[str, tuple[Array, Array | None]]:
-    """Joint angles of both arms by id: they lead the arm as drawn to the stated poses. Raises InputError where that is not possible."""
+    """Joint angles of both arms by id: they lead the arm as drawn to the stated poses. Raises InputError where that is
+    not possible."""
     given, second, found = data.joints(), data.joints(SECOND_JOINTS) if scene.two else {}, {}
     on_arm = scene.link not in (BASE, FLANGE)
     if (on_arm and not given) or (scene.two and not second):
         names = SECOND_JOINTS if scene.two else JOINTS
         raise InputError(
-            f"poses.csv needs the joint angles {names[0]} to {names[-1]} (rad): the pose of the flange alone does not say where the scanner is."
+            f"poses.csv needs the joint angles {names[0]} to {names[-1]} (rad): the pose of the flange alone does not"
+            " say where the scanner is."
         )
     near = scene.q_home
     for id, X_BF in data.poses.items():
@@ -317,13 +342,14 @@ def recorded_joints(data: Dataset, scene: MountingScene) -> dict[str, tuple[Arra
         if q is None or reached is None or not reached.IsNearlyEqualTo(X_BF, _SAME):
             if on_arm:
                 raise InputError(
-                    f"The joint angles of '{id}' do not lead the {scene.arm.name} to its stated pose. Check the robot's name, radians, and that the "
-                    "TCP is zero."
+                    f"The joint angles of '{id}' do not lead the {scene.arm.name} to its stated pose. Check the robot's"
+                    " name, radians, and that the TCP is zero."
                 )
             q = nearest_solution(scene.arm, X_BF, near if q is None else q)
         if q is None:
             raise InputError(
-                f"The {scene.arm.name} does not reach the stated pose of '{id}'. Check the robot's name, the unit, and that the TCP is zero."
+                f"The {scene.arm.name} does not reach the stated pose of '{id}'. Check the robot's name, the unit, and"
+                " that the TCP is zero."
             )
         near = q
         found[id] = (q, second.get(id))
@@ -335,7 +361,8 @@ def _pose(X: RigidTransform) -> tuple[list[float], list[float]]:
 
 
 def _observations(report: MountingReport) -> str:
-    """The rows of sightings.csv, one per scan: joints (deg), centre (mm) and normal in the camera frame, visible share of the edge."""
+    """The rows of sightings.csv, one per scan: joints (deg), centre (mm) and normal in the camera frame, visible share
+    of the edge."""
     two = report.scene.two
     joints = [f"q{i}_deg" for i in range(1, 7)] + ([f"second_q{i}_deg" for i in range(1, 7)] if two else [])
     columns = ["id", *joints, *(f"centre_{a}_mm" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "coverage"]

@@ -1,7 +1,8 @@
 """`weldcal mutate`: change the formulas of `tests/mutations.txt` one by one; the closest tests must fail.
 
-A stated list, and no tool that makes mutations up (cosmic-ray, mutmut): those make thousands of a file, with the same tests for each,
-days of computing, and most survivors change nothing that matters. Here every line is a formula that a result depends on.
+A stated list, and no tool that makes mutations up (cosmic-ray, mutmut): those make thousands of a file, with the same
+tests for each, days of computing, and most survivors change nothing that matters. Here every line is a formula that a
+result depends on.
 """
 
 import itertools
@@ -63,7 +64,8 @@ class Mutation:
 
 
 def read_mutations(text: str) -> tuple[Mutation, ...]:
-    """The mutations of a list: "file: tests" at the margin, then for each an indented reason, "- text", "+ replacement".
+    """The mutations of a list: "file: tests" at the margin, then for each an indented reason, "- text", "+
+    replacement".
 
     Raises:
         InputError: a line has another form.
@@ -171,7 +173,8 @@ def mutate(
     only: Annotated[str, option("--only", "TEXT", "Mutations whose file or reason holds TEXT.")] = "",
     jobs: Annotated[int, option("--jobs", "N", "Copies of the project that are tested side by side.", min=1)] = 1,
 ) -> Outcome:
-    """Apply each mutation of tests/mutations.txt to a copy of the project and run its closest tests, which must fail."""
+    """Apply each mutation of tests/mutations.txt to a copy of the project and run its closest tests, which must
+    fail."""
     chosen = [m for m in read_mutations(LIST.read_text()) if only in f"{m.file} {m.reason}"]
     if not chosen:
         raise InputError(f"No mutation's file or reason holds '{only}'; see {LIST}.")

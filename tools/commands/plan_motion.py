@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.data.results import load_result
-from weldcal.calibration.motion.expected import Expected, expected_of_motion
+from weldcal.calibration.motion.expected import PredictedSigma, expected_of_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.moves import closed_moves, recorded_stream
 from weldcal.models.arrays import Array
@@ -73,8 +73,8 @@ def _line(p: dict[str, float | None]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Planned:
-    """A motion and what it is expected to tell, one sigma; infinite where it shows nothing. ``cost_mm`` is the error of a point on a
-    part in motion. ``corners_deg`` are the joint angles of a cube's corners, empty for a stream."""
+    """A motion and what it is expected to tell, one sigma; infinite where it shows nothing. ``cost_mm`` is the error of
+    a point on a part in motion. ``corners_deg`` are the joint angles of a cube's corners, empty for a stream."""
 
     name: str
     error_mm: float
@@ -98,10 +98,10 @@ def plan_motions(
 ) -> dict[str, object]:
     """Compare motions and write plan.json, and best.script with the moves of the best cube, to ``out``.
 
-    The motions are ``streams``, tables as stream.csv that the robot's program has written without a scanner; without any, cubes
-    about the scenario's centre, of several sizes and leans, whose moves are free. ``calibration`` tells where the scanner stands,
-    else the scenario's guess. ``seconds`` is how long the scanner streams, ``device`` whether its frames have device times.
-    Raises InputError: no motion can be planned, or a file cannot be read.
+    The motions are ``streams``, tables as stream.csv that the robot's program has written without a scanner; without
+    any, cubes about the scenario's centre, of several sizes and leans, whose moves are free. ``calibration`` tells
+    where the scanner stands, else the scenario's guess. ``seconds`` is how long the scanner streams, ``device`` whether
+    its frames have device times. Raises InputError: no motion can be planned, or a file cannot be read.
     """
     loaded = load_scenario(scenario)
     X_BC = loaded.calibration.mounting_guess.pose() if calibration is None else load_result(calibration).X_BC
@@ -162,7 +162,7 @@ def _of_cubes(
     return found
 
 
-def _planned(name: str, told: Expected, corners: tuple[tuple[float, ...], ...] = ()) -> Planned:
+def _planned(name: str, told: PredictedSigma, corners: tuple[tuple[float, ...], ...] = ()) -> Planned:
     cost = float(np.hypot(told.work_m, _SPEED_M_S * told.offset_s))
     return Planned(
         name=name,

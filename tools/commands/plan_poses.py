@@ -1,4 +1,5 @@
-"""`weldcal plan-poses`: the poses whose scans tell most of camera, scanner and arm together, for `calibrate --refine`."""
+"""`weldcal plan-poses`: the poses whose scans tell most of camera, scanner and arm together, for `calibrate
+--refine`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,7 +36,8 @@ def plan_poses(
     scans: Annotated[int, option("--scans", "N", "Number of scans.", min=12)] = 20,
     kind: Annotated[str, option("--kind", "KIND", "The refinement that they are for: links or joints.")] = "links",
 ) -> Outcome:
-    """Choose flange poses that the arm reaches and the scanner sees, and write them as a table and URScript. Nothing moves."""
+    """Choose flange poses that the arm reaches and the scanner sees, and write them as a table and URScript. Nothing
+    moves."""
 
     found = plan_refining_poses(
         scenario, call.folder("plan-poses", scenario), scans=scans, kind=kind, seed=call.seed, progress=call.progress
@@ -53,10 +55,12 @@ def plan_refining_poses(
     seed: int = 0,
     progress: Progress = lambda stage, fraction: None,
 ) -> dict[str, object]:
-    """Choose ``scans`` poses of a scenario's arm before its scanner (at its guess); write poses.csv, poses.script and plan.json to ``out``.
+    """Choose ``scans`` poses of a scenario's arm before its scanner (at its guess); write poses.csv, poses.script and
+    plan.json to ``out``.
 
-    poses.csv is the table of a dataset with the joint angles as planned; replace them by those that the robot reports at each scan. Nothing
-    moves. Raises InputError: an unknown ``kind``, fewer scans than `--refine` needs, or a cell in which no such poses exist.
+    poses.csv is the table of a dataset with the joint angles as planned; replace them by those that the robot reports
+    at each scan. Nothing moves. Raises InputError: an unknown ``kind``, fewer scans than `--refine` needs, or a cell in
+    which no such poses exist.
     """
     if kind not in KINDS:
         raise InputError(f"There is no refinement '{kind}' of an arm; choose one of {', '.join(KINDS)}.")

@@ -37,8 +37,8 @@ def replay(
 ) -> Outcome:
     """Run today's algorithms on what a recorded cell saw, and compare all that they did, bit for bit.
 
-    The state is "identical", or "differs" with the first value that is another one; then the exit code is 1. A recording that was
-    cut off is replayed to its end.
+    The state is "identical", or "differs" with the first value that is another one; then the exit code is 1. A
+    recording that was cut off is replayed to its end.
     """
     found = replay_recording(recording / RECORDING if recording.is_dir() else recording, call.progress)
     summary = found.summary()
@@ -61,7 +61,8 @@ def replay(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
-    """A finished replay: seconds of the recording that were replayed, how many values were compared, and what differs by port.
+    """A finished replay: seconds of the recording that were replayed, how many values were compared, and what differs
+    by port.
 
     X_BC (4,4): the calibration that the replay has found, or None. cut_off: the file ends before its run.
     """

@@ -1,4 +1,5 @@
-"""Runs the job of a scenario for all commands: selects the robot, builds the cell, opens the viewer, records and advances it."""
+"""Runs the job of a scenario for all commands: selects the robot, builds the cell, opens the viewer, records and
+advances it."""
 
 import dataclasses as dc
 import json
@@ -31,7 +32,7 @@ from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.person import Person, person_at
 from weldcal.systems.recording.port_recorder import ENTERED, LEFT
 from weldcal.systems.recording.scenario_files import packed
-from weldcal.systems.recording.tap import Layout, OpenSink
+from weldcal.systems.recording.tap import OpenSink, PortLayout
 from weldcal.systems.recording.values import encode
 from weldcal.systems.recording.writer import RecordingWriter
 from weldcal.systems.runner import Progress, Run, run_cell
@@ -42,10 +43,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.viewer.kept import free_unused
 from weldcal.systems.viewer.live import LiveView
 from weldcal.tools import console
-from weldcal.tools.cli.options import (
-    LIVE,
-    Call,
-)
+from weldcal.tools.cli.options import LIVE, Call
 from weldcal.tools.connections import guard
 from weldcal.tools.dashboard.facts import facts_of
 from weldcal.tools.dashboard.recording import with_overlay
@@ -89,7 +87,8 @@ def named_once(name: str | None, scenario: str, preset: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class JobRun:
-    """A completed run, done or held; its recording viewer, or None; the name of its robot; what was shown of it, or None."""
+    """A completed run, done or held; its recording viewer, or None; the name of its robot; what was shown of it, or
+    None."""
 
     run: Run[Any]
     meshcat: Meshcat | None
@@ -97,7 +96,8 @@ class JobRun:
     live: LiveView | None = None
 
     def share(self, done: float) -> float:
-        """The completed share while results are written: ``done`` of a completed run; a held one keeps what it had reached."""
+        """The completed share while results are written: ``done`` of a completed run; a held one keeps what it had
+        reached."""
         return self.run.share if self.run.held else done
 
     @property
@@ -118,7 +118,8 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
     """Build the cell and run its job to the end; `key` is the key of the required job, None: any job.
 
     Raises:
-        InputError: the scenario has another job. UnreachableScanner, RobotRefused: see chosen_robot and build_cell; nothing has been written or moved.
+        InputError: the scenario has another job. UnreachableScanner, RobotRefused: see chosen_robot and build_cell;
+            nothing has been written or moved.
     """
     found = job_of(scenario).key
     if key and found != key:
@@ -174,8 +175,8 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
 def _one_thread() -> Iterator[None]:
     """Let NumPy and OpenCV use one thread for the duration of the block.
 
-    The products of a tick and the finger camera's pictures are small: a second thread waits busily for the next one and takes a
-    core from the robot's peer.
+    The products of a tick and the finger camera's pictures are small: a second thread waits busily for the next one and
+    takes a core from the robot's peer.
     """
     import cv2
     from threadpoolctl import threadpool_limits
@@ -191,7 +192,8 @@ def _one_thread() -> Iterator[None]:
 
 @contextmanager
 def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> Iterator[DashboardSource | None]:
-    """Serve the run's page for the duration of the block, and open it in the browser; None where no viewer is wanted."""
+    """Serve the run's page for the duration of the block, and open it in the browser; None where no viewer is
+    wanted."""
     if meshcat is None or not options.browser:
         yield None
         return
@@ -215,7 +217,8 @@ def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> 
 
 
 def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTransform) -> None:
-    """Set the background and the viewer's camera; everything is drawn in B, and shown as the base stands in the world."""
+    """Set the background and the viewer's camera; everything is drawn in B, and shown as the base stands in the
+    world."""
     if not X_WB.IsExactlyIdentity():
         meshcat.SetTransform("/drake", X_WB)
         camera, target = camera + X_WB.translation(), X_WB @ target
@@ -241,8 +244,8 @@ def chosen_robot(
     """Set `scenario.robot` by the option's value for the duration of the block.
 
     Args:
-        word: `simulated`; `emulated`, on a loopback address of its own, or `emulated@ADDRESS`; the address of a controller;
-            None: the scenario's own.
+        word: `simulated`; `emulated`, on a loopback address of its own, or `emulated@ADDRESS`; the address of a
+            controller; None: the scenario's own.
         scenario: its `robot` is replaced.
         dry_run: read the robot's state, then run with a simulated arm that has its kinematics and configuration.
         pace: controller seconds per second of the wall clock; other than 1 only for an emulated controller.
@@ -331,12 +334,16 @@ def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
     """Read the kinematics and configuration of a controller's arm; nothing is written, sent or moved.
 
     Raises:
-        RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the operator action.
+        RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the
+            operator action.
     """
     report = preflight(
-        config.host, upper_registers=config.upper_registers, nominal=nominal_arm(scenario), load=config.load(),
+        config.host,
+        upper_registers=config.upper_registers,
+        nominal=nominal_arm(scenario),
+        load=config.load(),
         set_points=config.set_points,
-    )  # fmt: skip
+    )
     require_ready(report)
     assert report.arm is not None
     assert report.arm_q is not None
@@ -355,7 +362,7 @@ class RunRecorder:
         """See build_cell."""
         return self._open
 
-    def _open(self, station: Station, layout: Layout) -> RecordingWriter:
+    def _open(self, station: Station, layout: PortLayout) -> RecordingWriter:
         sizes = {ENTERED: layout.entered, LEFT: layout.left}
         about = {
             "sizes": json.dumps(sizes),

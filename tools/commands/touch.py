@@ -1,4 +1,4 @@
-"""Judges a calibration by points that the robot's tip touched: from a table, or by the touch job of a scenario; for `verify`."""
+"""Judge a calibration by points that the tip touched, from a table or by a scenario's touch job; for `verify`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +13,10 @@ from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.report.files import csv_text, write_json
+from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.touch import TouchReport, touch_page
@@ -23,7 +25,8 @@ TABLE = "touches.csv"
 
 
 def verify_touches(result: Path, touches: Path, out: Path) -> TouchReport:
-    """Judge a calibration (its folder or calibration.yaml) by a table of touches; write report.html, touch_errors.csv and touch.json to ``out``.
+    """Judge a calibration (its folder or calibration.yaml) by a table of touches; write report.html, touch_errors.csv
+    and touch.json to ``out``.
 
     Raises:
         InputError: the result, the table or the output folder cannot be used; nothing is written.
@@ -38,9 +41,16 @@ def verify_touches(result: Path, touches: Path, out: Path) -> TouchReport:
     report = TouchReport(judge_touches(calibration, read, kinematics), out, calibration)
     f = report.found
     rows = [
-        (f.ids[k], f.features[k], f"{1e3 * f.error_m[k]:.4f}", f"{1e3 * f.limit_m[k]:.4f}", int(f.inside[k]), f"{1e3 * f.relative_m[k]:.4f}")
+        (
+            f.ids[k],
+            f.features[k],
+            f"{1e3 * f.error_m[k]:.4f}",
+            f"{1e3 * f.limit_m[k]:.4f}",
+            int(f.inside[k]),
+            f"{1e3 * f.relative_m[k]:.4f}",
+        )
         for k in range(len(f.ids))
-    ]  # fmt: skip
+    ]
     write_atomic(
         out / "touch_errors.csv", csv_text(("id", "feature", "error_mm", "limit_mm", "inside", "relative_mm"), rows)
     )
@@ -115,3 +125,35 @@ def run_touches(scenario: Scenario, options: RunOptions, progress: Progress) -> 
     found = LiveTouches(options, "held" if run.held else "done", run.reason or "", report, run.timing())
     write_json(out / "touch.json", found.summary())
     return found
+
+
+def touches_outcome(call: Call, result: Path, touches: Path) -> Outcome:
+    """What `weldcal verify --touch` prints of points in a file."""
+    report = verify_touches(result, touches, call.folder("verify", touches.resolve().stem))
+    verdict = report.verdict
+    return Outcome(
+        report.summary(),
+        values={},
+        rows={name: text for name, text in report.rows.items() if name != "verdict"},
+        first=report.first,
+        problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
+    )
+
+
+def live_touches_outcome(call: Call, result: Path, scenario: str, robot: str, points: int) -> Outcome:
+    """What `weldcal verify --scenario` prints of points that its robot touches."""
+    options = RunOptions(
+        scenario=scenario, out=call.folder("verify", scenario), seed=call.seed, robot=robot, **call.live
+    )
+    found = run_touches(touching(scenario, result, points), options, call.progress)
+    report, problem = found.report, ""
+    if found.state == "held":
+        problem = found.reason
+    elif report is not None and report.verdict.verdict == DO_NOT:
+        problem = f"The verdict is: {DO_NOT}. {report.verdict.reason}"
+    return Outcome(
+        found.summary(),
+        rows={} if report is None else report.rows,
+        problem=problem,
+        first=None if report is None else report.first,
+    )

@@ -52,8 +52,8 @@ _EVIDENT = 4.0  # standard errors of a scale error that is worth naming
 
 
 _UNCORRECTED = (
-    "The result's scanner correction is not applied, as requested. Its X_BC belongs to corrected points, so these are the "
-    "errors of a program that does not correct its scans."
+    "The result's scanner correction is not applied, as requested. Its X_BC belongs to corrected points, so these are"
+    " the errors of a program that does not correct its scans."
 )
 
 
@@ -74,7 +74,10 @@ def verify(
     dataset: Annotated[
         Path | None,
         typer.Argument(
-            help="Scans: a folder with poses and clouds, or pairs.csv. Or pairs of poses or pictures, as hand-eye reads (docs/datasets.md)."
+            help=(
+                "Scans: a folder with poses and clouds, or pairs.csv. Or pairs of poses or pictures, as hand-eye reads"
+                " (docs/datasets.md)."
+            )
         ),
     ] = None,
     touch: Annotated[
@@ -122,33 +125,52 @@ def verify(
 ) -> Outcome:
     """Verify a calibration on scans, pairs of poses or pictures that it did not use: a verdict, and the error of each.
 
-    Scans of the flange give position error and tilt at the flange. Pairs of robot and camera poses, or pictures of a board
-    (--board), give the error of any stated pose of a camera.
-    With --touch or --scenario: by points that the tip touched, each against the stated 95 % region. The exit code is 1 where the verdict is "do not use".
+    Scans of the flange give position error and tilt at the flange. Pairs of robot and camera poses, or pictures of a
+    board (--board), give the error of any stated pose of a camera. With --touch or --scenario: by points that the tip
+    touched, each against the stated 95 % region. The exit code is 1 where the verdict is "do not use".
     """
     if sum(given is not None for given in (dataset, touch, scenario)) != 1:
         raise typer.BadParameter(
             "give a folder of new scans, touched points (--touch FILE) or a cell (--scenario NAME)"
         )
+    if touch is not None or scenario is not None:
+        from weldcal.tools.commands.touch import live_touches_outcome, touches_outcome
     if scenario is not None:
-        return _touched_live(call, result, scenario, robot, points)
+        return live_touches_outcome(call, result, scenario, robot, points)
     if touch is not None or dataset is None:
         assert touch is not None
-        return _by_touch(call, result, touch)
+        return touches_outcome(call, result, touch)
     of_pairs = {
-        "--mounting": mounting, "--unit": unit, "--robot-poses": robot_poses, "--camera-poses": camera_poses,
-        "--robot-form": robot_form, "--camera-form": camera_form, "--intrinsics": intrinsics,
-    }  # fmt: skip
+        "--mounting": mounting,
+        "--unit": unit,
+        "--robot-poses": robot_poses,
+        "--camera-poses": camera_poses,
+        "--robot-form": robot_form,
+        "--camera-form": camera_form,
+        "--intrinsics": intrinsics,
+    }
     if board is not None or not holds_scans(dataset):
         paired = verify_on_pairs(
-            result, dataset, call.folder("verify", dataset.resolve().stem), mounting=mounting, unit=unit, pose=pose, limit_mm=limit_mm,
-            board=board, intrinsics=intrinsics, stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form), seed=call.seed,
-        )  # fmt: skip
+            result,
+            dataset,
+            call.folder("verify", dataset.resolve().stem),
+            mounting=mounting,
+            unit=unit,
+            pose=pose,
+            limit_mm=limit_mm,
+            board=board,
+            intrinsics=intrinsics,
+            stated=stated_forms(robot_poses, camera_poses, robot_form, camera_form),
+            seed=call.seed,
+        )
         settled = paired.verdict
         return Outcome(
-            paired.summary(), values={}, rows=paired.rows(), first=paired.first,
+            paired.summary(),
+            values={},
+            rows=paired.rows(),
+            first=paired.first,
             problem=f"The verdict is: {settled.verdict}. {settled.reason}" if settled.verdict == DO_NOT else "",
-        )  # fmt: skip
+        )
     surplus = next((name for name, value in of_pairs.items() if value is not None), None)
     if surplus is not None:
         raise typer.BadParameter(f"{surplus} is for pairs of poses, and '{dataset.name}' holds scans of a flange")
@@ -173,41 +195,6 @@ def verify(
     )
 
 
-def _by_touch(call: Call, result: Path, touches: Path) -> Outcome:
-    from weldcal.tools.commands.touch import verify_touches
-
-    report = verify_touches(result, touches, call.folder("verify", touches.resolve().stem))
-    verdict = report.verdict
-    return Outcome(
-        report.summary(),
-        values={},
-        rows={name: text for name, text in report.rows.items() if name != "verdict"},
-        first=report.first,
-        problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
-    )
-
-
-def _touched_live(call: Call, result: Path, scenario: str, robot: str, points: int) -> Outcome:
-    from weldcal.tools.commands.touch import run_touches, touching
-    from weldcal.tools.report.run import RunOptions
-
-    options = RunOptions(
-        scenario=scenario, out=call.folder("verify", scenario), seed=call.seed, robot=robot, **call.live
-    )
-    found = run_touches(touching(scenario, result, points), options, call.progress)
-    report, problem = found.report, ""
-    if found.state == "held":
-        problem = found.reason
-    elif report is not None and report.verdict.verdict == DO_NOT:
-        problem = f"The verdict is: {DO_NOT}. {report.verdict.reason}"
-    return Outcome(
-        found.summary(),
-        rows={} if report is None else report.rows,
-        problem=problem,
-        first=None if report is None else report.first,
-    )
-
-
 def verify_dataset(
     result: Path,
     dataset: Path,
@@ -220,12 +207,14 @@ def verify_dataset(
     limit_mm: float | None = None,
     pose: str | None = None,
 ) -> VerifyReport:
-    """Verify a calibration (its folder or calibration.yaml, or any file with a pose) on a dataset folder; write verification.json and report.html.
+    """Verify a calibration (its folder or calibration.yaml, or any file with a pose) on a dataset folder; write
+    verification.json and report.html.
 
     Errors are taken at the flange centre, in the base, after the result's scanner correction. A scan in which no flange
     is found is named and not used. Without ``correct_scanner`` the result's correction is not applied. ``flange``
-    overrides dataset.yaml; the fits follow ``seed``. ``limit_mm`` of the new scans' median replaces the one that follows from what
-    the calibration states. ``pose`` names the pose in a file of several. Nothing is written unless at least one scan can be used.
+    overrides dataset.yaml; the fits follow ``seed``. ``limit_mm`` of the new scans' median replaces the one that
+    follows from what the calibration states. ``pose`` names the pose in a file of several. Nothing is written unless at
+    least one scan can be used.
 
     Raises:
         InputError: the result, the dataset or the output folder cannot be used.
@@ -306,7 +295,8 @@ def verify_dataset(
 
 
 def _calibrations(path: Path, pose: str | None) -> tuple[list[CalibrationResult], tuple[str, ...]]:
-    """What `calibrate` wrote; or the camera's pose in another file in every reading that its numbers allow, and a sentence that names it."""
+    """What `calibrate` wrote; or the camera's pose in another file in every reading that its numbers allow, and a
+    sentence that names it."""
     try:
         return [load_result(path)], ()
     except InputError:
@@ -317,8 +307,8 @@ def _calibrations(path: Path, pose: str | None) -> tuple[list[CalibrationResult]
     given = read_stated_pose(path, pose)
     if given.mounting not in (None, "eye_on_base"):
         raise InputError(
-            f"'{given.name}' is the pose of a camera on the flange, which does not scan its own flange: give pairs of poses or pictures "
-            "(--board) in place of scans."
+            f"'{given.name}' is the pose of a camera on the flange, which does not scan its own flange: give pairs of"
+            " poses or pictures (--board) in place of scans."
         )
     covariance = np.zeros((6, 6)) if given.covariance is None else given.covariance
     found = [
@@ -336,16 +326,18 @@ def _with_kinematics(
     observations: tuple[Observation, ...],
     correction: ScannerCorrection | None,
 ) -> tuple[tuple[str, ...], tuple[Observation, ...], tuple[Array, Array] | None]:
-    """The observations with the poses that the arm of the result's kinematics file reaches, and what it states of their errors (see
-    shared_error), or a sentence where the scans have no joint angles."""
+    """The observations with the poses that the arm of the result's kinematics file reaches, and what it states of their
+    errors (see shared_error), or a sentence where the scans have no joint angles."""
     if not result.kinematics_file:
         return (), observations, None
     q = joint_angles(data, [o.id for o in observations], 6)
     if q is None:
         return (
             (
-                f"The result belongs to the arm of {result.kinematics_file}, and these scans have no joint angles (q1 to q6): the stated poses "
-                "are used.",
+                (
+                    f"The result belongs to the arm of {result.kinematics_file}, and these scans have no joint angles"
+                    " (q1 to q6): the stated poses are used."
+                ),
             ),
             observations,
             None,
@@ -433,8 +425,8 @@ def _differences(result: CalibrationResult, data: Dataset, flange: str) -> list[
         ("scanner", result.scanner, h.scanner),
     )
     return [
-        f"The calibration was made with the {what} '{was}', these scans with '{now}'. The figures are valid only if both "
-        "names mean the same one."
+        f"The calibration was made with the {what} '{was}', these scans with '{now}'. The figures are valid only if"
+        " both names mean the same one."
         for what, was, now in pairs
         if was and now and was != now
     ]
@@ -450,8 +442,8 @@ def _diagnostics(
     if again:
         names = ", ".join(again[:5]) + (f" and {len(again) - 5} more" if len(again) > 5 else "")
         out.append(
-            f"{len(again)} of the {n} scans were used in the calibration ({names}), so their errors are too small. Take "
-            "new scans."
+            f"{len(again)} of the {n} scans were used in the calibration ({names}), so their errors are too small. Take"
+            " new scans."
         )
     if n < _FEW:
         out.append(f"Only {n} scan{' was' if n == 1 else 's were'} used. Take {_FEW} or more across the work space.")
@@ -460,15 +452,16 @@ def _diagnostics(
     median = float(np.median([p.error_mm for p in poses]))
     if stated is not None and median > (stated if n >= _FEW else _GROSS * stated):
         out.append(
-            f"The median error, {median:.2f} mm, is larger than the calibration's own held-out error at 95 % ({stated:.2f} mm). "
-            "Scanner, robot or flange has changed, or these scans are in another region: calibrate again."
+            f"The median error, {median:.2f} mm, is larger than the calibration's own held-out error at 95 %"
+            f" ({stated:.2f} mm). Scanner, robot or flange has changed, or these scans are in another region: calibrate"
+            " again."
         )
     out += _gross(result, poses)
     tilts = [p.tilt_deg for p in poses if p.tilt_deg is not None]
     if tilts and float(np.median(tilts)) > _WORST_TILT_DEG:
         out.append(
-            f"The scanned faces are turned by {np.median(tilts):.0f} degrees from the flange's z axis in the poses. Check the "
-            "quaternion order (qw, qx, qy, qz), that the poses are the flange's, and the calibration."
+            f"The scanned faces are turned by {np.median(tilts):.0f} degrees from the flange's z axis in the poses."
+            " Check the quaternion order (qw, qx, qy, qz), that the poses are the flange's, and the calibration."
         )
     if result.scanner_correction is None:
         out.append(_uncorrected(result, observations))
@@ -485,7 +478,8 @@ def _uncorrected(result: CalibrationResult, observations: tuple[Observation, ...
 
 
 def _scale_error(result: CalibrationResult, observations: tuple[Observation, ...]) -> tuple[float, float]:
-    """Change of scale that best explains the errors together with a shift, and its standard error; NaN for few scans."""
+    """Change of scale that best explains the errors together with a shift, and its standard error; NaN for few
+    scans."""
     n = len(observations)
     if n < 6:
         return float("nan"), float("nan")

@@ -1,4 +1,5 @@
-"""`weldcal verify RESULT PAIRS`: judges any file with a camera's pose on pairs of robot and camera poses, or on pictures of a board."""
+"""`weldcal verify RESULT PAIRS`: judges any file with a camera's pose on pairs of robot and camera poses, or on
+pictures of a board."""
 
 import json
 from collections.abc import Callable
@@ -29,7 +30,8 @@ _MOUNTINGS = ("eye_in_hand", "eye_on_base")
 
 
 def holds_scans(path: Path) -> bool:
-    """Whether a file or folder holds scans of a flange, and not pairs of poses: clouds, pairs.csv of centres, or a ROS recording."""
+    """Whether a file or folder holds scans of a flange, and not pairs of poses: clouds, pairs.csv of centres, or a ROS
+    recording."""
     if path.is_file():
         return find_bag(path) is not None
     if not path.is_dir():
@@ -127,7 +129,8 @@ def _judged(
     read_in: Callable[[str | None], tuple[PosePairs, HandEyeResult | None]],
     config: HandEyeConfig,
 ) -> tuple[PosePairs, int, Judgement]:
-    """The pairs, the reading of the pose and its judgement, in the stated mounting or else in the one in which the pose fits."""
+    """The pairs, the reading of the pose and its judgement, in the stated mounting or else in the one in which the pose
+    fits."""
 
     def judged(mode: str | None) -> tuple[PosePairs, int, Judgement]:
         pairs, new = read_in(mode)
@@ -165,5 +168,6 @@ def _judged(
             return answer
         off = answer[2].off_mm if answer[2].other is None else answer[2].other[1]
         raise InconsistentPoses(
-            f"The pairs contradict each other as given. RESULT fits them as {mode}, within {off:.3g} mm: give --mounting {mode}."
+            f"The pairs contradict each other as given. RESULT fits them as {mode}, within {off:.3g} mm: give"
+            f" --mounting {mode}."
         ) from problem

@@ -10,7 +10,7 @@ from weldcal.calibration.calibrate import KINEMATICS_FILE
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.doctor.record import case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.stated_error import orientations_of
@@ -118,7 +118,8 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:
-    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, fit_up.csv, plots/, recording.html, summary.json, report.html."""
+    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, fit_up.csv, plots/, recording.html,
+    summary.json, report.html."""
     folder, run = result.folder, result.run
     with whole_result(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -232,8 +233,9 @@ def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robo
     return folder
 
 
-def live_case(cell: Cell[Any], root: Context) -> Case | None:
-    """What a live calibration has seen of its feature, as the doctor examines it; None where the job does not calibrate by it."""
+def live_case(cell: Cell[Any], root: Context) -> DoctorCase | None:
+    """What a live calibration has seen of its feature, as the doctor examines it; None where the job does not calibrate
+    by it."""
     status = getattr(cell.job, "calibration_status", None)
     seen = None if status is None else status(root)
     if seen is None or not seen.observations:

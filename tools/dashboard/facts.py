@@ -42,13 +42,15 @@ _SCAN_S, _MOVES_S, _TOUCH_S, _WHOLE_SEAM_MM = 3.0, {"Park": 3.0, "Approach": 5.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Facts:
-    """Of a run: `steps`: name and phases of each step that the job will make; lengths in mm, NaN or None where the job has none.
+    """Of a run: `steps`: name and phases of each step that the job will make; lengths in mm, NaN or None where the job
+    has none.
 
-    `band_mm`: least and largest deflection of the tip with which the seam is followed. `gain` computes the expected error after
-    the next pose from the present status. `settable_pace`: a simulation, whose pace may be chosen. `seconds`: about how long each
-    step takes, and SCAN, the scan of a pose with the way to it; empty: the time left follows from the completed share of the run.
-    `work_B` (3,) m: where the calibration's error is shown. `press_mm`: deflection of the tip at which it has touched. `height` computes how
-    far (m) a touched face lies above the scanned one.
+    `band_mm`: least and largest deflection of the tip with which the seam is followed. `gain` computes the expected
+    error after the next pose from the present status. `settable_pace`: a simulation, whose pace may be chosen.
+    `seconds`: about how long each step takes, and SCAN, the scan of a pose with the way to it; empty: the time left
+    follows from the completed share of the run. `work_B` (3,) m: where the calibration's error is shown. `press_mm`:
+    deflection of the tip at which it has touched. `height` computes how far (m) a touched face lies above the scanned
+    one.
     """
 
     title: str = ""
@@ -144,7 +146,8 @@ def _other_facts(cell: Cell[Any], title: str, robot: str, settable: bool) -> Fac
 
 
 def _gain_of(job: WeldJob) -> Callable[[CalibrationStatus, int], float]:
-    """A function that computes the expected error m at the work point after one more planned pose; NaN where it cannot."""
+    """A function that computes the expected error m at the work point after one more planned pose; NaN where it
+    cannot."""
     x, y, z = (float(v) for v in work_point(job.scenario))
     config = PlannerConfig(work_point_B=(x, y, z))
 

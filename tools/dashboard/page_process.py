@@ -1,4 +1,7 @@
-"""The process of one page: Flask, behind the limits of connections.py. It asks the run over a pipe for all that it shows."""
+"""The process of one page: Flask, behind the limits of connections.py.
+
+It asks the run over a pipe for all that it shows.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,8 @@ _PAGE = Path(__file__).parent / "page"
 
 @dataclass(frozen=True)
 class PageSetup:
-    """What the process is started with: its listening socket; the key of its buttons or None; the token of its address or None."""
+    """What the process is started with: its listening socket; the key of its buttons or None; the token of its address
+    or None."""
 
     listener: socket.socket
     view_url: str | None

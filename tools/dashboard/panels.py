@@ -1,4 +1,5 @@
-"""What the dashboard shows of the jobs besides the weld: steps, live plots and lines of text, from the job's newest messages."""
+"""What the dashboard shows of the jobs besides the weld: steps, live plots and lines of text, from the job's newest
+messages."""
 
 from __future__ import annotations
 
@@ -162,7 +163,17 @@ def _touch(facts: Facts, state: TouchState) -> dict[str, Any]:
     points = [(float(k + 1), y) for k, y in enumerate(heights)]
     reach = _high([0.1, *(abs(y) for y in heights)])
     across = (0.0, facts.maximum_scans + 1.0)
-    plots = [_plot("Touched face above the scanned one", "mm", [("touch", PLAIN, points)], across, (-reach, reach), "touches", dots=True)]  # fmt: skip
+    plots = [
+        _plot(
+            "Touched face above the scanned one",
+            "mm",
+            [("touch", PLAIN, points)],
+            across,
+            (-reach, reach),
+            "touches",
+            dots=True,
+        )
+    ]
     plots[0]["line"] = False
     if state.zero is not None and state.frames and state.phase in ("descend", "press"):
         given = 1e3 * np.array([frame[2] - state.zero[2] for frame in state.frames[-_NEWEST_FRAMES:]])

@@ -1,4 +1,5 @@
-"""The newest scan as a small depth picture, with the flange that was found in it; or the wrist camera's newest picture."""
+"""The newest scan as a small depth picture, with the flange that was found in it; or the wrist camera's newest
+picture."""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ def _ring(center: Array, normal: Array, radius_m: float) -> Array:
 
 
 def _pixels_of(points: Array, ring: Array) -> Array | None:
-    """Pixels (n, 2) of points in the organised cloud's own projection, u = a x / z + b, fitted to it; None without enough points."""
+    """Pixels (n, 2) of points in the organised cloud's own projection, u = a x / z + b, fitted to it; None without
+    enough points."""
     v, u = np.nonzero(np.isfinite(points[:, :, 2]))
     if len(u) < 50:
         return None

@@ -1,4 +1,5 @@
-"""recording.html: the 3D view's page with an overlay: phase, figures, legend, and cameras that follow the run until one is moved."""
+"""recording.html: the 3D view's page with an overlay: phase, figures, legend, and cameras that follow the run until one
+is moved."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The dashboard's pages, each served by a process of its own: on loopback, and read-only for the network behind a token."""
+"""The dashboard's pages, each served by a process of its own: on loopback, and read-only for the network behind a
+token."""
 
 from __future__ import annotations
 
@@ -23,9 +24,10 @@ END_S = FILES_S + LAST_WORDS_S + 1.0
 class Dashboard:
     """The pages of a run, served from when they are made until they are closed.
 
-    The buttons need a key that only the page itself can read: a foreign page in the same browser can neither read nor use it, and
-    nothing is answered under a foreign host name. `url` is the page's address on this computer; `shared_url` the one for the network,
-    with its token, or None. What strangers do to a port reaches its process only: the run answers one question of a page at a time.
+    The buttons need a key that only the page itself can read: a foreign page in the same browser can neither read nor
+    use it, and nothing is answered under a foreign host name. `url` is the page's address on this computer;
+    `shared_url` the one for the network, with its token, or None. What strangers do to a port reaches its process only:
+    the run answers one question of a page at a time.
     """
 
     def __init__(self, source: DashboardSource, view_url: str, share: bool = False) -> None:

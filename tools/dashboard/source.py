@@ -1,4 +1,5 @@
-"""DashboardSource: what the page is told of a run, and what its buttons ask of the person's wishes; used by the server's threads."""
+"""DashboardSource: what the page is told of a run, and what its buttons ask of the person's wishes; used by the
+server's threads."""
 
 from __future__ import annotations
 
@@ -39,7 +40,10 @@ PACE_OVER_S = 2.0
 
 
 class DashboardSource:
-    """Reads the run's live view and the person's wishes. It never waits for the Diagram, and the Diagram never for it."""
+    """Reads the run's live view and the person's wishes.
+
+    It never waits for the Diagram, and the Diagram never for it.
+    """
 
     def __init__(self, live: LiveView, person: Person, facts: Facts | None = None) -> None:
         self.live, self.person = live, person
@@ -62,7 +66,8 @@ class DashboardSource:
         self._ended = (HELD if held and not self.person.ends else ENDED if held else DONE, reason)
 
     def conclude(self, first: FirstScreen | None, folder: Path | None) -> None:
-        """Take the result: the first screen and the folder that holds report.html and recording.html; None: there is none."""
+        """Take the result: the first screen and the folder that holds report.html and recording.html; None: there is
+        none."""
         if folder is not None:
             self.files = {name: folder / name for name in PAGES if (folder / name).exists()}
         rows = {} if first is None else {n.strip(): t for n, t in first.rows().items() if n.strip() not in LEFT_OUT}
@@ -81,7 +86,8 @@ class DashboardSource:
         return self._ended is not None
 
     def act(self, what: str, value: float | None = None) -> bool:
-        """Do what a button asks: "hold", "go_on", "end", "pace" or "camera-NAME"; False where there is no such button now."""
+        """Do what a button asks: "hold", "go_on", "end", "pace" or "camera-NAME"; False where there is no such button
+        now."""
         person = self.person
         if self.ended:
             return False

@@ -1,4 +1,5 @@
-"""Puts what the page shows into words and numbers of JSON: the state in large letters, steps, plots, last and next scan."""
+"""Puts what the page shows into words and numbers of JSON: the state in large letters, steps, plots, last and next
+scan."""
 
 from __future__ import annotations
 
@@ -6,12 +7,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import PoseRequest
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
 from weldcal.systems.viewer.cameras import CAMERAS, FOLLOW, Views
 from weldcal.systems.viewer.live import ACTIVE, Moment, ScanRow, WeldRow
-from weldcal.systems.viewer.scene import RESIDUAL_MM, WELDING_PHASES, Key, legend, uncertainty_at
+from weldcal.systems.viewer.scene import RESIDUAL_MM, WELDING_PHASES, LegendKey, legend, uncertainty_at
 from weldcal.tools.dashboard.facts import SCAN, Facts
 from weldcal.tools.dashboard.panels import stage_of
 
@@ -105,7 +106,7 @@ def scan_values(facts: Facts, moment: Moment) -> dict[str, Any] | None:
         "next": None,
         "verified": [{"label": v.label, "error_mm": mm(v.error_m)} for v in status.verifications],
     }
-    if not status.done and isinstance(pose, NextPose) and pose.q is not None:
+    if not status.done and isinstance(pose, PoseRequest) and pose.q is not None:
         found["next"] = _next_pose(facts, status, pose)
     return found
 
@@ -129,7 +130,7 @@ def _last_scan(status: CalibrationStatus) -> str | None:
     return f"{label}: the flange was found, {residual:.2f} mm from where the calibration puts it"
 
 
-def _next_pose(facts: Facts, status: CalibrationStatus, pose: NextPose) -> str:
+def _next_pose(facts: Facts, status: CalibrationStatus, pose: PoseRequest) -> str:
     """The next pose, and why it is the next."""
     then = math.nan if facts.gain is None else facts.gain(status, pose.index)
     if math.isfinite(then) and math.isfinite(status.predicted_error_m):
@@ -154,7 +155,7 @@ def scan_rows(rows: Sequence[ScanRow]) -> list[list[float | None]]:
 def scene_values(facts: Facts, moment: Moment, views: Views) -> dict[str, Any]:
     """What lies over the 3D view: the cameras, and the legend of what is drawn now."""
     status = moment.shown.get("calibration_status")
-    keys: list[Key] = []
+    keys: list[LegendKey] = []
     estimate, scale = None, None
     if isinstance(status, CalibrationStatus):
         estimate = status.estimate if math.isfinite(facts.required_mm) else None
@@ -167,9 +168,9 @@ def scene_values(facts: Facts, moment: Moment, views: Views) -> dict[str, Any]:
         if estimate is not None and phase not in (*WELDING_PHASES, "scan_workpiece", "park", "home", "done", "held"):
             scale = RESIDUAL_MM
     return {
-        "cameras": [{"key": name, "name": CAMERAS[name]} for name in (FOLLOW, *views.known)]
-        if len(views.known) > 1
-        else [],
+        "cameras": (
+            [{"key": name, "name": CAMERAS[name]} for name in (FOLLOW, *views.known)] if len(views.known) > 1 else []
+        ),
         "wanted": views.wanted,
         "showing": views.showing,
         "legend": [key._asdict() for key in keys],

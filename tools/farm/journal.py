@@ -1,4 +1,5 @@
-"""Keeps the results of finished tasks in a file, one line each, so that a study that was killed goes on where it stopped."""
+"""Keeps the results of finished tasks in a file, one line each, so that a study that was killed goes on where it
+stopped."""
 
 import json
 import os
@@ -14,7 +15,9 @@ NAME = "tasks.jsonl"
 
 
 class Journal:
-    """The finished tasks of one study in a folder. The first line names the study; a last line that is cut off does not count.
+    """The finished tasks of one study in a folder.
+
+    The first line names the study; a last line that is cut off does not count.
 
     Raises:
         InputError: the folder holds the tasks of another study.

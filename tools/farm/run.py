@@ -38,7 +38,8 @@ class Farm:
         tasks: Mapping[str, Mapping[str, Any]],
         each: Callable[[dict[str, Result]], None] | None = None,
     ) -> dict[str, Result]:
-        """Call a module's function once per task with its keyword arguments; the results by task, in the order of ``tasks``.
+        """Call a module's function once per task with its keyword arguments; the results by task, in the order of
+        ``tasks``.
 
         Args:
             function: of a module, so that another process finds it; it returns values that JSON can hold.
@@ -46,7 +47,8 @@ class Farm:
             each: called after every finished task with the results so far.
 
         Raises:
-            InputError: the folder holds another study, or the scheduler cannot be reached. WorkerLost: a process has ended.
+            InputError: the folder holds another study, or the scheduler cannot be reached. WorkerLost: a process has
+                ended.
         """
         name = f"{function.__module__}:{function.__qualname__}"
         journal = Journal(self.folder, {"function": name, "software": software_version()})

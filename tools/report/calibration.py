@@ -15,12 +15,7 @@ from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, cor
 from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
-from weldcal.calibration.eye_on_base.validation import (
-    Algorithm1Run,
-    Convergence,
-    bootstrap_interval,
-    mean_interval,
-)
+from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence, bootstrap_interval, mean_interval
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -62,10 +57,11 @@ def error_summary(values: Array) -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm1Outcome:
-    """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive to.
+    """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive
+    to.
 
-    ``verification``: id of the pose held out for it. ``figure_mm``: reported by Algorithm 1; ``true_mm``: its errors at the
-    flange at unused poses; ``unseen``: components of a true error of which less than half appears in the figure.
+    ``verification``: id of the pose held out for it. ``figure_mm``: reported by Algorithm 1; ``true_mm``: its errors at
+    the flange at unused poses; ``unseen``: components of a true error of which less than half appears in the figure.
     """
 
     verification: str
@@ -89,9 +85,11 @@ class Algorithm1Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationReport:
-    """The result of `weldcal calibrate`: the estimate, the records written, and the folder. ``observations`` include the
-    scanner correction where one was accepted; ``notes`` say in which form the dataset was read; ``limit_mm`` is the error that the
-    job allows (None: not stated)."""
+    """The result of `weldcal calibrate`: the estimate, the records written, and the folder.
+
+    ``observations`` include the scanner correction where one was accepted; ``notes`` say in which form the dataset was
+    read; ``limit_mm`` is the error that the job allows (None: not stated).
+    """
 
     result: CalibrationResult
     estimate: CalibrationEstimate
@@ -113,7 +111,10 @@ class CalibrationReport:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. The error is the larger of two at 95 %: the calibration's own at the work point, and the held-out one."""
+        """The first screen.
+
+        The error is the larger of two at 95 %: the calibration's own at the work point, and the held-out one.
+        """
         r, work = self.result, self.work_point
         said = self._remarks
         # what is not observable and matters to X_BC is among the warnings
@@ -181,7 +182,8 @@ class CalibrationReport:
 
     @property
     def held_out_interval_mm(self) -> tuple[float, float] | None:
-        """Interval (mm) that holds the mean error of as many new scans with 95 % probability; None for fewer than four errors."""
+        """Interval (mm) that holds the mean error of as many new scans with 95 % probability; None for fewer than four
+        errors."""
         return mean_interval(1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
 
     def summary(self) -> dict[str, Any]:
@@ -211,16 +213,18 @@ class CalibrationReport:
             "error_budget": self.budget.document(),
             "features": feature_residuals(self.fits, self.patterns),
             **({} if self.refinement is None else {"refinement": self.refinement}),
-            "algorithm1": None
-            if a is None
-            else {
-                "verification": a.verification,
-                "metric": a.metric,
-                "figure_mm": a.figure_mm,
-                "true_mm": a.true_mm,
-                "at_verification_mm": a.at_verification_mm,
-                "unseen": list(a.unseen),
-            },
+            "algorithm1": (
+                None
+                if a is None
+                else {
+                    "verification": a.verification,
+                    "metric": a.metric,
+                    "figure_mm": a.figure_mm,
+                    "true_mm": a.true_mm,
+                    "at_verification_mm": a.at_verification_mm,
+                    "unseen": list(a.unseen),
+                }
+            ),
         }
 
 
@@ -408,7 +412,8 @@ _SHADES = LinearSegmentedColormap.from_list("known", ["#eef4f8", "#9dc0d8", "#1d
 
 
 def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
-    """Standard deviation (3-D) of a scanned point through the middle of poses (n >= 2, 3) m, from above and from the side."""
+    """Standard deviation (3-D) of a scanned point through the middle of poses (n >= 2, 3) m, from above and from the
+    side."""
     middle, extent = p_B.mean(axis=0), float(np.ptp(p_B, axis=0).max())
     weak, least = weakest_place(estimate, p_B), 1e3 * sigma_at(estimate, middle)
     figure = Figure(figsize=(8.2, 4.0), layout="constrained")

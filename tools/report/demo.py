@@ -20,7 +20,7 @@ from weldcal.tools.report import plots_weld
 from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.first_screen import (
     SCANNER,
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -88,7 +88,8 @@ class DemoResult:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen: of the calibration, by the job's own required error; of a weld alone, whether it was welded."""
+        """The first screen: of the calibration, by the job's own required error; of a weld alone, whether it was
+        welded."""
         scenario, status = self.run.cell.scenario, self.status
         estimate, c = status.estimate, self.run.cell.scenario.calibration
         against = [self.run.reason or "The job was held."] if self.state == "held" else []
@@ -96,14 +97,17 @@ class DemoResult:
         if estimate is None:
             found = Findings(
                 against=against,
-                no_tolerance="No scenario key states how far the torch may be off: compare the error below with what your joint allows.",
+                no_tolerance=(
+                    "No scenario key states how far the torch may be off: compare the error below with what your joint"
+                    " allows."
+                ),
                 concerns=self.warnings,
                 notes=self.arm_note,
             )
             more["pose"] = (
                 "none was computed: X_BC is the scenario's" if not scenario.job.calibrate else "none was found"
             )
-            none = Expected("error at the work point, 95 %", "not known", "there is no calibration")
+            none = ExpectedError("error at the work point, 95 %", "not known", "there is no calibration")
             return FirstScreen(
                 found, none if scenario.job.calibrate else self._torch(), self._next(), (), more, self._lead()
             )
@@ -112,11 +116,13 @@ class DemoResult:
         for v in status.verifications:
             limit = f"limit {c.verification_limit_mm:g} mm, calibration.verification_limit_mm"
             backing = f"{expected.backing}; at '{v.label}', held out by the job: {1e3 * v.error_m:.3f} mm ({limit})"
-            expected = Expected(expected.what, expected.figure, backing)
+            expected = ExpectedError(expected.what, expected.figure, backing)
         tolerance = Tolerance(
-            "the expected error at the work point, one sigma,", 1e3 * status.predicted_error_m, c.required_error_mm,
+            "the expected error at the work point, one sigma,",
+            1e3 * status.predicted_error_m,
+            c.required_error_mm,
             "calibration.required_error_mm",
-        )  # fmt: skip
+        )
         # what is not observable and matters to X_BC is among the warnings
         concerns = (*self.warnings, *estimate.warnings)
         notes = [*refused_note(status.refused, self.n_scans), *self.arm_note]
@@ -139,8 +145,11 @@ class DemoResult:
         arm = "What the refinement leaves of the arm's errors" if refined else "Errors of an arm as its maker leaves it"
         advice = "" if refined else " Calibrate with calibration.refine: links."
         return (
-            f"Along this seam the tool turns by up to {np.degrees(plan.arm_turn_rad):.0f} deg between the tip and the torch at the same "
-            f"place. {arm} then put the torch {1e3 * plan.arm_sigma_m:.2f} mm (rms) off the seam that the tip felt.{advice}",
+            (
+                f"Along this seam the tool turns by up to {np.degrees(plan.arm_turn_rad):.0f} deg between the tip and"
+                f" the torch at the same place. {arm} then put the torch {1e3 * plan.arm_sigma_m:.2f} mm (rms) off the"
+                f" seam that the tip felt.{advice}"
+            ),
         )
 
     def _lead(self) -> str:
@@ -155,15 +164,15 @@ class DemoResult:
         torch = self._torch()
         return {"torch": f"{torch.figure} ({torch.backing})"} if self.status.estimate is not None else {}
 
-    def _torch(self) -> Expected:
+    def _torch(self) -> ExpectedError:
         """The torch's distance from the true seam."""
         if self.weld is None or self.weld.error is None:
-            return Expected("torch off the seam", "not known", "the true seam is known in simulation only")
+            return ExpectedError("torch off the seam", "not known", "the true seam is known in simulation only")
         distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
         backing = (
             f"95 % of the weld; mean {distance.mean():.3f}, at most {distance.max():.3f} mm; known in simulation only"
         )
-        return Expected("torch off the seam", f"{np.percentile(distance, 95):.3f} mm", backing)
+        return ExpectedError("torch off the seam", f"{np.percentile(distance, 95):.3f} mm", backing)
 
     def _next(self) -> Next:
         folder, robot = self.folder, self.robot != "simulated"
@@ -389,7 +398,10 @@ def _process(result: DemoResult) -> list[tuple[str, str]]:
     return [
         (
             "process",
-            f"{process.name or 'not named'}, {process.current_A:g} A, {process.voltage_V:g} V as set; k = {process.k:g}",
+            (
+                f"{process.name or 'not named'}, {process.current_A:g} A, {process.voltage_V:g} V as set; k ="
+                f" {process.k:g}"
+            ),
         ),
         ("heat input", f"{mean} kJ/mm (mean; from {least} to {most})"),
     ]
@@ -410,7 +422,8 @@ def _timing(result: DemoResult) -> list[tuple[str, ...]]:
 
 
 def convergence(status: CalibrationStatus, required_m: float) -> bytes:
-    """Expected and held-out error of the estimate in use and Algorithm 1's own figure, against the scans taken (Fig. 11)."""
+    """Expected and held-out error of the estimate in use and Algorithm 1's own figure, against the scans taken (Fig.
+    11)."""
     n, expected, held_out, figure = (np.array(c, dtype=float) for c in zip(*status.history, strict=True))
     picture = Figure(figsize=(7.2, 3.4), layout="constrained")
     axes = picture.subplots()

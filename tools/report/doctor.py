@@ -8,8 +8,10 @@ from weldcal.welding.record.signs import WORN
 
 CALIBRATION = "calibration.yaml"
 CHECKED = (
-    "scanner moved", "TCP set at the controller", "wrong quaternion order", "poses inverted", "wrong rotation convention",
-    "scans and poses shifted by one", "robot in another installation", "wrong flange size", "unit mix", "poses too alike",
+    "scanner moved", "TCP set at the controller", "wrong quaternion order", "poses inverted",
+    "wrong rotation convention",
+    "scans and poses shifted by one", "robot in another installation", "wrong flange size", "unit mix",
+    "poses too alike",
     "scanner out of focus or range", "warm-up drift", "slack flange or loose mount", "wrong kinematics file",
     "outlier scans or partial views", "hidden tag", "soft tip worn", "scanner axes mirrored",
     "scans and poses in different orders", "scanner scale error", "too few scans",
@@ -36,7 +38,8 @@ _CENTRES_SAY = 1.5
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """The named causes, the likeliest first; what was examined, its number of scans and the spread that remains (mm, None: unknown)."""
+    """The named causes, the likeliest first; what was examined, its number of scans and the spread that remains (mm,
+    None: unknown)."""
 
     source: str
     causes: tuple[NamedCause, ...]
@@ -58,8 +61,8 @@ class DoctorReport:
         """The printed answer."""
         if not self.causes:
             return (
-                f"doctor: no cause found in {self.n} scans ({self.source}).\n  checked: {', '.join(CHECKED)}\n  Where new scans still "
-                "disagree: weldcal verify RESULT NEW_SCANS"
+                f"doctor: no cause found in {self.n} scans ({self.source}).\n  checked: {', '.join(CHECKED)}\n  Where"
+                " new scans still disagree: weldcal verify RESULT NEW_SCANS"
             )
         lines = [
             f"doctor: {len(self.causes)} cause{'s' if len(self.causes) > 1 else ''} in {self.n} scans ({self.source})"
@@ -93,16 +96,21 @@ def _fits(c: Cause) -> str:
     n = c.numbers
     if "without_deg" in n and n["without_mm"] < _CENTRES_SAY * n["with_mm"] and n["without_deg"] > n["with_deg"]:
         return (
-            f"with it the faces look along the poses' z axes to {n['with_deg']:.2f} degrees, without it to {n['without_deg']:.1f} (median); the "
-            f"centres fit to {n['with_mm']:.2f} mm either way"
+            f"with it the faces look along the poses' z axes to {n['with_deg']:.2f} degrees, without it to"
+            f" {n['without_deg']:.1f} (median); the centres fit to {n['with_mm']:.2f} mm either way"
         )
-    return f"with it the centres fit to {c.numbers['with_mm']:.2f} mm, without it to {c.numbers['without_mm']:.2f} mm (median)"
+    return (
+        f"with it the centres fit to {c.numbers['with_mm']:.2f} mm, without it to {c.numbers['without_mm']:.2f} mm"
+        " (median)"
+    )
 
 
 def _moved(c: Cause) -> tuple[str, str]:
     return (
-        f"From '{c.where[1]}' on the scans agree on another camera pose than up to '{c.where[0]}': {c.numbers['shift_mm']:.2f} mm and "
-        f"{c.numbers['turn_deg']:.3f} degrees apart; {_fits(c)}.",
+        (
+            f"From '{c.where[1]}' on the scans agree on another camera pose than up to '{c.where[0]}':"
+            f" {c.numbers['shift_mm']:.2f} mm and {c.numbers['turn_deg']:.3f} degrees apart; {_fits(c)}."
+        ),
         f"Fasten the scanner. Calibrate the later part alone (weldcal calibrate FOLDER --poses {c.where[1]}:).",
     )
 
@@ -112,8 +120,10 @@ def _tcp(c: Cause) -> tuple[str, str]:
     metres = ", ".join(f"{1e-3 * c.numbers[f'tcp_{a}_mm']:.4f}" for a in "xyz")
     return (
         f"The poses stand off the flange by a constant ({t}) mm in their own frame; {_fits(c)}.",
-        f"Set the TCP to zero at the controller and record again, or write poses: {{tcp: [{metres}, 0.0, 0.0, 0.0]}} (m, rad) in dataset.yaml; "
-        "if the TCP is turned too, with the rotation that the controller shows.",
+        (
+            f"Set the TCP to zero at the controller and record again, or write poses: {{tcp: [{metres}, 0.0, 0.0,"
+            " 0.0]} (m, rad) in dataset.yaml; if the TCP is turned too, with the rotation that the controller shows."
+        ),
     )
 
 
@@ -124,7 +134,9 @@ def _misread(c: Cause) -> tuple[str, str]:
         "poses inverted": "Set 'poses: {frame: base_in_flange}' in dataset.yaml, or invert the poses.",
         "wrong rotation convention": "Set 'poses: {rotation: ...}' in dataset.yaml to what the robot writes.",
         "scanner axes mirrored": "Export the clouds in a right-handed frame: x right, y down, z out of the scanner.",
-        "scans and poses in different orders": "Pair each scan with its own pose, by the same name; write numbers as 01, 02.",
+        "scans and poses in different orders": (
+            "Pair each scan with its own pose, by the same name; write numbers as 01, 02."
+        ),
         "scans and poses shifted by one": "Pair each scan with its own pose, by the same name.",
     }[c.name]
     return f"It fits if {c.words}: {_fits(c)}.", cure
@@ -132,9 +144,15 @@ def _misread(c: Cause) -> tuple[str, str]:
 
 def _installation(c: Cause) -> tuple[str, str]:
     return (
-        f"The scans agree with each other, but put the scanner {c.numbers['off_mm']:.0f} mm from where it was measured (stated to "
-        f"{c.numbers['stated_mm']:.0f} mm): the base is shifted by {c.numbers['shift_mm']:.0f} mm and turned by {c.numbers['turn_deg']:.0f} degrees.",
-        "Load the installation (base frame and mounting) that the cell uses, and record again; or measure scanner_guess anew.",
+        (
+            f"The scans agree with each other, but put the scanner {c.numbers['off_mm']:.0f} mm from where it was"
+            f" measured (stated to {c.numbers['stated_mm']:.0f} mm): the base is shifted by {c.numbers['shift_mm']:.0f}"
+            f" mm and turned by {c.numbers['turn_deg']:.0f} degrees."
+        ),
+        (
+            "Load the installation (base frame and mounting) that the cell uses, and record again; or measure"
+            " scanner_guess anew."
+        ),
     )
 
 
@@ -156,8 +174,10 @@ def _units(c: Cause) -> tuple[str, str]:
 
 def _alike(c: Cause) -> tuple[str, str]:
     return (
-        f"The flange centres spread by {c.numbers['spread_mm']:.0f} mm (and {c.numbers['second_mm']:.0f} mm across that), and the orientations "
-        f"differ by at most {c.numbers['turn_deg']:.1f} degrees.",
+        (
+            f"The flange centres spread by {c.numbers['spread_mm']:.0f} mm (and {c.numbers['second_mm']:.0f} mm across"
+            f" that), and the orientations differ by at most {c.numbers['turn_deg']:.1f} degrees."
+        ),
         "Take 8 to 12 poses over the working volume, tilted and turned by 20 degrees or more.",
     )
 
@@ -169,8 +189,10 @@ def _focus(c: Cause) -> tuple[str, str]:
         else ""
     )
     return (
-        f"The noise of the faces is {c.numbers['factor']:.1f} times larger about {c.numbers['at_mm']:.0f} mm from the scanner than distance "
-        f"explains ({_names(c)}).{span}",
+        (
+            f"The noise of the faces is {c.numbers['factor']:.1f} times larger about {c.numbers['at_mm']:.0f} mm from"
+            f" the scanner than distance explains ({_names(c)}).{span}"
+        ),
         "Keep the flange within the scanner's range, focus it on the middle of the poses, and scan those poses again.",
     )
 
@@ -186,7 +208,10 @@ def _drift(c: Cause) -> tuple[str, str]:
 def _slack(c: Cause) -> tuple[str, str]:
     what = "The flange or what it carries" if c.numbers["in_flange"] else "The scanner"
     return (
-        f"{what} stands in two places, {c.numbers['jump_mm']:.2f} mm apart, and jumps between them: {_names(c)} against the others; {_fits(c)}.",
+        (
+            f"{what} stands in two places, {c.numbers['jump_mm']:.2f} mm apart, and jumps between them: {_names(c)}"
+            f" against the others; {_fits(c)}."
+        ),
         "Tighten the flange's screws and the scanner's mount, push at both by hand, and record again.",
     )
 
@@ -194,25 +219,41 @@ def _slack(c: Cause) -> tuple[str, str]:
 def _kinematics(c: Cause) -> tuple[str, str]:
     if c.where[0].startswith("as of a "):
         return (
-            f"The poses are those of another arm: computed {c.where[0]} from the same joints they move by {c.numbers['largest_mm']:.0f} mm, and "
-            f"{_fits(c)}.",
-            f"Name the arm that stands there ({c.where[0].rpartition(' ')[2]}) in dataset.yaml and at the program that wrote the poses.",
+            (
+                f"The poses are those of another arm: computed {c.where[0]} from the same joints they move by"
+                f" {c.numbers['largest_mm']:.0f} mm, and {_fits(c)}."
+            ),
+            (
+                f"Name the arm that stands there ({c.where[0].rpartition(' ')[2]}) in dataset.yaml and at the program"
+                " that wrote the poses."
+            ),
         )
     return (
-        f"The residuals follow the joint angles: other joint zeros and link lengths (above all {c.where[0]}) move the flange by up to "
-        f"{c.numbers['largest_mm']:.1f} mm; {_fits(c)}.",
+        (
+            f"The residuals follow the joint angles: other joint zeros and link lengths (above all {c.where[0]}) move"
+            f" the flange by up to {c.numbers['largest_mm']:.1f} mm; {_fits(c)}."
+        ),
         "Compute the poses by this robot's own calibration file (its serial number), or read them from the controller.",
     )
 
 
 def _outliers(c: Cause) -> tuple[str, str]:
     if "worst_mm" in c.numbers:
-        said = f"{_names(c)} disagree by up to {c.numbers['worst_mm']:.1f} mm; the others agree to {c.numbers['others_mm']:.2f} mm."
+        said = (
+            f"{_names(c)} disagree by up to {c.numbers['worst_mm']:.1f} mm; the others agree to"
+            f" {c.numbers['others_mm']:.2f} mm."
+        )
     else:
-        said = f"{100 * c.numbers['share']:.0f} % of the scans show too little of the flange's edge, or none ({_names(c)})."
+        said = (
+            f"{100 * c.numbers['share']:.0f} % of the scans show too little of the flange's edge, or none"
+            f" ({_names(c)})."
+        )
     return (
         said,
-        "Look at these scans: remove them, or scan their poses again with the whole flange in view and nothing in front of it.",
+        (
+            "Look at these scans: remove them, or scan their poses again with the whole flange in view and nothing in"
+            " front of it."
+        ),
     )
 
 
@@ -224,13 +265,19 @@ def _hidden(c: Cause) -> tuple[str, str]:
     )
     return (
         " ".join(text for text in (c.words, log) if text),
-        "Clean the tag and the finger camera's window, keep spatter and cables off them, and check the light: weldcal check-cell.",
+        (
+            "Clean the tag and the finger camera's window, keep spatter and cables off them, and check the light:"
+            " weldcal check-cell."
+        ),
     )
 
 
 def _worn(c: Cause) -> tuple[str, str]:
     return (
-        f"At touch-on the tag moved {c.numbers['gain']:.2f} times as far as the tip; a good tip stays within {WORN:.2f} of 1.",
+        (
+            f"At touch-on the tag moved {c.numbers['gain']:.2f} times as far as the tip; a good tip stays within"
+            f" {WORN:.2f} of 1."
+        ),
         "Look at the soft tip for wear and cracks, replace it, and calibrate it: weldcal finger calibrate.",
     )
 
@@ -241,8 +288,10 @@ def _held(c: Cause) -> tuple[str, str]:
 
 def _scale(c: Cause) -> tuple[str, str]:
     return (
-        f"The scans are {abs(c.numbers['percent']):.2f} % too {'small' if c.numbers['percent'] > 0 else 'large'}; with that scale the centres "
-        f"fit to {c.numbers['with_mm']:.2f} mm (median).",
+        (
+            f"The scans are {abs(c.numbers['percent']):.2f} % too {'small' if c.numbers['percent'] > 0 else 'large'};"
+            f" with that scale the centres fit to {c.numbers['with_mm']:.2f} mm (median)."
+        ),
         "Check the scanner's own calibration and the unit of its export; weldcal corrects small errors by itself.",
     )
 
@@ -257,23 +306,39 @@ def _few(c: Cause) -> tuple[str, str]:
 def _unexplained(c: Cause) -> tuple[str, str]:
     if "normals_deg" in c.numbers:
         return (
-            f"The centres agree to {c.numbers['centres_mm']:.2f} mm, but the faces are turned by {c.numbers['normals_deg']:.1f} degrees from "
-            "the poses' z axes (median), and no known misreading of the rotations explains it.",
-            "Compare one stated orientation with the controller's screen: its order, unit (degrees or radians) and frame.",
+            (
+                f"The centres agree to {c.numbers['centres_mm']:.2f} mm, but the faces are turned by"
+                f" {c.numbers['normals_deg']:.1f} degrees from the poses' z axes (median), and no known misreading of"
+                " the rotations explains it."
+            ),
+            (
+                "Compare one stated orientation with the controller's screen: its order, unit (degrees or radians) and"
+                " frame."
+            ),
         )
     return (
-        f"After the best of all models the centres still disagree by {c.numbers['with_mm']:.1f} mm and the normals by "
-        f"{c.numbers['tilt_deg']:.1f} degrees (medians), most at {_names(c)} ({c.numbers['worst_mm']:.1f} mm). No known cause explains it.",
-        "Check by hand that each scan belongs to its pose; then record three scans at one pose: they must agree to the scanner's noise.",
+        (
+            f"After the best of all models the centres still disagree by {c.numbers['with_mm']:.1f} mm and the normals"
+            f" by {c.numbers['tilt_deg']:.1f} degrees (medians), most at {_names(c)} ({c.numbers['worst_mm']:.1f} mm)."
+            " No known cause explains it."
+        ),
+        (
+            "Check by hand that each scan belongs to its pose; then record three scans at one pose: they must agree to"
+            " the scanner's noise."
+        ),
     )
 
 
 _WORDS: dict[str, Callable[[Cause], tuple[str, str]]] = {
-    "scanner moved": _moved, "TCP set at the controller": _tcp, "wrong quaternion order": _misread, "poses inverted": _misread,
-    "wrong rotation convention": _misread, "scans and poses shifted by one": _misread, "robot in another installation": _installation,
-    "wrong flange size": _flange, "unit mix": _units, "poses too alike": _alike, "scanner out of focus or range": _focus,
+    "scanner moved": _moved, "TCP set at the controller": _tcp, "wrong quaternion order": _misread,
+    "poses inverted": _misread,
+    "wrong rotation convention": _misread, "scans and poses shifted by one": _misread,
+    "robot in another installation": _installation,
+    "wrong flange size": _flange, "unit mix": _units, "poses too alike": _alike,
+    "scanner out of focus or range": _focus,
     "warm-up drift": _drift, "slack flange or loose mount": _slack, "wrong kinematics file": _kinematics,
-    "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn, "the run was held": _held,
+    "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn,
+    "the run was held": _held,
     "scanner axes mirrored": _misread, "scans and poses in different orders": _misread, "scanner scale error": _scale,
     "too few scans": _few, "unexplained": _unexplained,
 }  # fmt: skip

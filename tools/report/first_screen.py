@@ -1,4 +1,5 @@
-"""The first screen of every report and of the terminal: verdict, expected error, what could be wrong, next step and poses.
+"""The first screen of every report and of the terminal: verdict, expected error, what could be wrong, next step and
+poses.
 
 It holds the rule of the verdict, every printed form of a pose, and the error of a scanned point at the work point.
 """
@@ -45,8 +46,10 @@ def pose_rows(pose: object, symbol: str = "X_BC", words: str = "") -> dict[str, 
 
 @dataclass(frozen=True)
 class WorkPoint:
-    """The expected error of a scanned point at ``p_B_mm`` in the base: with 95 % probability at most ``error_95_mm``, if the errors are as
-    stated; ``unseen_poses`` with a held-out error back it, 95 % of which were within ``held_out_95_mm`` (None: too few)."""
+    """The expected error of a scanned point at ``p_B_mm`` in the base: with 95 % probability at most ``error_95_mm``,
+    if the errors are as stated; ``unseen_poses`` with a held-out error back it, 95 % of which were within
+    ``held_out_95_mm`` (None: too few).
+    """
 
     p_B_mm: tuple[float, float, float]
     error_95_mm: float
@@ -105,14 +108,17 @@ class Tolerance:
         if not np.isfinite(self.figure):
             return f"{self.what} is not known, so it cannot be held against {self._text(self.limit)} ({self.source})."
         where = "within" if self.met else "above"
-        return f"{self.what} is {self._text(self.figure)}, {where} the tolerance of {self._text(self.limit)} ({self.source})."
+        return (
+            f"{self.what} is {self._text(self.figure)}, {where} the tolerance of {self._text(self.limit)}"
+            f" ({self.source})."
+        )
 
     def _text(self, value: float) -> str:
         return f"{value:.3f} {self.unit}".strip()
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedError:
     """The error to expect: `what` is measured, the figure with its unit, and what backs it, in words."""
 
     what: str
@@ -130,7 +136,8 @@ class Next:
 
 @dataclass(frozen=True, eq=False)
 class ShownPose:
-    """A pose that a command computed: its symbol (X_BC), frames in words, and the transform with its translation in m."""
+    """A pose that a command computed: its symbol (X_BC), frames in words, and the transform with its translation in
+    m."""
 
     symbol: str
     words: str
@@ -167,10 +174,12 @@ class Findings:
     """What a command found, as the verdict's rule reads it.
 
     Attributes:
-        against: what the command itself decided against its result: a held job, a moved scanner; any of them ends in "do not use".
+        against: what the command itself decided against its result: a held job, a moved scanner; any of them ends in
+            "do not use".
         tolerance: None where nobody stated one.
         no_tolerance: the sentence that takes its place.
-        unseen: number of poses that were unseen when their error was predicted; None for a result that has no such poses.
+        unseen: number of poses that were unseen when their error was predicted; None for a result that has no such
+            poses.
         concerns: what could be wrong; any of them leaves the verdict at "use with care".
         notes: what a reader should know; they do not change the verdict.
         settled: verdict and reason of a command that has a rule of its own (`verify`).
@@ -191,7 +200,8 @@ def decide(found: Findings) -> tuple[str, str]:
     1. A verdict that the command settled by a rule of its own stays as it is.
     2. "do not use": the command decided against the result (the job was held, no pose, the scanner has moved).
     3. "do not use": a tolerance is stated, and the figure is above it or not known.
-    4. "use with care": no tolerance is stated; or fewer than ENOUGH_UNSEEN unseen poses back the figure; or something could be wrong.
+    4. "use with care": no tolerance is stated; or fewer than ENOUGH_UNSEEN unseen poses back the figure; or something
+      could be wrong.
     5. "use it".
     """
     if found.settled is not None:
@@ -212,11 +222,14 @@ def decide(found: Findings) -> tuple[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class FirstScreen:
-    """The first screen. `lead` is said before the verdict's reason; `more` are rows by name: other results, and what takes the place of a
-    pose or a figure that the command does not have."""
+    """The first screen.
+
+    `lead` is said before the verdict's reason; `more` are rows by name: other results, and what takes the place of a
+    pose or a figure that the command does not have.
+    """
 
     found: Findings
-    expected: Expected
+    expected: ExpectedError
     next: Next
     poses: tuple[ShownPose, ...] = ()
     more: Mapping[str, str] = field(default_factory=dict)
@@ -244,7 +257,8 @@ class FirstScreen:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """At most three things that a reader should know and that do not speak against the result; the third says how many more there are."""
+        """At most three things that a reader should know and that do not speak against the result; the third says how
+        many more there are."""
         return _first_few(text for text in self.found.notes if text not in self.concerns)
 
     @property
@@ -291,7 +305,8 @@ def after_hold(
 
 
 def point_covariance(X: RigidTransform, covariance: Array, p: Array) -> Array:
-    """Covariance (3, 3) m^2 of a point at ``p`` (3,) m of the parent's axes, mapped by ``X`` with covariance (6, 6) [rotation; translation].
+    """Covariance (3, 3) m^2 of a point at ``p`` (3,) m of the parent's axes, mapped by ``X`` with covariance (6, 6)
+    [rotation; translation].
 
     The rotation is on the parent's side about the child's origin, as in every result of weldcal.
     """
@@ -303,11 +318,12 @@ def point_covariance(X: RigidTransform, covariance: Array, p: Array) -> Array:
 
 def expected_error(
     what: str, own_mm: float | None, held_95_mm: float | None, n: int, of: str, place: str = ""
-) -> tuple[Expected, float]:
-    """The error at 95 % in words, and in mm (NaN: not known): the larger of the result's own and that of what it had not seen.
+) -> tuple[ExpectedError, float]:
+    """The error at 95 % in words, and in mm (NaN: not known): the larger of the result's own and that of what it had
+    not seen.
 
-    ``own_mm``: from the covariance (None: none is stated), ``place``: where; ``held_95_mm``: 95 % of ``n`` held-out errors of ``of``
-    (poses, scans; None: there are none).
+    ``own_mm``: from the covariance (None: none is stated), ``place``: where; ``held_95_mm``: 95 % of ``n`` held-out
+    errors of ``of`` (poses, scans; None: there are none).
     """
     own = None if own_mm is None or not np.isfinite(own_mm) else own_mm
     held = None if held_95_mm is None or not np.isfinite(held_95_mm) else held_95_mm
@@ -318,22 +334,23 @@ def expected_error(
         else f"within which 95 % of {n} {of} were, each unseen by its calibration"
     )
     if own is None and held is None:
-        return Expected(
+        return ExpectedError(
             what, "not known", f"the method states no uncertainty, and none of the {of} was left out"
         ), float("nan")
     if held is None:
-        return Expected(what, f"{own:.3f} mm", f"{itself}; no unseen {of.removesuffix('s')} backs it"), float(
+        return ExpectedError(what, f"{own:.3f} mm", f"{itself}; no unseen {of.removesuffix('s')} backs it"), float(
             own or 0.0
         )
     if own is None:
-        return Expected(what, f"{held:.3f} mm", f"{seen}; the method states no uncertainty of its own"), held
+        return ExpectedError(what, f"{held:.3f} mm", f"{seen}; the method states no uncertainty of its own"), held
     larger = max(own, held)
-    return Expected(
-        what, f"{larger:.3f} mm", f"the larger of two: {own:.3f} mm {itself}, and {held:.3f} mm {seen}"
-    ), larger
+    return (
+        ExpectedError(what, f"{larger:.3f} mm", f"the larger of two: {own:.3f} mm {itself}, and {held:.3f} mm {seen}"),
+        larger,
+    )
 
 
-def work_point_expected(work: WorkPoint) -> tuple[Expected, float]:
+def work_point_expected(work: WorkPoint) -> tuple[ExpectedError, float]:
     """The error at the work point in words, and in mm."""
     x, y, z = work.p_B_mm
     place = f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the base"

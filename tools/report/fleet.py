@@ -33,7 +33,8 @@ class Checked:
 
     @property
     def error_mm(self) -> float | None:
-        """Median error of the cell's first calibration on this dataset, mm: held-out for its own dataset, else verified."""
+        """Median error of the cell's first calibration on this dataset, mm: held-out for its own dataset, else
+        verified."""
         if self.verification is None:
             return None if self.calibration["state"] == "failed" else self.calibration["held_out_mm"]["median"]
         return None if self.verification["state"] == "failed" else self.verification["position_error_mm"]["median"]
@@ -45,8 +46,9 @@ class Checked:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A cell with its datasets in order, oldest first, and what follows from them: VISIT, LOOK or FINE, why, and what to do."""
+class FleetCell:
+    """A cell with its datasets in order, oldest first, and what follows from them: VISIT, LOOK or FINE, why, and what
+    to do."""
 
     name: str
     datasets: tuple[Checked, ...]
@@ -99,7 +101,7 @@ class Cell:
 class FleetReport:
     """All cells, those that need a visit first, and where the page is."""
 
-    cells: tuple[Cell, ...]
+    cells: tuple[FleetCell, ...]
     out: Path
 
     def named(self, state: str) -> list[str]:
@@ -178,7 +180,7 @@ def _headline(visit: list[str], look: list[str], cells: int) -> str:
     return f"All {cells} cells are fine" if cells > 1 else "The cell is fine"
 
 
-def _row(cell: Cell) -> dict[str, object]:
+def _row(cell: FleetCell) -> dict[str, object]:
     newest = cell.datasets[-1]
     return {
         "name": cell.name,

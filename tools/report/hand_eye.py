@@ -1,4 +1,5 @@
-"""The result of `weldcal hand-eye` and its page: poses and how sure they are, errors of every sample, comparison of methods."""
+"""The result of `weldcal hand-eye` and its page: poses and how sure they are, errors of every sample, comparison of
+methods."""
 
 from base64 import b64encode
 from collections.abc import Mapping
@@ -11,10 +12,10 @@ from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.pictures.solution import PictureResult
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
-from weldcal.calibration.motion.pose_streams import Synchronised
+from weldcal.calibration.motion.pose_streams import ClockOffset
 from weldcal.calibration.planning.next_pose import NextPose
 from weldcal.models.arrays import Array
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, ShownPose, Tolerance
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 
@@ -33,7 +34,8 @@ class MethodRow:
 @dataclass(frozen=True, kw_only=True)
 class HandEyeReport:
     """A finished calibration: the result, the comparison, the next pose (``advice``: as a sentence) and the files;
-    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were given."""
+    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were given.
+    """
 
     result: HandEyeResult
     mounting: Mounting
@@ -43,7 +45,7 @@ class HandEyeReport:
     seconds: float
     corners: str = ""
     advice: str = ""
-    streams: Synchronised | None = None
+    streams: ClockOffset | None = None
     limit_mm: float | None = None
     folder: Path | None = None
     reading: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
@@ -66,9 +68,11 @@ class HandEyeReport:
         found = Findings(
             against=undetermined(r, everything=True), tolerance=tolerance, unseen=n, concerns=r.warnings, notes=notes
         )
-        after = Next(f"To know it better, add a pose. {self.advice}") if self.advice else Next(
-            "Compare with poses that were not in the file: the target must stay where the result puts it."
-        )  # fmt: skip
+        after = (
+            Next(f"To know it better, add a pose. {self.advice}")
+            if self.advice
+            else Next("Compare with poses that were not in the file: the target must stay where the result puts it.")
+        )
         return FirstScreen(found, expected, after, shown_poses(r, self.mounting))
 
     def summary(self) -> dict[str, object]:
@@ -106,7 +110,8 @@ class HandEyeReport:
         )
 
     def text(self) -> str:
-        """What is printed between the poses' diversity and the first screen: directions, sketch, uncertainty, comparison.
+        """What is printed between the poses' diversity and the first screen: directions, sketch, uncertainty,
+        comparison.
 
         The first screen has the poses themselves, the warnings and the next pose.
         """
@@ -210,21 +215,25 @@ def undetermined(r: HandEyeResult, *, everything: bool = False) -> list[str]:
     return [f"Not observable: {text}. Add poses that turn the hand about other axes." for text in r.unobservable]
 
 
-def held_out_error(r: HandEyeResult) -> tuple[Expected, float, int]:
-    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and the number of poses."""
+def held_out_error(r: HandEyeResult) -> tuple[ExpectedError, float, int]:
+    """The error of poses that their calibration never saw, in words; its 95 % in mm (NaN: none) and the number of
+    poses."""
     used = held_out_used(r)
     seen = np.isfinite(used.translation)
     held = 1e3 * used.translation[seen]
     what = "held-out error at the target, 95 %"
     if not len(held):
         return (
-            Expected(what, "not known", "too few poses to leave any out; it takes the place of a work point"),
+            ExpectedError(what, "not known", "too few poses to leave any out; it takes the place of a work point"),
             float("nan"),
             0,
         )
     p95 = float(np.percentile(held, 95))
-    backing = f"of {held_out_set(r)}, each unseen by its calibration; rms {used.rms_deg:.3f} degrees; in place of a work point"
-    return Expected(what, f"{p95:.3f} mm", backing), p95, len(np.unique(r.observation[r.inliers][seen]))
+    backing = (
+        f"of {held_out_set(r)}, each unseen by its calibration; rms {used.rms_deg:.3f} degrees; in place of a work"
+        " point"
+    )
+    return ExpectedError(what, f"{p95:.3f} mm", backing), p95, len(np.unique(r.observation[r.inliers][seen]))
 
 
 def shown_poses(r: HandEyeResult, mounting: Mounting) -> tuple[ShownPose, ...]:
@@ -279,7 +288,8 @@ def hand_eye_report(report: HandEyeReport, source: str, digest: str) -> str:
 
 
 def unknown_tables(result: HandEyeResult, mounting: Mounting, off: Mapping[str, str]) -> list[Table]:
-    """For each pose a caption and rows: component, value, one sigma; ``off`` adds words to the caption, by the pose's symbol."""
+    """For each pose a caption and rows: component, value, one sigma; ``off`` adds words to the caption, by the pose's
+    symbol."""
     found = []
     for k, X in result.poses.items():
         u, sigma = mounting.unknowns[k], np.sqrt(np.diag(result.covariance[k]))

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftEvent
-from weldcal.calibration.motion.drift.watch import Watched
+from weldcal.calibration.motion.drift.watch import DriftHistory
 from weldcal.models.arrays import Array
-from weldcal.tools.report.first_screen import SCANNER, Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.report.first_screen import SCANNER, ExpectedError, Findings, FirstScreen, Next, ShownPose, Tolerance
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
@@ -25,7 +25,7 @@ CALM, DRIFTED, WARMED = "no drift found", "the scanner has moved", "the scanner 
 class MonitorReport:
     """What was watched, the calibration, the recalibrated result where it was asked for, and the folder."""
 
-    watched: Watched
+    watched: DriftHistory
     calibration: CalibrationResult
     recalibrated: CalibrationResult | None
     cause: str
@@ -36,7 +36,10 @@ class MonitorReport:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. The tolerance is the test's threshold, which --false-alarms sets; there is no work point in a watch."""
+        """The first screen.
+
+        The tolerance is the test's threshold, which --false-alarms sets; there is no work point in a watch.
+        """
         w = self.watched
         largest = float(np.nanmax(w.statistic)) if len(w.statistic) else float("nan")
         source = f"--false-alarms {self.false_alarms_per_hour:g} per hour"
@@ -53,7 +56,7 @@ class MonitorReport:
         )
         errors = 1e3 * np.linalg.norm(w.residuals, axis=1)
         errors = errors[np.isfinite(errors)]
-        expected = Expected(
+        expected = ExpectedError(
             "error of the tracked flange, 95 %",
             f"{np.percentile(errors, 95):.3f} mm" if len(errors) else "not known",
             f"of {len(w.ids)} frames, which the calibration did not use; rms {1e3 * w.rms_m:.3f} mm",

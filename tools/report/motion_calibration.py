@@ -1,4 +1,5 @@
-"""The result of `weldcal calibrate` on a recording in motion and its page: residuals against time, cost against the offset."""
+"""The result of `weldcal calibrate` on a recording in motion and its page: residuals against time, cost against the
+offset."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -44,7 +45,10 @@ class MotionReport:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. The error is the larger of two at 95 %: the pose's own in the middle of the frames, and the held-out one."""
+        """The first screen.
+
+        The error is the larger of two at 95 %: the pose's own in the middle of the frames, and the held-out one.
+        """
         return motion_screen(self.result, self.estimate, self.frames.p_C, self.refused, self.out, self.limit_mm)
 
     @property

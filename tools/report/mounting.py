@@ -33,7 +33,7 @@ from weldcal.systems.jobs.mounting.job import AddedMounting
 from weldcal.systems.jobs.mounting.procedure import MountingStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -57,8 +57,7 @@ from weldcal.tools.report.run import robot_timing
 
 @dataclass(frozen=True)
 class TruthError:
-    """Error of an estimated pose against the ground truth: mm, deg, squared error in units of its covariance, and the bound
-    that it does not exceed with a probability of 99.7 %."""
+    """Error of a pose against the truth: mm, deg, squared error over its covariance, and the 99.7 % bound of that."""
 
     mm: float
     deg: float
@@ -141,14 +140,14 @@ class MountingReport:
         what = f"error of a scanned point {1e3 * self.scene.scanner.optimum_m:.0f} mm in front of the scanner, 95 %"
         if result is None:
             found = Findings(against=against or ["There is no result."], unseen=0)
-            none = Expected(what, "not known", "there is no calibration")
+            none = ExpectedError(what, "not known", "there is no calibration")
             held = after_hold(self.run is not None and self.run.ended_by_operator)
             return FirstScreen(found, none, held, more={"pose": "none was found"})
         _, p95, n = held_out_error(result)
         expected, figure = expected_error(what, 1e3 * status.error_95_m, p95, n, "poses")
         if aside:
             more = f"{expected.backing}; {len(aside)} held out by the job: at most {max(aside):.3f} mm"
-            expected = Expected(what, expected.figure, more)
+            expected = ExpectedError(what, expected.figure, more)
         limit, source = self.tolerance
         tolerance = None if limit is None else Tolerance("the expected error, 95 %,", figure, limit, source)
         open_directions = undetermined(result)
@@ -173,8 +172,9 @@ class MountingReport:
         m, f = len(r.joint_covariance), r.correction
         scale, along_x, along_y = np.sqrt(np.diag(r.with_factors)[m : m + 3])
         text = (
-            f"The pose goes with the scanner's correction in {RESULT_FILE}: scale {100 * (f.scale - 1.0):+.3f} % (sigma {100 * scale:.3f}), gradient "
-            f"{f.gradient_per_m[0]:+.4f} and {f.gradient_per_m[1]:+.4f} per m (sigma {along_x:.4f} and {along_y:.4f})."
+            f"The pose goes with the scanner's correction in {RESULT_FILE}: scale {100 * (f.scale - 1.0):+.3f} % (sigma"
+            f" {100 * scale:.3f}), gradient {f.gradient_per_m[0]:+.4f} and {f.gradient_per_m[1]:+.4f} per m (sigma"
+            f" {along_x:.4f} and {along_y:.4f})."
         )
         if r.undetermined:
             text += f" The scans do not determine its {', '.join(r.undetermined)}: the usual size is assumed."
@@ -273,14 +273,14 @@ class MountingReport:
         if aside:
             lines.append(f"verified     {aside} mm at held-out poses, which the calibration did not use")
         lines.append(
-            f"expected     {1e3 * status.sigma_work_m:.3f} mm (1 sigma), {1e3 * status.error_95_m:.3f} mm (95 %) of a scanned point at the "
-            "scanner's best distance"
+            f"expected     {1e3 * status.sigma_work_m:.3f} mm (1 sigma), {1e3 * status.error_95_m:.3f} mm (95 %) of a"
+            " scanned point at the scanner's best distance"
         )
         lines.append(f"scanner      {self.scanner_sentence()}")
         for symbol, e in self.truth_errors().items():
             lines.append(
-                f"truth        {symbol} is off by {e.mm:.3f} mm, {e.deg:.4f} deg (simulation; squared error in units of its "
-                f"covariance {e.nees:.1f}, 99.7 % of the time below {e.bound:.1f})"
+                f"truth        {symbol} is off by {e.mm:.3f} mm, {e.deg:.4f} deg (simulation; squared error in units of"
+                f" its covariance {e.nees:.1f}, 99.7 % of the time below {e.bound:.1f})"
             )
         lines += [f"refused      {id}: {why}" for id, why in status.refused]
         return "\n".join(lines)
@@ -288,8 +288,7 @@ class MountingReport:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecordedMounting(MountingReport):
-    """The result of recorded scans. ``limit_mm``: the error that the job allows (--limit-mm); ``source``: the dataset's name,
-    ``digest`` what stands for its files."""
+    """The result of recorded scans; ``limit_mm``: the error allowed, ``digest``: of the files of dataset ``source``."""
 
     recorded: MountingStatus
     place: MountingScene
@@ -364,9 +363,11 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         refused=status.refused,
         next_best=None if status.next_best is None else status.next_best.sentence(),
         growth=_growth(report) if len(status.history) > 1 else None,
-        bars=error_bars([k.label for k in status.held_out], aside, np.ones(len(aside), bool), "error, mm")
-        if len(aside)
-        else None,
+        bars=(
+            error_bars([k.label for k in status.held_out], aside, np.ones(len(aside), bool), "error, mm")
+            if len(aside)
+            else None
+        ),
         rows=rows,
         scanner="" if result is None else report.scanner_sentence(),
         seconds=None if report.run is None else report.run.seconds,
@@ -403,8 +404,7 @@ def station_picture(report: MountingReport) -> bytes | None:
     Seen from the side on which the frames lie farthest apart. It shows what truly is: None where nothing is simulated.
     """
     run = report.run
-    world = None if run is None else run.cell.station.world
-    if run is None or world is None:
+    if run is None or (world := run.cell.station.world) is None:
         return None
     pose = report.status.seen[-1].pose if report.status.seen else report.job.plan[0]
     frames = true_frames(report, pose.q, pose.q_2)
@@ -443,7 +443,7 @@ def true_frames(report: MountingReport, q: Array, q_2: Array | None) -> dict[str
 
 
 def _best_view(frames: dict[str, RigidTransform]) -> RigidTransform:
-    """From a little above, far enough for all frames, where the nearest two of them are farthest apart in the picture."""
+    """A view from above of all frames, in which the nearest two of them are farthest apart."""
     points = np.array([X.translation() for X in frames.values()])
     distinct = points[[all(np.linalg.norm(p - o) > 0.03 for o in points[:i]) for i, p in enumerate(points)]]
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0)) + np.array([0.0, 0.0, 0.05])

@@ -38,8 +38,8 @@ def error_bars(
     stated: tuple[float, str] | None = None,
     median_of: str = "",
 ) -> bytes:
-    """One bar per pose (n,), grey where not ``keep``; the median of the others as a line (``median_of`` names them), and
-    ``stated`` (a height and its name) as another. Gross outliers end at the top edge, with their value."""
+    """One bar per pose (n,), grey where not ``keep``; the median of the others as a line (``median_of`` names them),
+    and ``stated`` (a height and its name) as another. Gross outliers end at the top edge, with their value."""
     x = np.arange(len(error))
     figure = Figure(figsize=(8.2, 3.2), layout="constrained")
     axes = figure.subplots()

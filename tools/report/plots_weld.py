@@ -34,7 +34,8 @@ class WeldTrace:
         delta_n, delta_axial, speed, omega, n_d_dot_n_t: (N,); speed is the torch's, m/s.
         e_t: (N,) the servo's estimate of the torch's distance from the refined seam, m; drawn where there is no truth.
         weld_speed, delta_d, axial_d, omega_max: the set values.
-        work, travel: (N,) rad; predicted: (N,) travel angle predicted from the seam; windows: their (work, travel) limits.
+        work, travel: (N,) rad; predicted: (N,) travel angle predicted from the seam; windows: their (work, travel)
+            limits.
         axes: which coordinates are drawn to the right and up, and their names.
     """
 
@@ -67,7 +68,8 @@ class WeldTrace:
 
 
 def part_in_scan(points_B: Array, mesh: TriMesh, X_BP: RigidTransform) -> bytes:
-    """Draw where the scan (N,3) m agrees with the drawn part: its surface towards the scan, from above and from two sides."""
+    """Draw where the scan (N,3) m agrees with the drawn part: its surface towards the scan, from above and from two
+    sides."""
     model = PartModel(mesh)
     scan = into(X_BP, points_B[np.isfinite(points_B).all(axis=1)])
     low, high = mesh.bounds

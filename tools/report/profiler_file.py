@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.models.arrays import Array
 from weldcal.tools.report.first_screen import (
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -62,7 +62,8 @@ def pose_of(record: ProfilerRecord) -> RigidTransform:
 
 
 def middle_error_mm(record: ProfilerRecord, points_F: Array) -> float | None:
-    """Error at 95 % (mm) of a profile point in the middle of the points (n, 3) m in F, of the calibration itself; None: it states none."""
+    """Error at 95 % (mm) of a profile point in the middle of the points (n, 3) m in F, of the calibration itself; None:
+    it states none."""
     if record.covariance is None or not len(points_F):
         return None
     S = point_covariance(pose_of(record), record.covariance, np.asarray(points_F).mean(axis=0))
@@ -71,8 +72,8 @@ def middle_error_mm(record: ProfilerRecord, points_F: Array) -> float | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProfilerFile:
-    """A calibration of a profiler from a file: ``found`` are values of its JSON object, ``points`` (n, 2) m those that were measured in
-    the scan plane, ``held_out_mm`` (k,) the errors of scans that their calibration did not use."""
+    """A calibration of a profiler from a file: ``found`` are values of its JSON object, ``points`` (n, 2) m those that
+    were measured in the scan plane, ``held_out_mm`` (k,) the errors of scans that their calibration did not use."""
 
     record: ProfilerRecord
     found: Mapping[str, Any]
@@ -84,7 +85,10 @@ class ProfilerFile:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. The work point is the middle of the profile points; the error is the larger of two at 95 %."""
+        """The first screen.
+
+        The work point is the middle of the profile points; the error is the larger of two at 95 %.
+        """
         own = middle_error_mm(self.record, self.record.points_F(self.points))
         held = self.held_out_mm[np.isfinite(self.held_out_mm)]
         p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
@@ -95,10 +99,7 @@ class ProfilerFile:
             tolerance = Tolerance(f"the {what},", larger, self.limit_mm, "--limit-mm")
         grave, notes = scan_notes(self.found)
         found = Findings(
-            tolerance=tolerance,
-            unseen=len(held),
-            concerns=(*self.found.get("warnings", ()), *grave),
-            notes=notes,
+            tolerance=tolerance, unseen=len(held), concerns=(*self.found.get("warnings", ()), *grave), notes=notes
         )
         pose = ShownPose("X_FS", WORDS, pose_of(self.record))
         return FirstScreen(found, expected, self._next(), (pose,))
@@ -108,16 +109,19 @@ class ProfilerFile:
         if after:
             p, w = 1e3 * np.array(after["poses"][0][:3]), after["poses"][0][3:]
             return Next(
-                f"To know it better, add a scan with the flange at ({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) mm, rotation vector "
-                f"({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
+                f"To know it better, add a scan with the flange at ({p[0]:.1f}, {p[1]:.1f}, {p[2]:.1f}) mm, rotation"
+                f" vector ({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
             )
-        return Next("Map a groove with it and touch some of its points; --plan 3 proposes poses to add.",
-                    f"weldcal profiler seam SCANS --calibration {self.out}")  # fmt: skip
+        return Next(
+            "Map a groove with it and touch some of its points; --plan 3 proposes poses to add.",
+            f"weldcal profiler seam SCANS --calibration {self.out}",
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProfilerSeam:
-    """A groove that was mapped into the base: ``found`` are values of the JSON object, ``root_mm`` (n, 3) the root in B."""
+    """A groove that was mapped into the base: ``found`` are values of the JSON object, ``root_mm`` (n, 3) the root in
+    B."""
 
     record: ProfilerRecord
     found: Mapping[str, Any]
@@ -129,14 +133,17 @@ class ProfilerSeam:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. No pose is computed: X_FS is that of the calibration. No point of the groove is known otherwise."""
+        """The first screen.
+
+        No pose is computed: X_FS is that of the calibration. No point of the groove is known otherwise.
+        """
         own, n = self.found["error_95_mm"], self.found["found"]
         fit = f"{n} profiles fit their groove with {self.found['rms_mm']:.3f} mm rms (median)"
         what = "error of a mapped point, 95 %"
         if own is None:
-            expected = Expected(what, "not known", f"the calibration states no uncertainty; {fit}")
+            expected = ExpectedError(what, "not known", f"the calibration states no uncertainty; {fit}")
         else:
-            expected = Expected(
+            expected = ExpectedError(
                 what,
                 f"{own:.3f} mm",
                 f"of the profiler's calibration; {fit}; no point of the groove was measured otherwise",
@@ -176,18 +183,22 @@ def profiler_report(made: ProfilerFile) -> str:
         first=made.first,
         title=f"Profiler calibration from {made.source}",
         subtitle=f"Method: {made.record.method}.",
-        bars=error_bars([str(k) for k in range(len(held))], held, np.ones(len(held), bool), "left-out scan, mm")
-        if judged
-        else None,
+        bars=(
+            error_bars([str(k) for k in range(len(held))], held, np.ones(len(held), bool), "left-out scan, mm")
+            if judged
+            else None
+        ),
         seen=_seen(made.points),
         seam=None,
         rows=_rows(made.found),
-        sigma=[]
-        if sigma is None
-        else [
-            ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
-            ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
-        ],
+        sigma=(
+            []
+            if sigma is None
+            else [
+                ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
+                ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
+            ]
+        ),
         warnings=list(made.found.get("warnings", ())),
         lists=_lists(made.found),
         digest=made.record.data_sha256,

@@ -17,7 +17,7 @@ from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.systems.runner import Run
 from weldcal.tools.report.first_screen import (
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -81,7 +81,8 @@ class PoseOutcome:
 
 @dataclass(frozen=True, eq=False)
 class PathOutcome:
-    """Deviations along the seam: arc length (n,) m, and lateral and vertical distance (n,) m from the reference line."""
+    """Deviations along the seam: arc length (n,) m, and lateral and vertical distance (n,) m from the reference
+    line."""
 
     s: Array
     lateral: Array
@@ -191,7 +192,8 @@ class ProfilerLive:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen: X_FS by the edge and by the sphere, each in the middle of its profiles; held-out scans back them."""
+        """The first screen: X_FS by the edge and by the sphere, each in the middle of its profiles; held-out scans back
+        them."""
         s, held = self.state, self.run.held
         against = [self.run.reason or "The job was held."] if held else []
         poses, errors, unseen, backing = [], [], 0, []
@@ -212,7 +214,7 @@ class ProfilerLive:
                 )
         figure = " and ".join(f"{v:.3f} mm" for v in errors) or "not known"
         said = "; ".join(backing) or "no scan was held out"
-        expected = Expected(
+        expected = ExpectedError(
             "error in the middle of the profiles, 95 %", figure, f"of the calibration itself, by each target; {said}"
         )
         o, tolerance = self.outcome, None
@@ -380,8 +382,14 @@ def _aside(points: Array) -> float:
 
 def _row(name: str, p: PoseOutcome) -> tuple[str, ...]:
     return (
-        name, fixed(p.error_mm, 3), fixed(p.sigma_mm, 3), fixed(p.error_deg, 3), fixed(p.sigma_deg, 3), fixed(p.largest, 2), fixed(p.nees, 1)
-    )  # fmt: skip
+        name,
+        fixed(p.error_mm, 3),
+        fixed(p.sigma_mm, 3),
+        fixed(p.error_deg, 3),
+        fixed(p.sigma_deg, 3),
+        fixed(p.largest, 2),
+        fixed(p.nees, 1),
+    )
 
 
 def _shown(value: object) -> str:
@@ -412,7 +420,11 @@ def path_picture(paths: Mapping[str, PathOutcome], limit_mm: float) -> bytes:
     """Distance from the true line along it: raw points as dots, the seam and the torch as lines."""
     figure = Figure(figsize=(8.2, 3.2), layout="constrained")
     axes = figure.subplots()
-    styles = {"points": (".", GREY, "each profile's root"), "curve": ("-", OURS, "seam as found"), "torch": ("-", RUST, "torch")}  # fmt: skip
+    styles = {
+        "points": (".", GREY, "each profile's root"),
+        "curve": ("-", OURS, "seam as found"),
+        "torch": ("-", RUST, "torch"),
+    }
     for name, path in paths.items():
         style, colour, label = styles[name]
         axes.plot(1e3 * path.s, path.distance_mm, style, color=colour, label=label, markersize=3, linewidth=1.6)

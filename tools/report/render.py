@@ -131,7 +131,8 @@ _STYLE = re.compile(r'style="[^"]*"')
 def inline_svg(svg: str, alt: str) -> Markup:
     """The SVG's markup as an image with an alternative text; its ids are its own, so that several stand in one page.
 
-    Black and dark greys become the page's text colour, white its ground, the faint grid its lines; curves keep their hue.
+    Black and dark greys become the page's text colour, white its ground, the faint grid its lines; curves keep their
+    hue.
     """
     name = hashlib.sha256(svg.encode()).hexdigest()[:8]
     text = _DROPPED.sub("", svg).strip()

@@ -33,7 +33,8 @@ class RunOptions:
         recording: write the viewer's recording.html.
         share: show the dashboard, read-only, to the network too.
         record: write recording.mcap, which `weldcal replay` plays back.
-        keep_page: takes the dashboard when the run has ended, as what shows its result and what closes it; None: it closes at once.
+        keep_page: takes the dashboard when the run has ended, as what shows its result and what closes it; None: it
+            closes at once.
     """
 
     scenario: str
@@ -58,7 +59,8 @@ def robot_timing(run: Run[Any]) -> dict[str, object]:
         return {}
     late = clock.lateness
     slowed = (
-        f"The path was slowed to {fixed(100.0 * clock.slowest_rate, 0)} % at the slowest, and took {fixed(clock.slowed_s, 2)} s longer."
+        f"The path was slowed to {fixed(100.0 * clock.slowest_rate, 0)} % at the slowest, and took"
+        f" {fixed(clock.slowed_s, 2)} s longer."
         if clock.slowest_rate < 1.0
         else "The path was never slowed."
     )
@@ -66,8 +68,8 @@ def robot_timing(run: Run[Any]) -> dict[str, object]:
         "robot_timing": {
             "picture": histogram(late),
             "sentence": (
-                f"{fixed(late.on_time_percent, 2)} % of {sum(late.counts)} velocities left less than {ON_TIME_MS:.0f} ms late "
-                f"while the arm moved; the latest {fixed(late.worst_ms, 1)} ms. {slowed}"
+                f"{fixed(late.on_time_percent, 2)} % of {sum(late.counts)} velocities left less than {ON_TIME_MS:.0f}"
+                f" ms late while the arm moved; the latest {fixed(late.worst_ms, 1)} ms. {slowed}"
                 + ("" if run.host is None else f" This computer before the first motion: {run.host.words}.")
             ),
             "behind": clock.sentence(),

@@ -15,7 +15,15 @@ from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import Run
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance, after_hold
+from weldcal.tools.report.first_screen import (
+    ExpectedError,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    after_hold,
+)
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 from weldcal.tools.report.run import robot_timing
@@ -32,11 +40,15 @@ _UNITS = {"phi": ("deg", 180.0 / np.pi), "scale": ("", 1.0), "roll": ("deg", 180
 
 WORDS = "pose of the camera C in the robot's flange F"
 NO_KEY = "No scenario key states how exact a touch must be: compare the error with what your job allows."
-NOTHING = Expected("error of a touch, 95 %", "not known", "there is no calibration")
+NOTHING = ExpectedError("error of a touch, 95 %", "not known", "there is no calibration")
 
 
 def tablet_screen(result: TabletResult, queries_mm: Array, limit_mm: float | None, no_tolerance: str) -> FirstScreen:
-    """Of one visit. The error is that of a touch at a landmark which its fit did not use; of the file's queries (n,) mm where it has any."""
+    """Of one visit.
+
+    The error is that of a touch at a landmark which its fit did not use; of the file's queries (n,) mm where it has
+    any.
+    """
     left = np.array([v for v in result.leave_one_out_mm if v is not None])
     held, what = (queries_mm, "queries of the file") if queries_mm.size else (left, "landmarks")
     expected, tolerance = _touch(held, what, limit_mm)
@@ -71,29 +83,34 @@ def visits_screen(
 
 
 def run_screen(first: FirstScreen | None, reason: str, found: Mapping[str, object], ended: bool = False) -> FirstScreen:
-    """Of a run in simulation: its calibration's (None: it was held before), with the errors that the simulation knows."""
+    """Of a run in simulation: its calibration's (None: it was held before), with the errors that the simulation
+    knows."""
     if first is None:
         lost = Findings(against=[reason or "The job was held."], unseen=0)
         return FirstScreen(lost, NOTHING, after_hold(ended), more={"pose": "none was found"})
     unseen = found["unseen_touch_mm"]
     assert isinstance(unseen, Mapping)
     truth = (
-        f"camera off by {found['X_FC_error_mm']:.2f} mm and {found['X_FC_error_deg']:.3f} degrees; at 50 untouched points the pen is off by "
-        f"{unseen['mean']:.3f} mm on average, {unseen['max']:.3f} at most (known in simulation only)"
+        f"camera off by {found['X_FC_error_mm']:.2f} mm and {found['X_FC_error_deg']:.3f} degrees; at 50 untouched"
+        f" points the pen is off by {unseen['mean']:.3f} mm on average, {unseen['max']:.3f} at most (known in"
+        " simulation only)"
     )
     return FirstScreen(first.found, first.expected, first.next, first.poses, {**first.more, "truth": truth})
 
 
-def _touch(held_mm: Array, what: str, limit_mm: float | None) -> tuple[Expected, Tolerance | None]:
+def _touch(held_mm: Array, what: str, limit_mm: float | None) -> tuple[ExpectedError, Tolerance | None]:
     held = held_mm[np.isfinite(held_mm)]
     p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
     name = "error of a touch, 95 %"
     tolerance = None if limit_mm is None else Tolerance(f"the {name},", p95, limit_mm, "--limit-mm")
     if not len(held):
-        return Expected(name, "not known", "no landmark could be left out"), tolerance
-    return Expected(
-        name, f"{p95:.3f} mm", f"of {len(held)} {what} that the fit did not use; mean {held.mean():.3f} mm"
-    ), tolerance
+        return ExpectedError(name, "not known", "no landmark could be left out"), tolerance
+    return (
+        ExpectedError(
+            name, f"{p95:.3f} mm", f"of {len(held)} {what} that the fit did not use; mean {held.mean():.3f} mm"
+        ),
+        tolerance,
+    )
 
 
 def _next(tolerance: Tolerance | None) -> Next:
@@ -219,17 +236,24 @@ def calibration_report(
 
 
 def visit_report(
-    run: Run[AddedVisit], found: Mapping[str, Any], result: TabletResult | None, shown: Shown | None,
-    *, first: FirstScreen, recording: bool,
-) -> str:  # fmt: skip
+    run: Run[AddedVisit],
+    found: Mapping[str, Any],
+    result: TabletResult | None,
+    shown: Shown | None,
+    *,
+    first: FirstScreen,
+    recording: bool,
+) -> str:
     """The page of a run in a scenario; `result` and `shown` are None if it was held before its end."""
     scenario, job, name = run.cell.scenario, run.cell.job, str(found["scenario"])
     subtitle = f"{scenario.description.rstrip('.')}. " if scenario.description else ""
     robot = "Simulation" if found["robot"] == "simulated" else f"Rendered sensors; robot: {found['robot']}"
     provenance = [
-        ("software", software_version()), ("scenario", name), ("seed", str(found["seed"])),
+        ("software", software_version()),
+        ("scenario", name),
+        ("seed", str(found["seed"])),
         ("real-time factor", fixed(float(found["real_time_factor"]), 2)),
-    ]  # fmt: skip
+    ]
     common: dict[str, Any] = {
         "title": "Tablet calibration in simulation",
         "subtitle": f"{subtitle}{robot}, seed {found['seed']}.",
@@ -247,12 +271,24 @@ def visit_report(
     unseen = found["unseen_touch_mm"]
     header, rows = landmark_rows(result, shown.names)
     cards: list[Card] = [
-        ("Error at untouched points", fixed(unseen["mean"], 3), "mm", "good", f"mean of 50; largest {fixed(unseen['max'], 3)}"),
+        (
+            "Error at untouched points",
+            fixed(unseen["mean"], 3),
+            "mm",
+            "good",
+            f"mean of 50; largest {fixed(unseen['max'], 3)}",
+        ),
         ("Held-out landmark, mean", fixed(found["leave_one_out_mm"], 3), "mm", "plain", "by a fit without it"),
-        ("True error of the camera", fixed(found["X_FC_error_mm"], 2), "mm", "plain", f"{fixed(found['X_FC_error_deg'], 3)} deg"),
+        (
+            "True error of the camera",
+            fixed(found["X_FC_error_mm"], 2),
+            "mm",
+            "plain",
+            f"{fixed(found['X_FC_error_deg'], 3)} deg",
+        ),
         ("True error of the pen", fixed(found["pen_error_mm"], 3), "mm", "plain", "its tip, on the flange"),
         touched,
-    ]  # fmt: skip
+    ]
     return render(
         "tablet.html.j2",
         first=first,
@@ -270,7 +306,7 @@ def visit_report(
             provenance=[*provenance, *_files(result)],
             **common,
         ),
-    )  # fmt: skip
+    )
 
 
 def _truth(job: AddedVisit, found: Mapping[str, Any]) -> list[tuple[str, ...]]:

@@ -1,4 +1,5 @@
-"""What `weldcal tool check` understood of a tool file, and its page: the tool from three sides, and what its finger camera sees."""
+"""What `weldcal tool check` understood of a tool file, and its page: the tool from three sides, and what its finger
+camera sees."""
 
 import io
 from dataclasses import dataclass
@@ -57,9 +58,11 @@ class ToolCheck:
             "mass_kg": t.mass_kg,
             "centre_of_gravity_mm": _mm(t.centre_of_mass_m),
             "feature": "flange" if t.ring is None else "tool_ring",
-            "ring": None
-            if t.ring is None
-            else {"outer_mm": 1e3 * t.ring.outer_m, "bore_mm": 1e3 * t.ring.bore_m, **_pose(t.X_FR)},
+            "ring": (
+                None
+                if t.ring is None
+                else {"outer_mm": 1e3 * t.ring.outer_m, "bore_mm": 1e3 * t.ring.bore_m, **_pose(t.X_FR)}
+            ),
             "tip": {
                 **_pose(t.X_FT),
                 "radius_mm": 1e3 * t.tip_radius_m,
@@ -111,18 +114,34 @@ class ToolCheck:
         tag, ring = s["tag"], t.ring
         assert isinstance(tag, dict)
         return {
-            "weight": f"{t.mass_kg:g} kg at {_text(t.centre_of_mass_m)} mm; carried by {', '.join(self.carriers) or 'no arm'}",
-            "measured by the scanner": "the arm's bare flange"
-            if ring is None
-            else f"ring of {1e3 * ring.outer_m:g} mm, bore {1e3 * ring.bore_m:g} mm, at {_text(t.X_FR.translation())} mm",
-            "tip": f"ball of {1e3 * t.tip_radius_m:g} mm radius at {_text(t.X_FT.translation())} mm, "
-            f"{1e-3 * t.lateral_stiffness_N_per_m:g} N/mm across and {1e-3 * t.axial_stiffness_N_per_m:g} N/mm along",
-            "torch": f"wire point at {_text(self.loaded.p_FW)} mm, {1e3 * t.chord_m:.1f} mm behind the tip and "
-            f"{1e3 * t.torch_height_m:.1f} mm above it, {self.torch_to_finger_deg:.0f} deg from the finger",
-            "finger camera": f"{camera.width} x {camera.height} px, focal length {camera.focal_px:g} px, at "
-            f"{_text(t.X_FK.translation())} mm",
-            "tag": f"{t.tag_dictionary} number {t.tag_id}, {1e3 * t.tag_size_m:.2f} mm, {tag['from_camera_mm']:.1f} mm from the camera: "
-            f"{tag['side_px']:.0f} px wide",
+            "weight": (
+                f"{t.mass_kg:g} kg at {_text(t.centre_of_mass_m)} mm; carried by {', '.join(self.carriers) or 'no arm'}"
+            ),
+            "measured by the scanner": (
+                "the arm's bare flange"
+                if ring is None
+                else (
+                    f"ring of {1e3 * ring.outer_m:g} mm, bore {1e3 * ring.bore_m:g} mm, at"
+                    f" {_text(t.X_FR.translation())} mm"
+                )
+            ),
+            "tip": (
+                f"ball of {1e3 * t.tip_radius_m:g} mm radius at {_text(t.X_FT.translation())} mm,"
+                f" {1e-3 * t.lateral_stiffness_N_per_m:g} N/mm across and {1e-3 * t.axial_stiffness_N_per_m:g} N/mm"
+                " along"
+            ),
+            "torch": (
+                f"wire point at {_text(self.loaded.p_FW)} mm, {1e3 * t.chord_m:.1f} mm behind the tip and "
+                f"{1e3 * t.torch_height_m:.1f} mm above it, {self.torch_to_finger_deg:.0f} deg from the finger"
+            ),
+            "finger camera": (
+                f"{camera.width} x {camera.height} px, focal length {camera.focal_px:g} px, at "
+                f"{_text(t.X_FK.translation())} mm"
+            ),
+            "tag": (
+                f"{t.tag_dictionary} number {t.tag_id}, {1e3 * t.tag_size_m:.2f} mm, {tag['from_camera_mm']:.1f} mm"
+                f" from the camera: {tag['side_px']:.0f} px wide"
+            ),
             "least pipe": f"{self.least_pipe_mm:g} mm across, welded onto a plate from outside",
             "bodies": f"{len(t.drawn())} drawn, {len(t.capsules())} capsules kept clear",
         }
@@ -156,7 +175,8 @@ def tool_report(check: ToolCheck, picture: bytes) -> str:
 
 
 def tool_picture(loaded: LoadedTool) -> bytes:
-    """PNG: the tool from the side (x, z), from behind (y, z) and along the flange's axis (x, y), mm in F; the camera's picture."""
+    """PNG: the tool from the side (x, z), from behind (y, z) and along the flange's axis (x, y), mm in F; the camera's
+    picture."""
     figure = Figure(figsize=(13.0, 9.5), layout="constrained")
     axes = figure.subplots(2, 2)
     for at, plane, names in ((axes[0, 0], (0, 2), "xz"), (axes[0, 1], (1, 2), "yz"), (axes[1, 0], (0, 1), "xy")):

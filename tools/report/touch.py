@@ -8,7 +8,7 @@ import numpy as np
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.touch.judge import LEVEL, TouchErrors
 from weldcal.tools.report.calibration import error_summary, scanner_pose
-from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, Expected, Findings, FirstScreen, Next, Tolerance
+from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, ExpectedError, Findings, FirstScreen, Next, Tolerance
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.verify import Verdict
@@ -34,7 +34,7 @@ class TouchReport:
             "touches outside their region", float(f.outside), float(f.most_outside), "99 % of good cells", ""
         )
         found = Findings(tolerance=tolerance, unseen=len(f.ids), settled=(v.verdict, v.reason))
-        expected = Expected(
+        expected = ExpectedError(
             "touched less scanned, 95 %",
             f"{np.percentile(errors, 95):.3f} mm",
             f"of {len(errors)} touches, which the calibration did not use; median {np.median(errors):.3f} mm",
@@ -57,8 +57,8 @@ class TouchReport:
             return Verdict(
                 DO_NOT,
                 limit,
-                f"{count}; by chance at most {f.most_outside} of {n} lie outside in 99 % of good cells. Calibrate again, or check the tip's "
-                "place on the flange.",
+                f"{count}; by chance at most {f.most_outside} of {n} lie outside in 99 % of good cells. Calibrate"
+                " again, or check the tip's place on the flange.",
             )
         if n < ENOUGH:
             return Verdict(CARE, limit, f"{count}; fewer than {ENOUGH} touches say little.")
@@ -77,12 +77,15 @@ class TouchReport:
         left = error_summary(1e3 * np.abs(f.relative_m))
         rows = {
             "verdict": f"{self.verdict.verdict}: {self.verdict.reason}",
-            "touched - scanned": f"median {e['median']:.3f} mm, largest {e['max']:.3f} mm; stated 95 % limit {self.verdict.limit_mm:.3f} mm "
-            "(median)",
+            "touched - scanned": (
+                f"median {e['median']:.3f} mm, largest {e['max']:.3f} mm; stated 95 % limit {self.verdict.limit_mm:.3f}"
+                " mm (median)"
+            ),
         }
         if np.isfinite(left["median"]):
             rows["from point to point"] = (
-                f"median {left['median']:.3f} mm, largest {left['max']:.3f} mm, once the tool has touched the other points"
+                f"median {left['median']:.3f} mm, largest {left['max']:.3f} mm, once the tool has touched the other"
+                " points"
             )
         return rows
 

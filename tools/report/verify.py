@@ -16,7 +16,7 @@ from weldcal.tools.report.first_screen import (
     DO_NOT,
     ENOUGH_UNSEEN,
     USE,
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -28,8 +28,8 @@ from weldcal.tools.report.render import fixed, render
 
 @dataclass(frozen=True)
 class PoseError:
-    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face normals
-    (None where none was seen), and whether the calibration used this scan."""
+    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face
+    normals (None where none was seen), and whether the calibration used this scan."""
 
     id: str
     error_mm: float
@@ -42,8 +42,8 @@ NONE = "not a verification"
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict of a verification (one of the four above), its limit for the median of the new scans in mm (None: the calibration
-    states none) and the reason, a sentence."""
+    """The verdict of a verification (one of the four above), its limit for the median of the new scans in mm (None: the
+    calibration states none) and the reason, a sentence."""
 
     verdict: str
     limit_mm: float | None
@@ -91,13 +91,15 @@ class VerifyReport:
         )
         if len(new):
             what = f"{len(new)} new scan{'' if len(new) == 1 else 's'}, which the calibration did not use"
-            expected = Expected(
+            expected = ExpectedError(
                 "error at the flange, 95 %",
                 f"{np.percentile(new, 95):.3f} mm",
                 f"of {what}; median {np.median(new):.3f} mm",
             )
         else:
-            expected = Expected("error at the flange, 95 %", "not known", "every scan here was used in the calibration")
+            expected = ExpectedError(
+                "error at the flange, 95 %", "not known", "every scan here was used in the calibration"
+            )
         return FirstScreen(found, expected, self._next(), (scanner_pose(r),))
 
     def _next(self) -> Next:
@@ -184,16 +186,18 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
             stated=None if stated is None else (stated, "stated by the calibration"),
             median_of=median_of,
         ),
-        tilt_bars=error_bars(
-            [i for i, s in zip(ids, seen, strict=True) if s],
-            tilts[seen],
-            fresh[seen],
-            "tilt, deg",
-            stated=None if stated_tilt is None else (stated_tilt, "stated by the calibration"),
-            median_of=median_of,
-        )
-        if seen.any()
-        else None,
+        tilt_bars=(
+            error_bars(
+                [i for i, s in zip(ids, seen, strict=True) if s],
+                tilts[seen],
+                fresh[seen],
+                "tilt, deg",
+                stated=None if stated_tilt is None else (stated_tilt, "stated by the calibration"),
+                median_of=median_of,
+            )
+            if seen.any()
+            else None
+        ),
         field=error_field(report.result.X_BC, report.observations),
         hashes=list(report.hashes.items()),
     )

@@ -1,4 +1,5 @@
-"""The result of `weldcal verify RESULT PAIRS` and its page: the rule of the verdict, residuals and held-out errors of every pair."""
+"""The result of `weldcal verify RESULT PAIRS` and its page: the rule of the verdict, residuals and held-out errors of
+every pair."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,7 +9,7 @@ import numpy as np
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.pairs.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL, Judgement
 from weldcal.calibration.hand_eye.solve import as_transform
-from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, Expected, Findings, FirstScreen, Next, ShownPose
+from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, ExpectedError, Findings, FirstScreen, Next, ShownPose
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.verify import NONE, Verdict
@@ -52,13 +53,18 @@ class PairsReport:
 
         1. The result was computed from these pairs: no verification.
         2. It names another mounting: do not use.
-        3. The pairs have no solution of their own: cannot tell; do not use where the residuals alone are above a stated limit.
-        4. The new solution is better than chance: do not use where the error is above the limit. Without a limit: above its own uncertainty
-           and above SMALL of the held-out error of one pose. Else use with care.
-        5. It is not: use, if the pairs show an error of the limit (SHOWN_MM without one) with the probability POWER; else cannot tell.
+        3. The pairs have no solution of their own: cannot tell; do not use where the residuals alone are above a stated
+          limit.
+        4. The new solution is better than chance: do not use where the error is above the limit. Without a limit: above
+           its own uncertainty and above SMALL of the held-out error of one pose. Else use with care.
+        5. It is not: use, if the pairs show an error of the limit (SHOWN_MM without one) with the probability POWER;
+          else cannot tell.
         """
         j, limit = self.judgement, self.limit_mm
-        held = f"The held-out error of {int(j.used.sum())} pairs with it is {j.held_out_mm:.3f} mm and {j.held_out_deg:.3f} degrees (rms)"
+        held = (
+            f"The held-out error of {int(j.used.sum())} pairs with it is {j.held_out_mm:.3f} mm and"
+            f" {j.held_out_deg:.3f} degrees (rms)"
+        )
         if self.same_data:
             return Verdict(NONE, limit, f"RESULT was computed from these pairs. {held}. Record new pairs to verify it.")
         if self.mounting_stated not in (None, self.mounting.name):
@@ -90,7 +96,10 @@ class PairsReport:
                 return Verdict(CARE, limit, f"{off}. {held}. {chance} {why}")
             return Verdict(DO_NOT, limit, f"{off}. {held}. {chance} Use the new solution, or calibrate again.")
         need, source = (SHOWN_MM, "which is needed without --limit-mm") if limit is None else (limit, "the limit")
-        text = f"{off}, no more than chance explains. {held}. The pairs show errors from {j.shown_mm:.3g} mm on with {100 * POWER:.0f} %"
+        text = (
+            f"{off}, no more than chance explains. {held}. The pairs show errors from {j.shown_mm:.3g} mm on with"
+            f" {100 * POWER:.0f} %"
+        )
         if j.shown_mm > need:
             return Verdict(CANNOT_TELL, limit, f"{text}, and not of {need:g} mm, {source}. Add pairs.")
         return Verdict(USE, limit, f"{text}.")
@@ -101,10 +110,11 @@ class PairsReport:
         v, j = self.verdict, self.judgement
         lead = {NONE: "This is no verification. ", CANNOT_TELL: "These pairs cannot tell. "}.get(v.verdict, "")
         settled = (v.verdict if v.verdict in (USE, CARE, DO_NOT) else CARE, lead + v.reason)
-        expected = Expected(
-            "held-out error at the target, 95 %", f"{1e3 * np.percentile(j.held_translation_m[j.used], 95):.3f} mm",
+        expected = ExpectedError(
+            "held-out error at the target, 95 %",
+            f"{1e3 * np.percentile(j.held_translation_m[j.used], 95):.3f} mm",
             f"of {int(j.used.sum())} pairs, with RESULT's pose and the target's pose from the other pairs",
-        )  # fmt: skip
+        )
         unknown = self.mounting.unknowns["X"]
         words = f"pose of the {unknown.child_words} in the {unknown.parent_words} frame"
         poses = [ShownPose(unknown.symbol, f"{words}, as RESULT states it", as_transform(j.X))]
@@ -154,13 +164,15 @@ class PairsReport:
             "chance": _known(j.chance),
             "false_alarm": FALSE_ALARM,
             "fits": None if j.other is None else {"form": j.other[0], "off_mm": j.other[1]},
-            "new": None
-            if j.new is None
-            else {
-                "X": j.new.X,
-                "held_out_mm": _known(j.new_held_out_mm),
-                "held_out_deg": _known(j.new.held_out.rms_deg),
-            },
+            "new": (
+                None
+                if j.new is None
+                else {
+                    "X": j.new.X,
+                    "held_out_mm": _known(j.new_held_out_mm),
+                    "held_out_deg": _known(j.new.held_out.rms_deg),
+                }
+            ),
             "per_pose": [
                 {"id": i, "used": bool(u), "residual_deg": a, "residual_mm": b, "held_out_deg": c, "held_out_mm": d}
                 for i, u, a, b, c, d in self._columns()
@@ -173,8 +185,11 @@ class PairsReport:
     def _columns(self) -> list[tuple[str, bool, float, float, float, float]]:
         j = self.judgement
         columns = (
-            np.degrees(j.rotation_rad), 1e3 * j.translation_m, np.degrees(j.held_rotation_rad), 1e3 * j.held_translation_m
-        )  # fmt: skip
+            np.degrees(j.rotation_rad),
+            1e3 * j.translation_m,
+            np.degrees(j.held_rotation_rad),
+            1e3 * j.held_translation_m,
+        )
         return [(i, bool(u), *map(float, row)) for i, u, *row in zip(self.ids, j.used, *columns, strict=True)]
 
     def rows(self) -> dict[str, str]:

@@ -48,8 +48,8 @@ def true_work_point(
     """The place (3,) m in the true base that the arm reports as the work point (3,) m.
 
     With a tool: where its tip is when it is reported there, upright as at ``q_home`` (6,) rad. Without one no posture
-    belongs to the work point: it is mapped by the rigid transform that fits the true to the reported flange positions of
-    the calibration ``poses`` (n, 6) rad best.
+    belongs to the work point: it is mapped by the rigid transform that fits the true to the reported flange positions
+    of the calibration ``poses`` (n, 6) rad best.
     """
     if X_FT is not None:
         p_FT = np.asarray(X_FT.translation())
@@ -92,8 +92,8 @@ class WeldOutcome:
 
 @dataclass(frozen=True, eq=False)
 class FeltSeam:
-    """The points of the refined seam, (N,) m: arc length on the true seam, and distance to the left of and above the nominal
-    line of a seated tip's measured centre."""
+    """The points of the refined seam, (N,) m: arc length on the true seam, and distance to the left of and above the
+    nominal line of a seated tip's measured centre."""
 
     s: Array
     lateral: Array
@@ -123,9 +123,11 @@ def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: 
 def live_calibration_error(
     cell: Cell[WeldJob], estimate: CalibrationEstimate, arm: ArmModel | None = None
 ) -> CalibrationError | None:
-    """Error of a live calibration in a simulated world whose scanner and arm have errors of their own; None without truth.
+    """Error of a live calibration in a simulated world whose scanner and arm have errors of their own; None without
+    truth.
 
-    `at_work_m` is the distance between where scanner and calibration put the work point and where the arm reports it: by ``arm``, the refined one, where given.
+    `at_work_m` is the distance between where scanner and calibration put the work point and where the arm reports it:
+    by ``arm``, the refined one, where given.
     """
     station, scenario = cell.station, cell.scenario
     truth, work = station.truth, work_point(scenario)
@@ -284,7 +286,8 @@ def felt_seams(run: Run[WeldJob]) -> list[bool]:
 
 
 def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:
-    """Least, mean and largest value of gap, misalignment and angle along a seam, mm and deg, with their typical sigma."""
+    """Least, mean and largest value of gap, misalignment and angle along a seam, mm and deg, with their typical
+    sigma."""
     if found is None:
         return {}
     rows = {}
@@ -298,7 +301,8 @@ def fit_up_document(found: FitUp | None) -> dict[str, dict[str, float]]:
 
 
 def fit_up_csv(records: Sequence[SeamRecord]) -> str:
-    """One line per plan and place: gap, misalignment and angle with their sigmas; empty where the scan does not show them."""
+    """One line per plan and place: gap, misalignment and angle with their sigmas; empty where the scan does not show
+    them."""
     columns = [f"{name}{kind}_{unit}" for name, (unit, _) in FIT_UP.items() for kind in ("", "_sigma")]
     rows = []
     for record in records:

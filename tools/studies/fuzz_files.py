@@ -12,13 +12,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.damaged_files import (
-    GOOD,
-    READERS,
-    Reader,
-    damaged,
-    lay_out,
-)
+from weldcal.tools.worlds.damaged_files import GOOD, READERS, Reader, damaged, lay_out
 from weldcal.tools.worlds.damaged_reading import Child
 
 _KEPT = 20  # offending files of each reader and verdict
@@ -32,7 +26,8 @@ def benchmark_fuzz_files(
         list[str] | None, option("--readers", "NAME", "Only this reader; repeat for more.", show_default="all")
     ] = None,
 ) -> Outcome:
-    """Damage files of every format by its own grammar: each reader must accept or refuse them by a sentence, in 10 s and 1 GB."""
+    """Damage files of every format by its own grammar: each reader must accept or refuse them by a sentence, in 10 s
+    and 1 GB."""
     wanted = chosen(readers or ())
     result = fuzz_files(wanted, cases, call.seed, call.folder("benchmark", "fuzz-files"), call.progress)
     rows = {name: ", ".join(f"{n} {said}" for said, n in count.most_common()) for name, count in result.counts.items()}
@@ -40,7 +35,7 @@ def benchmark_fuzz_files(
 
 
 @dataclass(frozen=True)
-class Finding:
+class FuzzFailure:
     """A case that was neither accepted nor refused; ``folder`` holds its files."""
 
     reader: str
@@ -55,7 +50,7 @@ class FuzzResult:
     """Verdicts by reader, what must not be, the slowest case of each reader (s), and some refusals of each."""
 
     counts: dict[str, Counter[str]]
-    findings: tuple[Finding, ...]
+    findings: tuple[FuzzFailure, ...]
     slowest_s: dict[str, float]
     seed: int
 
@@ -66,10 +61,14 @@ class FuzzResult:
         first = next(iter(self.findings), None)
         return {
             "state": "failed" if self.findings else "done",
-            "reason": None
-            if first is None
-            else f"{len(self.findings)} damaged files in {len(bad)} readers were neither accepted nor refused; the first, {first.reader} "
-            f"case {first.case}: {first.said}.",
+            "reason": (
+                None
+                if first is None
+                else (
+                    f"{len(self.findings)} damaged files in {len(bad)} readers were neither accepted nor refused; the"
+                    f" first, {first.reader} case {first.case}: {first.said}."
+                )
+            ),
             "seed": self.seed,
             "cases": total.total(),
             **{name.replace(" ", "_"): n for name, n in sorted(total.items())},
@@ -97,7 +96,7 @@ def fuzz_files(
     """
     counts = {reader.name: Counter[str]() for reader in readers}
     slowest = dict.fromkeys(counts, 0.0)
-    findings: list[Finding] = []
+    findings: list[FuzzFailure] = []
     with TemporaryDirectory() as place, Child(Path(place)) as child:
         for n, reader in enumerate(readers):
             for case in range(cases):
@@ -107,7 +106,7 @@ def fuzz_files(
                 if verdict.said not in GOOD:
                     kept = counts[reader.name][verdict.said] <= _KEPT
                     folder = _keep(reader, seed, case, out) if kept else ""
-                    findings.append(Finding(reader.name, case, verdict.said, verdict.detail, folder))
+                    findings.append(FuzzFailure(reader.name, case, verdict.said, verdict.detail, folder))
                 if case % 50 == 0:
                     progress(reader.name, (n + case / cases) / len(readers))
             # after each reader, since thousands of cases take a while

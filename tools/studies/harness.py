@@ -62,7 +62,8 @@ class Study:
     Attributes:
         name: the words of its command after "benchmark" or "reproduce", such as "touch".
         what: one sentence for the page of all studies.
-        case: a module's function; keyword arguments to a mapping of JSON values. None: the results are computed elsewhere.
+        case: a module's function; keyword arguments to a mapping of JSON values. None: the results are computed
+            elsewhere.
         figures: from the results of the cases, failed ones included, to the JSON object.
         header: names of the table's columns.
         rows: the table's lines, from the figures.
@@ -169,7 +170,8 @@ class Measured:
         return [(t.what, t.wanted, f"{t.value:.4g}", t.verdict) for t in self.targets]
 
     def outcome(self) -> Outcome:
-        """The outcome of the command: the JSON object and the table, exit code 1 where a reproduced target is missed."""
+        """The outcome of the command: the JSON object and the table, exit code 1 where a reproduced target is
+        missed."""
         problem = None if self.figures["state"] != "done" else MISSED if self._fails else ""
         return Outcome(self.figures, text=self.show, problem=problem)
 
@@ -225,7 +227,8 @@ def command_line() -> str:
 
 
 def statistics(values: Iterable[float] | Array, *names: str) -> dict[str, float]:
-    """Statistics of finite values, NaN for none: by name median, mean, rms, p95, min, max; without names median, mean, p95, max."""
+    """Statistics of finite values, NaN for none: by name median, mean, rms, p95, min, max; without names median, mean,
+    p95, max."""
     v = np.array([x for x in np.asarray(list(values), dtype=float) if np.isfinite(x)])
     of: dict[str, Callable[[Array], Any]] = {
         "median": np.median,

@@ -1,4 +1,5 @@
-"""Writes one page of all measured figures from result folders of studies: what was measured, how, and what was found."""
+"""Writes one page of all measured figures from result folders of studies: what was measured, how, and what was
+found."""
 
 import json
 from pathlib import Path
@@ -15,8 +16,9 @@ from weldcal.tools.studies.output import markdown_table
 PAGE = "BENCHMARK.md"
 HEAD = """# Measured figures
 
-`weldcal benchmark page` wrote this page from the results of the studies. Each section has the command that measured it. The sizes
-(`--runs`, `--quick` and similar) are in that command. A larger size gives narrower figures. Times are of the machine that ran it.
+`weldcal benchmark page` wrote this page from the results of the studies. Each section has the command that measured it.
+The sizes (`--runs`, `--quick` and similar) are in that command. A larger size gives narrower figures. Times are of the
+machine that ran it.
 
 """
 
@@ -28,7 +30,8 @@ def page(
         list[Path], typer.Argument(metavar="RESULTS", help="Result folders of studies, or folders of such folders.")
     ],
 ) -> Outcome:
-    """Write BENCHMARK.md from the results of `benchmark` and `reproduce`: figures, targets, command, version and date."""
+    """Write BENCHMARK.md from the results of `benchmark` and `reproduce`: figures, targets, command, version and
+    date."""
     found = sorted((path for folder in results for path in folder.rglob(TABLE)), key=lambda path: path.parent.name)
     studies = [study for study in map(_read, found) if study is not None]
     if not studies:

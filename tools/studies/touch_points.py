@@ -23,10 +23,18 @@ def judge_worlds(seeds: list[int]) -> Mapping[str, object]:
         world = touch_world(seed)
         found = judge_touches(world.result, world.touches)
         rows += [
-            [seed, found.features[k], 1e3 * abs(found.error_m[k]), 1e3 * found.limit_m[k], bool(found.inside[k]),
-             1e3 * abs(found.relative_m[k]), bool(found.relative_inside[k]), found.outside > found.most_outside]
+            [
+                seed,
+                found.features[k],
+                1e3 * abs(found.error_m[k]),
+                1e3 * found.limit_m[k],
+                bool(found.inside[k]),
+                1e3 * abs(found.relative_m[k]),
+                bool(found.relative_inside[k]),
+                found.outside > found.most_outside,
+            ]
             for k in range(len(found.ids))
-        ]  # fmt: skip
+        ]
     return {"seeds": seeds, "rows": rows}
 
 
@@ -80,7 +88,8 @@ _EACH = 20  # worlds of one case
 
 
 def touch_cell(scenario: str, seed: int, points: int, folder: str) -> Mapping[str, object]:
-    """Calibrate a whole simulated cell, let its soft tip touch the part, and judge: the JSON object of `verify --scenario`."""
+    """Calibrate a whole simulated cell, let its soft tip touch the part, and judge: the JSON object of `verify
+    --scenario`."""
     calibrated = run_calibration_live(
         RunOptions(scenario=scenario, out=Path(folder) / f"cell{seed}", seed=seed, browser=False, recording=False)
     )

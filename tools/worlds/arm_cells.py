@@ -1,4 +1,5 @@
-"""Makes cells whose flange is small, far or hidden: an arm of drawn housings, a second arm, a table and clutter, by rays."""
+"""Makes cells whose flange is small, far or hidden: an arm of drawn housings, a second arm, a table and clutter, by
+rays."""
 
 import tempfile
 from collections.abc import Mapping
@@ -65,12 +66,14 @@ _DRAWN: dict[str, list[tuple[int, str, tuple[float, float], float, float, float]
         (7, "z", (0.045, 0.045), 0.06, 0.1, 0.03),
     ],
 }
-"""Cylinders of arms without drawings: link, axis, the line's place in the other two coordinates (z, x for y), from, to, radius, m."""
+"""Cylinders of arms without drawings: link, axis, the line's place in the other two coordinates (z, x for y), from, to,
+radius, m."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArmCell:
-    """A cell: its arm, true pose of the scanner X_BC, joints (n, k) rad, scans (H, W, 3) m with NaN, flange's designation."""
+    """A cell: its arm, true pose of the scanner X_BC, joints (n, k) rad, scans (H, W, 3) m with NaN, flange's
+    designation."""
 
     arm: str
     flange: str
@@ -100,7 +103,8 @@ def _box(size: Array, X: RigidTransform) -> TriMesh:
 
 
 def arm_links(name: str, rng: np.random.Generator) -> list[TriMesh]:
-    """Bodies of base and links in their frames, m, thicker or thinner than drawn by up to 8 %, with a box and a hose on them."""
+    """Bodies of base and links in their frames, m, thicker or thinner than drawn by up to 8 %, with a box and a hose on
+    them."""
     chain = load_chain(name)
     if name in known_arms():
         arm = load_arm(name)
@@ -141,7 +145,8 @@ def posed(links: list[TriMesh], flange: TriMesh, frames: list[Array]) -> TriMesh
 
 
 def clutter(reach: float, eye: Array, rng: np.random.Generator) -> TriMesh:
-    """A table, boxes, cans and discs of a flange's size on it, none within 0.2 m of B, and a wall that hides nothing from ``eye`` (3,) m."""
+    """A table, boxes, cans and discs of a flange's size on it, none within 0.2 m of B, and a wall that hides nothing
+    from ``eye`` (3,) m."""
     table = _box(np.array([3.0 * reach, 3.0 * reach, 0.04]), RigidTransform([0.0, 0.0, -0.02 - rng.uniform(0.0, 0.05)]))
     parts = [table]
     for _ in range(int(rng.integers(3, 9))):
@@ -164,7 +169,8 @@ def clutter(reach: float, eye: Array, rng: np.random.Generator) -> TriMesh:
 
 
 def render(mesh: TriMesh, X_BC: RigidTransform, rng: np.random.Generator, sigma: float) -> Array:
-    """A scan (H, W, 3) m with noise that grows with distance and slant, flying pixels, and holes where nothing came back."""
+    """A scan (H, W, 3) m with noise that grows with distance and slant, flying pixels, and holes where nothing came
+    back."""
     u, v = np.meshgrid((np.arange(WIDTH) - 0.5 * WIDTH) / FOCAL, (np.arange(HEIGHT) - 0.5 * HEIGHT) / FOCAL)
     rays_C = np.stack([u, v, np.ones_like(u)], axis=-1)
     d = rays_C @ X_BC.rotation().matrix().T
@@ -254,7 +260,8 @@ def write_cell(cell: ArmCell, folder: Path, *, joints: bool = True) -> None:
         rows.append([f"p{k:02d}", *(repr(float(v)) for v in (*X.translation(), *w, *(q if joints else ())))])
     (folder / "poses.csv").write_text(csv_text(("id", "x", "y", "z", "qw", "qx", "qy", "qz", *names), rows))
     (folder / "dataset.yaml").write_text(
-        f"schema: 1\nrobot: {cell.arm}\nflange: {cell.flange}\nconfiguration: eye_on_base\nunits: {{clouds: m, poses: m}}\n"
+        f"schema: 1\nrobot: {cell.arm}\nflange: {cell.flange}\nconfiguration: eye_on_base\nunits: {{clouds: m, poses:"
+        " m}\n"
     )
     (folder / "clouds").mkdir(exist_ok=True)
     for k, cloud in enumerate(cell.clouds):
@@ -270,12 +277,7 @@ def calibrate_cell(seed: int) -> Mapping[str, object]:
     def error(X_BC: RigidTransform) -> float:
         return float(np.linalg.norm(X_BC @ (cell.X_BC.inverse() @ work) - work))
 
-    found: dict[str, object] = {
-        "arm": cell.arm,
-        "start": "refused",
-        "calibration": "refused",
-        "mm": None,
-    }
+    found: dict[str, object] = {"arm": cell.arm, "start": "refused", "calibration": "refused", "mm": None}
     arm = load_chain(cell.arm)
     start = find_arm(cell.clouds[:START_SCANS], [arm_shape(arm, q) for q in cell.q[:START_SCANS]])
     if start is not None:

@@ -1,4 +1,5 @@
-"""Damages binary files by the grammar of their format: clouds with headers, npz and npy, images, and bytes of any kind."""
+"""Damages binary files by the grammar of their format: clouds with headers, npz and npy, images, and bytes of any
+kind."""
 
 import io
 import re
@@ -59,9 +60,10 @@ def cloud(content: bytes, rng: Rng) -> Damage:
         return head.encode("latin-1") + body[:cut], not text
     if kind == 1:
         more = bytes(rng.integers(1, 256, int(rng.integers(16, 400)), dtype=np.uint8))
-        return content + more, not text and b"list" not in content[: end.end()] and b"compressed" not in content[
-            : end.end()
-        ]
+        return (
+            content + more,
+            not text and b"list" not in content[: end.end()] and b"compressed" not in content[: end.end()],
+        )
     if kind == 2:  # a count that is not the body's
         places = list(re.finditer(r"(?:element \w+|POINTS|WIDTH|HEIGHT|COUNT|SIZE) ([\d ]+)", head))
         spot = _pick(rng, places)
@@ -257,5 +259,10 @@ def image(content: bytes, rng: Rng) -> Damage:
 
 
 GRAMMARS: dict[str, Callable[[bytes, Rng], Damage]] = {
-    "bytes": any_bytes, "cloud": cloud, "npz": npz, "npy": npy, "matlab": matlab, "image": image
-}  # fmt: skip
+    "bytes": any_bytes,
+    "cloud": cloud,
+    "npz": npz,
+    "npy": npy,
+    "matlab": matlab,
+    "image": image,
+}

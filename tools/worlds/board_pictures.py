@@ -29,8 +29,13 @@ SIZE = (640, 480)
 K = np.array([[620.0, 0.0, 322.0], [0.0, 623.0, 236.0], [0.0, 0.0, 1.0]])
 DIST = np.array([-0.12, 0.06, 0.0008, -0.0006])
 BOARDS = (
-    "chessboard:9x6:20", "charuco:8x6:20:15:5X5_100", "circles:7x5:20", "acircles:4x11:12", "tag:7:60:APRILTAG_36h11", "tags:4x3:30:10:4X4_50",
-)  # fmt: skip
+    "chessboard:9x6:20",
+    "charuco:8x6:20:15:5X5_100",
+    "circles:7x5:20",
+    "acircles:4x11:12",
+    "tag:7:60:APRILTAG_36h11",
+    "tags:4x3:30:10:4X4_50",
+)
 _N, _BAD = 20, (3, 9, 14)
 _CORNER_PX, _ROBOT_DEG, _ROBOT_MM = 0.1, 0.03, 0.1
 _SUB = 3  # rays of a pixel in each direction
@@ -54,7 +59,7 @@ class Drawing:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class BoardWorld:
     """Robot poses (n, 4, 4) as the robot states them, poses of the board in the camera, and the truth."""
 
     robot: Array
@@ -116,7 +121,9 @@ def render(drawing: Drawing, C: Array, rng: np.random.Generator) -> NDArray[np.u
     return np.asarray(np.clip(np.rint(value), 0, 255), dtype=np.uint8)
 
 
-def views(drawing: Drawing, rng: np.random.Generator, n: int, *, eye_in_hand: bool, deg: float, mm: float) -> World:
+def views(
+    drawing: Drawing, rng: np.random.Generator, n: int, *, eye_in_hand: bool, deg: float, mm: float
+) -> BoardWorld:
     """``n`` views of the whole board, and the robot's poses with normal errors of ``deg`` and ``mm`` per axis."""
     X = pose(exp_rotation(np.array([0.1, -0.2, 1.5])), np.array([0.03, -0.05, 0.10]))
     turn, shift = ([0.2, 0.1, 0.5], [0.5, 0.1, 0.05]) if eye_in_hand else ([0.1, 2.9, 0.3], [0.01, 0.02, 0.05])
@@ -137,7 +144,7 @@ def views(drawing: Drawing, rng: np.random.Generator, n: int, *, eye_in_hand: bo
         noise = pose(exp_rotation(rng.normal(0.0, np.radians(deg), 3)), rng.normal(0.0, 1e-3 * mm, 3))
         robot.append((F if eye_in_hand else inverse(F)) @ noise)
         camera.append(C)
-    return World(np.array(robot), np.array(camera), X, Y)
+    return BoardWorld(np.array(robot), np.array(camera), X, Y)
 
 
 def calibrated(kind: str, board: str, seed: int) -> Mapping[str, object]:
@@ -173,12 +180,18 @@ def calibrated(kind: str, board: str, seed: int) -> Mapping[str, object]:
     keep, truth = result.inliers, as_transform(world.X)
     theirs = {m: opencv_solve(m, pairs.F[keep], pairs.G[keep]) for m in METHODS}
     return {
-        "square": result.normalised_error("X", truth), "inside": result.normalised_error("X", truth) < result.region(),
-        "each": (difference(np.asarray(result.X.GetAsMatrix4()), world.X) ** 2 / np.diag(result.covariance["X"])).tolist(),
-        "error": _errors(np.asarray(result.X.GetAsMatrix4()), world.X), "opencv": {m: None if t is None else _errors(t[0], world.X) for m, t in theirs.items()},
-        "used": sum(not p.why for p in found.pictures), "right": all(bool(p.why) == (kind == "bad" and k in _BAD) for k, p in enumerate(found.pictures)),
-        "sigma_px": found.bundle.sigma_px, "dof": result.degrees_of_freedom,
-    }  # fmt: skip
+        "square": result.normalised_error("X", truth),
+        "inside": result.normalised_error("X", truth) < result.region(),
+        "each": (
+            difference(np.asarray(result.X.GetAsMatrix4()), world.X) ** 2 / np.diag(result.covariance["X"])
+        ).tolist(),
+        "error": _errors(np.asarray(result.X.GetAsMatrix4()), world.X),
+        "opencv": {m: None if t is None else _errors(t[0], world.X) for m, t in theirs.items()},
+        "used": sum(not p.why for p in found.pictures),
+        "right": all(bool(p.why) == (kind == "bad" and k in _BAD) for k, p in enumerate(found.pictures)),
+        "sigma_px": found.bundle.sigma_px,
+        "dof": result.degrees_of_freedom,
+    }
 
 
 def _errors(X: Array, truth: Array) -> list[float]:

@@ -1,4 +1,5 @@
-"""Builds small valid clouds as scanners write them, from a seed: grids, lists of a vertex, packed and stored files, depth images."""
+"""Builds small valid clouds as scanners write them, from a seed: grids, lists of a vertex, packed and stored files,
+depth images."""
 
 import gzip
 import io

@@ -1,4 +1,5 @@
-"""Damaged files for every reader of a file that a user can write: an example is built, damaged and read; a verdict says what was read."""
+"""Damaged files for every reader of a file that a user can write: an example is built, damaged and read; a verdict says
+what was read."""
 
 import os
 import pickle
@@ -52,8 +53,8 @@ Values = Sequence[Any]
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader: ``target`` is the file of the example that is damaged, by the grammar ``kind``; ``read`` takes the folder and
-    returns what was read, all numbers of which must be finite where ``finite``."""
+    """A reader: ``target`` is the file of the example that is damaged, by the grammar ``kind``; ``read`` takes the
+    folder and returns what was read, all numbers of which must be finite where ``finite``."""
 
     name: str
     kind: str
@@ -196,7 +197,7 @@ def all_finite(value: Any) -> bool:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ReaderVerdict:
     """What a reader did with a case, and its sentence or traceback."""
 
     said: str
@@ -204,7 +205,8 @@ class Verdict:
 
 
 def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, str]:
-    """The example, the damaged files, whether they contradict themselves, and what is there instead of a file ("" a file)."""
+    """The example, the damaged files, whether they contradict themselves, and what is there instead of a file ("" a
+    file)."""
     number = READERS.index(reader)
     rng = np.random.default_rng((seed, number, case))
     files = _example(number, seed, case % _EXAMPLES)
@@ -255,37 +257,37 @@ def lay_out(folder: Path, files: Files, target: str, place: str = "") -> None:
         path.symlink_to(path.name)
 
 
-def judge(reader: Reader, seed: int, case: int, folder: Path) -> Verdict:
+def judge(reader: Reader, seed: int, case: int, folder: Path) -> ReaderVerdict:
     """Build, damage and read a case in the folder, which is the working directory of this process."""
     example, files, contradicts, place = damaged(reader, seed, case)
     lay_out(folder, files, reader.target, place)
     verdict, values = _read(reader, folder)
     if any(path.name == "executed" for path in (*folder.iterdir(), *Path.cwd().iterdir())):
-        return Verdict(EXECUTED)
+        return ReaderVerdict(EXECUTED)
     if verdict.said != ACCEPTED:
         return verdict
     if reader.finite and not all_finite(values):
-        return Verdict(WRONG, "numbers that are not finite were accepted")
+        return ReaderVerdict(WRONG, "numbers that are not finite were accepted")
     if contradicts:
         lay_out(folder, example, reader.target)
         _, original = _read(reader, folder)
         if digest(values) != digest(original):
             lay_out(folder, files, reader.target, place)
-            return Verdict(WRONG, "a file that contradicts itself was accepted, with other data")
+            return ReaderVerdict(WRONG, "a file that contradicts itself was accepted, with other data")
     return verdict
 
 
-def _read(reader: Reader, folder: Path) -> tuple[Verdict, Any]:
+def _read(reader: Reader, folder: Path) -> tuple[ReaderVerdict, Any]:
     try:
         values = reader.read(folder)
     except InputError as e:
         sentence = str(e)
         if not sentence or "\n" in sentence or len(sentence) > _LONGEST:
-            return Verdict(INTERNAL, f"no clear sentence ({len(sentence)} characters): {sentence[:200]}"), None
-        return Verdict(REFUSED, sentence), None
+            return ReaderVerdict(INTERNAL, f"no clear sentence ({len(sentence)} characters): {sentence[:200]}"), None
+        return ReaderVerdict(REFUSED, sentence), None
     except Exception:
-        return Verdict(INTERNAL, traceback.format_exc(limit=-6)), None
-    return Verdict(ACCEPTED), values
+        return ReaderVerdict(INTERNAL, traceback.format_exc(limit=-6)), None
+    return ReaderVerdict(ACCEPTED), values
 
 
 def digest(values: Any) -> str:

@@ -1,6 +1,7 @@
 """Reads damaged files in a child process, which is started anew after it hung, died or took too much memory.
 
-As a program of its own this module is the child: it reads "reader seed case" lines and answers each with a line of JSON.
+As a program of its own this module is the child: it reads "reader seed case" lines and answers each with a line of
+JSON.
 """
 
 import json
@@ -15,7 +16,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from weldcal.tools.worlds.damaged_files import CRASH, HANG, MEMORY, READERS, Reader, Verdict, judge
+from weldcal.tools.worlds.damaged_files import CRASH, HANG, MEMORY, READERS, Reader, ReaderVerdict, judge
 
 WATCHDOG_S = 10.0
 WORKER = ("-m", "weldcal.tools.worlds.damaged_reading")
@@ -37,7 +38,7 @@ class Child:
     def __exit__(self, *error: object) -> None:
         self._end()
 
-    def ask(self, reader: Reader, seed: int, case: int) -> tuple[Verdict, float]:
+    def ask(self, reader: Reader, seed: int, case: int) -> tuple[ReaderVerdict, float]:
         """The verdict of a case, and how many seconds it took with making its files."""
         limit = WATCHDOG_S if self._process is not None else WATCHDOG_S + _START_S
         process = self._process or self._start()
@@ -47,18 +48,18 @@ class Child:
             process.stdin.flush()
         except BrokenPipeError:
             self._end()
-            return Verdict(CRASH, "the worker ended before the case"), 0.0
+            return ReaderVerdict(CRASH, "the worker ended before the case"), 0.0
         answer = self._line(process, limit)
         if answer is None:
             hung = process.poll() is None
             self._end()
             if hung:
-                return Verdict(HANG, f"no answer within {WATCHDOG_S:g} s"), WATCHDOG_S
-            return Verdict(CRASH, f"exit {process.returncode}"), 0.0
+                return ReaderVerdict(HANG, f"no answer within {WATCHDOG_S:g} s"), WATCHDOG_S
+            return ReaderVerdict(CRASH, f"exit {process.returncode}"), 0.0
         said: dict[str, Any] = json.loads(answer)
         if said["said"] == MEMORY:  # the next case begins with little
             self._end()
-        return Verdict(said["said"], said["detail"]), said["seconds"]
+        return ReaderVerdict(said["said"], said["detail"]), said["seconds"]
 
     def _start(self) -> subprocess.Popen[str]:
         shutil.rmtree(self._place, ignore_errors=True)
@@ -110,7 +111,7 @@ def main() -> None:
         seconds = time.monotonic() - begin
         size = sum(p.stat().st_size for p in place.rglob("*") if p.is_file() and not p.is_symlink())
         if too_much(_peak() - idle, size):
-            verdict = Verdict(MEMORY, f"{(_peak() - idle) / 2**20:.0f} MiB for {size} bytes; {verdict.said}")
+            verdict = ReaderVerdict(MEMORY, f"{(_peak() - idle) / 2**20:.0f} MiB for {size} bytes; {verdict.said}")
         answers.write(json.dumps({"said": verdict.said, "detail": verdict.detail, "seconds": seconds}) + "\n")
         answers.flush()
 

@@ -16,13 +16,14 @@ _STILL: Vector = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """Times in s after the start, lengths in mm in axes of the base, angles (roll, pitch, yaw) in degrees; zeros: nothing happens.
+    """Times in s after the start, lengths in mm in axes of the base, angles (roll, pitch, yaw) in degrees; zeros:
+    nothing happens.
 
     knock_s, knock_mm, knock_deg   the scanner's housing jumps: its own origin by knock_mm, its axes by knock_deg
-    creep_mm_per_min               the scanner moves steadily from creep_s on
-    base_s, base_mm, base_deg      the robot's base jumps: the scanner and everything that stands still move in its frame
-    warm_up_s                      time constant of the scanner's own warm-up; 0: it is warm
-    warm_up_scale, warm_up_gradient_per_m  its relative error of lengths, and that per metre of x, while cold; both die away
+    creep_mm_per_min               the scanner moves steadily from creep_s on base_s, base_mm, base_deg      the robot's
+    base jumps: the scanner and everything that stands still move in its frame warm_up_s                      time
+    constant of the scanner's own warm-up; 0: it is warm warm_up_scale, warm_up_gradient_per_m  its relative error of
+    lengths, and that per metre of x, while cold; both die away
     """
 
     knock_s: float = 0.0
@@ -38,7 +39,8 @@ class Disturbance:
     warm_up_gradient_per_m: float = 0.0
 
     def world_in_base(self, t: float) -> RigidTransform:
-        """Pose X_BW of what stands still, in the robot's base, at ``t`` s; the two are one before the base has moved."""
+        """Pose X_BW of what stands still, in the robot's base, at ``t`` s; the two are one before the base has
+        moved."""
         if t < self.base_s or not any((*self.base_mm, *self.base_deg)):
             return RigidTransform()
         return _pose(self.base_mm, self.base_deg).inverse()
@@ -77,9 +79,10 @@ class Disturbance:
             out["base"] = {"time_s": start_s + self.base_s, "mm": self.base_mm, "deg": self.base_deg}
         if self.warm_up_s:
             out["warm_up"] = {
-                "time_constant_s": self.warm_up_s, "scale": self.warm_up_scale,
+                "time_constant_s": self.warm_up_s,
+                "scale": self.warm_up_scale,
                 "gradient_per_m": self.warm_up_gradient_per_m,
-            }  # fmt: skip
+            }
         return out
 
 
@@ -98,11 +101,18 @@ def disturbance_of(knock: str = "", creep: str = "", base: str = "", warm_up: st
     based = _numbers(base, "--base", (4, 7))
     warming = _numbers(warm_up, "--warm-up", (2, 3))
     return Disturbance(
-        knock_s=knocked[0], knock_mm=_vector(knocked[1:4]), knock_deg=_vector(knocked[4:7]),
-        creep_s=creeping[0], creep_mm_per_min=_vector(creeping[1:4]),
-        base_s=based[0], base_mm=_vector(based[1:4]), base_deg=_vector(based[4:7]),
-        warm_up_s=warming[0], warm_up_scale=1e-6 * warming[1], warm_up_gradient_per_m=1e-6 * warming[2],
-    )  # fmt: skip
+        knock_s=knocked[0],
+        knock_mm=_vector(knocked[1:4]),
+        knock_deg=_vector(knocked[4:7]),
+        creep_s=creeping[0],
+        creep_mm_per_min=_vector(creeping[1:4]),
+        base_s=based[0],
+        base_mm=_vector(based[1:4]),
+        base_deg=_vector(based[4:7]),
+        warm_up_s=warming[0],
+        warm_up_scale=1e-6 * warming[1],
+        warm_up_gradient_per_m=1e-6 * warming[2],
+    )
 
 
 def _numbers(text: str, name: str, counts: tuple[int, ...]) -> tuple[float, ...]:

@@ -1,7 +1,8 @@
-"""Simulated sets of flange scans, clean or with one cause; the arm and the scanner err in ways that the doctor's models do not hold.
+"""Simulated sets of flange scans, clean or with one cause; the arm and the scanner err in ways that the doctor's models
+do not hold.
 
-The arm has joint zeros, link lengths, sag and repeatability of its own; the scanner a polynomial warp to the third power, noise that
-grows with distance, and normals that bend at the rim.
+The arm has joint zeros, link lengths, sag and repeatability of its own; the scanner a polynomial warp to the third
+power, noise that grows with distance, and normals that bend at the rim.
 """
 
 from collections.abc import Callable
@@ -11,7 +12,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import DoctorCase
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.models.arms.chain import Chain, chain_poses, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics
@@ -23,7 +24,7 @@ FLANGE = "iso9409-1-50-4-m6"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class World:
+class DoctorWorld:
     """A cell in which scans are taken: the arm as its controller believes it, as it is, the camera and its errors."""
 
     rng: np.random.Generator
@@ -42,7 +43,7 @@ class World:
         return len(self.q)
 
 
-def make_world(seed: int, *, alike: bool = False) -> World:
+def make_world(seed: int, *, alike: bool = False) -> DoctorWorld:
     """A cell of its own for each seed: arm, scanner place, and 10 to 20 poses in front of the scanner."""
     rng = np.random.default_rng([seed, 18])
     name = ARMS[int(rng.integers(len(ARMS)))]
@@ -84,7 +85,7 @@ def make_world(seed: int, *, alike: bool = False) -> World:
         q = answers[np.argmin(np.abs(np.angle(np.exp(1j * (answers - near)))).sum(axis=1))]
         if np.abs(np.angle(np.exp(1j * (q - near)))).max() < 2.2:
             found.append(q)
-    return World(
+    return DoctorWorld(
         rng=rng,
         name=name,
         believed=believed,
@@ -105,10 +106,10 @@ def _off(chain: Chain, rng: np.random.Generator, length: float) -> Chain:
 
 
 def observe(
-    world: World, X_BF: Array, X_BC: Array | None = None, believed: Array | None = None, *, soft: float = 0.0
-) -> Case:
-    """What the scanner sees of the true flange poses (n, 4, 4); ``believed`` is what the controller states, ``soft`` the distance (m) from
-    which on the image is out of focus (0: nowhere)."""
+    world: DoctorWorld, X_BF: Array, X_BC: Array | None = None, believed: Array | None = None, *, soft: float = 0.0
+) -> DoctorCase:
+    """What the scanner sees of the true flange poses (n, 4, 4); ``believed`` is what the controller states, ``soft``
+    the distance (m) from which on the image is out of focus (0: nowhere)."""
     rng, n = world.rng, len(X_BF)
     X_CF = inverse(np.broadcast_to(world.X_BC if X_BC is None else X_BC, (n, 4, 4))) @ X_BF
     c, m = X_CF[:, :3, 3], X_CF[:, :3, 2]
@@ -132,7 +133,7 @@ def observe(
     )
     normals = np.einsum("kij,kj->ki", exp_rotation(turn), m)
     noise = 6e-5 * far * blur * np.exp(rng.normal(0.0, 0.12, n))
-    return Case(
+    return DoctorCase(
         ids=tuple(f"scan{k + 1:02d}" for k in range(n)),
         X_BF=chain_poses(world.believed, world.q) if believed is None else believed,
         c=seen,
@@ -147,7 +148,7 @@ def observe(
     )
 
 
-def true_poses(world: World) -> Array:
+def true_poses(world: DoctorWorld) -> Array:
     """Flange poses X_BF (n, 4, 4) as they are: the arm's own lengths, zeros, sag and repeatability."""
     sag = np.zeros_like(world.q)
     sag[:, 1] = 4e-5 * np.cos(world.q[:, 1])
@@ -155,13 +156,13 @@ def true_poses(world: World) -> Array:
     return chain_poses(world.true, q)
 
 
-def clean(seed: int) -> Case:
+def clean(seed: int) -> DoctorCase:
     """A set without a cause."""
     world = make_world(seed)
     return observe(world, true_poses(world))
 
 
-def _moved(seed: int) -> Case:
+def _moved(seed: int) -> DoctorCase:
     world = make_world(seed)
     rng, n = world.rng, world.n
     k = int(rng.integers(max(3, n // 3), n - max(3, n // 3) + 1))
@@ -179,7 +180,7 @@ def _direction(rng: np.random.Generator) -> Array:
     return np.asarray(v / np.linalg.norm(v))
 
 
-def _tcp(seed: int) -> Case:
+def _tcp(seed: int) -> DoctorCase:
     world = make_world(seed)
     rng = world.rng
     t = np.array([rng.normal(0.0, 0.02), rng.normal(0.0, 0.02), rng.uniform(0.03, 0.25)])
@@ -187,7 +188,7 @@ def _tcp(seed: int) -> Case:
     return observe(world, true_poses(world), believed=chain_poses(world.believed, world.q) @ pose(turn, t))
 
 
-def _quaternion(seed: int) -> Case:
+def _quaternion(seed: int) -> DoctorCase:
     world = make_world(seed)
     X = chain_poses(world.believed, world.q)
     first = bool(world.rng.uniform() < 0.5)
@@ -196,7 +197,7 @@ def _quaternion(seed: int) -> Case:
     return observe(world, true_poses(world), believed=pose(wrong, X[:, :3, 3]))
 
 
-def _installation(seed: int) -> Case:
+def _installation(seed: int) -> DoctorCase:
     world = make_world(seed)
     rng = world.rng
     kind = int(rng.integers(3))
@@ -207,12 +208,12 @@ def _installation(seed: int) -> Case:
     return observe(world, true_poses(world), believed=X @ chain_poses(world.believed, world.q))
 
 
-def _flange(seed: int) -> Case:
+def _flange(seed: int) -> DoctorCase:
     names = ("iso9409-1-40-4-m6", "iso9409-1-63-4-m6", "iso9409-1-31.5-4-m5")
     return replace(clean(seed), fits_flange=names[seed % 3])
 
 
-def _units(seed: int) -> Case:
+def _units(seed: int) -> DoctorCase:
     case = clean(seed)
     rng = np.random.default_rng([seed, 5])
     X = case.X_BF.copy()
@@ -224,17 +225,17 @@ def _units(seed: int) -> Case:
     return case.with_poses(X)
 
 
-def _alike(seed: int) -> Case:
+def _alike(seed: int) -> DoctorCase:
     world = make_world(seed, alike=True)
     return observe(world, true_poses(world))
 
 
-def _focus(seed: int) -> Case:
+def _focus(seed: int) -> DoctorCase:
     world = make_world(seed)
     return observe(world, true_poses(world), soft=float(world.rng.uniform(0.57, 0.64)))
 
 
-def _drift(seed: int) -> Case:
+def _drift(seed: int) -> DoctorCase:
     world = make_world(seed)
     rng, n = world.rng, world.n
     t = np.linspace(0.0, 1.0, n)
@@ -246,7 +247,7 @@ def _drift(seed: int) -> Case:
     return observe(world, true_poses(world), X_BC)
 
 
-def _slack(seed: int) -> Case:
+def _slack(seed: int) -> DoctorCase:
     world = make_world(seed)
     rng, n = world.rng, world.n
     X = true_poses(world)
@@ -263,7 +264,7 @@ def _slack(seed: int) -> Case:
     return observe(world, X, X_BC)
 
 
-def _kinematics(seed: int) -> Case:
+def _kinematics(seed: int) -> DoctorCase:
     world = make_world(seed)
     rng = world.rng
     if rng.uniform() < 0.3:
@@ -277,7 +278,7 @@ def _kinematics(seed: int) -> Case:
     return observe(world, true_poses(world), believed=chain_poses(wrong, q))
 
 
-def _outliers(seed: int) -> Case:
+def _outliers(seed: int) -> DoctorCase:
     case = clean(seed)
     rng = np.random.default_rng([seed, 7])
     bad = rng.permutation(case.n)[: int(rng.integers(1, max(2, case.n // 5) + 1))]
@@ -288,7 +289,7 @@ def _outliers(seed: int) -> Case:
     return replace(case, c=c, coverage=coverage)
 
 
-CAUSES: dict[str, Callable[[int], Case]] = {
+CAUSES: dict[str, Callable[[int], DoctorCase]] = {
     "scanner moved": _moved,
     "TCP set at the controller": _tcp,
     "wrong quaternion order": _quaternion,
@@ -305,52 +306,52 @@ CAUSES: dict[str, Callable[[int], Case]] = {
 """What each cause does to a set, by seed."""
 
 
-def _inverted(seed: int) -> Case:
+def _inverted(seed: int) -> DoctorCase:
     case = clean(seed)
     return case.with_poses(inverse(case.X_BF))
 
 
-def _euler(seed: int) -> Case:
+def _euler(seed: int) -> DoctorCase:
     case = clean(seed)
     angles = Rotation.from_matrix(case.X_BF[:, :3, :3]).as_euler("ZYX")
     return case.with_poses(pose(Rotation.from_euler("xyz", angles).as_matrix(), case.X_BF[:, :3, 3]))
 
 
-def _shifted(seed: int) -> Case:
+def _shifted(seed: int) -> DoctorCase:
     case = clean(seed)
     return case.pick(np.arange(1, case.n)).with_poses(case.X_BF[:-1])
 
 
-def _mirrored(seed: int) -> Case:
+def _mirrored(seed: int) -> DoctorCase:
     case = clean(seed)
     flip = np.array([1.0, -1.0, 1.0])
     return replace(case, c=case.c * flip, m=case.m * flip)
 
 
-def _scale(seed: int) -> Case:
+def _scale(seed: int) -> DoctorCase:
     case = clean(seed)
     return replace(case, c=case.c * (1.03 if seed % 2 else 0.97))
 
 
-def _encoder(seed: int) -> Case:
+def _encoder(seed: int) -> DoctorCase:
     world = make_world(seed)
     q = world.q.copy()
     q[:, 1 + seed % 4] += np.radians(2.5)
     return observe(world, true_poses(world), believed=chain_poses(world.believed, q))
 
 
-def _shuffled(seed: int) -> Case:
+def _shuffled(seed: int) -> DoctorCase:
     case = clean(seed)
     return case.with_poses(case.X_BF[np.random.default_rng([seed, 11]).permutation(case.n)])
 
 
-def _random_turns(seed: int) -> Case:
+def _random_turns(seed: int) -> DoctorCase:
     case = clean(seed)
     R = Rotation.random(case.n, random_state=seed).as_matrix()
     return case.with_poses(pose(R, case.X_BF[:, :3, 3]))
 
 
-UNKNOWN: dict[str, Callable[[int], Case]] = {
+UNKNOWN: dict[str, Callable[[int], DoctorCase]] = {
     "poses inverted": _inverted,
     "wrong rotation convention": _euler,
     "scans and poses shifted by one": _shifted,
@@ -360,4 +361,7 @@ UNKNOWN: dict[str, Callable[[int], Case]] = {
     "scans of other poses": _shuffled,
     "rotations without meaning": _random_turns,
 }
-"""What each does to a set, by seed. Of the last three no model has the name: "unexplained", or a kinematics file, is right."""
+"""What each does to a set, by seed.
+
+Of the last three no model has the name: "unexplained", or a kinematics file, is right.
+"""

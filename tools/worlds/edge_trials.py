@@ -42,7 +42,8 @@ SETS = ("xy_paper", "tilt_paper", "xy_nominal", "tilt_nominal")
 
 
 class EdgeError(NamedTuple):
-    """Error of a calibration: rotation deg, translation mm, normalised error squared of six numbers (NaN without covariance)."""
+    """Error of a calibration: rotation deg, translation mm, normalised error squared of six numbers (NaN without
+    covariance)."""
 
     deg: float
     mm: float
@@ -54,7 +55,8 @@ class EdgeTrial:
     """One calibration by an edge.
 
     Attributes:
-        poses, points: flange poses (n) as reported and profile points (n, 2) m, usually 25 rotations of 10 translations.
+        poses, points: flange poses (n) as reported and profile points (n, 2) m, usually 25 rotations of 10
+            translations.
         truth, noise: of these.
         ball_poses, ball: profiles of a ball (60, m, 2) m on which the result is tried, and the flange poses.
         wrong: (n,) which points are outliers, where some are.
@@ -150,7 +152,8 @@ def fixed_edge_trials(folder: Path, name: str) -> Iterator[EdgeTrial]:
 def made_edge_trials(name: str, count: int, seed: int) -> Iterator[EdgeTrial]:
     """Made from seeds, as the fixed files were: the scanner's pose and the edge are theirs, poses and noise are not.
 
-    Besides `SETS`: free_paper, free_nominal (40 poses, all different), outlier_nominal (every tenth point is 1 to 8 mm off).
+    Besides `SETS`: free_paper, free_nominal (40 poses, all different), outlier_nominal (every tenth point is 1 to 8 mm
+    off).
     """
     kind, level = name.split("_")
     make = {"free": _free, "outlier": _outlier}.get(kind, _arcs)

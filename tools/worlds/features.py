@@ -1,4 +1,5 @@
-"""A world of flange features without clouds: arm with kinematic errors, warped scanner, jitter, knocks; for long drift studies."""
+"""A world of flange features without clouds: arm with kinematic errors, warped scanner, jitter, knocks; for long drift
+studies."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,8 +22,10 @@ _ACCELERATION = 1.2  # m/s^2 of the TCP, roughly
 
 @dataclass(frozen=True)
 class Change:
-    """Something that happens at ``time_s``: the scanner turns by ``rotation_rad`` (3,) about its own origin and shifts by
-    ``translation_m`` (3,), in the base, at once or, over ``over_s`` seconds, evenly; ``scale`` changes with exp(-t / over_s)."""
+    """Something that happens at ``time_s``: the scanner turns by ``rotation_rad`` (3,) about its own origin and shifts
+    by ``translation_m`` (3,), in the base, at once or, over ``over_s`` seconds, evenly; ``scale`` changes with exp(-t /
+    over_s).
+    """
 
     time_s: float = np.inf
     translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -33,8 +36,10 @@ class Change:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
-    """What differs between worlds: size of the work (m), speed (m/s), time between frames (s), jitter of the stamps: ``device`` a
-    clock of 0.1 ms, ``arrival`` a skewed transport of 15 ms; sigmas of systematic errors of the arm (rad) and the scanner (m)."""
+    """What differs between worlds: size of the work (m), speed (m/s), time between frames (s), jitter of the stamps:
+    ``device`` a clock of 0.1 ms, ``arrival`` a skewed transport of 15 ms; sigmas of systematic errors of the arm (rad)
+    and the scanner (m).
+    """
 
     cube_m: float = 0.2
     speed_m_s: float = 0.25
@@ -54,7 +59,7 @@ class WorldConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class FeatureWorld:
     """A calibration and the residuals of the frames against it. Truth stays in ``config``."""
 
     X_BC: RigidTransform
@@ -63,9 +68,12 @@ class World:
     rows: Rows
 
 
-def simulate(config: WorldConfig, duration_s: float, seed: int) -> World:
-    """Residuals of a recording. The arm moves by joint-space moves between the corners of random tasks, each repeated for
-    ``task_s``; its poses are reported by other kinematics than it has. Deterministic for ``seed``."""
+def simulate(config: WorldConfig, duration_s: float, seed: int) -> FeatureWorld:
+    """Residuals of a recording.
+
+    The arm moves by joint-space moves between the corners of random tasks, each repeated for ``task_s``; its poses are
+    reported by other kinematics than it has. Deterministic for ``seed``.
+    """
     rng = np.random.default_rng(seed)
     z = -_CENTER / np.linalg.norm(_CENTER) * 0.2 + np.array([0.1, 0.35, -0.9])
     z = z / np.linalg.norm(z)
@@ -105,7 +113,8 @@ def simulate(config: WorldConfig, duration_s: float, seed: int) -> World:
     wrong = rng.random(n) < config.outliers
     p_C[wrong] += rng.normal(0.0, 2e-3, (int(wrong.sum()), 3))
     n_C[wrong] = _unit(n_C[wrong] + rng.normal(0.0, 0.01, (int(wrong.sum()), 3)))
-    # the calibration: the pose that fits the first task best, with an error of the size that it states, about the middle of the work
+    # the calibration: the pose that fits the first task best, with an error of the size that it states, about the
+    # middle of the work
     a = fitted[:3] + config.calibration_rad * rng.standard_normal(3)
     b = fitted[3:] + config.calibration_m * rng.standard_normal(3)
     R_hat = exp_rotation(a) @ R_true
@@ -119,7 +128,7 @@ def simulate(config: WorldConfig, duration_s: float, seed: int) -> World:
     rows = rows_of(
         X_BC, _CENTER, stamps, p, nrm, V[:, 3:], np.cross(V[:, :3], nrm), p_C, n_C, config.stated**2 * S, stated
     )
-    return World(X_BC, C, _CENTER, rows.part(np.argsort(stamps, kind="stable")))
+    return FeatureWorld(X_BC, C, _CENTER, rows.part(np.argsort(stamps, kind="stable")))
 
 
 def _best_move(p_C: Array, p_B: Array, R: Array, p: Array, which: Array) -> Array:

@@ -25,7 +25,10 @@ from weldcal.welding.record.weld_log import COLUMNS, WeldRecord, weld_log_texts
 Files = dict[str, bytes]
 Rng = np.random.Generator
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-DATASET = "schema: 1\nrobot: ur10e\nflange: iso9409-1-50-4-m6\nscanner: phoxi_m\nconfiguration: eye_on_base\nunits: {clouds: m, poses: m}\n"
+DATASET = (
+    "schema: 1\nrobot: ur10e\nflange: iso9409-1-50-4-m6\nscanner: phoxi_m\nconfiguration: eye_on_base\nunits: {clouds:"
+    " m, poses: m}\n"
+)
 
 
 def points(rng: Rng, n: int = 60) -> Array:
@@ -34,7 +37,8 @@ def points(rng: Rng, n: int = 60) -> Array:
 
 
 def ply(rng: Rng) -> Files:
-    """Text or binary of either order; coordinates of several types, among other properties, a camera or faces behind."""
+    """Text or binary of either order; coordinates of several types, among other properties, a camera or faces
+    behind."""
     n, kind = 60, str(rng.choice(["ascii", "binary_little_endian", "binary_big_endian"]))
     names = ["x", "y", "z"] + (["intensity"] if rng.random() < 0.5 else [])
     types = [str(rng.choice(["float", "double", "int"])) for _ in names]
@@ -370,7 +374,8 @@ def profiler_blocks(rng: Rng) -> Files:
 
 
 def profiler_heights(rng: Rng) -> Files:
-    """A grid of heights with the x of its columns in the first row, or of its rows in the first column; and their poses."""
+    """A grid of heights with the x of its columns in the first row, or of its rows in the first column; and their
+    poses."""
     grid = np.vstack([np.linspace(-20.0, 20.0, 12), rng.uniform(80.0, 120.0, (6, 12))])
     grid[3, 4] = -99999.9999
     rows = grid if rng.random() < 0.5 else grid.T
@@ -397,11 +402,20 @@ def planar(rng: Rng) -> Files:
     """Planar touches with depths and queries."""
     px = np.array([[400.0 * i, 250.0 * j] for j in range(3) for i in range(3)])
     arrays = {
-        "uv": 320.0 + 0.3 * px + rng.normal(size=(9, 2)), "depth": np.full(9, 420.0), "hand": rng.uniform(-200.0, 200.0, (9, 2)),
-        "theta_deg": np.linspace(-90.0, 90.0, 9), "delta_px": rng.normal(size=(9, 2)), "tablet_px": px, "mm_per_px": np.array(0.19),
-        "f": np.array([617.7, 617.7]), "c": np.array([319.5, 239.5]), "hand_capture": np.array([0.0, 0.0, 300.0]),
-        "uv_q": rng.uniform(0.0, 600.0, (3, 2)), "theta_q": rng.uniform(-1.0, 1.0, 3), "hand_q": rng.uniform(-200.0, 200.0, (3, 2)),
-    }  # fmt: skip
+        "uv": 320.0 + 0.3 * px + rng.normal(size=(9, 2)),
+        "depth": np.full(9, 420.0),
+        "hand": rng.uniform(-200.0, 200.0, (9, 2)),
+        "theta_deg": np.linspace(-90.0, 90.0, 9),
+        "delta_px": rng.normal(size=(9, 2)),
+        "tablet_px": px,
+        "mm_per_px": np.array(0.19),
+        "f": np.array([617.7, 617.7]),
+        "c": np.array([319.5, 239.5]),
+        "hand_capture": np.array([0.0, 0.0, 300.0]),
+        "uv_q": rng.uniform(0.0, 600.0, (3, 2)),
+        "theta_q": rng.uniform(-1.0, 1.0, 3),
+        "hand_q": rng.uniform(-200.0, 200.0, (3, 2)),
+    }
     return {"a.npz": npz(arrays)}
 
 

@@ -20,8 +20,9 @@ _SEGMENTS = 96  # of bodies that are no flange
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """One scan (H, W, 3) m with NaN where nothing was measured, and the pose X_CR of the flange in it (None: no flange)."""
+class FlangeScan:
+    """One scan (H, W, 3) m with NaN where nothing was measured, and the pose X_CR of the flange in it (None: no
+    flange)."""
 
     points_C: Array
     X_CR: RigidTransform | None
@@ -58,13 +59,13 @@ def flange_frame(
     X_CR: RigidTransform | None = None,
     clutter: int = 6,
     before: tuple[TriMesh, ...] = (),
-) -> Frame:
+) -> FlangeScan:
     """A frame with the flange on an arm's wrist, a table behind, and ``clutter`` things about it that do not hide it;
     ``before`` holds bodies (in the camera frame) that may."""
     X_CR = random_place(scanner, standard, rng) if X_CR is None else X_CR
     bodies = [m.transformed(X_CR) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
     bodies += _surroundings(scanner, standard, rng, clutter, clear_of=X_CR)
-    return Frame(_scan([*bodies, *before], scanner, rng), X_CR)
+    return FlangeScan(_scan([*bodies, *before], scanner, rng), X_CR)
 
 
 def sphere_frame(
@@ -75,30 +76,33 @@ def sphere_frame(
     p_FS: Array,
     radius_m: float,
 ) -> Array:
-    """A scan (H, W, 3) m of a flange at X_CF on its wrist that carries a ball of this radius at p_FS (3,) m, over a table."""
+    """A scan (H, W, 3) m of a flange at X_CF on its wrist that carries a ball of this radius at p_FS (3,) m, over a
+    table."""
     ball = _ball(radius_m, 121).transformed(X_CF @ RigidTransform(p_FS))
     bodies = [m.transformed(X_CF) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
     bodies += _surroundings(scanner, standard, rng, 0, clear_of=X_CF)
     return _scan([*bodies, ball], scanner, rng)
 
 
-def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator) -> Frame:
-    """A frame without the flange: a table, things, and lookalikes (discs, rings and flanges of other sizes, tube ends)."""
+def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator) -> FlangeScan:
+    """A frame without the flange: a table, things, and lookalikes (discs, rings and flanges of other sizes, tube
+    ends)."""
     bodies = _surroundings(scanner, standard, rng, 9, clear_of=None)
     for k in range(3):
         bodies.append(_lookalike(standard, rng, k).transformed(random_place(scanner, standard, rng)))
-    return Frame(_scan(bodies, scanner, rng), None)
+    return FlangeScan(_scan(bodies, scanner, rng), None)
 
 
 class FrameFit(NamedTuple):
-    """The centre's error (m), its square per axis in units of the stated covariance, and the share of the edge that was seen."""
+    """The centre's error (m), its square per axis in units of the stated covariance, and the share of the edge that was
+    seen."""
 
     error_m: float
     normalised: float
     coverage: float
 
 
-def fit_frame(frame: Frame, standard: FlangeStandard) -> FrameFit:
+def fit_frame(frame: FlangeScan, standard: FlangeStandard) -> FrameFit:
     """Fit the flange of a frame and compare with the truth. Raises FlangeNotFound."""
     assert frame.X_CR is not None
     fit = fit_flange(frame.points_C, standard)
@@ -109,7 +113,7 @@ def fit_frame(frame: Frame, standard: FlangeStandard) -> FrameFit:
 
 def hidden_frame(
     way: str, scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator, *, share: float = 0.5
-) -> Frame:
+) -> FlangeScan:
     """A frame that hides ``share`` of the flange's width in one of the ``WAYS``, from a random side."""
     X_CR = random_place(scanner, standard, rng, max_tilt_deg=25.0)
     beyond = (0.5 - share) * standard.outer_m  # from the centre to where the hidden part begins

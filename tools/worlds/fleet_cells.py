@@ -1,4 +1,5 @@
-"""Writes a folder of made cells with several datasets each; robot and scanner have errors that no calibration models."""
+"""Writes a folder of made cells with several datasets each; robot and scanner have errors that no calibration
+models."""
 
 from pathlib import Path
 

@@ -31,7 +31,7 @@ _SLACK = 3.0  # times that region: noise here is not normal, and a covariance is
 
 
 @dataclass(frozen=True)
-class World:
+class MistakenPairs:
     """Pairs as a file would hold them, how they were made, and the truth."""
 
     pairs: PosePairs
@@ -41,18 +41,19 @@ class World:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What the solver said of a world: "answer", "open" (a direction named), "warning", "refused", "named" (the mistake), or
-    "NAN" and "WRONG", which must not be; ``nees``: of the answer, in units of the region that holds the truth."""
+class SolverVerdict:
+    """What the solver said of a world: "answer", "open" (a direction named), "warning", "refused", "named" (the
+    mistake), or "NAN" and "WRONG", which must not be; ``nees``: of the answer, in units of the region that holds the
+    truth."""
 
     said: str
     sentence: str
     nees: float
 
 
-def random_world(rng: np.random.Generator, mistake: str | None = None) -> World:
-    """A world with any motion, mounting, noise (normal or heavy-tailed, about the middle of a board whose origin is a corner),
-    outliers, and one of the usual mistakes (``mistake``; else half of them without)."""
+def random_world(rng: np.random.Generator, mistake: str | None = None) -> MistakenPairs:
+    """A world with any motion, mounting, noise (normal or heavy-tailed, about the middle of a board whose origin is a
+    corner), outliers, and one of the usual mistakes (``mistake``; else half of them without)."""
     motion = str(rng.choice(MOTIONS))
     if mistake is None:
         mistake = "none" if rng.uniform() < 0.5 else str(rng.choice(MISTAKES[1:]))
@@ -75,23 +76,23 @@ def random_world(rng: np.random.Generator, mistake: str | None = None) -> World:
         bad = rng.choice(n, int(rng.integers(1, 1 + n // 5)), replace=False)
         G[bad] = G[bad] @ pose(exp_rotation(rng.normal(size=(len(bad), 3)) * 0.5), rng.normal(size=(len(bad), 3)) * 0.1)
     robot, camera = _MISTAKES[mistake](hand, G, rng)
-    return World(PosePairs(source="world", robot=robot, camera=camera, mode=mode), motion, mistake, X)
+    return MistakenPairs(PosePairs(source="world", robot=robot, camera=camera, mode=mode), motion, mistake, X)
 
 
-def judge(world: World, config: HandEyeConfig | None = None) -> Verdict:
+def judge(world: MistakenPairs, config: HandEyeConfig | None = None) -> SolverVerdict:
     """Solve a world as the command does and judge what it said against the truth."""
     try:
         result = solve_pairs(world.pairs, config or HandEyeConfig(folds=0))
     except WeldcalError as e:
-        return Verdict("named" if "agree if" in str(e) else "refused", str(e), float("nan"))
+        return SolverVerdict("named" if "agree if" in str(e) else "refused", str(e), float("nan"))
     whole = all(np.isfinite(v).all() for v in (result.X.GetAsMatrix4(), result.joint_covariance, result.translation))
     if not whole:
-        return Verdict("NAN", result.method, float("nan"))
+        return SolverVerdict("NAN", result.method, float("nan"))
     nees = result.normalised_error("X", as_transform(world.X)) / result.region(_SURE)
     other_warnings = [w for w in result.warnings if "left out" not in w]
     if nees > _SLACK:
-        return Verdict("warning" if other_warnings else "WRONG", "; ".join(result.warnings), nees)
-    return Verdict(
+        return SolverVerdict("warning" if other_warnings else "WRONG", "; ".join(result.warnings), nees)
+    return SolverVerdict(
         "open" if result.unobservable else "warning" if other_warnings else "answer", "; ".join(other_warnings), nees
     )
 

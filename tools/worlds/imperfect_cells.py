@@ -1,4 +1,5 @@
-"""Simulates hand-eye pose pairs whose errors no solver's noise model has: a wrong camera matrix, a wrong robot, corners as seen."""
+"""Simulates hand-eye pose pairs whose errors no solver's noise model has: a wrong camera matrix, a wrong robot, corners
+as seen."""
 
 from dataclasses import dataclass
 
@@ -14,17 +15,18 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 
 KINDS = ("corners only", "camera", "robot", "both", "target poses", "heavy tails", "poor camera", "far target")
-"""What is wrong besides the corners' own noise; "target poses" and "heavy tails": no corners, but poses with noise of their own (normal, or Student's t of
-three degrees of freedom); "far target": a larger board 2 to 6 m away."""
+"""What is wrong besides the corners' own noise; "target poses" and "heavy tails": no corners, but poses with noise of
+their own (normal, or Student's t of three degrees of freedom); "far target": a larger board 2 to 6 m away."""
 _ARMS = ("ur10e", "ur5e")
 _WIDTH, _HEIGHT = 1280.0, 960.0
 _LEAST = 6  # corners in an image that is kept
 
 
 @dataclass(frozen=True)
-class Cell:
-    """Pairs of one cell: ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as estimated, ``X`` (4, 4)
-    and ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this ``kind``."""
+class PairedPoses:
+    """Pairs of one cell: ``F`` (n, 4, 4) the stated flange poses, ``G`` (n, 4, 4) the target in the camera as
+    estimated, ``X`` (4, 4) and ``Y`` (4, 4) the truth, which no solver is given; F X G = Y but for the errors of this
+    ``kind``."""
 
     kind: str
     F: Array
@@ -33,13 +35,13 @@ class Cell:
     Y: Array
 
 
-def imperfect_cell(kind: str, seed: int) -> Cell:
+def imperfect_cell(kind: str, seed: int) -> PairedPoses:
     """One cell with a wrist camera and a board; numbers are drawn from ranges that cells have (metres, rad, pixels).
 
-    8 to 60 poses about a work point, scattered or on a path, with turns of 6 to 35 degrees; a board of 0.1 to 0.3 m, 0.3 to 1 m away,
-    whose origin is its corner; corners read to 0.1 to 0.6 px. ``camera``: focal lengths off by 0.5 %, principal point by 5 px, a
-    distortion of 0.02 (rms). ``robot``: joint offsets of 0.1 degrees, lengths of 0.5 mm, turns of 0.05 degrees. The board's pose
-    is OpenCV's solvePnP with the wrong camera matrix.
+    8 to 60 poses about a work point, scattered or on a path, with turns of 6 to 35 degrees; a board of 0.1 to 0.3 m,
+    0.3 to 1 m away, whose origin is its corner; corners read to 0.1 to 0.6 px. ``camera``: focal lengths off by 0.5 %,
+    principal point by 5 px, a distortion of 0.02 (rms). ``robot``: joint offsets of 0.1 degrees, lengths of 0.5 mm,
+    turns of 0.05 degrees. The board's pose is OpenCV's solvePnP with the wrong camera matrix.
     """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     arm = load_chain(_ARMS[int(rng.integers(len(_ARMS)))])
@@ -91,7 +93,7 @@ def imperfect_cell(kind: str, seed: int) -> Cell:
             G.append(found)
         if len(F) == n:
             break
-    return Cell(kind, np.array(F), np.array(G), X, Y)
+    return PairedPoses(kind, np.array(F), np.array(G), X, Y)
 
 
 def _read(

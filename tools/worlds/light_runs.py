@@ -40,8 +40,8 @@ _FACE_M = 0.025  # a fitted normal is that of a plane through a ring of this rad
 
 @dataclass(frozen=True, eq=False)
 class LightRuns:
-    """Calibrations (k): scans that each took, error and expected error (m) at the work point, and whether the error lies in
-    the stated 95 % region. ``rigid_m`` are the errors of the same scans without a scanner correction."""
+    """Calibrations (k): scans that each took, error and expected error (m) at the work point, and whether the error
+    lies in the stated 95 % region. ``rigid_m`` are the errors of the same scans without a scanner correction."""
 
     scans: Array
     error_m: Array
@@ -74,10 +74,12 @@ class _World:
 
 
 def study_light_runs(scenario: Scenario, runs: int, *, seed: int = 0, progress: Progress = no_progress) -> LightRuns:
-    """Calibrate ``runs`` times in the scenario's simulated world, with a device, an arm and a mounting of its own each time.
+    """Calibrate ``runs`` times in the scenario's simulated world, with a device, an arm and a mounting of its own each
+    time.
 
-    The job's own poses and stopping rule; the rendering and the flange fit are replaced by their stated noise. The arm's
-    links and the scanner's warp are drawn from models that the estimator does not contain. Deterministic for ``seed``.
+    The job's own poses and stopping rule; the rendering and the flange fit are replaced by their stated noise. The
+    arm's links and the scanner's warp are drawn from models that the estimator does not contain. Deterministic for
+    ``seed``.
 
     Raises InputError for a scenario without a simulated arm and a rendered scanner in the base.
     """
@@ -106,12 +108,15 @@ def study_light_runs(scenario: Scenario, runs: int, *, seed: int = 0, progress: 
 
 
 def _simulated(scenario: Scenario) -> tuple[SimulatedUr, RenderedScanner]:
-    """The scenario's arm and scanner. Raises InputError where they are not simulated, or the scanner moves with the arm."""
+    """The scenario's arm and scanner.
+
+    Raises InputError where they are not simulated, or the scanner moves with the arm.
+    """
     robot, scanner = scenario.robot, scenario.scanner_config()
     if not isinstance(robot, SimulatedUr) or not isinstance(scanner, RenderedScanner) or scanner.mounted_on != "base":
         raise InputError(
-            "This study needs a simulated arm and a scanner that stands in the base: give a scenario with robot: !SimulatedUr and "
-            "scanner: !RenderedScanner, such as s_groove."
+            "This study needs a simulated arm and a scanner that stands in the base: give a scenario with robot:"
+            " !SimulatedUr and scanner: !RenderedScanner, such as s_groove."
         )
     return robot, scanner
 
@@ -192,9 +197,12 @@ def mounted_plan(name: str) -> tuple[Scenario, MountingScene, float, tuple[Mount
 
 
 def mounted_world(name: str, seed: int, scans: int | None = None) -> MountedWorld:
-    """Draw a cell of a mounting's scenario: device, arms and mounting of its own. ``scans``: how many; None: the scenario's maximum.
+    """Draw a cell of a mounting's scenario: device, arms and mounting of its own.
 
-    The arm's links, its stops and the scanner's warp are drawn from the simulation's models; a fit of the circle errs by its noise.
+    ``scans``: how many; None: the scenario's maximum.
+
+    The arm's links, its stops and the scanner's warp are drawn from the simulation's models; a fit of the circle errs
+    by its noise.
     """
     scenario, scene, radius, plan = mounted_plan(name)
     rng = np.random.default_rng([seed, 1])

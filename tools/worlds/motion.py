@@ -1,7 +1,9 @@
-"""An independent world for calibration in motion: an arm through a cube's corners, seen by a streaming scanner, as a dataset.
+"""An independent world for calibration in motion: an arm through a cube's corners, seen by a streaming scanner, as a
+dataset.
 
-It shares no model with the estimators: the motion is the controller's exact trapezoid, frames are rendered pixel by pixel over
-their exposure, delays are skewed, stamps jitter, and all numbers in the files are rounded. The truth is a file beside the dataset.
+It shares no model with the estimators: the motion is the controller's exact trapezoid, frames are rendered pixel by
+pixel over their exposure, delays are skewed, stamps jitter, and all numbers in the files are rounded. The truth is a
+file beside the dataset.
 """
 
 from collections.abc import Iterator
@@ -25,7 +27,7 @@ from weldcal.models.scanners import ScannerPreset, depth_to_points, get_scanner
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
 from weldcal.tools.worlds.disturbance import Disturbance
-from weldcal.tools.worlds.moving_scene import Body, MovingScene, arm_bodies
+from weldcal.tools.worlds.moving_scene import MovingScene, RigidBody, arm_bodies
 from weldcal.tools.worlds.robot_path import RobotPath, cube_poses, path_through, reachable_start
 
 _DEPTH_STEP_M = 1e-5  # of the stored depths: a tenth of the smallest noise
@@ -36,11 +38,11 @@ _POSE_DIGITS, _JOINT_DIGITS = 6, 6  # decimals of the stream's numbers
 class MotionOptions:
     """What is simulated. Lengths m, times s; ``size`` (width, height) resizes the scanner's image.
 
-    ``stream_columns`` is "joints" or "pose"; ``stream_jitter_s`` the standard deviation of a row's time about its instant;
-    ``lead_s`` how long the stream runs before the first and after the last frame (negative: frames lie outside it);
-    ``device_clock`` False leaves out the device's stamps; ``mount_mm`` and ``mount_deg`` are how far the scanner's true pose
-    is off the nominal one; ``stop_and_go`` lets the arm rest for that time at each corner; ``surroundings`` False leaves out
-    the table and the blocks on it, which makes the files three times smaller.
+    ``stream_columns`` is "joints" or "pose"; ``stream_jitter_s`` the standard deviation of a row's time about its
+    instant; ``lead_s`` how long the stream runs before the first and after the last frame (negative: frames lie outside
+    it); ``device_clock`` False leaves out the device's stamps; ``mount_mm`` and ``mount_deg`` are how far the scanner's
+    true pose is off the nominal one; ``stop_and_go`` lets the arm rest for that time at each corner; ``surroundings``
+    False leaves out the table and the blocks on it, which makes the files three times smaller.
     """
 
     robot: str = "ur5e"
@@ -78,8 +80,9 @@ class MotionOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """A streamed frame: depth (H, W) m, and the truth behind it: the capture on the robot's clock and both poses then."""
+class StreamedFrame:
+    """A streamed frame: depth (H, W) m, and the truth behind it: the capture on the robot's clock and both poses
+    then."""
 
     id: str
     depth: Depth
@@ -105,9 +108,14 @@ class MotionWorld:
         self.centre, self.towards = centre, up
         poses = cube_poses(centre, o.cube_m, up, np.radians(o.lean_deg), self._rng)
         self.path: RobotPath = path_through(
-            self.arm, poses, reachable_start(self.arm, RigidTransform(up, centre)),
-            move=o.move, speed=o.speed, acceleration=o.acceleration, dwell_s=o.stop_and_go,
-        )  # fmt: skip
+            self.arm,
+            poses,
+            reachable_start(self.arm, RigidTransform(up, centre)),
+            move=o.move,
+            speed=o.speed,
+            acceleration=o.acceleration,
+            dwell_s=o.stop_and_go,
+        )
         bodies = [*arm_bodies(self.arm, self.flange), *(surroundings(centre) if o.surroundings else [])]
         self.scene = MovingScene(self.arm, bodies, self.scanner, self.timing)
         captures = self.timing.captures(o.frames, self._rng) + self.timing.exposure_s
@@ -124,7 +132,7 @@ class MotionWorld:
         """The scanner's true pose in the robot's base at ``t`` s after the start."""
         return self.options.disturbance.scanner_pose(self.X_BC, t)
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Iterator[StreamedFrame]:
         """Every frame that arrives, rendered one after the other."""
         o = self.options
         for k, t in enumerate(self.captures):
@@ -132,10 +140,15 @@ class MotionWorld:
             device = o.disturbance.device(self.scanner, capture)
             # the robot's base moves with the robot: static bodies then move in the base, as the camera does
             depth = self.scene.frame(
-                self.joints, self.X_BC_at(capture), capture, rng, samples=o.exposure_samples, scanner=device,
+                self.joints,
+                self.X_BC_at(capture),
+                capture,
+                rng,
+                samples=o.exposure_samples,
+                scanner=device,
                 X_BW=o.disturbance.world_in_base(capture),
-            )  # fmt: skip
-            yield Frame(
+            )
+            yield StreamedFrame(
                 f"{k:05d}",
                 depth,
                 o.robot_start_s + capture,
@@ -175,27 +188,38 @@ class MotionWorld:
             "X_BC": self.X_BC.GetAsMatrix4().tolist(),
             "X_BC_nominal": self.X_BC_nominal.GetAsMatrix4().tolist(),
             "delay_ms": {
-                "of_the_process": 1e3 * self.timing.delay_s, "mean": float(late.mean()), "sd": float(late.std()),
-                "smallest": float(late.min()), "shortest_possible": 1e3 * self.timing.shortest_delay_s,
+                "of_the_process": 1e3 * self.timing.delay_s,
+                "mean": float(late.mean()),
+                "sd": float(late.std()),
+                "smallest": float(late.min()),
+                "shortest_possible": 1e3 * self.timing.shortest_delay_s,
             },
-            "device_clock": None if not o.device_clock else {
-                "offset_ms_at_middle": float(np.interp(0.5 * (t[0] + t[-1]), t, offset)),
-                "offset_ms_mean": float(offset.mean()), "drift_ppm": self.timing.device_drift_ppm,
-            },
+            "device_clock": (
+                None
+                if not o.device_clock
+                else {
+                    "offset_ms_at_middle": float(np.interp(0.5 * (t[0] + t[-1]), t, offset)),
+                    "offset_ms_mean": float(offset.mean()),
+                    "drift_ppm": self.timing.device_drift_ppm,
+                }
+            ),
             "readout_ms": 1e3 * self.timing.readout_s,
             "exposure_ms": 1e3 * self.timing.exposure_s,
             "disturbance": o.disturbance.summary(o.robot_start_s),
             "capture_s": {f"{k:05d}": round(float(v), 7) for k, v in enumerate(t)},
-        }  # fmt: skip
+        }
 
 
 def write_motion_dataset(world: MotionWorld, folder: Path, truth: Path, progress: Progress) -> None:
     """Write the dataset to ``folder`` and the truth to the file ``truth``, which lies outside of it."""
     o, s = world.options, world.scanner
     header = DatasetHeader(
-        robot=o.robot, flange=world.flange.designation, scanner=s.name, configuration="eye_on_base",
+        robot=o.robot,
+        flange=world.flange.designation,
+        scanner=s.name,
+        configuration="eye_on_base",
         note="simulated: an arm through the corners of a cube",
-    )  # fmt: skip
+    )
     intrinsics = (s.fx, s.fy, s.cx, s.cy)
 
     def clouds() -> Iterator[tuple[str, Array]]:
@@ -217,8 +241,8 @@ def _scanner(o: MotionOptions) -> ScannerPreset:
 def layout(robot: str, scanner: ScannerPreset) -> tuple[Array, RigidTransform]:
     """The cube's centre (3,) m in the base and the scanner's nominal pose X_BC, at its optimum distance from it.
 
-    The scanner looks down at the cube from the side that is away from the arm (Fig. 4 of the paper), so that the forearm does
-    not stand in its view.
+    The scanner looks down at the cube from the side that is away from the arm (Fig. 4 of the paper), so that the
+    forearm does not stand in its view.
     """
     big = get_robot(robot).reach_m > 1.0
     centre = np.array([0.70 if big else 0.45, -0.10, 0.32])
@@ -238,14 +262,14 @@ def facing(centre: Array, X_BC: RigidTransform) -> RotationMatrix:
     return RotationMatrix(np.column_stack([x, np.cross(z, x), z]))
 
 
-def surroundings(centre: Array) -> list[Body]:
+def surroundings(centre: Array) -> list[RigidBody]:
     """The table and blocks on it in the scanner's view: by them a moved scanner is told from a moved robot."""
     blocks = []
     for x, y, top in ((-0.16, 0.22, 0.24), (0.10, 0.24, 0.18), (0.16, -0.25, 0.22), (-0.10, -0.26, 0.14)):
         place = centre + np.array([x, y, 0.0])
         size = np.array([[-0.03, -0.04], [0.03, -0.04], [0.03, 0.04], [-0.03, 0.04]]) + place[:2]
-        blocks.append(Body(None, extrude(size, 0.0, top)))
-    return [*blocks, Body(None, _table())]
+        blocks.append(RigidBody(None, extrude(size, 0.0, top)))
+    return [*blocks, RigidBody(None, _table())]
 
 
 def _table() -> TriMesh:

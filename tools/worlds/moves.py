@@ -1,4 +1,5 @@
-"""Draws motions through corners of a cube, what a streaming scanner measures of them, and what chance alone makes of its errors."""
+"""Draws motions through corners of a cube, what a streaming scanner measures of them, and what chance alone makes of
+its errors."""
 
 from dataclasses import dataclass
 
@@ -28,7 +29,8 @@ _SHAPE = 4.0  # of the gamma law of the transport's tail: skewness 1
 def cube_moves(
     rng: np.random.Generator, *, linear: bool = False, tilt_deg: float = 15.0
 ) -> tuple[Moves, RigidTransform]:
-    """Moves of a UR10e through four corners of a 200 mm cube, flange up, and a scanner's pose X_BC above that looks down."""
+    """Moves of a UR10e through four corners of a 200 mm cube, flange up, and a scanner's pose X_BC above that looks
+    down."""
     chain = load_chain(ROBOT)
     middle = np.array([rng.uniform(0.45, 0.65), rng.uniform(-0.25, 0.25), rng.uniform(0.25, 0.4)])
     turn = rng.uniform(-np.pi, np.pi)
@@ -62,8 +64,9 @@ def observed_frames(
 ) -> tuple[ObservedFrames, Array]:
     """Frames of a streaming scanner, and their true capture times (N,) s.
 
-    A frame is the mean of what the exposure passes over. Arrivals are late by a floor and a gamma tail, 140 +- 15 ms; the device's
-    clock reads (capture - epoch_s) / (1 + drift). ``rolling_s``: an image row y/z is exposed so much later per unit.
+    A frame is the mean of what the exposure passes over. Arrivals are late by a floor and a gamma tail, 140 +- 15 ms;
+    the device's clock reads (capture - epoch_s) / (1 + drift). ``rolling_s``: an image row y/z is exposed so much later
+    per unit.
     """
     count = int((duration_s - 1.0) / FRAME_S)
     capture = 0.5 + FRAME_S * np.linspace(0.0, count - 1.0, count) + float(rng.uniform(0.0, FRAME_S))
@@ -113,7 +116,8 @@ def _axes(n: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SeenFromHand:
-    """A fixed target X_BT as it moves in the frame of a moving flange: what takes the place of Moves for a scanner on the flange."""
+    """A fixed target X_BT as it moves in the frame of a moving flange: what takes the place of Moves for a scanner on
+    the flange."""
 
     moves: Moves
     X_BT: RigidTransform
@@ -126,8 +130,8 @@ class SeenFromHand:
 def exact_errors(frames: ObservedFrames, capture: Array, moves: Moves, X_BC: RigidTransform) -> Array:
     """Errors (7,) of X_BC's six and of the clock's offset in sigmas, by least squares with the true motion and noise.
 
-    The capture times (N,) s are known but for an offset and a drift, as those of a device are. An estimator can do no better, so that
-    what this differs from the normal law by is the draw.
+    The capture times (N,) s are known but for an offset and a drift, as those of a device are. An estimator can do no
+    better, so that what this differs from the normal law by is the draw.
     """
     X = moves.at(capture)
     rate = (moves.at(capture + _STEP_S) - moves.at(capture - _STEP_S)) / (2.0 * _STEP_S)

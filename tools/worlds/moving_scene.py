@@ -1,7 +1,8 @@
 """Renders an arm in motion pixel by pixel: each pixel is a mix over its exposure, and each row has its own time.
 
-Every link is a body of its own in its own frame. A ray of a pixel and a time is cast in the link's frame of that time, so that
-no frame is rendered with an arm at rest. Bodies are the drawn solids of the arm's description and the mesh of its flange.
+Every link is a body of its own in its own frame. A ray of a pixel and a time is cast in the link's frame of that time,
+so that no frame is rendered with an arm at rest. Bodies are the drawn solids of the arm's description and the mesh of
+its flange.
 """
 
 import xml.etree.ElementTree as ET
@@ -38,8 +39,9 @@ _DARK = {"charcoal": 0.7, "blue_grey": 0.0, "light_grey": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
-    """A rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None stands in the base; ``dark`` 0 to 1."""
+class RigidBody:
+    """A rigid body: ``link`` counts as link_frames does (0 the base, 6 wrist 3), None stands in the base; ``dark`` 0 to
+    1."""
 
     link: int | None
     mesh: TriMesh
@@ -49,7 +51,7 @@ class Body:
 class _Cast:
     """The bodies of one link as a scene of its own."""
 
-    def __init__(self, bodies: list[Body]) -> None:
+    def __init__(self, bodies: list[RigidBody]) -> None:
         self.link = bodies[0].link
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         for body in bodies:
@@ -67,10 +69,10 @@ class _Cast:
         return hit["t_hit"].numpy(), self.dark[ids]
 
 
-def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[Body]:
+def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[RigidBody]:
     """The drawn solids of an arm and the mesh of its flange, in their links' frames."""
     root = ET.fromstring(arm_urdf(arm))
-    bodies = [Body(6, flange_mesh(flange, _THICK_M))]
+    bodies = [RigidBody(6, flange_mesh(flange, _THICK_M))]
     for link in root.iter("link"):
         for visual in link.iter("visual"):
             origin, geometry, material = (visual.find(tag) for tag in ("origin", "geometry", "material"))
@@ -80,7 +82,7 @@ def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[Body]:
             xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
             mesh = _solid(geometry[0]).transformed(RigidTransform(RollPitchYaw(rpy), xyz))
             bodies.append(
-                Body(arm.link_names.index(link.get("name", "")), mesh, _DARK.get(material.get("name", ""), 0.0))
+                RigidBody(arm.link_names.index(link.get("name", "")), mesh, _DARK.get(material.get("name", ""), 0.0))
             )
     return bodies
 
@@ -99,12 +101,12 @@ def _solid(shape: ET.Element) -> TriMesh:
 class MovingScene:
     """Renders what a streaming scanner returns of bodies on a moving arm and of bodies that stand in the base."""
 
-    def __init__(self, arm: ArmModel, bodies: list[Body], scanner: ScannerPreset, stream: ScannerStream) -> None:
+    def __init__(self, arm: ArmModel, bodies: list[RigidBody], scanner: ScannerPreset, stream: ScannerStream) -> None:
         self.arm, self.scanner, self.stream = arm, scanner, stream
         links = sorted({b.link for b in bodies if b.link is not None})
         self._moving = [_Cast([b for b in bodies if b.link == k]) for k in links]
         fixed = [b for b in bodies if b.link is None]
-        self._fixed = [_Cast([Body(None, merge(*(b.mesh for b in fixed)))])] if fixed else []
+        self._fixed = [_Cast([RigidBody(None, merge(*(b.mesh for b in fixed)))])] if fixed else []
         self._X_WC = RigidTransform()
         self._background: tuple[Array, Depth] | None = None  # camera pose and its depth map
         u = (np.arange(scanner.width) - scanner.cx) / scanner.fx
@@ -126,9 +128,9 @@ class MovingScene:
     ) -> Depth:
         """The depth map (H, W) m of one frame, 0 where nothing was measured.
 
-        ``joints(t)`` are the joint angles (6,) rad at time t, ``capture_s`` the middle of the exposure of the middle row;
-        ``samples`` times of the exposure are mixed; ``scanner`` has the errors of this frame (the preset's); ``X_BW`` is the pose
-        in the base of what stands still (identity).
+        ``joints(t)`` are the joint angles (6,) rad at time t, ``capture_s`` the middle of the exposure of the middle
+        row; ``samples`` times of the exposure are mixed; ``scanner`` has the errors of this frame (the preset's);
+        ``X_BW`` is the pose in the base of what stands still (identity).
         """
         device = self.scanner if scanner is None else scanner
         self._X_WC = X_BC if X_BW is None else X_BW.InvertAndCompose(X_BC)
@@ -149,7 +151,8 @@ class MovingScene:
     def _mixed(
         self, joints: Callable[[float], Array], X_BC: RigidTransform, capture_s: float, n: int, rng: np.random.Generator
     ) -> tuple[Depth, Depth]:
-        """Depth and darkness (H, W) after the exposure: the mean of its samples on a surface, one or a mix of two at an edge."""
+        """Depth and darkness (H, W) after the exposure: the mean of its samples on a surface, one or a mix of two at an
+        edge."""
         stream, shape = self.stream, self._rays.shape[:2]
         offsets = stream.exposure_s * ((np.arange(n) + 0.5) / n - 0.5)
         dark = np.zeros(shape, dtype=np.float32)
@@ -163,7 +166,8 @@ class MovingScene:
         return out, dark
 
     def _pixels(self, body: _Cast, X_CL: list[RigidTransform]) -> Pixels:
-        """Indices (n,) of the pixels in which a body may show during a frame: where a coarse picture shows it, and around."""
+        """Indices (n,) of the pixels in which a body may show during a frame: where a coarse picture shows it, and
+        around."""
         assert body.link is not None
         X = X_CL[body.link]
         R, p = X.rotation().matrix(), X.translation()

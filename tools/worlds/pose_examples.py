@@ -26,11 +26,17 @@ def _kuka(k: int, p: Array, turn: Rotation) -> str:
 def _fanuc(k: int, p: Array, turn: Rotation) -> str:
     x, y, z = 1e3 * p
     w, v, r = turn.as_euler("xyz", degrees=True)
-    return f"P[{k}]{{\n   GP1:\n\tX = {x:.4f} mm, Y = {y:.4f} mm, Z = {z:.4f} mm,\n\tW = {w:.5f} deg, P = {v:.5f} deg, R = {r:.5f} deg\n}};"
+    return (
+        f"P[{k}]{{\n   GP1:\n\tX = {x:.4f} mm, Y = {y:.4f} mm, Z = {z:.4f} mm,\n\tW = {w:.5f} deg, P = {v:.5f} deg, R ="
+        f" {r:.5f} deg\n}};"
+    )
 
 
 def _rapid(k: int, p: Array, turn: Rotation) -> str:
-    return f"CONST robtarget p{k}:=[[{_row(1e3 * p)}],[{_row(turn.as_quat(scalar_first=True))}],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];"
+    return (
+        "CONST robtarget"
+        f" p{k}:=[[{_row(1e3 * p)}],[{_row(turn.as_quat(scalar_first=True))}],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];"
+    )
 
 
 def _staubli(k: int, p: Array, turn: Rotation) -> str:
@@ -46,10 +52,18 @@ _PROGRAMS: tuple[tuple[str, str, Callable[[int, Array, Rotation], str]], ...] = 
     ('<Data name="p" type="pointRx" size="12">', "</Data>", _staubli),
     ("def f():", "end", lambda k, p, turn: f"  movel(p[{_row(p, turn.as_rotvec())}], a=1.2, v=0.25)"),
     ("", "", lambda k, p, turn: f"movel(posx({_row(1e3 * p, turn.as_euler('ZYZ', degrees=True))}), vel=100)"),
-    ("//POS\n///POSTYPE BASE\n///RECTAN", "//INST\nEND", lambda k, p, turn: f"C{k:05d}={_row(1e3 * p, turn.as_euler('xyz', degrees=True))}"),
+    (
+        "//POS\n///POSTYPE BASE\n///RECTAN",
+        "//INST\nEND",
+        lambda k, p, turn: f"C{k:05d}={_row(1e3 * p, turn.as_euler('xyz', degrees=True))}",
+    ),
     (".TRANS", ".END", lambda k, p, turn: f"p{k} {_row(1e3 * p, turn.as_euler('ZYZ', degrees=True), mark=' ')}"),
-    ("At time 1.0", "", lambda k, p, turn: f"- Translation: [{_row(p)}]\n- Rotation: in Quaternion [{_row(turn.as_quat())}]"),
-)  # fmt: skip
+    (
+        "At time 1.0",
+        "",
+        lambda k, p, turn: f"- Translation: [{_row(p)}]\n- Rotation: in Quaternion [{_row(turn.as_quat())}]",
+    ),
+)
 
 
 def _camera(G: Array) -> bytes:

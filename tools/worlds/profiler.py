@@ -1,7 +1,8 @@
 """Simulated worlds for the calibration by a sphere: arm with kinematic errors, distorted sensor, bent torch.
 
-Everything random follows from the seed. Two cells: the one that the fixed files were made in, from which files of other seeds
-come, and a UR10e with another scanner pose in every world. The sag has the form that the calibration's model also has.
+Everything random follows from the seed. Two cells: the one that the fixed files were made in, from which files of other
+seeds come, and a UR10e with another scanner pose in every world. The sag has the form that the calibration's model also
+has.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ ABOUT = np.array([0.0, 0.2])  # the middle of the sensor's field
 
 @dataclass(frozen=True, kw_only=True)
 class WorldErrors:
-    """One sigma of each cause (m, rad): lengths, joints and twists of the arm, sag per metre of lever, sensor, tip, repeatability."""
+    """One sigma of each cause (m, rad): lengths, joints and twists of the arm, sag per metre of lever, sensor, tip,
+    repeatability."""
 
     length_m: float = 0.125e-3
     angle_rad: float = np.radians(0.0125)
@@ -41,9 +43,9 @@ CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, twist_rad=0.0, sag_rad_m=0.0, a
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cell:
-    """Where a world's arm stands: its table, joints at which the tool points downwards, the sphere's centre (3,) m, and where
-    the groove's and the frustum's frames lie, the groove turned about z."""
+class ProfilerCell:
+    """Where a world's arm stands: its table, joints at which the tool points downwards, the sphere's centre (3,) m, and
+    where the groove's and the frustum's frames lie, the groove turned about z."""
 
     arm: DhArm
     home: Floats
@@ -54,13 +56,13 @@ class Cell:
     boss_yaw_deg: float
 
 
-def files_cell() -> Cell:
+def files_cell() -> ProfilerCell:
     """Of the fixed files: an arm of 1.4 m reach with a torch of 342 mm."""
     rows = np.array(
         [[180, -90, 400, 0], [600, 0, 0, -90], [120, -90, 0, 0], [0, 90, 620, 0], [0, -90, 0, 0], [0, 0, 115, 0]], float
-    ) * [1e-3, np.radians(1.0), 1e-3, np.radians(1.0)]  # fmt: skip
+    ) * [1e-3, np.radians(1.0), 1e-3, np.radians(1.0)]
     center = np.array([0.93, 0.06, 0.26])
-    return Cell(
+    return ProfilerCell(
         arm=DhArm(rows),
         home=np.array([0.0, 0.35, 0.25, 0.0, 0.95, 0.0]),
         center=center,
@@ -71,11 +73,11 @@ def files_cell() -> Cell:
     )
 
 
-def ur10e_cell() -> Cell:
+def ur10e_cell() -> ProfilerCell:
     """A UR10e."""
     center = np.array([-0.75, 0.12, 0.18])
     home = np.radians([0.0, -110.0, 120.0, -100.0, -90.0, 0.0])
-    return Cell(
+    return ProfilerCell(
         arm=DhArm.of(load_arm("ur10e")),
         home=home,
         center=center,
@@ -88,7 +90,8 @@ def ur10e_cell() -> Cell:
 
 @dataclass(frozen=True, eq=False)
 class SphereTests:
-    """Points that the sensor saw and the tip then touched: joints (n, 6) at both, the profile points (n, 2) m, which of three."""
+    """Points that the sensor saw and the tip then touched: joints (n, 6) at both, the profile points (n, 2) m, which of
+    three."""
 
     q_view: Floats
     seen: Floats
@@ -100,7 +103,7 @@ class SphereTests:
 class SphereWorld:
     """One robot with one profiler and one torch: `nominal` is what is believed, the rest is how it is."""
 
-    cell: Cell
+    cell: ProfilerCell
     real: DhArm
     sag: Floats
     rotation: Floats
@@ -114,7 +117,8 @@ class SphereWorld:
 
     @staticmethod
     def like_the_files(seed: int) -> SphereWorld:
-        """Of another seed than the fixed files, and else as they were made: only the arm's table, the tip and signs vary."""
+        """Of another seed than the fixed files, and else as they were made: only the arm's table, the tip and signs
+        vary."""
         e = WorldErrors(angle_rad=np.radians(0.015), twist_rad=np.radians(0.01))
         rng = np.random.default_rng([seed, 75])
         cell = files_cell()
@@ -260,7 +264,8 @@ class SphereTrial:
 def sphere_trial(
     world: SphereWorld, seed: int, *, translations: int = 10, free: int = 10, touches: int = 60, views: int = 10
 ) -> SphereTrial:
-    """Ten translations, ten free poses (tilt 12, turn 10 deg), sixty touches and three points seen and touched in ten views."""
+    """Ten translations, ten free poses (tilt 12, turn 10 deg), sixty touches and three points seen and touched in ten
+    views."""
     rng = np.random.default_rng([seed, 72])
     n = translations + free
     R_BS = np.concatenate(
@@ -269,10 +274,12 @@ def sphere_trial(
     p_S = np.column_stack(
         [
             np.concatenate([rng.uniform(-0.016, 0.016, translations), rng.uniform(-0.012, 0.012, free)]),
-            np.concatenate([rng.uniform(0.0055, 0.0165, translations), rng.uniform(0.006, 0.014, free) * rng.choice([-1, 1], free)]),
+            np.concatenate(
+                [rng.uniform(0.0055, 0.0165, translations), rng.uniform(0.006, 0.014, free) * rng.choice([-1, 1], free)]
+            ),
             np.concatenate([rng.uniform(0.198, 0.226, translations), rng.uniform(0.195, 0.230, free)]),
         ]
-    )  # fmt: skip
+    )
     q = world.joints(*world.viewing(R_BS, p_S, np.tile(world.center, (n, 1))))
     profiles, sign = arcs(world, q, rng)
     out = rng.standard_normal((touches, 3))

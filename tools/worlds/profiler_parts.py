@@ -1,4 +1,5 @@
-"""Workpieces under a simulated profiler: the S-shaped V-groove and the frustum; whole worlds with both, simulated or from files."""
+"""Workpieces under a simulated profiler: the S-shaped V-groove and the frustum; whole worlds with both, simulated or
+from files."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,7 +25,8 @@ TOP_M, HIP_M = 0.040, 0.050
 
 @dataclass(frozen=True, eq=False)
 class GrooveScan:
-    """Joints (n, 6), raw profiles (n, m, 2) m, the true features (n, 3, 2) m as the sensor shows them, touch joints (n, 3, 6)."""
+    """Joints (n, 6), raw profiles (n, m, 2) m, the true features (n, 3, 2) m as the sensor shows them, touch joints (n,
+    3, 6)."""
 
     q: Floats
     profiles: Floats

@@ -15,9 +15,9 @@ from weldcal.tools.report.weld import calibration_error
 
 
 @dataclass(frozen=True, eq=False)
-class Station:
-    """What made the observations: arm (its joints (n, 6) rad at each of them), how well the flange repeats (m, rms), the true X_BC,
-    and the work point (3,) m in B."""
+class RedrawnStation:
+    """What made the observations: arm (its joints (n, 6) rad at each of them), how well the flange repeats (m, rms),
+    the true X_BC, and the work point (3,) m in B."""
 
     arm: ArmModel
     joints: Array
@@ -28,8 +28,8 @@ class Station:
 
 @dataclass(frozen=True, eq=False)
 class Redrawn:
-    """Errors (k,) of a point at the work point (m) and of the rotation (rad): of calibrations whose noise was drawn anew, and of
-    as many draws from the Gaussian that the Cramer-Rao bound allows."""
+    """Errors (k,) of a point at the work point (m) and of the rotation (rad): of calibrations whose noise was drawn
+    anew, and of as many draws from the Gaussian that the Cramer-Rao bound allows."""
 
     at_work_m: Array
     rotation_rad: Array
@@ -44,7 +44,8 @@ class Redrawn:
 
 
 def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Array) -> Array:
-    """Joints (n, 6) rad in which a bare flange stands where each observation says: the solution nearest to ``q_home``."""
+    """Joints (n, 6) rad in which a bare flange stands where each observation says: the solution nearest to
+    ``q_home``."""
     out = []
     for o in observations:
         solutions = inverse_kinematics(arm, o.X_BR)
@@ -52,9 +53,9 @@ def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Arra
     return np.array(out)
 
 
-def redraw(observations: tuple[Observation, ...], station: Station, count: int, seed: int = 0) -> Redrawn:
-    """``count`` calibrations from the poses of these observations, each with noise of its own: joint offsets that displace the flange
-    by the repeatability, and fits that err as they state. Deterministic for ``seed``."""
+def redraw(observations: tuple[Observation, ...], station: RedrawnStation, count: int, seed: int = 0) -> Redrawn:
+    """``count`` calibrations from the poses of these observations, each with noise of its own: joint offsets that
+    displace the flange by the repeatability, and fits that err as they state. Deterministic for ``seed``."""
     rng = np.random.default_rng(seed)
     errors = np.empty((2, count))
     for k in range(count):
@@ -73,12 +74,12 @@ def joined(parts: list[Redrawn]) -> Redrawn:
     return Redrawn(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
-def bound_covariance(observations: tuple[Observation, ...], station: Station) -> Array:
-    """Cramer-Rao: the least covariance (6, 6) [rotation rad; displacement of the work point m] that an unbiased calibration from
-    these observations of a bare flange can have.
+def bound_covariance(observations: tuple[Observation, ...], station: RedrawnStation) -> Array:
+    """Cramer-Rao: the least covariance (6, 6) [rotation rad; displacement of the work point m] that an unbiased
+    calibration from these observations of a bare flange can have.
 
-    The arm's error is six independent joint offsets that displace the flange by the repeatability (rms); the scanner's is what
-    each fit states of itself. Centre and normal of a pose err together, as one offset of the joints moves both.
+    The arm's error is six independent joint offsets that displace the flange by the repeatability (rms); the scanner's
+    is what each fit states of itself. Centre and normal of a pose err together, as one offset of the joints moves both.
     """
     information = np.zeros((6, 6))
     for o, q in zip(observations, station.joints, strict=True):
@@ -96,12 +97,12 @@ def bound_covariance(observations: tuple[Observation, ...], station: Station) ->
     return np.asarray(np.linalg.inv(information))
 
 
-def _joint_sigma(station: Station, J: Array) -> float:
+def _joint_sigma(station: RedrawnStation, J: Array) -> float:
     """Standard deviation (rad) of each joint's offset, as the simulated arm draws it."""
     return station.repeatability_m / float(np.linalg.norm(J[3:]))
 
 
-def _redrawn(o: Observation, q: Array, station: Station, rng: np.random.Generator) -> Observation:
+def _redrawn(o: Observation, q: Array, station: RedrawnStation, rng: np.random.Generator) -> Observation:
     """The observation with noise of its own; the robot's reported pose stays."""
     offset = _joint_sigma(station, jacobian(station.arm, q)) * rng.standard_normal(6)
     X_CR = station.X_BC.inverse() @ forward_kinematics(station.arm, q + offset)

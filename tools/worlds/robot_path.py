@@ -1,7 +1,8 @@
 """A UR arm's exact motion through waypoints: moveJ or moveL with trapezoidal speed, as its controller plans it.
 
-A segment has one path parameter s from 0 to 1; s(t) accelerates, cruises and brakes with constant rates. moveJ interpolates the
-joints by s, moveL the flange's position, its rotation about one axis. The arm rests at each waypoint for the dwell time.
+A segment has one path parameter s from 0 to 1; s(t) accelerates, cruises and brakes with constant rates. moveJ
+interpolates the joints by s, moveL the flange's position, its rotation about one axis. The arm rests at each waypoint
+for the dwell time.
 """
 
 from dataclasses import dataclass
@@ -143,7 +144,10 @@ def path_through(
     acceleration: float = 1.2,
     dwell_s: float = 0.0,
 ) -> RobotPath:
-    """A closed path through flange poses X_BF, from joint angles near ``q_near`` (6,) rad. Raises InputError out of reach."""
+    """A closed path through flange poses X_BF, from joint angles near ``q_near`` (6,) rad.
+
+    Raises InputError out of reach.
+    """
     if len(poses) < 2 or not (speed > 0.0 and acceleration > 0.0 and dwell_s >= 0.0):
         raise InputError("A path needs two poses, and a positive speed and acceleration.")
     q: list[Array] = []
@@ -159,7 +163,8 @@ def path_through(
 def cube_poses(
     centre_m: Array, edge_m: float, towards: RotationMatrix, lean_rad: float, rng: np.random.Generator
 ) -> list[RigidTransform]:
-    """Flange poses at four corners of a cube about ``centre_m``, each turned away from ``towards`` by up to ``lean_rad``."""
+    """Flange poses at four corners of a cube about ``centre_m``, each turned away from ``towards`` by up to
+    ``lean_rad``."""
     return [leaning(centre_m + edge_m * corner, towards, lean_rad, rng) for corner in CORNERS]
 
 
@@ -170,7 +175,10 @@ def leaning(p: Array, towards: RotationMatrix, lean_rad: float, rng: np.random.G
 
 
 def reachable_start(arm: ArmModel, X_BF: RigidTransform, elbow_up: bool = True) -> Array:
-    """Joint angles (6,) rad for a pose, with the elbow as high as it gets (or as low). Raises InputError out of reach."""
+    """Joint angles (6,) rad for a pose, with the elbow as high as it gets (or as low).
+
+    Raises InputError out of reach.
+    """
     found = inverse_kinematics(arm, X_BF)
     if not len(found):
         raise InputError(f"The {arm.name} does not reach the cube: move it nearer.")

@@ -37,8 +37,9 @@ class SphereScan:
 
 
 def cell_scans(n: int, seed: int, progress: Progress = no_progress) -> list[SphereScan]:
-    """``n`` scans of a flange that carries a sphere, by one arm and one scanner whose errors no estimate is given: links 0.4 mm (rms at the
-    flange), repeatability 0.035 mm, scale 0.2 %, gradient 0.13 % per 100 mm, a warp of 0.1 mm."""
+    """``n`` scans of a flange that carries a sphere, by one arm and one scanner whose errors no estimate is given:
+    links 0.4 mm (rms at the flange), repeatability 0.035 mm, scale 0.2 %, gradient 0.13 % per 100 mm, a warp of 0.1
+    mm."""
     rng = np.random.default_rng(seed)
     arm, standard = load_arm("ur10e"), get_flange("iso9409-1-50-4-m6")
     true = draw_true_arm(arm, _ARM_MM, _HOME, rng)
@@ -75,7 +76,8 @@ def cell_scans(n: int, seed: int, progress: Progress = no_progress) -> list[Sphe
 
 
 def _sphere(points_C: Array, fit: FlangeFit) -> Array:
-    """Centre of the ball beside the fitted flange: what stands proud of the face, on the ring where the ball must lie."""
+    """Centre of the ball beside the fitted flange: what stands proud of the face, on the ring where the ball must
+    lie."""
     p = points_C.reshape(-1, 3)
     p = p[np.isfinite(p).all(axis=1)]
     away = p - fit.center_C

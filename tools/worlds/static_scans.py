@@ -1,4 +1,5 @@
-"""The static experiment of the paper: the arm stops at a 4 x 4 grid and the scanner takes a picture in its finest mode at each."""
+"""The static experiment of the paper: the arm stops at a 4 x 4 grid and the scanner takes a picture in its finest mode
+at each."""
 
 from dataclasses import dataclass
 
@@ -68,7 +69,8 @@ class StaticMode:
 
 
 def noise_of_face(points_C: Array, fit: FlangeFit, world: MotionWorld) -> tuple[float, float, int]:
-    """Rms of the points of the flat face about its plane (mm), rms of its outer edge about its circle (mm), and their number."""
+    """Rms of the points of the flat face about its plane (mm), rms of its outer edge about its circle (mm), and their
+    number."""
     flat = points_C.reshape(-1, 3)
     flat = flat[np.isfinite(flat[:, 2])]
     d = flat - fit.center_C

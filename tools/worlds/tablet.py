@@ -1,7 +1,8 @@
 """The tablet paper's data and results (Tables 2, 3, 7 to 12), and simulated trials with its noise.
 
-J. Sato, "Hand-Eye Calibration Using a Tablet Computer", Math. Comput. Appl. 2023, 28(1), 22, doi 10.3390/mca28010022, CC BY 4.0.
-The tablet's grid and the turn at the first landmark are not printed; both are inferred from the printed results.
+J. Sato, "Hand-Eye Calibration Using a Tablet Computer", Math. Comput. Appl. 2023, 28(1), 22, doi 10.3390/mca28010022,
+CC BY 4.0. The tablet's grid and the turn at the first landmark are not printed; both are inferred from the printed
+results.
 """
 
 from dataclasses import dataclass
@@ -17,11 +18,17 @@ from weldcal.models.arrays import Array
 # Table 2: u, v (px), depth (mm), hand x, y (mm), touching error (px)
 TABLE_2 = np.array(
     [
-        [119, 105, 168.2, 289, 1, -3, 1], [339, 108, 168.6, 347, 8, -2, 3], [558, 109, 167.7, 403, 14, -1, 5],
-        [556, 246, 167.5, 395, -20, -1, 4], [338, 244, 169.2, 327, -17, -3, -1], [119, 242, 168.7, 257, -16, 3, 3],
-        [118, 379, 168.6, 249, -59, 2, 0], [337, 379, 170.2, 305, -67, -1, 3], [554, 381, 168.9, 363, -77, 1, 2],
+        [119, 105, 168.2, 289, 1, -3, 1],
+        [339, 108, 168.6, 347, 8, -2, 3],
+        [558, 109, 167.7, 403, 14, -1, 5],
+        [556, 246, 167.5, 395, -20, -1, 4],
+        [338, 244, 169.2, 327, -17, -3, -1],
+        [119, 242, 168.7, 257, -16, 3, 3],
+        [118, 379, 168.6, 249, -59, 2, 0],
+        [337, 379, 170.2, 305, -67, -1, 3],
+        [554, 381, 168.9, 363, -77, 1, 2],
     ]
-)  # fmt: skip
+)
 # Table 3; the hand's turn is printed as 22.5 m, but only 90 - 22.5 m reproduces any of the results
 HAND_CAPTURE_MM = (320.0, -70.0, 290.0)
 FOCAL_PX = 617.7
@@ -93,7 +100,9 @@ def published_touches() -> TabletTouches:
 @dataclass(frozen=True, kw_only=True)
 class TabletNoise:
     """Noise of the simulated devices, as the paper's data suggest it: a depth camera that reads 1.5 % short and 0.8 mm
-    noisy, blobs of 0.15 px read to whole pixels, hands read to whole millimetres, touches 2.5 px off the dot, a table level within 0.7 deg."""
+    noisy, blobs of 0.15 px read to whole pixels, hands read to whole millimetres, touches 2.5 px off the dot, a table
+    level within 0.7 deg.
+    """
 
     depth_scale: float = 0.985
     depth_m: float = 0.8e-3
@@ -122,7 +131,8 @@ class TabletTrial:
 
 
 def simulate_trial(seed: tuple[int, ...], noise: TabletNoise | None = None, queries: int = 16) -> TabletTrial:
-    """One trial with a mounting, a pen and a tablet drawn from the seed; the camera hangs about 172 mm over the tablet."""
+    """One trial with a mounting, a pen and a tablet drawn from the seed; the camera hangs about 172 mm over the
+    tablet."""
     noise = noise or TabletNoise()
     rng = np.random.default_rng(seed)
     pitch = published_touches().pitch_m

@@ -10,10 +10,12 @@ import numpy as np
 
 Rng = np.random.Generator
 Damage = tuple[bytes, bool]
-"""The damaged bytes, and whether they contradict themselves: if they are accepted with other data, that is silently wrong."""
+"""The damaged bytes, and whether they contradict themselves: if they are accepted with other data, that is silently
+wrong."""
 
 NUMBERS = (
-    "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-0", "-1", "1e9", "1e400", "9" * 400, "0x10", "1_000", "1,5", "", "x",
+    "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-0", "-1", "1e9", "1e400", "9" * 400, "0x10", "1_000",
+    "1,5", "", "x",
     "\u0663", "true", "null", "[1, 2]", "{a: 1}", "2026-01-01", "~", "'", "1e5", "00012",
 )  # fmt: skip
 WORDS = (

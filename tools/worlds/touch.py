@@ -1,4 +1,5 @@
-"""A light world of a cell: its true arm, scanner and tip, the calibration from its scans, and touches of plates, spheres, an edge and a point."""
+"""A light world of a cell: its true arm, scanner and tip, the calibration from its scans, and touches of plates,
+spheres, an edge and a point."""
 
 from dataclasses import dataclass, replace
 
@@ -36,19 +37,19 @@ _TAUGHT_M, _BALL_M, _CONTACT_M = 5e-5, 2e-5, 2e-5  # tip as taught, per axis; it
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class TouchWorld:
     """What calibration and judge are given: the result, and the touches."""
 
     result: CalibrationResult
     touches: tuple[Touch, ...]
 
 
-def touch_world(seed: int, scans: int = SCANS) -> World:
+def touch_world(seed: int, scans: int = SCANS) -> TouchWorld:
     """The cell of this seed. What no estimate is given, and no model of the estimator has:
 
-    an arm with zeros off by 0.02 to 0.05 degrees and axes by 0.1 to 0.3 mm and 0.02 degrees, that repeats to 0.035 mm; a scanner with a scale
-    error of 0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion; a tip that is taught to 0.05 mm per axis and whose ball is up to
-    0.02 mm too large or small; contact that is seen 0.02 mm early or late.
+    an arm with zeros off by 0.02 to 0.05 degrees and axes by 0.1 to 0.3 mm and 0.02 degrees, that repeats to 0.035 mm;
+    a scanner with a scale error of 0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion; a tip that is taught
+    to 0.05 mm per axis and whose ball is up to 0.02 mm too large or small; contact that is seen 0.02 mm early or late.
     """
     rng, nominal = np.random.default_rng(seed), load_arm("ur10e")
     true = _wrong(nominal, rng)
@@ -63,7 +64,7 @@ def touch_world(seed: int, scans: int = SCANS) -> World:
     touches = tuple(
         _touch(f"{kind}{k}", kind, nominal, true, scanner, tip, ball, rng) for k, kind in enumerate(FEATURES)
     )
-    return World(_calibrated(observations), touches)
+    return TouchWorld(_calibrated(observations), touches)
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,8 @@ def _splines(device: int, warp_m: float) -> Array:
 
 
 def warped_point(p_C: Array, device: int, warp_m: float = WARP_M) -> Array:
-    """Where a scanner whose depth is off by a field of cosines over its image puts a point (3,) m; no polynomial in x and y."""
+    """Where a scanner whose depth is off by a field of cosines over its image puts a point (3,) m; no polynomial in x
+    and y."""
     column, row = ((1.0 + p_C[k] / p_C[2] / _FIELD) * 200.0 for k in (0, 1))
     place = [[row + _BORDER], [column + _BORDER]]
     off = float(map_coordinates(_splines(device, warp_m), place, order=3, mode="nearest", prefilter=False)[0])
@@ -53,8 +54,10 @@ def warped_point(p_C: Array, device: int, warp_m: float = WARP_M) -> Array:
 def warped_observations(
     device: int, n: int, seed: int, warp_m: float = WARP_M, arm_m: float = 0.0
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """Observations (n) and hole circles by such a scanner; both follow from where it puts the points of the flange. The arm's stated
-    positions are off by a smooth field of ``arm_m`` (per axis, rms)."""
+    """Observations (n) and hole circles by such a scanner; both follow from where it puts the points of the flange.
+
+    The arm's stated positions are off by a smooth field of ``arm_m`` (per axis, rms).
+    """
     rng, observations, patterns, h = np.random.default_rng((device, seed)), [], {}, 0.02
     for k in range(n):
         true = _MIDDLE + rng.uniform(-_REACH, _REACH)
@@ -86,7 +89,8 @@ def warped_observations(
 
 
 def arm_error(p_B: Array, device: int, arm_m: float) -> Array:
-    """By how much (3,) m an arm misses a place: six waves of about 0.8 m, as kinematics that are off by hundredths of a degree do."""
+    """By how much (3,) m an arm misses a place: six waves of about 0.8 m, as kinematics that are off by hundredths of a
+    degree do."""
     rng = np.random.default_rng([device, 41])
     waves, phases = 2.0 * np.pi / _ARM_WAVE_M * rng.standard_normal((6, 3)), rng.uniform(0.0, 2.0 * np.pi, 6)
     along = arm_m * np.sqrt(2.0 / 6.0) * rng.standard_normal((6, 3))
@@ -113,9 +117,9 @@ SIGMA_M, SIGMA_RAD, SIGMA_RATIO = 1e-4, 1e-3, 1e-3  # of a centre and a normal p
 
 
 def simulated_observations(n: int, rng: np.random.Generator) -> tuple[list[Observation], RigidTransform]:
-    """Observations (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``SIGMA_M`` and ``SIGMA_RAD`` an
-    axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane, which a calibration refuses,
-    are drawn again."""
+    """Observations (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``SIGMA_M`` and
+    ``SIGMA_RAD`` an axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane,
+    which a calibration refuses, are drawn again."""
     X_BC = RigidTransform(
         RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
     )

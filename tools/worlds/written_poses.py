@@ -1,4 +1,5 @@
-"""Pairs of lists of poses in random conventions: SciPy writes them, so that the readers' own tables are not the truth."""
+"""Pairs of lists of poses in random conventions: SciPy writes them, so that the readers' own tables are not the
+truth."""
 
 import warnings
 from dataclasses import dataclass
@@ -46,7 +47,8 @@ class WrittenSet:
 
 
 def written_set(rng: np.random.Generator, n: int | None = None) -> WrittenSet:
-    """Poses of an eye in hand (6 to 40 or ``n``), in a random notation, unit and order each; one list may be changed as a whole."""
+    """Poses of an eye in hand (6 to 40 or ``n``), in a random notation, unit and order each; one list may be changed as
+    a whole."""
     n = int(rng.integers(6, 41)) if n is None else n
     noise = np.radians(ROTATION_DEG) * rng.uniform(), 1e-3 * POSITION_MM * rng.uniform()
     turned = Rotation.from_rotvec(rng.normal(size=(n, 3)) * float(rng.choice(_SPREADS)) / 2.0) * Rotation.random(
@@ -64,9 +66,16 @@ def written_set(rng: np.random.Generator, n: int | None = None) -> WrittenSet:
     (robot,), form = _written([A], rng, units[0], changed)
     (camera, clean), other = _written([B, exact], rng, units[1], not changed)
     return WrittenSet(
-        robot=robot, camera=camera, exact=clean, forms=(form, other), X=X, scale=units[0], unit_ratio=units[0] / units[1],
-        rotation=noise[0], position=noise[1] * units[0],
-    )  # fmt: skip
+        robot=robot,
+        camera=camera,
+        exact=clean,
+        forms=(form, other),
+        X=X,
+        scale=units[0],
+        unit_ratio=units[0] / units[1],
+        rotation=noise[0],
+        position=noise[1] * units[0],
+    )
 
 
 def _written(

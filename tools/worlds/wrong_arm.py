@@ -34,8 +34,9 @@ _CANDIDATES = 250
 
 
 @dataclass(frozen=True)
-class Station:
-    """One world: stated observations at joint angles q with their hole circles, and the errors (n, 6) of the arm that no estimate is given."""
+class WrongArmStation:
+    """One world: stated observations at joint angles q with their hole circles, and the errors (n, 6) of the arm that
+    no estimate is given."""
 
     observations: list[Observation]
     q: Array
@@ -47,9 +48,10 @@ class Station:
 
 def station(
     seed: int, scans: int = SCANS, new: int = NEW, *, planned: bool = True, links: bool = True, size: float = 1.0
-) -> Station:
-    """A UR10e with offsets of 0.02 to 0.05 degrees and axes off by 0.1 to 0.3 mm and 0.02 degrees, and a scanner 0.65 m from its flange with
-    a scale error of 0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion that the correction's polynomial has only in part.
+) -> WrongArmStation:
+    """A UR10e with offsets of 0.02 to 0.05 degrees and axes off by 0.1 to 0.3 mm and 0.02 degrees, and a scanner 0.65 m
+    from its flange with a scale error of 0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion that the
+    correction's polynomial has only in part.
 
     ``planned``: the scans are those of 250 candidates that tell most (informative_poses); the new ones are random.
     Without ``links`` only the joints' zeros are wrong; ``size`` multiplies the errors.
@@ -73,7 +75,7 @@ def station(
     bend = (1e-3 * rng.normal(), 5e-3 * rng.normal(size=2), 3e-3 * rng.normal())
     one, other = q[chosen], q[_CANDIDATES:]
     seen, patterns = _seen(arm, one, errors, X_BC, bend, rng, "p")
-    return Station(seen, one, _seen(arm, other, errors, X_BC, bend, rng, "n")[0], other, errors, patterns)
+    return WrongArmStation(seen, one, _seen(arm, other, errors, X_BC, bend, rng, "n")[0], other, errors, patterns)
 
 
 def _visible(arm: Chain, X_BC: Array, rng: np.random.Generator, n: int) -> Array:
@@ -103,7 +105,8 @@ def _seen(
     rng: np.random.Generator,
     name: str,
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """What the wrong scanner sees of the wrong arm, and of its hole circles, beside the poses that the controller states."""
+    """What the wrong scanner sees of the wrong arm, and of its hole circles, beside the poses that the controller
+    states."""
     stated, real = flange_poses(arm, q, np.zeros((arm.n, 6))), flange_poses(arm, q, errors)
     out, patterns = [], {}
     for i, X in enumerate(inverse(X_BC) @ real):
@@ -130,8 +133,8 @@ def _distorted(p: Array, bend: tuple[float, Array, float]) -> Array:
 
 @dataclass(frozen=True)
 class Found:
-    """One world: errors (m,) m at new scans of the plain and of the refined calibration, whether they lie in the stated 95 % regions, and
-    the joint offsets' errors in units of their sigma."""
+    """One world: errors (m,) m at new scans of the plain and of the refined calibration, whether they lie in the stated
+    95 % regions, and the joint offsets' errors in units of their sigma."""
 
     plain_m: Array
     refined_m: Array
@@ -139,8 +142,9 @@ class Found:
     offsets_sigma: Array
 
 
-def study_station(world: Station, kind: str = "links", prior: FactoryPrior | None = None) -> Found:
-    """Calibrate one world plain, with the choice of the scanner's correction, and refined, and judge both on its new scans."""
+def study_station(world: WrongArmStation, kind: str = "links", prior: FactoryPrior | None = None) -> Found:
+    """Calibrate one world plain, with the choice of the scanner's correction, and refined, and judge both on its new
+    scans."""
     arm = load_chain("ur10e")
     sought: ArmErrors = arm_errors(arm, kind, prior)
     X_BC, correction = solve_jointly(world.observations, world.patterns)
@@ -170,7 +174,8 @@ def study_station(world: Station, kind: str = "links", prior: FactoryPrior | Non
 
 
 def judged(worlds: Sequence[Found]) -> dict[str, float]:
-    """Mean errors (mm) at new scans before and after, the share inside the stated regions, and of offsets within three sigma."""
+    """Mean errors (mm) at new scans before and after, the share inside the stated regions, and of offsets within three
+    sigma."""
     before, after = (1e3 * np.concatenate([getattr(f, name) for f in worlds]) for name in ("plain_m", "refined_m"))
     off = np.concatenate([np.abs(f.offsets_sigma) for f in worlds])
     return {

@@ -1,4 +1,5 @@
-"""Calibrates the finger: the camera's intrinsics from pictures of a board, the tag's size and the tip from touches on a plate."""
+"""Calibrates the finger: the camera's intrinsics from pictures of a board, the tag's size and the tip from touches on a
+plate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,18 +13,19 @@ from weldcal.welding.numerics import Array
 
 FEWEST_PICTURES, FEWEST_CORNERS = 6, 8
 HELD_OUT = 4  # every fourth picture judges and is not used
-WORST_PX = 1.0
+WORST_PX = 1.0  # OpenCV's corners of a sharp picture are good to some tenths; above 1 px a corner is a wrong one
 LEAST_TILT_DEG = 8.0  # the board is turned by so much in some pictures: else focal length and distance are one number
 FEWEST_TOUCHES = 4
-LEAST_PRESS_M = 5e-4
+LEAST_PRESS_M = 5e-4  # a choice: about ten times the tag's own noise at the tip, a sixth of the weld's deflection
 FAR_OFF = 0.2  # of the nominal size: a tag that is further off is another tag
 AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Intrinsics:
-    """A camera: K (3, 3) px, OpenCV's five distortion coefficients, picture size, rms reprojection in px of the pictures that
-    were used and of those that were not, their numbers, and the standard deviation of the focal length in px."""
+class FingerIntrinsics:
+    """A camera: K (3, 3) px, OpenCV's five distortion coefficients, picture size, rms reprojection in px of the
+    pictures that were used and of those that were not, their numbers, and the standard deviation of the focal length in
+    px."""
 
     K: Array
     distortion: Array
@@ -40,11 +42,11 @@ class Intrinsics:
 class TipCalibration:
     """What touches show.
 
-    `scale`: displacement that the nominal tag shows over the true one, with its standard deviation; the true tag is the nominal
-    one over it. `rotation_deg`: between the camera's displacements and the tool's, None where only one direction was pressed.
-    `seat_m` (3,): displacement that is shown where none is expected; NaN in directions that were not pressed.
-    `stiffness_N_per_m` by axis of T, for axes that were pressed with a force. `held_out_m`: median error of a touch that the fit
-    did not use. `unknown`: sentences on what the touches leave open.
+    `scale`: displacement that the nominal tag shows over the true one, with its standard deviation; the true tag is the
+    nominal one over it. `rotation_deg`: between the camera's displacements and the tool's, None where only one
+    direction was pressed. `seat_m` (3,): displacement that is shown where none is expected; NaN in directions that were
+    not pressed. `stiffness_N_per_m` by axis of T, for axes that were pressed with a force. `held_out_m`: median error
+    of a touch that the fit did not use. `unknown`: sentences on what the touches leave open.
     """
 
     scale: float
@@ -57,7 +59,8 @@ class TipCalibration:
 
 
 def find_board(picture: NDArray[np.uint8], board: cv2.aruco.CharucoBoard) -> tuple[Array, Array] | None:
-    """Corners of the board in a grey picture: points on the board (n, 3) m and pixels (n, 2); None where too few are seen."""
+    """Corners of the board in a grey picture: points on the board (n, 3) m and pixels (n, 2); None where too few are
+    seen."""
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(picture)
     if corners is None or len(corners) < FEWEST_CORNERS:
         return None
@@ -66,10 +69,12 @@ def find_board(picture: NDArray[np.uint8], board: cv2.aruco.CharucoBoard) -> tup
     )
 
 
-def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, int]) -> Intrinsics:
-    """The camera from points on a board (n, 3) m and their pixels (n, 2) in each picture; every fourth picture is held out.
+def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, int]) -> FingerIntrinsics:
+    """The camera from points on a board (n, 3) m and their pixels (n, 2) in each picture; every fourth picture is held
+    out.
 
-    Zhang, A flexible new technique for camera calibration, 2000, with two radial and two tangential coefficients (OpenCV).
+    Zhang, A flexible new technique for camera calibration, 2000, with two radial and two tangential coefficients
+    (OpenCV).
 
     Raises:
         InputError: too few pictures, a board that is never turned, or a fit worse than a pixel.
@@ -94,18 +99,18 @@ def calibrate_intrinsics(seen: Sequence[tuple[Array, Array]], size: tuple[int, i
     tilts = np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0)))
     if np.sort(tilts)[-3:].min() < LEAST_TILT_DEG:
         raise InputError(
-            f"The board is turned by at most {tilts.max():.0f} degrees: tilt it by 20 to 40 degrees to all sides, or its distance and "
-            "the focal length cannot be told apart."
+            f"The board is turned by at most {tilts.max():.0f} degrees: tilt it by 20 to 40 degrees to all sides, or"
+            " its distance and the focal length cannot be told apart."
         )
     if rms > WORST_PX:
         raise InputError(
-            f"The corners of the board are {rms:.2f} px off: give the board's true --board (measure a square), keep it flat, and "
-            "take sharp pictures."
+            f"The corners of the board are {rms:.2f} px off: give the board's true --board (measure a square), keep it"
+            " flat, and take sharp pictures."
         )
     errors = [_reprojection(np.asarray(p), np.asarray(u), K, distortion) for p, u in judges]
     held_out = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     focal_sigma = float(np.ravel(sigmas)[0])
-    return Intrinsics(
+    return FingerIntrinsics(
         K=np.asarray(K),
         distortion=np.ravel(distortion),
         width=size[0],
@@ -128,11 +133,11 @@ def _reprojection(points: Array, pixels: Array, K: Array, distortion: Array) -> 
 def calibrate_tip(pressed_m: Array, shown_m: Array, forces_N: Array | None = None) -> TipCalibration:
     """The tag's scale, the seat and the stiffness from touches on a plate that does not give way.
 
-    `pressed_m` (n, 3): how far the robot moved the flange towards and along the plate after the contact that is expected, as the
-    displacement of the tip in T. `shown_m` (n, 3): the displacement that the camera shows with the nominal tag.
-    `forces_N` (n, 3): of the plate on the tip, NaN where none was measured.
-    The fit is shown = scale * R * pressed + seat, by least squares (Umeyama, 1991) where two or more directions were pressed, else
-    along the one direction.
+    `pressed_m` (n, 3): how far the robot moved the flange towards and along the plate after the contact that is
+    expected, as the displacement of the tip in T. `shown_m` (n, 3): the displacement that the camera shows with the
+    nominal tag. `forces_N` (n, 3): of the plate on the tip, NaN where none was measured. The fit is shown = scale * R *
+    pressed + seat, by least squares (Umeyama, 1991) where two or more directions were pressed, else along the one
+    direction.
 
     Raises:
         InputError: too few touches, too small ones, or a scale that no tag of this kind has.
@@ -149,7 +154,8 @@ def calibrate_tip(pressed_m: Array, shown_m: Array, forces_N: Array | None = Non
     scale, R, seat = _similar(pressed, shown, turned)
     if abs(scale - 1.0) > FAR_OFF:
         raise InputError(
-            f"The tag shows {scale:.2f} times the robot's displacement: the tip slipped, the plate gave way, or the tag is another one."
+            f"The tag shows {scale:.2f} times the robot's displacement: the tip slipped, the plate gave way, or the tag"
+            " is another one."
         )
     left = []
     for k in range(len(pressed)):
@@ -179,7 +185,8 @@ def calibrate_tip(pressed_m: Array, shown_m: Array, forces_N: Array | None = Non
 
 
 def _similar(a: Array, b: Array, turned: bool) -> tuple[float, Array, Array]:
-    """Scale, rotation (3, 3) and shift (3,) with b = scale R a + shift; without the rotation where `turned` is false."""
+    """Scale, rotation (3, 3) and shift (3,) with b = scale R a + shift; without the rotation where `turned` is
+    false."""
     a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
     R = np.eye(3)
     if turned:

@@ -159,8 +159,8 @@ def detect_tag(
 ) -> TagObservation:
     """Find `tag` in one image and its pose in the camera.
 
-    ArUco corners refined to a hundredth of a pixel by the tag's sides, IPPE for a square, then Levenberg-Marquardt on the reprojection.
-    Two poses explain a tag that is nearly parallel to the image: their translation, which is all that
+    ArUco corners refined to a hundredth of a pixel by the tag's sides, IPPE for a square, then Levenberg-Marquardt on
+    the reprojection. Two poses explain a tag that is nearly parallel to the image: their translation, which is all that
     `deflection_from_tag` uses, is the same.
 
     Args:
@@ -237,12 +237,13 @@ def deflection_from_tag(
 
 
 def corners_from_sides(grey: NDArray[np.uint8], corners: Array, cells: int) -> Array | None:
-    """Locate the corners (4, 2) px of a black square on white as intersections of its sides; None where a side is not visible.
+    """Locate the corners (4, 2) px of a black square on white as intersections of its sides; None where a side is not
+    visible.
 
-    Corner refinement looks at a few pixels round each corner, and where blur rounds the corner or the print differs on its two
-    sides they move outwards: a tag of 112 px reads half a pixel too large, which is 0.2 mm in 40 mm of distance. Across a
-    whole side the blur is symmetric: the total grey of a profile gives the position of its edge (the area under a
-    blurred step equals that of the step, whatever the blur), averaged over a hundred pixels of a side.
+    Corner refinement looks at a few pixels round each corner, and where blur rounds the corner or the print differs on
+    its two sides they move outwards: a tag of 112 px reads half a pixel too large, which is 0.2 mm in 40 mm of
+    distance. Across a whole side the blur is symmetric: the total grey of a profile gives the position of its edge (the
+    area under a blurred step equals that of the step, whatever the blur), averaged over a hundred pixels of a side.
 
     Args:
         grey: (H, W) uint8.

@@ -18,15 +18,15 @@ STRIPS, STRIP_AGREES = 8, math.radians(2.5)
 LEAST_TURN = math.sin(math.radians(8.0))  # between two normals that are to span a cylinder
 NORMALS_AGREE = math.cos(math.radians(9.0))
 STEEPEST = math.cos(math.radians(65.0))
-BAND_M = 0.003
+BAND_M = 0.003  # about a flat or bent face: above a scanner's noise and form error, below a plate's thickness
 
 
 @dataclass(frozen=True, eq=False)
 class BentFace:
     """A cylindrical face: frame Q is tangent to it at its origin, x around it, y along its axis, z out of the face; m.
 
-    radius_m is negative where the axis lies above the face (a hollow one). Unrolled, a point has the coordinates
-    (arc length around, along, height over the face). reach_m: how far from the origin the face was seen, around and along.
+    radius_m is negative where the axis lies above the face (a hollow one). Unrolled, a point has the coordinates (arc
+    length around, along, height over the face). reach_m: how far from the origin the face was seen, around and along.
     """
 
     X_AQ: RigidTransform
@@ -80,7 +80,8 @@ def find_bent_faces(
 ) -> list[BentFace]:
     """Find up to `most` faces with a bend radius in a range, largest first, in a cloud (N,3) m whose z is up.
 
-    Two points and their normals span a cylinder; the one that most others agree with, in distance and in normal, is fitted.
+    Two points and their normals span a cylinder; the one that most others agree with, in distance and in normal, is
+    fitted.
     """
     at, normal = _normals(points, rng, min(map(abs, radii_m)))
     found: list[BentFace] = []
@@ -101,8 +102,8 @@ def find_bent_faces(
 
 
 def _normals(points: Floats, rng: np.random.Generator, least_radius_m: float) -> tuple[Floats, Floats]:
-    """Some points (M,3) and the normals (M,3) of the surface there, up; those at edges are left out, but none for a bend of that
-    radius or a wider one."""
+    """Some points (M,3) and the normals (M,3) of the surface there, up; those at edges are left out, but none for a
+    bend of that radius or a wider one."""
     sample = points[rng.choice(len(points), size=min(len(points), 16 * SEEDS), replace=False)]
     seeds = sample[: min(SEEDS, len(sample))]
     near = sample[cKDTree(sample).query(seeds, k=min(NEIGHBOURS, len(sample)))[1]]
@@ -118,12 +119,7 @@ def _normals(points: Floats, rng: np.random.Generator, least_radius_m: float) ->
 
 
 def _spanned(
-    at: Floats,
-    normal: Floats,
-    radii_m: tuple[float, float],
-    rng: np.random.Generator,
-    least: int,
-    hollow: bool,
+    at: Floats, normal: Floats, radii_m: tuple[float, float], rng: np.random.Generator, least: int, hollow: bool
 ) -> BentFace | None:
     """The cylinder spanned by two points and their normals with the most inliers, or None."""
     first, second = rng.integers(len(at), size=(2, 20 * PAIRS))
@@ -166,7 +162,8 @@ def _centred(face: BentFace, at: Floats, normal: Floats) -> BentFace:
 
 
 def _turns(face: BentFace, x: Floats, normal: Floats) -> bool:
-    """Whether the normals (M,3) rotate with the arc length x (M,) as on that cylinder; those of a tangent plane do not."""
+    """Whether the normals (M,3) rotate with the arc length x (M,) as on that cylinder; those of a tangent plane do
+    not."""
     n = normal @ face.X_AQ.rotation().matrix()
     off = np.arctan2(n[:, 0], n[:, 2]) - x / face.radius_m
     # Strip by strip around it: a mixture of planes agrees on the whole, but in no strip.

@@ -1,8 +1,9 @@
 """Registers a bent plate to one scan by its cylindrical face and its outline.
 
 The drawing gives the radius. The face is found by its normals and unrolled; there the flat outline is slid over the
-flat edge of what was seen. Then pose and inset are fitted together to the face (distance from the cylinder) and to its outermost
-points (distance from the outline, unrolled): the face alone does not constrain the position along and around the axis.
+flat edge of what was seen. Then pose and inset are fitted together to the face (distance from the cylinder) and to its
+outermost points (distance from the outline, unrolled): the face alone does not constrain the position along and around
+the axis.
 """
 
 import math
@@ -92,8 +93,8 @@ def register_bent(
             best = (score, X_BP_guess @ face.at(float(x), float(y_), float(yaw)))
     if best is None:
         raise WorkpieceNotFound(
-            f"The scan shows no face bent over {1e3 * radius:.0f} mm where the workpiece should be: check the guess and which "
-            "workpiece this is."
+            f"The scan shows no face bent over {1e3 * radius:.0f} mm where the workpiece should be: check the guess and"
+            " which workpiece this is."
         )
     return _refine(points, workpiece, best[1], config, eye_B)
 
@@ -224,7 +225,8 @@ def _fit(
 
 
 def _slants(outline: Floats, radius: float, eye_P: Floats | None) -> Floats:
-    """For each edge (k,) the angle between the face's normal at its middle and the sight: the ends of the plate lean."""
+    """For each edge (k,) the angle between the face's normal at its middle and the sight: the ends of the plate
+    lean."""
     middle = 0.5 * (outline + np.roll(outline, -1, axis=0))
     angle = middle[:, 0] / radius
     if eye_P is None:

@@ -1,7 +1,7 @@
 """Finds a plate in a scan without an initial guess: template search over all faces and turns, then fine registration.
 
-Coarse: the planes that face up; on each, the outline as a template (face inside, none just outside) correlated with what
-was seen, over all turns. Fine: register_workpiece from the best of these places. The answer is compared with its
+Coarse: the planes that face up; on each, the outline as a template (face inside, none just outside) correlated with
+what was seen, over all turns. Fine: register_workpiece from the best of these places. The answer is compared with its
 runners-up: a second place that fits as well, or a half turn that looks the same, is refused as ambiguous. Where the
 outline is symmetric the groove decides, if it is drawn asymmetrically and can be seen.
 """
@@ -203,7 +203,10 @@ def _decided(
     found = turns[chosen]
     confidence = float(np.clip(found.confidence * (1.0 - max(0.0, other - 0.5)), 0.0, 1.0))
     word = "high" if confidence > 0.85 else "fair" if confidence > 0.65 else "low"
-    summary = f"{word} confidence {confidence:.2f}: {found.summary}; the next best place is {100 * other:.0f} % as good, and {why}"
+    summary = (
+        f"{word} confidence {confidence:.2f}: {found.summary}; the next best place is {100 * other:.0f} % as good, and"
+        f" {why}"
+    )
     turned_groove = grooves[1 - chosen] if len(grooves) == 2 else None
     return FoundWorkpiece(found, other, grooves[chosen], turned_groove, confidence, summary)
 
@@ -242,7 +245,8 @@ def _bent_places(
 def _correlate(
     q: Floats, workpiece: Workpiece, config: FindConfig, only: tuple[float, ...] | None = None
 ) -> list[tuple[float, RigidTransform]]:
-    """The few best poses of the outline in one plane: turns by template (`only` these, where given), places by correlation."""
+    """The few best poses of the outline in one plane: turns by template (`only` these, where given), places by
+    correlation."""
     cell = config.cell_m
     reach = 0.5 * float(np.hypot(*workpiece.size_m[:2]))
     corner = q[:, :2].min(axis=0) - 0.3 * reach

@@ -1,7 +1,8 @@
 """Computes the 6x6 pose covariance of a plate's registration, and from it the sigma of the drawn seam.
 
-Errors of neighbouring scan points are correlated, and so may be those of all points of one edge: which pixel is the last
-on the plate repeats along an edge. Both are modelled; the figures were tuned on simulated scans and are tested on others.
+Errors of neighbouring scan points are correlated, and so may be those of all points of one edge: which pixel is the
+last on the plate repeats along an edge. Both are modelled; the figures were tuned on simulated scans and are tested on
+others.
 """
 
 import math
@@ -19,7 +20,7 @@ EDGE_NOISES = 0.25  # error of an edge per noise of the face: flying points incr
 SLANT_PITCHES = 0.15  # error of an edge per tangent of the angle at which the face is seen
 INSET_PITCHES = 0.25  # common to all edges
 USUAL_SLANT_RAD = math.radians(8.0)
-HEIGHT_FLOOR_M = 2e-6
+HEIGHT_FLOOR_M = 2e-6  # a plane's mean of any number of points; keeps the matrix regular
 
 
 def outline_covariance(
@@ -32,8 +33,8 @@ def outline_covariance(
     noise: float,
 ) -> Floats:
     """(3,3) of x, y, turn from the Jacobian (M+1,4) of the outline fit, whose last row is the inset's prior, and the
-    distances (M,) of the outermost points from their edges, m. slant_rad: between the face's normal and the sight; noise of the
-    face, m.
+    distances (M,) of the outermost points from their edges, m. slant_rad: between the face's normal and the sight;
+    noise of the face, m.
     """
     slant = math.tan(USUAL_SLANT_RAD if slant_rad is None else slant_rad)
     G = np.linalg.inv(J.T @ J) @ J.T

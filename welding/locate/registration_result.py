@@ -67,8 +67,8 @@ class WorkpieceRegistration:
     def summary(self) -> str:
         """One sentence that describes the result."""
         return (
-            f"{100 * self.supported:.0f} % of the outline agrees with the drawing, {100 * self.contradicted:.0f} % contradicts it; "
-            f"the drawn seam is known to {1e3 * self.seam_sigma_m:.2f} mm"
+            f"{100 * self.supported:.0f} % of the outline agrees with the drawing, {100 * self.contradicted:.0f} %"
+            f" contradicts it; the drawn seam is known to {1e3 * self.seam_sigma_m:.2f} mm"
         )
 
     def turned_round(self, workpiece: Workpiece) -> WorkpieceRegistration:
@@ -123,8 +123,8 @@ def known_well_enough(
     uncertain = seam_sigma(covariance, workpiece)
     if uncertain > config.max_sigma_m:
         raise WorkpieceNotFound(
-            f"The plate was found, but its position is only known to {1e3 * uncertain:.2f} mm from this scan (noise "
-            f"{1e3 * noise:.2f} mm, points {1e3 * pitch:.1f} mm apart) and {1e3 * config.max_sigma_m:.2f} mm are required: "
-            "use a finer scanner or move it nearer."
+            f"The plate was found, but its position is only known to {1e3 * uncertain:.2f} mm from this scan (noise"
+            f" {1e3 * noise:.2f} mm, points {1e3 * pitch:.1f} mm apart) and {1e3 * config.max_sigma_m:.2f} mm are"
+            " required: use a finer scanner or move it nearer."
         )
     return uncertain

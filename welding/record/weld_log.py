@@ -1,4 +1,5 @@
-"""Writes and reads the weld log: a CSV with one row per servo tick and a JSON header with the meaning and unit of each column."""
+"""Writes and reads the weld log: a CSV with one row per servo tick and a JSON header with the meaning and unit of each
+column."""
 
 import csv
 import hashlib
@@ -30,7 +31,7 @@ class WeldLogError(InputError):
     """A weld log that cannot be read."""
 
 
-class Column(NamedTuple):
+class LogColumn(NamedTuple):
     """A column of the CSV: its name (unit included), unit, frame ("" for a scalar) and meaning."""
 
     name: str
@@ -39,44 +40,45 @@ class Column(NamedTuple):
     meaning: str
 
 
-def _vector(name: str, axes: str, unit: str, frame: str, meaning: str, suffix: str) -> tuple[Column, ...]:
-    return tuple(Column(f"{name}_{axis}{suffix}", unit, frame, meaning) for axis in axes)
+def _vector(name: str, axes: str, unit: str, frame: str, meaning: str, suffix: str) -> tuple[LogColumn, ...]:
+    return tuple(LogColumn(f"{name}_{axis}{suffix}", unit, frame, meaning) for axis in axes)
 
 
-COLUMNS: tuple[Column, ...] = (
-    Column("time_s", "s", "", "servo tick, on the robot's clock"),
-    Column(
+COLUMNS: tuple[LogColumn, ...] = (
+    LogColumn("time_s", "s", "", "servo tick, on the robot's clock"),
+    LogColumn(
         "phase",
         "",
         "",
-        "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT; HELD while a person holds the weld, BACK on the way back after that",
+        "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT; HELD while a person holds the weld, BACK on the way"
+        " back after that",
     ),
-    Column("torch_on", "", "", "process output, 1 or 0: servo, job, robot, guard and person all agree"),
-    Column("s_tip_m", "m", "planned seam", "arc length beside the tip"),
-    Column("s_torch_m", "m", "planned seam", "arc length beside the torch; negative before the seam"),
+    LogColumn("torch_on", "", "", "process output, 1 or 0: servo, job, robot, guard and person all agree"),
+    LogColumn("s_tip_m", "m", "planned seam", "arc length beside the tip"),
+    LogColumn("s_torch_m", "m", "planned seam", "arc length beside the torch; negative before the seam"),
     *_vector("p_BW", "xyz", "m", "B", "torch (wire) point, from the measured joints", "_m"),
     *_vector("q_BW", "wxyz", "", "B", "orientation of the torch frame W, whose axes are those of T", ""),
     *_vector("p_BT", "xyz", "m", "B", "origin of T, the tip's rest point: the robot end effector of the paper", "_m"),
     *_vector("q_BT", "wxyz", "", "B", "orientation of T: x from torch to tip, z up from the work", ""),
     *_vector("deflection", "xyz", "m", "T", "the tip's displacement from rest, as the tag shows it", "_m"),
-    Column("delta_n_m", "m", "seam", "lateral deflection that the servo acts on, gain corrected"),
-    Column("delta_axial_m", "m", "seam", "axial deflection that the servo acts on, gain corrected"),
+    LogColumn("delta_n_m", "m", "seam", "lateral deflection that the servo acts on, gain corrected"),
+    LogColumn("delta_axial_m", "m", "seam", "axial deflection that the servo acts on, gain corrected"),
     *_vector("p_BTip", "xyz", "m", "B", "newest felt point of the tip, at its picture's own time", "_m"),
     *_vector("p_BSeam", "xyz", "m", "B", "point of the refined seam beside the torch, which the torch is led to", "_m"),
-    Column("e_t_m", "m", "seam", "torch off the refined seam, positive to the left of travel"),
-    Column("e_height_m", "m", "seam", "torch off the refined seam, positive upwards"),
-    Column("torch_speed_m_s", "m/s", "B", "speed of the torch point, its path over 50 ms"),
-    Column("torch_speed_commanded_m_s", "m/s", "B", "torch speed that the servo asked for"),
-    Column("tip_speed_m_s", "m/s", "B", "speed along the seam that the servo asked of the tip"),
-    Column("omega_rad_s", "rad/s", "T", "commanded turning rate about the tool's up axis"),
-    Column("n_d_dot_n_t", "", "", "the measure by which the published law divides"),
-    Column("conditioning", "", "", "of the guarded law's equations, 0 to sqrt 2"),
-    Column("work_angle_rad", "rad", "planned seam", "lean across the chord, from the wanted work angle"),
-    Column("travel_angle_rad", "rad", "planned seam", "lean along the chord, positive where the tip is higher"),
-    Column("heat_input_J_m", "J/m", "", "k U I / v while the arc burns (1 kJ/mm = 1e6 J/m); nan where not known"),
-    Column("gain", "", "", "gain of the tag in use, from the touch-on calibration"),
-    Column("n_points", "", "", "committed tactile points so far"),
-    Column("sigma_min", "", "", "least singular value of the arm's length-scaled Jacobian"),
+    LogColumn("e_t_m", "m", "seam", "torch off the refined seam, positive to the left of travel"),
+    LogColumn("e_height_m", "m", "seam", "torch off the refined seam, positive upwards"),
+    LogColumn("torch_speed_m_s", "m/s", "B", "speed of the torch point, its path over 50 ms"),
+    LogColumn("torch_speed_commanded_m_s", "m/s", "B", "torch speed that the servo asked for"),
+    LogColumn("tip_speed_m_s", "m/s", "B", "speed along the seam that the servo asked of the tip"),
+    LogColumn("omega_rad_s", "rad/s", "T", "commanded turning rate about the tool's up axis"),
+    LogColumn("n_d_dot_n_t", "", "", "the measure by which the published law divides"),
+    LogColumn("conditioning", "", "", "of the guarded law's equations, 0 to sqrt 2"),
+    LogColumn("work_angle_rad", "rad", "planned seam", "lean across the chord, from the wanted work angle"),
+    LogColumn("travel_angle_rad", "rad", "planned seam", "lean along the chord, positive where the tip is higher"),
+    LogColumn("heat_input_J_m", "J/m", "", "k U I / v while the arc burns (1 kJ/mm = 1e6 J/m); nan where not known"),
+    LogColumn("gain", "", "", "gain of the tag in use, from the touch-on calibration"),
+    LogColumn("n_points", "", "", "committed tactile points so far"),
+    LogColumn("sigma_min", "", "", "least singular value of the arm's length-scaled Jacobian"),
 )
 NAMES = tuple(c.name for c in COLUMNS)
 _NUMBERS = tuple(name for name in NAMES if name != "phase")
@@ -172,7 +174,8 @@ def load_weld_log(path: Path | str) -> WeldRecord:
     text = _text(csv_path)
     if hashlib.sha256(text.encode()).hexdigest() != header["sha256"]:
         raise WeldLogError(
-            f"{csv_path} is not the table that {header_path.name} describes: it was cut off or changed; use the original."
+            f"{csv_path} is not the table that {header_path.name} describes: it was cut off or changed; use the"
+            " original."
         )
     try:
         rows = list(csv.reader(io.StringIO(text)))

@@ -1,4 +1,5 @@
-"""Computes the motion that a planned seam requires of a tool whose torch trails its tip: turn, speed and travel angle."""
+"""Computes the motion that a planned seam requires of a tool whose torch trails its tip: turn, speed and travel
+angle."""
 
 import math
 from dataclasses import dataclass
@@ -83,7 +84,8 @@ def chord_map(
         d: chord m.
         weld_speed, tip_speed_limit: m/s; omega_limit: rad/s.
         spacing: step along the pair curve, m.
-        tip_left: the tip's end of the chord runs this far to the left of the seam, m: the rest point of a tip that leans.
+        tip_left: the tip's end of the chord runs this far to the left of the seam, m: the rest point of a tip that
+            leans.
     """
     pairs = [(0.0, -math.sqrt(d * d - tip_left * tip_left))]
     tip, torch = pairs[0]
@@ -136,7 +138,8 @@ def chord_map(
 
 
 def _ends(plan: SeamCurve, tip: float, torch: float, tip_left: float) -> tuple[float, float, float]:
-    """(tip direction . u, torch direction . u, distance m) of a pair of arc lengths; on the inside of a bend the tip's path is shorter."""
+    """(tip direction . u, torch direction . u, distance m) of a pair of arc lengths; on the inside of a bend the tip's
+    path is shorter."""
     x, y, z, tx, ty, tz, nx, ny, nz, _, _, _, curvature = plan.frame_numbers(tip)
     at_x, at_y, at_z, to_x, to_y, to_z, *_ = plan.frame_numbers(torch)
     x, y, z = x - at_x, y - at_y, z - at_z

@@ -67,8 +67,8 @@ class SeamFrame(NamedTuple):
 class SeamCurve:
     """An arc-length cubic spline of a seam in one frame, straight beyond both ends.
 
-    The groove may be drawn on past a seam's end: beyond `length` the curve then follows it to the last knot, and is straight after it.
-    Curvature is signed: positive where the seam turns towards its left normal (up x tangent).
+    The groove may be drawn on past a seam's end: beyond `length` the curve then follows it to the last knot, and is
+    straight after it. Curvature is signed: positive where the seam turns towards its left normal (up x tangent).
 
     Attributes:
         knots: (n+1,) arc lengths in m, from 0 to `drawn_m`.
@@ -150,7 +150,8 @@ class SeamCurve:
 
     @property
     def drawn_m(self) -> float:
-        """The arc length in m up to which the groove is drawn: the seam's own, or more where the groove goes on past its end."""
+        """The arc length in m up to which the groove is drawn: the seam's own, or more where the groove goes on past
+        its end."""
         return float(self.knots[-1])
 
     def _pieces(self, s: Array) -> tuple[Array, Array, Array]:
@@ -200,7 +201,8 @@ class SeamCurve:
 
     @cached_property
     def _rows(self) -> Array:
-        """(n, 18), per piece: the cubic's 12 coefficients, highest power first, then the up-normals at its two knots."""
+        """(n, 18), per piece: the cubic's 12 coefficients, highest power first, then the up-normals at its two
+        knots."""
         return np.hstack([self.coefficients.reshape(len(self.coefficients), 12), self.ups[:-1], self.ups[1:]])
 
     @cached_property

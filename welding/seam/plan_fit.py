@@ -16,7 +16,8 @@ from weldcal.welding.seam.curve import SeamCurve
 class PlanFitConfig:
     """Weights of the plan's registration to the tactile points.
 
-    The along-track shift is unobservable on a straight seam, so a prior holds it; correlated neighbours count as one point.
+    The along-track shift is unobservable on a straight seam, so a prior holds it; correlated neighbours count as one
+    point.
 
     Attributes:
         window_m: length of the newest tactile points used.

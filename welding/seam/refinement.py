@@ -19,7 +19,8 @@ class CornerConfig:
     A tip held `delta_d` to the side jumps across every convex corner of a smaller radius without measuring it.
 
     Attributes:
-        jump_m: a step between points that is a gap in the measurement, if it also is `jump_steps` times the step before.
+        jump_m: a step between points that is a gap in the measurement, if it also is `jump_steps` times the step
+            before.
         side_m: length of each side that is fitted; points: how many it needs.
         turn_rad: sides that turn by less are one side.
         reach_m: farther than this from the points felt the sides do not meet.
@@ -40,7 +41,7 @@ class CornerConfig:
 
 
 @dataclass(frozen=True)
-class Corner:
+class RoundedCorner:
     """The points (n,3) m to put between the two sides, the path's length m from the last felt point to each, and the
     whole length m from side to side; `middle`: the length m to the corner's middle."""
 
@@ -58,7 +59,7 @@ def is_jump(last: Array, point: Array, config: CornerConfig) -> bool:
     return config.jump_m < step < config.reach_m and step > config.jump_steps * norm(last[-1] - last[-4]) / 3.0
 
 
-def fill_corner(before: Array, after: Array, config: CornerConfig) -> Corner | None:
+def fill_corner(before: Array, after: Array, config: CornerConfig) -> RoundedCorner | None:
     """Compute the corner between two sides, each (n,3) m in order of travel; None where there is none.
 
     The lines through the sides are met where they pass closest in space.
@@ -95,7 +96,7 @@ def fill_corner(before: Array, after: Array, config: CornerConfig) -> Corner | N
             rows.append(start + radius * (math.sin(a) * t + (1.0 - math.cos(a)) * inward))
         else:
             rows.append(apex + (tangent + x - first - arc) * w)
-    return Corner(np.array(rows).reshape(-1, 3), along, length, first + 0.5 * arc)
+    return RoundedCorner(np.array(rows).reshape(-1, 3), along, length, first + 0.5 * arc)
 
 
 def _line(points: Array) -> tuple[Array, Array]:
@@ -111,7 +112,7 @@ _EMPTY_ARC = np.zeros(0)
 _STEPS = 6  # frames over which the tip's own path is measured
 _SLOW = 0.5  # share of the progress below which the tip is held back
 _FRAME_M = 1.5e-3  # longer than one frame's progress (40 mm/s at 30 Hz): a longer step is a gap
-_LEAST_STEP_M = 0.01e-3
+_LEAST_STEP_M = 0.01e-3  # a few per cent of a frame's usual way: keeps a ratio finite while the tip stands
 _STICKING = 0.25  # path per progress below which the tip is almost at rest
 
 
@@ -129,8 +130,8 @@ class RefinementConfig:
     Attributes:
         frames_to_commit: further good frames a point waits for.
         fit_sigma_m: width of the local fit's Gaussian; fit_radius_share: of the plan's radius, where that is less.
-        fit_sagitta_m: it is as wide as sqrt(sagitta R), up to fit_sigma_wide_m, where that is more and R the least radius
-            nearby: where curvature jumps by 1/R a quadratic is off by 0.06 sigma^2/R, 6 um with these numbers.
+        fit_sagitta_m: it is as wide as sqrt(sagitta R), up to fit_sigma_wide_m, where that is more and R the least
+            radius nearby: where curvature jumps by 1/R a quadratic is off by 0.06 sigma^2/R, 6 um with these numbers.
         fit_sigma_max_m: how wide it may grow to find points.
         fit_points: effective points it grows for.
         bridge_from_m: farther than this from any point a gap is bridged on the moved plan instead.
@@ -189,8 +190,8 @@ def refine(
 ) -> RefinedSeam:
     """The seam after one more valid frame: its point is queued, and the oldest of a full queue is committed.
 
-    A gap in the points is filled in as a corner only where the plan has one (`is_corner`): a tip that sticks and slips in a
-    gentle bend leaves a gap too.
+    A gap in the points is filled in as a corner only where the plan has one (`is_corner`): a tip that sticks and slips
+    in a gentle bend leaves a gap too.
     """
     pending = (*seam.pending, PendingPoint(point, arc))
     if len(pending) <= config.frames_to_commit:
@@ -209,8 +210,9 @@ def refine(
         seam = replace(seam, jumped=seam.jumped + extra, jump=(before, len(seam)) if is_corner else None)
         arc += extra
     elif len(seam) >= _STEPS:
-        # Where the tip hardly advances, as in a concave corner that the rest point goes round outside, the parameter follows
-        # the tip: points a third as far apart as their parameters give the direction as well, points at rest do not.
+        # Where the tip hardly advances, as in a concave corner that the rest point goes round outside, the parameter
+        # follows the tip: points a third as far apart as their parameters give the direction as well, points at rest do
+        # not.
         step = arc - float(seam.arc[-1])
         way = max(float(np.linalg.norm(oldest.point - seam.points[-_STEPS])) / _STEPS, _LEAST_STEP_M)
         if way < _SLOW * step < _SLOW * _FRAME_M:
@@ -290,8 +292,8 @@ def local_fit(
     if len(seam.corners):
         # The points of a corner that was filled in are dense and free of noise: a wide fit would cut the corner.
         sigma = max(min(sigma, 0.4 * float(np.min(np.abs(seam.corners - arc)))), 0.3e-3)
-    # At the ends points lie on one side only, and a quadratic's end is three times as noisy as its middle: a window up to
-    # twice as wide compensates for that.
+    # At the ends points lie on one side only, and a quadratic's end is three times as noisy as its middle: a window up
+    # to twice as wide compensates for that.
     edge = min(arc - float(seam.arc[0]), float(seam.arc[-1]) - arc) if len(seam) else math.inf
     if edge < 2.0 * sigma and not len(seam.corners):
         sigma = max(sigma, min((2.0 - max(edge, 0.0) / (2.0 * sigma)) * sigma, config.fit_sigma_max_m, 0.2 * radius))
@@ -330,8 +332,8 @@ def local_fit(
     left_over = points - basis.T @ c
     slope = slope + (inverse[0] @ (weighted * x)) @ left_over / sigma
     speed = math.sqrt(float(slope @ slope))
-    # A tip that sticks leaves points that hardly advance, and their direction is noise: the plan's stands in for it. In a
-    # concave corner of 1 mm the tip still comes on by a third of the rest point's way, and its direction is good.
+    # A tip that sticks leaves points that hardly advance, and their direction is noise: the plan's stands in for it. In
+    # a concave corner of 1 mm the tip still comes on by a third of the rest point's way, and its direction is good.
     slope = slope + max(0.0, _STICKING - speed) * plan_tangent
     speed = math.sqrt(float(slope @ slope))
     if speed < 0.2:

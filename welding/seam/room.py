@@ -16,16 +16,17 @@ from weldcal.models.tool import WeldingTool
 from weldcal.welding.numerics import Array, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 
+# A choice: above the errors of a registered part and of a calibrated arm, some tenths of a millimetre each.
 CLEARANCE_M = 0.001
 NEAR_TIP_M = 0.030  # finger and wire are in the joint by design: only what lies farther from the tip is checked
-AHEAD_STEP_M = 0.002
+AHEAD_STEP_M = 0.002  # below the radius of a tip: it does not pass a wall between two rays
 ACROSS_COS = 0.5  # a wall within 60 degrees of square to the way stops the tool
 ASIDE_M = 0.003  # what the leaning tip still yields sideways before its mechanical limit
 CLIMB_M = 0.010  # the wall of a groove, met at a slant, lifts the tip out over so much
 BESIDE_M = 1e-7 * np.array([3.7, 6.1, 7.1])  # keeps rays off the edges between triangles, which would count twice
 ASIDE_RAD = np.radians(np.arange(0.0, 181.0, 15.0))
 SAMPLES = 20_000
-STEP_M = 0.02
+STEP_M = 0.02  # along the seam; the tool, 20 mm and more wide, meets every place between
 SPHERES = 40  # that stand for one capsule of the tool where points far from it are left out
 # From the part's surface: above a scan's noise and the registration's error, below the height of a tack, 3 mm and more.
 OTHER_M = 0.0025
@@ -37,7 +38,8 @@ WIRE_M = 0.001  # radius of the wire with its play
 
 
 class NoRoom(WeldcalError):
-    """The tool's body would touch the part while the tip is in the joint; `short_m`: by how much its clearance is too small."""
+    """The tool's body would touch the part while the tip is in the joint; `short_m`: by how much its clearance is too
+    small."""
 
     def __init__(self, sentence: str, short_m: float) -> None:
         super().__init__(sentence)
@@ -55,8 +57,8 @@ def check_room(
 ) -> None:
     """Check the distance between the tool's capsules (in the flange frame) and the part's surface along the seam.
 
-    The tool stands as the servo holds it: its axis along the mean of the bisectors at tip and torch, and leaning from it across the chord by
-    `lean_rad`.
+    The tool stands as the servo holds it: its axis along the mean of the bisectors at tip and torch, and leaning from
+    it across the chord by `lean_rad`.
 
     Raises:
         NoRoom: less than 1 mm, with the place.
@@ -72,8 +74,9 @@ def check_room(
             near = float(_distances(points_T, a, b).min()) - radius
             if near < CLEARANCE_M:
                 raise NoRoom(
-                    f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body would come within "
-                    f"{1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer finger or weld the joint from elsewhere.",
+                    f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body"
+                    f" would come within {1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer"
+                    " finger or weld the joint from elsewhere.",
                     CLEARANCE_M - near,
                 )
 
@@ -89,10 +92,12 @@ def check_beside(
     stops: list[float] | None = None,
     from_m: float = 0.0,
 ) -> None:
-    """Check that nothing that a scan (N,3) shows and the drawing does not, as a clamp or a tack, is in the way of the tool.
+    """Check that nothing that a scan (N,3) shows and the drawing does not, as a clamp or a tack, is in the way of the
+    tool.
 
-    Tip, finger, torch and the tool's body along the seam from `from_m` on, and lifted off at both of its ends; below `table_z_m` it is the
-    table. Where `stops` is given, the places of the tip at which something is in the way are added to it instead.
+    Tip, finger, torch and the tool's body along the seam from `from_m` on, and lifted off at both of its ends; below
+    `table_z_m` it is the table. Where `stops` is given, the places of the tip at which something is in the way are
+    added to it instead.
 
     Raises:
         NoRoom: with the place.
@@ -132,7 +137,10 @@ def check_beside(
                 stops.append(s)
             elif len(met) and len(both) >= least:
                 x, y, z = np.median(other[both], axis=0)
-                there = f"near ({1e3 * x:.0f}, {1e3 * y:.0f}, {1e3 * z:.0f}) mm in the base, at {1e3 * s:.0f} mm of the seam"
+                there = (
+                    f"near ({1e3 * x:.0f}, {1e3 * y:.0f}, {1e3 * z:.0f}) mm in the base, at {1e3 * s:.0f} mm of the"
+                    " seam"
+                )
                 if z < table_z_m + OTHER_M:
                     what, change = f"The tool would touch the table {there}", "raise the part"
                 else:
@@ -143,10 +151,11 @@ def check_beside(
 def clear_pieces(
     seam: SeamCurve, stops: Sequence[float], chord_m: float, run_up_m: float
 ) -> list[tuple[float, float, float]]:
-    """Split a seam where something is in the way of the tool: for each piece its start and end and the place where the tip comes down, m.
+    """Split a seam where something is in the way of the tool: for each piece its start and end and the place where the
+    tip comes down, m.
 
-    The tip is a chord ahead of the torch. A piece ends where the tip would meet a thing. The next one begins where the torch has passed it, and
-    `run_up_m` later, when the torch is on the seam.
+    The tip is a chord ahead of the torch. A piece ends where the tip would meet a thing. The next one begins where the
+    torch has passed it, and `run_up_m` later, when the torch is on the seam.
     """
     found = []
     edges = [-math.inf, *sorted(stops), math.inf]
@@ -160,11 +169,12 @@ def clear_pieces(
 
 
 def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:
-    """Check that nothing of the part stands in the way of the tip beyond the seam's end and of the torch before its start.
+    """Check that nothing of the part stands in the way of the tip beyond the seam's end and of the torch before its
+    start.
 
-    The tip runs `chord_m` ahead of the torch, straight on where the groove is drawn no further; the torch comes from as far behind its
-    start. A wall met at a slant, as that of a curved joint cut short, leads the tip aside, or up and out of the groove. Where it is too
-    high for that, as a web that the seam follows on its hollow side, it stops the tip.
+    The tip runs `chord_m` ahead of the torch, straight on where the groove is drawn no further; the torch comes from as
+    far behind its start. A wall met at a slant, as that of a curved joint cut short, leads the tip aside, or up and out
+    of the groove. Where it is too high for that, as a web that the seam follows on its hollow side, it stops the tip.
 
     Raises:
         NoRoom: with how much of the seam to cut off.
@@ -181,8 +191,8 @@ def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: fl
             by_length = name == "end" and seam.end is not None
             change = f"welding.seam_length_mm {off} smaller" if by_length else f"{name}_mm of the seam {off} larger"
             raise NoRoom(
-                f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs {1e3 * needed:.0f} mm there: "
-                f"set {change}, or weld it from elsewhere.",
+                f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs"
+                f" {1e3 * needed:.0f} mm there: set {change}, or weld it from elsewhere.",
                 needed - free,
             )
 
@@ -223,7 +233,8 @@ def _yields(
 
 
 def _crossings(triangles: NDArray[np.float64], origin: Array, direction: Array) -> tuple[Array, Array]:
-    """Distances (K,) m along a unit vector at which its line crosses triangles (M,3,3), and its cosines with their inward normals.
+    """Distances (K,) m along a unit vector at which its line crosses triangles (M,3,3), and its cosines with their
+    inward normals.
 
     Source: Moeller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997.
     """

@@ -104,10 +104,10 @@ def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoCon
 def _steering(state: WeldingState, delta: Array, seam: SeamFrame, config: ServoConfig) -> float:
     """Angle to turn the tip's frame about up, rad, where the deformation contradicts the plan's normal.
 
-    The tip leans against the wall that stops it. A lean far from the plan's normal shows that the plan is wrong there, and
-    moving on along its tangent would jam the tip; steady drag by friction is not such evidence. Two causes explain the lean: a
-    plan that is ahead or behind at a corner, whose own tangent nearby then leaves no lean; or a wall where none is
-    planned, to which the frame turns.
+    The tip leans against the wall that stops it. A lean far from the plan's normal shows that the plan is wrong there,
+    and moving on along its tangent would jam the tip; steady drag by friction is not such evidence. Two causes explain
+    the lean: a plan that is ahead or behind at a corner, whose own tangent nearby then leaves no lean; or a wall where
+    none is planned, to which the frame turns.
     """
     steering = config.steering
     lean, delta_n = dot(delta, seam.tangent), dot(delta, seam.normal)

@@ -29,7 +29,8 @@ def watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Weld
         return fault(state, text)
     if not config.felt:
         return state
-    # Past the end of a seam cut short the tip is not needed: what it feels, or does not, is no reason to stop the torch.
+    # Past the end of a seam cut short the tip is not needed: what it feels, or does not, is no reason to stop the
+    # torch.
     needed = state.phase != Phase.TRACK or state.s_tip <= state.s_end or not goes_on(state, config)
     if beyond_limit(state, config) and state.phase != Phase.FINISH:
         text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
@@ -71,8 +72,9 @@ def unlit(state: WeldingState, s_torch: float, past_start: float, error: float, 
     if math.isfinite(state.lit_at) or (past_start <= config.torch.ignition_window_m and s_torch < state.s_end):
         return None
     return (
-        f"Not welded: {1e3 * past_start:.0f} mm past the seam's start the arc is not lit, because the torch is "
-        f"{1e3 * error:.2f} mm off the seam (limit {1e3 * config.torch.ignition_error_m:.2g} mm); check the plan's start."
+        f"Not welded: {1e3 * past_start:.0f} mm past the seam's start the arc is not lit, because the torch is"
+        f" {1e3 * error:.2f} mm off the seam (limit {1e3 * config.torch.ignition_error_m:.2g} mm); check the plan's"
+        " start."
     )
 
 
@@ -96,13 +98,10 @@ def angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> str
     margin = math.radians(5.0)
     travel = math.asin(clip(dot(R[:, 0], target.up), -1.0, 1.0)) + config.windows.tilt_rad
     work = math.asin(clip(dot(R[:, 1], target.up), -1.0, 1.0)) - config.torch.work_angle_rad
-    for name, angle, limit in (
-        ("travel", travel, config.windows.travel_rad),
-        ("work", work, config.windows.work_rad),
-    ):
+    for name, angle, limit in (("travel", travel, config.windows.travel_rad), ("work", work, config.windows.work_rad)):
         if abs(angle) > limit + margin:
             return (
-                f"The {name} angle is {math.degrees(angle):.1f} deg, beyond its window of {math.degrees(limit):.0f} deg; "
-                "check the plan's surface."
+                f"The {name} angle is {math.degrees(angle):.1f} deg, beyond its window of {math.degrees(limit):.0f}"
+                " deg; check the plan's surface."
             )
     return None

@@ -18,9 +18,9 @@ BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH handled here
 _STRAIGHT_RAD = math.radians(10.0)  # a bend turns by more than this
 _BESIDE_M = 4.0e-3  # the tip must not touch down within this distance of a bend
 _REACH_M = 0.030  # nor farther than this from the start
-_SETTLED_M = 0.15e-3
-_REENTRY_M = 12.0e-3
-_LEAST_STEP_M = 0.03e-3
+_SETTLED_M = 0.15e-3  # three times the tag's noise of 0.05 mm, small against the tip's radius
+_REENTRY_M = 12.0e-3  # a choice, two tip diameters and more: a groove that is not met by then does not begin here
+_LEAST_STEP_M = 0.03e-3  # a choice, below the tag's noise of 0.05 mm: nearer points give the curve no direction
 
 
 def with_touch_place(plan: SeamCurve, config: ServoConfig) -> ServoConfig:
@@ -47,7 +47,8 @@ def begin_feeling_back(state: WeldingState, now: float) -> WeldingState:
 def feel_start_step(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig
 ) -> tuple[WeldingState, tuple[float, float, float], str | None, bool]:
-    """One tick: back until contact is lost or six millimetres past the plan's start; then up, and into the groove again.
+    """One tick: back until contact is lost or six millimetres past the plan's start; then up, and into the groove
+    again.
 
     Args:
         before: the state before this tick's frame, `is_new`: whether there is one.
@@ -97,7 +98,8 @@ def feel_start_step(
 
 
 def _start_found(before: WeldingState, state: WeldingState, now: float, config: ServoConfig) -> WeldingState:
-    """The state after contact was lost: the last uncertain points are dropped, and the seam starts where contact ended."""
+    """The state after contact was lost: the last uncertain points are dropped, and the seam starts where contact
+    ended."""
     assert before.measurement is not None
     assert state.plan_fit is not None
     felt = state.touch.felt[: max(0, len(state.touch.felt) - config.refinement.frames_to_commit)]

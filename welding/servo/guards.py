@@ -67,8 +67,8 @@ class ArmGuardConfig:
 
 GUARD = ArmGuardConfig()
 """The thresholds of every guarded motion, and of the check of its path before it starts."""
+# Of the joints' speed limits, for guarded motions. A choice: a joint then stops in a quarter of its longest way (v^2).
 SPEED_SHARE = 0.5
-"""Share of the joints' speed limits that a guarded motion may use."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ def guarded_joint_velocity(
 def _guarded(
     J: Array, V: Array, bound: Array, row_scale: Array, stop: float, slow: float, q_dot: Array
 ) -> tuple[float, float, float]:
-    """Fill q_dot (6,), which is zero; returns sigma_min, the share of the wanted velocity that is left (0: stopped), and that
-    near a singularity (below 0: an input is not finite)."""
+    """Fill q_dot (6,), which is zero; returns sigma_min, the share of the wanted velocity that is left (0: stopped),
+    and that near a singularity (below 0: an input is not finite)."""
     if not (np.isfinite(J).all() and np.isfinite(V).all() and np.isfinite(bound).all()):
         return 0.0, 0.0, -1.0
     scaled, wanted = J * row_scale.reshape(6, 1), V * row_scale
@@ -202,7 +202,8 @@ def _slew(wanted: Array, v: Array, a: Array, speed: Array, top: Array, jerk: Arr
     for k in range(len(v)):
         step = jerk[k] * dt
         gap = min(max(wanted[k] if finite else 0.0, -speed[k]), speed[k]) - v[k]
-        # With m whole jerk steps to undo afterwards, a tick at `a` and the fall gain dt((m+1)a - step m(m+1)/2) = |gap|.
+        # With m whole jerk steps to undo afterwards, a tick at `a` and the fall gain dt((m+1)a - step m(m+1)/2) =
+        # |gap|.
         m = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * abs(gap) / (step * dt)) - 1.0))
         wish = np.sign(gap) * (abs(gap) / dt + 0.5 * step * m * (m + 1.0)) / (m + 1.0)
         a[k] = min(max(min(max(wish, -top[k]), top[k]), a[k] - step), a[k] + step)

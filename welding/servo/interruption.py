@@ -1,4 +1,5 @@
-"""Holds a weld and lets it go on: arc off and tool at rest; then back along its own path a little, and on with the arc."""
+"""Holds a weld and lets it go on: arc off and tool at rest; then back along its own path a little, and on with the
+arc."""
 
 import math
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ TRAIL_TICKS = 600  # 5 s: longer than the overlap takes at any speed but creepin
 EASE_S = 0.15  # from rest to the speed of the way back, and to rest again
 FEEDBACK_PER_S = 8.0  # as the FlangeMover
 BACK_AGAIN_M, BACK_AGAIN_RAD = 0.1e-3, 2e-3
-LONGEST_BACK_S = 8.0
+LONGEST_BACK_S = 8.0  # longer than the trail of 5 s that the way back follows: what takes longer is blocked
 MOVED_M = 1.0e-3  # a tool at rest that is found so far away has been moved
 
 
@@ -48,7 +49,8 @@ class Interruption:
         step: "" (not held), "stop" (to rest, and at rest) or "back".
         ticks: since the step began.
         V_stop: (6,) the twist at its begin; p_stop: (3,) m, the tool at rest, None before.
-        at, goal: places on the trail, in ticks: of the tool on its way back, and where that ends; nan without a way back.
+        at, goal: places on the trail, in ticks: of the tool on its way back, and where that ends; nan without a way
+            back.
     """
 
     trail: tuple[TrailPoint, ...] = ()
@@ -65,7 +67,8 @@ class Interruption:
 
     @property
     def way_back(self) -> tuple[TrailPoint, ...]:
-        """What lies between the tool and the place where the weld goes on, that place first; empty without a way back."""
+        """What lies between the tool and the place where the weld goes on, that place first; empty without a way
+        back."""
         return () if not self.step or math.isnan(self.at) else self.trail[self.goal : round(self.at) + 1]
 
     @property
@@ -80,10 +83,11 @@ def interruptible_step(
 ) -> tuple[WeldingState, Interruption, WeldingCommand]:
     """One tick of `welding_step`, or of a hold while `holds`, and of the way back after it.
 
-    A hold turns the arc off in its first tick and the tool comes to rest within RAMP_S, pressed on as it is. When it is let go, the tool
-    goes back along the poses that it came by, as far as OVERLAP_M of seam before the place where the arc went out, but not before
-    its start; there the arc starts again as at the seam's begin, over what is welded already. Without an arc there is no way
-    back. Faults are watched for throughout. Without a hold every number is that of `welding_step`.
+    A hold turns the arc off in its first tick and the tool comes to rest within RAMP_S, pressed on as it is. When it is
+    let go, the tool goes back along the poses that it came by, as far as OVERLAP_M of seam before the place where the
+    arc went out, but not before its start; there the arc starts again as at the seam's begin, over what is welded
+    already. Without an arc there is no way back. Faults are watched for throughout. Without a hold every number is that
+    of `welding_step`.
     """
     over = state.phase in (Phase.DONE, Phase.FAULT)
     sane = state.plan_fit is not None and math.isfinite(sample.time) and finite(sample.X_BT.translation())

@@ -16,12 +16,12 @@ from weldcal.welding.servo.guards import seam_conditioning
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
-from weldcal.welding.servo.track import Motion, TorchTarget, guarded_motion
+from weldcal.welding.servo.track import TickMotion, TorchTarget, guarded_motion
 
 _OMEGA_CEILING = 100.0  # rad/s; an unguarded law may command thousands, which no robot reaches
 
 MotionLaw = Callable[
-    [WeldingState, RigidTransform, SeamFrame, TorchTarget, tuple[float, float], ServoConfig, float], Motion
+    [WeldingState, RigidTransform, SeamFrame, TorchTarget, tuple[float, float], ServoConfig, float], TickMotion
 ]
 
 
@@ -95,7 +95,7 @@ def motion_law(law: SteeringLaw) -> MotionLaw:
         servo: tuple[float, float],
         config: ServoConfig,
         dt: float,
-    ) -> Motion:
+    ) -> TickMotion:
         del dt  # the published law bounds no rate
         return paper_motion(law, state, X_BT, tip, target, servo, config)
 
@@ -110,7 +110,7 @@ def paper_motion(
     target: TorchTarget,
     servo: tuple[float, float],
     config: ServoConfig,
-) -> Motion:
+) -> TickMotion:
     """Algorithm 2, lines 8-14: V_r = V_const t + servo, omega from V_t . n_t = 0 (weld_law.md, section 2).
 
     The paper is planar; as in the guarded law, pitch keeps the torch's height and roll the work angle.
@@ -137,7 +137,7 @@ def paper_motion(
     w_p /= d * height_share(axes, b)
     w_p = clip(w_p, -limits.pitch_rate_max_rad_s, limits.pitch_rate_max_rad_s)
     V = np.concatenate([omega * a + w_p * m + roll_rate(axes, b, config) * u, V_tip])
-    return Motion(V, v, dot(flat, t), omega, seam_conditioning(u, tip.tangent, t))
+    return TickMotion(V, v, dot(flat, t), omega, seam_conditioning(u, tip.tangent, t))
 
 
 def literal_tangent(seam: RefinedSeam, p_torch: Array, otherwise: Array) -> Array:

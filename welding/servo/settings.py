@@ -1,4 +1,5 @@
-"""Settings of the welding servo in SI units, grouped by what they govern; the defaults are those of docs/weld_law.md."""
+"""Settings of the welding servo in SI units, grouped by what they govern; the defaults are those of
+docs/weld_law.md."""
 
 import math
 from dataclasses import dataclass, field
@@ -75,7 +76,8 @@ class ServoConfigError(InputError):
 
 
 def _check_numbers(group: str, settings: object, signed: tuple[str, ...] = (), zero: tuple[str, ...] = ()) -> None:
-    """Raise ServoConfigError unless every number of a group is finite and positive; `zero` may be 0, `signed` anything."""
+    """Raise ServoConfigError unless every number of a group is finite and positive; `zero` may be 0, `signed`
+    anything."""
     for name, value in vars(settings).items():
         if isinstance(value, bool) or not isinstance(value, Real):
             continue
@@ -119,7 +121,7 @@ class ToolGeometry:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TouchConfig:
+class TouchOnConfig:
     """The touch-on: descent, search for the groove, gain calibration and zero.
 
     Attributes:
@@ -131,8 +133,8 @@ class TouchConfig:
         settle_s: pause on the face before the search.
         calibrate_gain: press to `press_ratio` times the wanted deflection and back, and fit the tag's gain.
         press_m_s: speed of that; gain_sigma: prior sigma of the gain about 1.
-        feel_start: draw the seated tip back over the seam's start before the weld, so that the torch has tactile points to
-            start on and the arc starts where the groove does (welding.servo.feel_start).
+        feel_start: draw the seated tip back over the seam's start before the weld, so that the torch has tactile points
+            to start on and the arc starts where the groove does (welding.servo.feel_start).
         zero_frames: frames of the free tip, before the descent, whose mean is taken as its rest (0: the tag's own
             rest pose is); zero_limit_m: with a larger mean or spread the tip is not free.
     """
@@ -208,7 +210,8 @@ class FaultLimits:
 
     Attributes:
         lateral_m, axial_m: mechanical limits of the tip's deflection.
-        hidden_s: longest time without a valid view of the tag; frozen_frames: identical readings in so many frames are a fault.
+        hidden_s: longest time without a valid view of the tag; frozen_frames: identical readings in so many frames are
+            a fault.
         stall_s: time in which the torch must advance by half a millimetre.
         torch_error_m: largest distance of the burning torch from the seam.
     """
@@ -255,7 +258,8 @@ class TorchControl:
         k_roll: work-angle feedback, 1/s; work_angle_rad: wanted roll about the chord.
         ignition_error_m: the arc starts only with the torch this close to the seam; ignition_window_m: a weld whose arc
             does not start within so much of the seam is a fault.
-        ignition_limit_s: longest time from the torch's start to an established arc; arc_lost_s: longest time without it after.
+        ignition_limit_s: longest time from the torch's start to an established arc; arc_lost_s: longest time without it
+            after.
     """
 
     k_b: float = 4.0
@@ -278,7 +282,8 @@ class MotionLimits:
 
     Attributes:
         tip_speed_max_m_s, omega_max_rad_s, pitch_rate_max_rad_s: largest speeds.
-        tip_acceleration_m_s2, omega_acceleration_rad_s2, pitch_acceleration_rad_s2: rate limits of tip speed, turning and pitch.
+        tip_acceleration_m_s2, omega_acceleration_rad_s2, pitch_acceleration_rad_s2: rate limits of tip speed, turning
+            and pitch.
         turn_rate_max_rad_s: the tip speed is at most this times the seam's radius; tip_speed_floor: but not below this
             share of the weld speed.
         creep: share of the weld speed that a tip square to the chord keeps.
@@ -366,7 +371,7 @@ class ServoConfig:
     """
 
     tool: ToolGeometry = field(default_factory=ToolGeometry)
-    touch: TouchConfig = field(default_factory=TouchConfig)
+    touch: TouchOnConfig = field(default_factory=TouchOnConfig)
     contact: ContactConfig = field(default_factory=ContactConfig)
     gap: GapConfig = field(default_factory=GapConfig)
     faults: FaultLimits = field(default_factory=FaultLimits)

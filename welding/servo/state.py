@@ -14,7 +14,10 @@ from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam
 
 
 class Phase(StrEnum):
-    """The phases of one weld, in order; FAULT is latched. HELD and BACK: a person holds it, and the way back after that."""
+    """The phases of one weld, in order; FAULT is latched.
+
+    HELD and BACK: a person holds it, and the way back after that.
+    """
 
     TOUCH = "TOUCH"
     TRACK = "TRACK"
@@ -38,8 +41,8 @@ class DeflectionSample:
 
 @dataclass(frozen=True)
 class ServoSample:
-    """One servo tick's input: time s, pose of T in B now, the newest frame (the same again until a newer comes), and whether
-    the arc is established where the torch is on; True where nobody tells.
+    """One servo tick's input: time s, pose of T in B now, the newest frame (the same again until a newer comes), and
+    whether the arc is established where the torch is on; True where nobody tells.
     """
 
     time: float
@@ -110,9 +113,11 @@ class GainFit(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TouchState:
-    """State of the touch search: its step, the step's start, heights and lateral place; `free`: deflections of the free tip;
-    `felt`: points measured on the way back to the start, each with how far ahead of its rest point friction held the tip."""
+class TouchOnState:
+    """State of the touch search: its step, the step's start, heights and lateral place; `free`: deflections of the free
+    tip; `felt`: points measured on the way back to the start, each with how far ahead of its rest point friction held
+    the tip.
+    """
 
     step: str = "descend"
     since: float = 0.0
@@ -135,7 +140,7 @@ class WeldingState:
     started: float = 0.0
     plan_fit: PlanFit | None = None
     refined: RefinedSeam = field(default_factory=RefinedSeam.empty)
-    touch: TouchState = field(default_factory=TouchState)
+    touch: TouchOnState = field(default_factory=TouchOnState)
     gain: float = 1.0
     zero: Array | None = None
     measurement: Measurement | None = None

@@ -29,7 +29,8 @@ from weldcal.welding.servo.track import torch_target
 
 
 def start_arc(state: WeldingState, curve: SeamCurve) -> float:
-    """Arc length m on the moved plan at which the arc starts: the measured start of the groove, else the planned one."""
+    """Arc length m on the moved plan at which the arc starts: the measured start of the groove, else the planned
+    one."""
     return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
 
 
@@ -45,7 +46,8 @@ def with_arc(state: WeldingState, sample: ServoSample) -> WeldingState:
 def wait_for_arc(
     state: WeldingState, sample: ServoSample, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, Array, str | None]:
-    """One tick with the torch on and no arc: the next state, the motion (6,) that ramps to rest, and the reason to stop.
+    """One tick with the torch on and no arc: the next state, the motion (6,) that ramps to rest, and the reason to
+    stop.
 
     No time of standing counts as a lack of progress.
     """
@@ -194,7 +196,8 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
     if state.phase == Phase.TRACK:
         lost, law = contact_lost(before, state, config), get_law(config.law)
         if not law.guarded:
-            # The paper appends every point and does not detect contact; the wanted deflection without contact is an interpretation.
+            # The paper appends every point and does not detect contact; the wanted deflection without contact is an
+            # interpretation.
             return changed(
                 with_point(state, config),
                 delta_wanted=0.0 if lost and law.lost == "zeroed" else None,
@@ -322,7 +325,8 @@ def _weld(
 
 
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
-    """The tip's wanted lateral and upward speed, m/s: from the deflection in TRACK, from the moved plan in COAST and FINISH."""
+    """The tip's wanted lateral and upward speed, m/s: from the deflection in TRACK, from the moved plan in COAST and
+    FINISH."""
     deflection = config.deflection
     if state.phase == Phase.TRACK:
         # A late frame shows where the tip was, not where it is: its correction fades out.
@@ -350,7 +354,8 @@ def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoCon
 
 
 def _rest(state: WeldingState, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
-    """The answer in DONE and FAULT: the last motion ramps to zero with the arc off, by ticks: the clock may be faulty."""
+    """The answer in DONE and FAULT: the last motion ramps to zero with the arc off, by ticks: the clock may be
+    faulty."""
     share = clip(1.0 - state.stopped_ticks * config.period_s / config.limits.ramp_s, 0.0, 1.0)
     state = changed(state, torch_on=False, stopped_ticks=state.stopped_ticks + 1)
     return _answer(state, share * state.V_stop, config, Diagnostics())
@@ -361,8 +366,7 @@ def _answer(
 ) -> tuple[WeldingState, WeldingCommand]:
     if not finite(V):
         state = fault(
-            state,
-            "The welding law returned a number that is not finite: this is a defect, report it with a recording.",
+            state, "The welding law returned a number that is not finite: this is a defect, report it with a recording."
         )
         V = state.V_stop
     measurement = state.measurement

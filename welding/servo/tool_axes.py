@@ -1,4 +1,5 @@
-"""Computes the tool's chord and axes on the seam, the roll rate that holds the work angle, its path along a seam, and the least pipe for it."""
+"""Computes the tool's chord and axes on the seam, the roll rate that holds the work angle, its path along a seam, and
+the least pipe for it."""
 
 import math
 from typing import NamedTuple
@@ -79,7 +80,8 @@ def roll_rate(axes: ToolAxes, torch_up: Array, config: ServoConfig) -> float:
 
 
 class ToolPath(NamedTuple):
-    """The tool along a whole seam, one row a place: arc lengths of torch and tip (n,) m, time (n,) s, and poses of T in B."""
+    """The tool along a whole seam, one row a place: arc lengths of torch and tip (n,) m, time (n,) s, and poses of T in
+    B."""
 
     s_torch: Array
     s_tip: Array
@@ -90,8 +92,8 @@ class ToolPath(NamedTuple):
 def tool_path(plan: SeamCurve, config: ServoConfig) -> ToolPath:
     """Compute how the servo moves the tool along a planned seam, from the touch to the torch at the seam's end.
 
-    The tip's rest point leads: it is pressed aside and down by the wanted deflections. The torch trails by the chord, at its height. The
-    lean across the chord is the wanted work angle against the surface at the torch.
+    The tip's rest point leads: it is pressed aside and down by the wanted deflections. The torch trails by the chord,
+    at its height. The lean across the chord is the wanted work angle against the surface at the torch.
 
     Args:
         plan: the planned seam in B.
@@ -126,7 +128,8 @@ def _pressed(line: SeamCurve, tip: Array, torch: Array, config: ServoConfig) -> 
 
 
 def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
-    """Check the torch's travel angle along a planned seam, with the pressed tip's rest point deeper in the joint than the torch.
+    """Check the torch's travel angle along a planned seam, with the pressed tip's rest point deeper in the joint than
+    the torch.
 
     Raises:
         InfeasibleSeam: the angle leaves its window by more than TRAVEL_MARGIN_RAD.
@@ -145,16 +148,17 @@ def check_travel(plan: SeamCurve, config: ServoConfig) -> None:
     k = int(np.argmax(travel))
     if travel[k] > windows.travel_rad + TRAVEL_MARGIN_RAD:
         raise InfeasibleSeam(
-            f"Plan infeasible: the torch's travel angle would be {math.degrees(travel[k]):.0f} deg at {1e3 * path.s_torch[k]:.0f} mm of "
-            f"the seam, and its window is {math.degrees(windows.travel_rad):.0f} deg; "
-            "take a tool whose torch is nearer to its tip, or weld the straight edges as seams of their own."
+            f"Plan infeasible: the torch's travel angle would be {math.degrees(travel[k]):.0f} deg at"
+            f" {1e3 * path.s_torch[k]:.0f} mm of the seam, and its window is {math.degrees(windows.travel_rad):.0f}"
+            " deg; take a tool whose torch is nearer to its tip, or weld the straight edges as seams of their own."
         )
 
 
 def check_ring(
     mesh: TriMesh, line: Array, up: Array, section: JointSection, tool: WeldingTool, lean_rad: float = 0.0
 ) -> None:
-    """Check that a tool fits along a root (N,3) m of a joint with directions up (N,3) out of it, and that its torch can follow.
+    """Check that a tool fits along a root (N,3) m of a joint with directions up (N,3) out of it, and that its torch can
+    follow.
 
     Raises:
         NoRoom: its body would touch the part.

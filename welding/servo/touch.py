@@ -46,7 +46,8 @@ def check_length(line: SeamCurve, config: ServoConfig) -> None:
     least = config.touch.arc_m + config.gap.end_window_m
     if line.length < least:
         raise SeamError(
-            f"The seam is only {1e3 * line.length:.0f} mm long: too short for the touch-on, which needs {1e3 * least:.0f} mm."
+            f"The seam is only {1e3 * line.length:.0f} mm long: too short for the touch-on, which needs"
+            f" {1e3 * least:.0f} mm."
         )
 
 
@@ -126,7 +127,10 @@ def _zeroed(
     readings = np.array(free)
     zero = readings.mean(axis=0)
     if max(float(np.abs(zero).max()), float(np.ptp(readings, axis=0).max())) > touch.zero_limit_m:
-        text = f"The tip is not free before touch-on: it reads {1e3 * float(np.linalg.norm(zero)):.1f} mm; raise the start pose."
+        text = (
+            f"The tip is not free before touch-on: it reads {1e3 * float(np.linalg.norm(zero)):.1f} mm; raise the start"
+            " pose."
+        )
         return state, text
     return changed(state, zero=zero, touch=replace(t, free=())), None
 

@@ -42,7 +42,7 @@ class TorchTarget(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Motion:
+class TickMotion:
     """The motion of one tick: V_BT (6,), tip and torch speed m/s, rate about the tool's up rad/s, conditioning."""
 
     V_BT: Array
@@ -91,7 +91,8 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
         on_path = plan.position + residual[0] * plan.normal + residual[1] * up
         step = s - state.s_torch
     else:
-        # The plan gives the surface better than a few points near a corner: the path leaves it by three degrees at most.
+        # The plan gives the surface better than a few points near a corner: the path leaves it by three degrees at
+        # most.
         rise = dot(fit.tangent, plan.up)
         t = unit(fit.tangent + (clip(rise, -_RISE, _RISE) - rise) * plan.up, fit.tangent)
         on_path = fit.point
@@ -101,8 +102,8 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     if fit is not None:
         bend = dot(fit.bend, n) / fit.speed**2
         if abs(plan.curvature) > _SHARP_PER_M:
-            # At a sharp corner the bend here does not describe the path a moment later, and turning the torch's path takes
-            # a ramp at the limit of the turning rate, of which half counts as lag.
+            # At a sharp corner the bend here does not describe the path a moment later, and turning the torch's path
+            # takes a ramp at the limit of the turning rate, of which half counts as lag.
             speed = config.weld_speed_m_s
             ramp = speed / (config.tool.torch_offset_m * config.limits.omega_acceleration_rad_s2)
             then = local_fit(
@@ -193,7 +194,7 @@ def guarded_motion(
     servo: tuple[float, float],
     config: ServoConfig,
     dt: float,
-) -> Motion:
+) -> TickMotion:
     """One tick of the guarded law in space (docs/weld_law.md, sections 3 and 4).
 
     Unknown are the tip's speed along the seam and the rate about the tool's up; pitch is eliminated by the torch's
@@ -262,4 +263,4 @@ def guarded_motion(
     level = unit(u - dot(u, up) * up, u)
     w_r = clip((roll_rate(axes, b, config) - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
     V = np.concatenate([w * a + w_p * m + w_r * u, v * tb + base])
-    return Motion(V, v, v * t_v + w * t_w + t_0, w, seam_conditioning(u, tb, t))
+    return TickMotion(V, v, v * t_v + w * t_w + t_0, w, seam_conditioning(u, tb, t))

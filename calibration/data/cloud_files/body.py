@@ -70,8 +70,8 @@ def check_points(path: Path, points: int, size: int) -> None:
         raise CloudError(f"The cloud {path.name} is empty; scan again.")
     if points > MOST_POINTS or 24 * points > expansion_limit(size):
         raise CloudError(
-            f"The header of {path.name} promises {points} points, more than {min(MOST_POINTS, expansion_limit(size) // 24)}, the most "
-            "that are read of a file of its size."
+            f"The header of {path.name} promises {points} points, more than"
+            f" {min(MOST_POINTS, expansion_limit(size) // 24)}, the most that are read of a file of its size."
         )
 
 
@@ -110,7 +110,8 @@ def text_columns(
                 continue
             if numbers is not None and len(words) != numbers:
                 raise CloudError(
-                    f"The file {path.name} is damaged: point {k + 1} has {len(words)} numbers instead of the {numbers} of its header."
+                    f"The file {path.name} is damaged: point {k + 1} has {len(words)} numbers instead of the {numbers}"
+                    " of its header."
                 )
             if not columns:
                 continue
@@ -120,7 +121,8 @@ def text_columns(
                 block = []
     if found < lines:
         raise CloudError(
-            f"The file {path.name} is truncated: its header promises {rows} points and {max(min(found - skip, rows), 0)} are there."
+            f"The file {path.name} is truncated: its header promises {rows} points and"
+            f" {max(min(found - skip, rows), 0)} are there."
         )
     if found > lines:
         raise CloudError(

@@ -1,4 +1,5 @@
-"""Turns depth images (PNG, TIFF, NPY) and depth maps of NPZ files into organised points by the camera's intrinsics, which a file beside them may state."""
+"""Turns depth images (PNG, TIFF, NPY) and depth maps of NPZ files into organised points by the camera's intrinsics,
+which a file beside them may state."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,10 @@ IMAGES = (".png", ".tif", ".tiff")
 """Endings of depth images."""
 _PIXEL_BITS = 16
 _STEMS = (
-    "camera_info", "depth_camera_info", "depth_intrinsics", "intrinsics", "intrinsic", "camera_intrinsics", "camera_intrinsic",
-    "camera-intrinsics", "intrinsic_depth", "camera_matrix", "camera", "depth_camera", "depth", "k", "cam_k", "camchain", "scene_camera",
+    "camera_info", "depth_camera_info", "depth_intrinsics", "intrinsics", "intrinsic", "camera_intrinsics",
+    "camera_intrinsic",
+    "camera-intrinsics", "intrinsic_depth", "camera_matrix", "camera", "depth_camera", "depth", "k", "cam_k",
+    "camchain", "scene_camera",
 )  # fmt: skip
 _TREES = (".yaml", ".yml", ".json", ".xml")
 _TEXTS = (".txt", ".csv")
@@ -27,7 +30,7 @@ _ADVICE = "write 'intrinsics: {fx: ..., fy: ..., cx: ..., cy: ...}' (pixels) int
 
 
 @dataclass(frozen=True, kw_only=True)
-class Intrinsics:
+class DepthIntrinsics:
     """A camera as its file states it.
 
     Attributes:
@@ -48,7 +51,7 @@ def is_camera_file(path: Path) -> bool:
     return path.stem.lower() in _STEMS and path.suffix.lower() in (*_TREES, *_TEXTS)
 
 
-def find_intrinsics(*folders: Path) -> Intrinsics | None:
+def find_intrinsics(*folders: Path) -> DepthIntrinsics | None:
     """The camera of the first of these folders that holds a file of one; None where none does.
 
     Raises:
@@ -69,37 +72,41 @@ def checked_intrinsics(values: tuple[float, ...], source: str) -> tuple[float, f
     fx, fy, cx, cy = values
     if not (np.isfinite(values).all() and min(fx, fy) > 0.0 and max(map(abs, values)) < 1e6):
         raise CloudError(
-            f"The intrinsics in {source} are not usable (fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}): focal lengths are positive, in pixels."
+            f"The intrinsics in {source} are not usable (fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}): focal lengths are"
+            " positive, in pixels."
         )
     return fx, fy, cx, cy
 
 
-def intrinsics_of(found: Intrinsics | None, shape: tuple[int, int], name: str) -> tuple[float, float, float, float]:
+def intrinsics_of(
+    found: DepthIntrinsics | None, shape: tuple[int, int], name: str
+) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy for a depth image (height, width).
 
     Raises:
-        CloudError: no camera is known, its images have another size, or a lens distortion. The sentence says what to write where.
+        CloudError: no camera is known, its images have another size, or a lens distortion. The sentence says what to
+            write where.
     """
     height, width = shape
     if found is None:
         raise CloudError(
-            f"{name} is a depth image of {width} x {height} pixels, and its camera's intrinsics are not known: {_ADVICE}, or put the "
-            "camera's file (camera_info.yaml of ROS, OpenCV or Kalibr) beside the images."
+            f"{name} is a depth image of {width} x {height} pixels, and its camera's intrinsics are not known:"
+            f" {_ADVICE}, or put the camera's file (camera_info.yaml of ROS, OpenCV or Kalibr) beside the images."
         )
     if found.size not in ((0, 0), (width, height)):
         raise CloudError(
-            f"{name} has {width} x {height} pixels, and {found.source.name} states a camera of {found.size[0]} x {found.size[1]}: give the "
-            f"camera of the depth images, or {_ADVICE}."
+            f"{name} has {width} x {height} pixels, and {found.source.name} states a camera of {found.size[0]} x"
+            f" {found.size[1]}: give the camera of the depth images, or {_ADVICE}."
         )
     if not found.straight:
         raise CloudError(
-            f"{found.source.name} states a lens distortion, and points follow from rectified depth images only: where {name} is rectified, "
-            f"{_ADVICE}."
+            f"{found.source.name} states a lens distortion, and points follow from rectified depth images only: where"
+            f" {name} is rectified, {_ADVICE}."
         )
     return found.values
 
 
-def _stated(path: Path) -> Intrinsics | None:
+def _stated(path: Path) -> DepthIntrinsics | None:
     """The camera in a file; None where it holds none."""
     try:
         found = find_camera(path)
@@ -109,7 +116,7 @@ def _stated(path: Path) -> Intrinsics | None:
         return None
     K, straight = found.K, not found.distortion.any()
     values = checked_intrinsics((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), path.name)
-    return Intrinsics(values=values, source=path, size=found.size or (0, 0), straight=straight)
+    return DepthIntrinsics(values=values, source=path, size=found.size or (0, 0), straight=straight)
 
 
 def may_be_depth(path: Path) -> bool:
@@ -128,10 +135,13 @@ def is_depth(path: Path) -> bool:
         return False
 
 
-def camera_of(path: Path, form: CloudForm) -> Intrinsics | None:
-    """The camera of a depth image: as stated, else of a file beside it or in the dataset's folder. Raises CloudError."""
+def camera_of(path: Path, form: CloudForm) -> DepthIntrinsics | None:
+    """The camera of a depth image: as stated, else of a file beside it or in the dataset's folder.
+
+    Raises CloudError.
+    """
     if form.intrinsics is not None:
-        return Intrinsics(values=checked_intrinsics(form.intrinsics, "dataset.yaml"), source=Path("dataset.yaml"))
+        return DepthIntrinsics(values=checked_intrinsics(form.intrinsics, "dataset.yaml"), source=Path("dataset.yaml"))
     return find_intrinsics(path.parent, *(() if form.folder is None else (form.folder,)))
 
 
@@ -140,17 +150,20 @@ def read_depth_image(path: Path, form: CloudForm) -> Array:
     pixels = read_raw_image(path)
     if pixels.ndim != 2:
         raise CloudError(
-            f"{path.name} is a picture of {pixels.shape[2]} channels, and a depth image has one: give the depth image, or a cloud."
+            f"{path.name} is a picture of {pixels.shape[2]} channels, and a depth image has one: give the depth image,"
+            " or a cloud."
         )
     if pixels.dtype.itemsize * 8 < _PIXEL_BITS:
         raise CloudError(
-            f"{path.name} has 8 bits a pixel, too coarse for depth: export depth images with 16 bits, or as floating-point numbers."
+            f"{path.name} has 8 bits a pixel, too coarse for depth: export depth images with 16 bits, or as"
+            " floating-point numbers."
         )
     return depth_points(path, pixels, form)
 
 
 def depth_points(path: Path, pixels: Any, form: CloudForm) -> Array:
-    """Points (H, W, 3) of the pixels (H, W) of a depth image: depth along the optical axis; 0, NaN and 65535 hold none."""
+    """Points (H, W, 3) of the pixels (H, W) of a depth image: depth along the optical axis; 0, NaN and 65535 hold
+    none."""
     if pixels.dtype.kind not in "fui":
         raise CloudError(f"{path.name} holds {pixels.dtype}, and depth is 16-bit or floating-point numbers.")
     check_pixels(path, pixels.size)
@@ -177,7 +190,8 @@ def check_pixels(path: Path, pixels: int) -> None:
 
 
 def back_projected(depth: Array, intrinsics: tuple[float, float, float, float]) -> Array:
-    """Points (H, W, 3) in the unit of the depths (H, W) along the optical axis; NaN where a depth is no positive number."""
+    """Points (H, W, 3) in the unit of the depths (H, W) along the optical axis; NaN where a depth is no positive
+    number."""
     fx, fy, cx, cy = intrinsics
     points = np.empty((*depth.shape, 3))
     z = points[:, :, 2]

@@ -15,7 +15,8 @@ _CLEAR = 1.25  # by which the next best width must be worse
 
 
 def measured(points: Array, name: str) -> Array:
-    """The points without missing ones: NaN in a grid, left out of a list; a list in the sensor's order becomes its grid.
+    """The points without missing ones: NaN in a grid, left out of a list; a list in the sensor's order becomes its
+    grid.
 
     Args:
         points: (N, 3), or organised (H, W, 3). A point with NaN, or at 0 0 0 (the camera's centre), was not measured.
@@ -49,8 +50,8 @@ def measured(points: Array, name: str) -> Array:
 def sensor_width(points: Array, valid: NDArray[np.bool_], widths: tuple[int, ...] = ()) -> int | None:
     """Width of the grid in which points (N, 3) follow each other row by row; None where they do not.
 
-    In a grid the point one row below is about as near as the next one, and both are much nearer than any two points. That
-    tells the width among the divisors of N.
+    In a grid the point one row below is about as near as the next one, and both are much nearer than any two points.
+    That tells the width among the divisors of N.
 
     Args:
         valid: which points were measured (N).

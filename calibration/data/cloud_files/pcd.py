@@ -29,7 +29,8 @@ _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWP
 
 @dataclass(frozen=True, kw_only=True)
 class _Header:
-    """What the header says: of x, y, z the column (in text) and (offset, type) in a record; bytes and numbers of a record."""
+    """What the header says: of x, y, z the column (in text) and (offset, type) in a record; bytes and numbers of a
+    record."""
 
     columns: tuple[int, ...]
     fields: tuple[tuple[int, str], ...]
@@ -50,13 +51,15 @@ class _Header:
 def read_pcd(path: Path, form: CloudForm | None = None) -> Array:
     """Points (N, 3), or (H, W, 3) where the header has more than one row, in the file's unit.
 
-    VIEWPOINT is the pose of the sensor when it took the scan. PCL's documentation does not state the frame of the points, and
-    programs differ: PCL's viewer and `transform_from_viewpoint` apply VIEWPOINT to points in the sensor's frame; PCL's estimation
-    of normals takes it as the sensor's place among points that were moved already. So VIEWPOINT other than identity is refused
-    until ``form.viewpoint`` says which: ``sensor`` (it is not applied) or ``world`` (it is undone).
+    VIEWPOINT is the pose of the sensor when it took the scan. PCL's documentation does not state the frame of the
+    points, and programs differ: PCL's viewer and `transform_from_viewpoint` apply VIEWPOINT to points in the sensor's
+    frame; PCL's estimation of normals takes it as the sensor's place among points that were moved already. So VIEWPOINT
+    other than identity is refused until ``form.viewpoint`` says which: ``sensor`` (it is not applied) or ``world`` (it
+    is undone).
 
     Raises:
-        CloudError: no PCD, a header that contradicts itself or the body's length, coordinates that are missing, VIEWPOINT.
+        CloudError: no PCD, a header that contradicts itself or the body's length, coordinates that are missing,
+            VIEWPOINT.
         InputError: the file cannot be opened.
     """
     with cloud_stream(path) as (stream, size):
@@ -79,14 +82,15 @@ def read_pcd(path: Path, form: CloudForm | None = None) -> Array:
 
 
 def _in_sensor_frame(path: Path, points: Array, viewpoint: tuple[float, ...], form: CloudForm) -> Array:
-    """The points in the frame of the sensor, by VIEWPOINT (tx, ty, tz, qw, qx, qy, qz; empty: identity) and what is stated of it."""
+    """The points in the frame of the sensor, by VIEWPOINT (tx, ty, tz, qw, qx, qy, qz; empty: identity) and what is
+    stated of it."""
     if not viewpoint or form.viewpoint == "sensor":
         return points
     if form.viewpoint != "world":
         raise CloudError(
-            f"{path.name} has the VIEWPOINT {' '.join(f'{v:g}' for v in viewpoint)}, and programs differ in what that means: write "
-            "'viewpoint: sensor' into dataset.yaml where the points are in the sensor's frame, 'viewpoint: world' where they were moved "
-            "by VIEWPOINT."
+            f"{path.name} has the VIEWPOINT {' '.join(f'{v:g}' for v in viewpoint)}, and programs differ in what that"
+            " means: write 'viewpoint: sensor' into dataset.yaml where the points are in the sensor's frame,"
+            " 'viewpoint: world' where they were moved by VIEWPOINT."
         )
     missing = ~points.any(axis=1)
     wxyz = np.array(viewpoint[3:])
@@ -193,12 +197,13 @@ def _whole(path: Path, key: str, words: list[str], n: int | None = None) -> list
 def _check_length(path: Path, h: _Header, there: int) -> None:
     if there < h.points * h.record:
         raise CloudError(
-            f"The file {path.name} is truncated: its header promises {h.points} points and {there // h.record} are there."
+            f"The file {path.name} is truncated: its header promises {h.points} points and {there // h.record} are"
+            " there."
         )
     if there > h.points * h.record + 1:  # a last newline is no contradiction
         raise CloudError(
-            f"The header of {path.name} promises {h.points} points, and {there - h.points * h.record} bytes more follow; export it "
-            "again."
+            f"The header of {path.name} promises {h.points} points, and {there - h.points * h.record} bytes more"
+            " follow; export it again."
         )
 
 
@@ -216,7 +221,8 @@ def _compressed(path: Path, h: _Header, stream: BinaryIO, size: int) -> Array:
         raise CloudError(f"The file {path.name} is truncated: {packed} bytes are promised and {there} are there.")
     if unpacked != h.points * h.record:
         raise CloudError(
-            f"The file {path.name} is damaged: its header promises {h.points * h.record} bytes of points and its body {unpacked}."
+            f"The file {path.name} is damaged: its header promises {h.points * h.record} bytes of points and its body"
+            f" {unpacked}."
         )
     if unpacked > expansion_limit(size):
         raise CloudError(

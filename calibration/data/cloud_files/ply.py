@@ -22,8 +22,10 @@ from weldcal.calibration.data.cloud_files.ply_lists import Element, cells, layou
 from weldcal.models.arrays import Array
 
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8",
+    "float64": "f8",
 }  # fmt: skip
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _COUNTS = [name for name, kind in _TYPES.items() if kind[0] != "f"]
@@ -182,7 +184,8 @@ def _binary(
     points_there = max(there - skip, 0) // max(vertex.least, 1)
     if points_there < vertex.count:
         raise CloudError(
-            f"The file {path.name} is truncated: its header promises {vertex.count} points and {points_there} are there."
+            f"The file {path.name} is truncated: its header promises {vertex.count} points and {points_there} are"
+            " there."
         )
     if least < vertex.least * vertex.count:
         missing = vertex.least * vertex.count - least
@@ -234,7 +237,8 @@ def _vertices(path: Path, order: str, e: Element, columns: list[int], content: b
 
 
 def _placed(path: Path, points: Array, of_cells: NDArray[np.int64], sides: tuple[int, int]) -> Array:
-    """The points (H, W, 3) in the cells of a range_grid, NaN in empty ones; (N, 3) where no grid of two sides is stated."""
+    """The points (H, W, 3) in the cells of a range_grid, NaN in empty ones; (N, 3) where no grid of two sides is
+    stated."""
     some = of_cells[of_cells >= 0]
     if len(some) and int(some.max()) >= len(points):
         raise CloudError(f"The file {path.name} is damaged: its range_grid names point {int(some.max())}.")
@@ -243,8 +247,8 @@ def _placed(path: Path, points: Array, of_cells: NDArray[np.int64], sides: tuple
     cols, rows = sides
     if cols * rows not in (0, len(of_cells)):
         raise CloudError(
-            f"The header of {path.name} contradicts itself: num_cols {cols} times num_rows {rows} is not the {len(of_cells)} cells "
-            "of its range_grid."
+            f"The header of {path.name} contradicts itself: num_cols {cols} times num_rows {rows} is not the"
+            f" {len(of_cells)} cells of its range_grid."
         )
     out = np.full((len(of_cells), 3), np.nan)
     out[of_cells >= 0] = points[some]

@@ -1,4 +1,5 @@
-"""Walks the elements of a PLY file whose records hold lists: where each property lies, and the cells of a range_grid."""
+"""Walks the elements of a PLY file whose records hold lists: where each property lies, and the cells of a
+range_grid."""
 
 import re
 import struct
@@ -59,7 +60,8 @@ def layout(path: Path, order: str, e: Element, content: bytes) -> tuple[int, lis
 
 
 def walked(path: Path, order: str, e: Element, content: bytes) -> tuple[NDArray[np.int64], int]:
-    """Places (n, properties) of each property of each record, bytes, and the bytes of all records, one after the other."""
+    """Places (n, properties) of each property of each record, bytes, and the bytes of all records, one after the
+    other."""
     places = np.empty((e.count, len(e.properties)), dtype=np.int64)
     formats = [(int(t[1]), int(n[1]) if n else 0, _LETTERS[n] if n else "") for _, t, n in e.properties]
     at = 0
@@ -116,12 +118,14 @@ def text_cells(path: Path, e: Element, words: list[bytes], columns: list[int]) -
         count = words[at] if at < len(words) else b""
         if counter and not (count.isdigit() and len(count) < 10):
             raise CloudError(
-                f"The file {path.name} is damaged: '{count.decode('latin-1')[:40]}' is no count of a list of its points."
+                f"The file {path.name} is damaged: '{count.decode('latin-1')[:40]}' is no count of a list of its"
+                " points."
             )
         at += 1 + int(count) if counter else 1
     if at != len(words):
         raise CloudError(
-            f"The file {path.name} is damaged: a point has {len(words)} numbers instead of the {at} of its header and lists."
+            f"The file {path.name} is damaged: a point has {len(words)} numbers instead of the {at} of its header and"
+            " lists."
         )
     return [words[places[c]] for c in columns]
 

@@ -27,8 +27,8 @@ _CLOUD, _POSE, _JOINTS, _TF = "PointCloud2", "PoseStamped", "JointState", "TFMes
 
 @dataclass(frozen=True, eq=False)
 class BagScans:
-    """Scans of a recording at rest: ``ids``, X_BF (n, 4, 4) in metres, clouds (N, 3) or (H, W, 3) in metres, stamps (n,) s, a phrase on
-    what was read, and (id, reason) of those left out."""
+    """Scans of a recording at rest: ``ids``, X_BF (n, 4, 4) in metres, clouds (N, 3) or (H, W, 3) in metres, stamps
+    (n,) s, a phrase on what was read, and (id, reason) of those left out."""
 
     ids: tuple[str, ...]
     X: Array
@@ -49,7 +49,8 @@ class _Poses:
 
 
 def find_bag(folder: Path) -> Path | None:
-    """The recording of a folder: the folder itself where it has ROS 2's metadata.yaml, else its one .mcap, .db3 or .bag file."""
+    """The recording of a folder: the folder itself where it has ROS 2's metadata.yaml, else its one .mcap, .db3 or .bag
+    file."""
     if folder.is_file():
         return folder if folder.suffix.lower() in ENDINGS else None
     if (folder / "metadata.yaml").is_file():
@@ -64,8 +65,8 @@ def find_bag(folder: Path) -> Path | None:
 def read_bag(path: Path, form: PoseForm, robot: str) -> BagScans:
     """Clouds of a recording with the flange's pose at the stamp of each, of the moments at which the arm rested.
 
-    The poses come from ``form.topic`` where it is given, else from the first of: a topic of PoseStamped, the transforms (tf) from base
-    to flange, joint angles with the kinematics of ``robot``. One scan is kept for each pose.
+    The poses come from ``form.topic`` where it is given, else from the first of: a topic of PoseStamped, the transforms
+    (tf) from base to flange, joint angles with the kinematics of ``robot``. One scan is kept for each pose.
 
     Raises:
         DatasetError: rosbags is not installed, the file is damaged, or there are no clouds or no poses.
@@ -117,7 +118,8 @@ def _cloud_topic(path: Path, kinds: dict[str, str], form: PoseForm) -> str:
     if not found:
         have = ", ".join(f"{t} ({k})" for t, k in sorted(kinds.items())[:8]) or "nothing"
         raise DatasetError(
-            f"'{path.name}' holds no topic of PointCloud2{f' called {form.cloud_topic}' if form.cloud_topic else ''}, but {have}."
+            f"'{path.name}' holds no topic of PointCloud2{f' called {form.cloud_topic}' if form.cloud_topic else ''},"
+            f" but {have}."
         )
     raise DatasetError(
         f"'{path.name}' holds clouds on {', '.join(found)}; set 'poses: {{cloud_topic: {found[0]}}}' in dataset.yaml."
@@ -134,10 +136,14 @@ def _points(path: Path, m: Any) -> Array:
     fields = {f.name: f for f in m.fields}
     if not {"x", "y", "z"} <= set(fields) or m.is_bigendian or m.height * m.width > MOST_POINTS:
         raise DatasetError(f"A cloud of '{path.name}' has no fields x, y, z that can be read.")
-    dtype = np.dtype({
-        "names": list("xyz"), "formats": [_KINDS[fields[a].datatype] for a in "xyz"],
-        "offsets": [fields[a].offset for a in "xyz"], "itemsize": m.point_step,
-    })  # fmt: skip
+    dtype = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": [_KINDS[fields[a].datatype] for a in "xyz"],
+            "offsets": [fields[a].offset for a in "xyz"],
+            "itemsize": m.point_step,
+        }
+    )
     data = np.ascontiguousarray(np.frombuffer(m.data, np.uint8)).reshape(m.height, m.row_step)[
         :, : m.width * m.point_step
     ]
@@ -177,7 +183,8 @@ def _flange(path: Path, s: _Poses, form: PoseForm, robot: str) -> tuple[Array, A
     known = (*s.poses, *s.joints)
     if form.topic and form.topic not in (*known, "/tf", "tf"):
         raise DatasetError(
-            f"'{path.name}' has no poses on {form.topic}; it has {', '.join(known) or 'none'}{' and tf' if s.transforms else ''}."
+            f"'{path.name}' has no poses on {form.topic}; it has"
+            f" {', '.join(known) or 'none'}{' and tf' if s.transforms else ''}."
         )
     stamped = [t for t in s.poses if form.topic in ("", t)]
     if len(stamped) > 1:
@@ -195,7 +202,8 @@ def _flange(path: Path, s: _Poses, form: PoseForm, robot: str) -> tuple[Array, A
     if len(angles) == 1:
         if not robot:
             raise DatasetError(
-                f"'{path.name}' holds joint angles ({angles[0]}); name the arm, 'robot:' in dataset.yaml or --robot, for its kinematics."
+                f"'{path.name}' holds joint angles ({angles[0]}); name the arm, 'robot:' in dataset.yaml or --robot,"
+                " for its kinematics."
             )
         arm = load_chain(robot)
         rows = sorted(s.joints[angles[0]], key=lambda r: r[0])
@@ -208,7 +216,8 @@ def _flange(path: Path, s: _Poses, form: PoseForm, robot: str) -> tuple[Array, A
 
 
 def _order(path: Path, names: tuple[str, ...], n: int) -> list[int]:
-    """Positions of the arm's joints among the names, from the base to the flange; a UR's driver sorts them by the alphabet."""
+    """Positions of the arm's joints among the names, from the base to the flange; a UR's driver sorts them by the
+    alphabet."""
     ur = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     found = [next((k for k, name in enumerate(names) if part in name), -1) for part in ur]
     if n == 6 and min(found) >= 0:
@@ -247,15 +256,16 @@ def _chained(path: Path, s: _Poses, form: PoseForm, *, needed: bool) -> tuple[Ar
         if not needed:
             return None
         raise DatasetError(
-            f"The transforms of '{path.name}' lead from no base to the flange (frames: {', '.join(sorted(frames)[:10])}); set "
-            "poses.base_frame and poses.flange_frame in dataset.yaml."
+            f"The transforms of '{path.name}' lead from no base to the flange (frames:"
+            f" {', '.join(sorted(frames)[:10])}); set poses.base_frame and poses.flange_frame in dataset.yaml."
         )
     chain = chain[: above.index(base_above) + 1]
     moving = [e for e in chain if e not in s.fixed and len(s.transforms[e]) > 1]
     clock = max((_table(s.transforms[e])[0] for e in moving), key=len, default=None)
     if clock is None:
         raise DatasetError(
-            f"The transforms of '{path.name}' from {base} to {flange} never change: record /tf while the arm goes from pose to pose."
+            f"The transforms of '{path.name}' from {base} to {flange} never change: record /tf while the arm goes from"
+            " pose to pose."
         )
     X = np.broadcast_to(extra, (len(clock), 4, 4))
     for edge in reversed(chain):
@@ -284,7 +294,10 @@ def _at_rest(path: Path, clouds: list[tuple[float, Array]], times: Array, X: Arr
             refused.append(
                 (
                     id,
-                    f"It was taken {min(abs(t - times[0]), abs(t - times[-1])):.1f} s before or after the poses were recorded.",
+                    (
+                        f"It was taken {min(abs(t - times[0]), abs(t - times[-1])):.1f} s before or after the poses"
+                        " were recorded."
+                    ),
                 )
             )
             continue

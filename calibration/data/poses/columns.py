@@ -4,21 +4,56 @@ import re
 from dataclasses import dataclass
 
 IDS = (
-    "id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no", "sample", "frame", "#", "point", "idx",
+    "id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no", "sample",
+    "frame", "#", "point", "idx",
 )  # fmt: skip
 TIMES = (
-    "time", "%time", "timestamp", "stamp", "t", "time_s", "header.stamp", "sec", "secs", "timestamp_s", "time_ns", "timestamp_ns",
-)  # fmt: skip
+    "time",
+    "%time",
+    "timestamp",
+    "stamp",
+    "t",
+    "time_s",
+    "header.stamp",
+    "sec",
+    "secs",
+    "timestamp_s",
+    "time_ns",
+    "timestamp_ns",
+)
 _POSITION = {
-    "position", "pos", "translation", "trans", "t", "p", "tvec", "xyz", "location", "origin", "linear", "coord",
-}  # fmt: skip
+    "position",
+    "pos",
+    "translation",
+    "trans",
+    "t",
+    "p",
+    "tvec",
+    "xyz",
+    "location",
+    "origin",
+    "linear",
+    "coord",
+}
 _ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad"}
 _VECTOR = {"rvec", "rotvec", "rv", "axisangle", "aa", "rodrigues"}
 _QUATERNION = {"quat", "quaternion", "q"}
 _FILLERS = {"field", "pose", "transform", "transforms0", "vector", "tcp", "data", "actual", "x1"}
 _OWNERS = (
-    "robot", "camera", "cam", "hand", "eye", "ee", "base", "flange", "target", "marker", "board", "gripper", "tool",
-)  # fmt: skip
+    "robot",
+    "camera",
+    "cam",
+    "hand",
+    "eye",
+    "ee",
+    "base",
+    "flange",
+    "target",
+    "marker",
+    "board",
+    "gripper",
+    "tool",
+)
 _WHOLE = {
     "qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o",
 }  # fmt: skip
@@ -42,8 +77,9 @@ _UNITS = {
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column that is part of a pose: which list it belongs to, its role in a pose, its unit and its place in the table."""
+class PoseColumn:
+    """A column that is part of a pose: which list it belongs to, its role in a pose, its unit and its place in the
+    table."""
 
     prefix: str
     role: str
@@ -51,13 +87,14 @@ class Column:
     index: int
 
 
-def columns_of(header: list[str]) -> tuple[list[Column], dict[str, int]]:
+def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
     """The columns of poses of a header, and the places of its ids and times.
 
-    Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector for sure); roll, pitch,
-    yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to m33.
+    Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector
+    for sure); roll, pitch, yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to
+    m33.
     """
-    found: list[Column] = []
+    found: list[PoseColumn] = []
     other: dict[str, int] = {}
     plain = [_unit_of(h.strip().lower()) for h in header]
     joints = any(name in ("q5", "q6") for name, _ in plain)  # then q1 to q4 are joint angles and no quaternion
@@ -72,7 +109,7 @@ def columns_of(header: list[str]) -> tuple[list[Column], dict[str, int]]:
                 other["time"] = k
             continue
         for prefix, role in _roles(name):
-            found.append(Column(prefix, role, unit, k))
+            found.append(PoseColumn(prefix, role, unit, k))
             break
     return _merged(_with_quaternions(_with_euler(found, plain), plain)), other
 
@@ -128,29 +165,33 @@ def _prefix(words: list[str]) -> str:
     return "_".join(w for w in words if w not in skipped)
 
 
-def _with_quaternions(columns: list[Column], names: list[tuple[str, str]]) -> list[Column]:
+def _with_quaternions(columns: list[PoseColumn], names: list[tuple[str, str]]) -> list[PoseColumn]:
     """Rotation columns x, y, z, w of one list are a quaternion."""
     four = {c.prefix for c in columns if c.role == "rw"}
     return [
-        Column(c.prefix, f"q{c.role[1]}", c.unit, c.index)
-        if c.prefix in four and re.fullmatch("r[wxyz]", c.role)
-        else c
+        (
+            PoseColumn(c.prefix, f"q{c.role[1]}", c.unit, c.index)
+            if c.prefix in four and re.fullmatch("r[wxyz]", c.role)
+            else c
+        )
         for c in columns
     ]
 
 
-def _with_euler(columns: list[Column], names: list[tuple[str, str]]) -> list[Column]:
+def _with_euler(columns: list[PoseColumn], names: list[tuple[str, str]]) -> list[PoseColumn]:
     plain = [n for n, _ in names]
     for words in _EULER_WORDS:
         if set(words) <= set(plain):
-            columns += [Column("", f"e{k + 1}", names[plain.index(w)][1], plain.index(w)) for k, w in enumerate(words)]
+            columns += [
+                PoseColumn("", f"e{k + 1}", names[plain.index(w)][1], plain.index(w)) for k, w in enumerate(words)
+            ]
     if {"o", "a", "t"} <= set(plain) and "x" in plain:
         columns = [c for c in columns if c.role not in ("o", "a")]
-        columns += [Column("", w, names[plain.index(w)][1], plain.index(w)) for w in "oat"]
+        columns += [PoseColumn("", w, names[plain.index(w)][1], plain.index(w)) for w in "oat"]
     return columns
 
 
-def _merged(columns: list[Column]) -> list[Column]:
+def _merged(columns: list[PoseColumn]) -> list[PoseColumn]:
     """Positions of one prefix and rotations of another are one list where there is one of each."""
     have: dict[str, set[str]] = {}
     for c in columns:
@@ -158,7 +199,7 @@ def _merged(columns: list[Column]) -> list[Column]:
     positions = [p for p, kinds in have.items() if kinds == {"p"}]
     rotations = [p for p, kinds in have.items() if kinds == {"r"}]
     if len(have) == 2 and len(positions) == len(rotations) == 1:
-        return [Column("", c.role, c.unit, c.index) for c in columns]
+        return [PoseColumn("", c.role, c.unit, c.index) for c in columns]
     whole = {
         p
         for p, kinds in have.items()

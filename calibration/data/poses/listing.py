@@ -68,7 +68,10 @@ class Listing:
         return out
 
     def stated(self, form: PoseForm, option: str) -> "Listing":
-        """The list with what dataset.yaml or an option states of its form. Raises DatasetError where the numbers contradict it."""
+        """The list with what dataset.yaml or an option states of its form.
+
+        Raises DatasetError where the numbers contradict it.
+        """
         rotation, angles, changes = parse_form(form.rotation, option) if form.rotation else ("", "", ())
         angles = form.angles or angles
         if form.frame == "base_in_flange":
@@ -117,8 +120,8 @@ def listing_of(
 
 
 def listing_of_array(name: str, values: Array, **more: object) -> Listing:
-    """A list of an array of a usual shape: (4, 4), (3, 4), (n, 4, 4), (n, 3, 4), (4, 4, n), (4 n, 4), (n, 16), (n, 12), (n, 6), (n, 7), each
-    also with a column of times before it, and (6, n), (7, n).
+    """A list of an array of a usual shape: (4, 4), (3, 4), (n, 4, 4), (n, 3, 4), (4, 4, n), (4 n, 4), (n, 16), (n, 12),
+    (n, 6), (n, 7), each also with a column of times before it, and (6, n), (7, n).
 
     Raises:
         DatasetError: another shape, or no rigid poses.
@@ -131,12 +134,12 @@ def listing_of_array(name: str, values: Array, **more: object) -> Listing:
         shape = " x ".join(map(str, v.shape))
         if v.shape[-1] in (12, 16) or v.shape[-2:] in ((4, 4), (3, 4)):
             raise DatasetError(
-                f"'{name}' holds {shape} numbers, and most of its matrices are no rigid pose: the columns of the 3 x 3 part must have length 1 "
-                "and be at right angles."
+                f"'{name}' holds {shape} numbers, and most of its matrices are no rigid pose: the columns of the 3 x 3"
+                " part must have length 1 and be at right angles."
             )
         raise DatasetError(
-            f"'{name}' holds {shape} numbers, which is no list of poses: 6 (x,y,z,rx,ry,rz), 7 (x,y,z and a quaternion) or 16 "
-            "(a 4 x 4 matrix) a pose."
+            f"'{name}' holds {shape} numbers, which is no list of poses: 6 (x,y,z,rx,ry,rz), 7 (x,y,z and a quaternion)"
+            " or 16 (a 4 x 4 matrix) a pose."
         )
     least = min(kind for kind, *_ in found)
     chosen = [(p, r) for kind, p, r, _ in found if kind == least]
@@ -234,7 +237,10 @@ def _unit(q: Array) -> bool:
 
 
 def require_pose(lists: list[Listing]) -> list[Listing]:
-    """The lists. Raises DatasetError where one pose alone is missing: it may be one of many files, and is left out there."""
+    """The lists.
+
+    Raises DatasetError where one pose alone is missing: it may be one of many files, and is left out there.
+    """
     for one in lists:
         if len(one.left_out) == len(one):
             raise DatasetError(f"'{one.name}' holds no pose: {one.left_out[0][1]}")
@@ -253,7 +259,8 @@ def _listing(
     n = len(meanings[0][0])
     if n > MOST_POSES:
         raise DatasetError(
-            f"'{name}' holds {n:,} poses, and at most {MOST_POSES:,} are read. Keep one for each scan or picture: the pose at its time."
+            f"'{name}' holds {n:,} poses, and at most {MOST_POSES:,} are read. Keep one for each scan or picture: the"
+            " pose at its time."
         )
     left_out = _without_pose(meanings)
     if len(left_out) == n > 1:
@@ -271,7 +278,8 @@ def _listing(
 
 
 def _without_pose(meanings: Sequence[tuple[Array, Array]]) -> list[tuple[int, str]]:
-    """Rows that hold no pose: a number is missing, the rotation is zero, or both are those of no motion (a failed detection)."""
+    """Rows that hold no pose: a number is missing, the rotation is zero, or both are those of no motion (a failed
+    detection)."""
     p, r = meanings[0]
     flat = np.concatenate([p, r.reshape(len(r), -1)], axis=1)
     missing = ~np.isfinite(flat).all(axis=1)

@@ -21,7 +21,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, MOST_CELLS, file_size, read_bytes, read_text, require_few_lines
 
 TEXT = (
-    ".csv", ".txt", ".tsv", ".script", ".urscript", ".dat", ".src", ".ls", ".mod", ".prg", ".tum", ".log", ".asc", ".urp", ".sys", ".jbi",
+    ".csv", ".txt", ".tsv", ".script", ".urscript", ".dat", ".src", ".ls", ".mod", ".prg", ".tum", ".log", ".asc",
+    ".urp", ".sys", ".jbi",
     ".dtx", ".as", ".py", ".m", ".drl", ".lua", ".pnt", ".pos", ".jsonl", ".out",
 )  # fmt: skip
 TREES = (".yml", ".yaml", ".json", ".xml", ".samples", ".calib", ".rob")
@@ -81,7 +82,8 @@ def lists_of_file(path: Path) -> list[Listing]:
 
 
 def folder_lists(folder: Path, needed: int = 2, skip: frozenset[Path] = frozenset()) -> list[Listing]:
-    """Every list of poses of a folder: of its files, and of files with one pose each (pos01.yaml, pos02.yaml ...), one level deep.
+    """Every list of poses of a folder: of its files, and of files with one pose each (pos01.yaml, pos02.yaml ...), one
+    level deep.
 
     Args:
         folder: the folder.
@@ -130,7 +132,10 @@ def _numbered_folders(folder: Path) -> frozenset[Path]:
 
 
 def _may_hold_poses(path: Path) -> bool:
-    """Whether a file's name is that of poses. Raises DatasetError where another thing than a file or a folder has such a name."""
+    """Whether a file's name is that of poses.
+
+    Raises DatasetError where another thing than a file or a folder has such a name.
+    """
     named = path.suffix.lower() in ENDINGS and path.name.lower() not in _OWN and not path.name.startswith((".", "_"))
     if named and not path.is_file() and (not path.is_dir() or _one_of_files(path)):
         raise DatasetError(f"'{path.name}' is no file that can be read; replace it by a file, or remove it.")
@@ -223,11 +228,12 @@ def two_lists(
         )
     if len(lists) == 1:
         raise DatasetError(
-            f"'{source}' holds one list of poses, {known}, and two are needed: the robot's and the camera's. Put both into one folder as "
-            "robot.csv and camera.csv, or name them."
+            f"'{source}' holds one list of poses, {known}, and two are needed: the robot's and the camera's. Put both"
+            " into one folder as robot.csv and camera.csv, or name them."
         )
     raise DatasetError(
-        f"The names of the lists of '{source}' do not tell {missing} poses: {known}. Name them with --robot-poses and --camera-poses."
+        f"The names of the lists of '{source}' do not tell {missing} poses: {known}. Name them with --robot-poses and"
+        " --camera-poses."
     )
 
 
@@ -262,8 +268,8 @@ def together(robot: Listing, camera: Listing, near_s: float = 0.05) -> tuple[np.
         return np.arange(len(robot)), np.arange(len(camera)), "in order"
     if robot.times is None or camera.times is None:
         raise DatasetError(
-            f"'{robot.name}' holds {len(robot)} poses and '{camera.name}' holds {len(camera)}; without times or numbers they pair in order, "
-            "one for one: remove what has no partner."
+            f"'{robot.name}' holds {len(robot)} poses and '{camera.name}' holds {len(camera)}; without times or numbers"
+            " they pair in order, one for one: remove what has no partner."
         )
     order = np.argsort(robot.times, kind="stable")
     after = np.clip(np.searchsorted(robot.times[order], camera.times), 0, len(order) - 1)
@@ -308,7 +314,8 @@ def _workbook(path: Path) -> list[Listing]:
         from openpyxl import load_workbook
     except ImportError as problem:
         raise DatasetError(
-            f"'{path.name}' is an Excel file: save each sheet as CSV, or install the extra 'excel' (pip install openpyxl)."
+            f"'{path.name}' is an Excel file: save each sheet as CSV, or install the extra 'excel' (pip install"
+            " openpyxl)."
         ) from problem
     try:
         book = load_workbook(path, read_only=True, data_only=True)

@@ -53,10 +53,12 @@ def _either_way(one: str, other: str) -> re.Pattern[str]:
 
 _FRAME_ROBOT, _FRAME_CAMERA = _either_way(_ROBOT_FRAMES, _BASE_FRAMES), _either_way(_CAMERA_FRAMES, _TARGET_FRAMES)
 _CAMERA = re.compile(
-    r"(?i)(target|board|marker|object|chess|pattern|tag|camera|vision|(^|[^a-z])cam([^a-z]|$)|cam\d|eye|optical|sensor|tracking|cpo|x_cm|aruco|charuco)"
+    r"(?i)(target|board|marker|object|chess|pattern|tag|camera|vision|(^|[^a-z])cam([^a-z]|$)|cam\d|eye"
+    r"|optical|sensor|tracking|cpo|x_cm|aruco|charuco)"
 )
 _ROBOT = re.compile(
-    r"(?i)(robot|hand|grip|(^|[^a-z])ee([^a-z]|$)|ee2|2ee|effector|flange|tcp|tool|(^|[^a-z])arm([^a-z]|$)|fpe|x_bf|base_t|t_base|o_t_ee)"
+    r"(?i)(robot|hand|grip|(^|[^a-z])ee([^a-z]|$)|ee2|2ee|effector|flange|tcp|tool|(^|[^a-z])arm([^a-z]|$)"
+    r"|fpe|x_bf|base_t|t_base|o_t_ee)"
 )
 _POSES = re.compile(r"(?i)(^|[^a-z])pos(es?)?([^a-z]|$)")
 

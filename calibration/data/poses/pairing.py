@@ -34,12 +34,12 @@ def find_clouds(folder: Path, poses: Path | tuple[Path, ...]) -> list[Path]:
         if closed:
             ending = Path(closed[0]).suffix.lower()
             raise DatasetError(
-                f"The clouds of '{folder.name}' are {ending} files ({closed[0]}), a closed format that only software of {_CLOSED[ending]} "
-                f"reads: export each as .ply or .pcd, or its points as .npy, beside the poses."
+                f"The clouds of '{folder.name}' are {ending} files ({closed[0]}), a closed format that only software of"
+                f" {_CLOSED[ending]} reads: export each as .ply or .pcd, or its points as .npy, beside the poses."
             )
     raise DatasetError(
-        f"'{folder.name}' has poses but no clouds; put one for each pose into clouds/: .ply, .pcd, .npy, .npz, .xyz, .pts or .csv, or "
-        "depth images (.png of 16 bits, .tif, .npy)."
+        f"'{folder.name}' has poses but no clouds; put one for each pose into clouds/: .ply, .pcd, .npy, .npz, .xyz,"
+        " .pts or .csv, or depth images (.png of 16 bits, .tif, .npy)."
     )
 
 
@@ -86,8 +86,9 @@ def pair(ids: Sequence[str], n: int, clouds: Sequence[Path], source: str) -> tup
         raise _apart(ids, clouds, source)
     if len(clouds) != n:
         raise DatasetError(
-            f"'{source}' holds {n} poses, and there are {len(clouds)} clouds ({clouds[0].name} to {clouds[-1].name}); without names each "
-            "pose needs its cloud, in the same order: remove what has no partner, or add a column id with the clouds' names."
+            f"'{source}' holds {n} poses, and there are {len(clouds)} clouds ({clouds[0].name} to {clouds[-1].name});"
+            " without names each pose needs its cloud, in the same order: remove what has no partner, or add a column"
+            " id with the clouds' names."
         )
     return [cloud_id(p) for p in clouds], list(clouds), f"paired in order, {clouds[0].name} with the first pose"
 
@@ -96,12 +97,14 @@ def _no_orphans(orphans: list[str], source: str) -> None:
     if orphans:
         names = ", ".join(orphans[:5])
         raise DatasetError(
-            f"'{source}' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or remove the cloud."
+            f"'{source}' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or remove the"
+            " cloud."
         )
 
 
 def _apart(ids: Sequence[str], clouds: Sequence[Path], source: str) -> DatasetError:
     return DatasetError(
-        f"The names do not go together: '{source}' has {len(ids)} poses, {ids[0]} to {ids[-1]}, and there are {len(clouds)} clouds, "
-        f"{clouds[0].name} to {clouds[-1].name}; give each cloud the name, or the number, of its pose."
+        f"The names do not go together: '{source}' has {len(ids)} poses, {ids[0]} to {ids[-1]}, and there are"
+        f" {len(clouds)} clouds, {clouds[0].name} to {clouds[-1].name}; give each cloud the name, or the number, of its"
+        " pose."
     )

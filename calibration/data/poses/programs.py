@@ -17,8 +17,9 @@ _CALLS = (
     (")(", rf"=\s*\(\s*({_SIX})(?:\s*,\s*{NUMBER})*\s*\)\s*\(", "euler_xyz", "Mitsubishi positions"),
     ("POS(", rf"\bPOS\s*\(\s*({_SIX})", "euler_ZYZ", "Comau positions"),
     ("P(", rf"(?<!\w)P\s*\(\s*({_SIX})", "euler_xyz", "Denso positions"),
-)  # fmt: skip
-"""A word of each, the pattern of a pose, the usual notation of its angles, and its name; lengths in mm, angles in degrees."""
+)
+"""A word of each, the pattern of a pose, the usual notation of its angles, and its name; lengths in mm, angles in
+degrees."""
 _JOB = re.compile(rf"^[A-Z]{{1,2}}\d{{3,5}}=({_SIX})", re.MULTILINE)
 _DTX = re.compile(r"<Value\b([^<>]{0,2000})>")
 _DTX_FIELD = re.compile(rf'\b(x|y|z|rx|ry|rz)="({NUMBER})"')
@@ -28,13 +29,15 @@ _HALCON = re.compile(
 )
 _HALCON_TYPES = {"0": "euler_XYZ", "2": "euler_xyz", "4": "rotation_vector"}
 _JOINTS = re.compile(
-    rf"\bjointtarget\b|\bE6AXIS\b|\bAXIS\s*:\s*A1\b|\bA1\s+{NUMBER}\s*,\s*A2\s|\bJ1\s*=\s*{NUMBER}\s*deg|^\s*movej\s*\(\s*\[",
+    rf"\bjointtarget\b|\bE6AXIS\b|\bAXIS\s*:\s*A1\b|\bA1\s+{NUMBER}\s*,\s*A2\s|\bJ1\s*=\s*{NUMBER}\s*deg"
+    rf"|^\s*movej\s*\(\s*\[",
     re.MULTILINE,
 )
 _UR = re.compile(rf"p\s*\[\s*({NUMBER}(?:\s*,\s*{NUMBER}){{5}})\s*\]")
 _UR_SETTINGS = re.compile(r"set_tcp\s*\(|set_payload\s*\(|set_gravity\s*\(|_tcp\s*=")
 _RAPID = re.compile(
-    rf"(?:\b(\w{{1,80}})\s{{0,9}}:=\s{{0,9}})?\[\s*\[({NUMBER}(?:\s*,\s*{NUMBER}){{2}})\]\s*,\s*\[({NUMBER}(?:\s*,\s*{NUMBER}){{3}})\]"
+    rf"(?:\b(\w{{1,80}})\s{{0,9}}:=\s{{0,9}})?\[\s*\[({NUMBER}(?:\s*,\s*{NUMBER}){{2}})\]"
+    rf"\s*,\s*\[({NUMBER}(?:\s*,\s*{NUMBER}){{3}})\]"
 )
 _KUKA = re.compile(r"(?:\b(\w{1,80})\s{0,9}=\s{0,9})?\{([^{}]{10,2000})\}")
 _KUKA_FIELD = re.compile(rf"\b([XYZABC])\s+({NUMBER})", re.IGNORECASE)
@@ -96,9 +99,15 @@ def _fanuc(text: str, name: str) -> Listing | None:
     ids = [f"P{number}" for number in _FANUC_POINT.findall(text)]
     table = np.array(rows)
     return listing_of(
-        name, table[:, :3], table[:, 3:], rotation="euler_xyz", angles="deg", ids=_unique(ids) if len(ids) == len(rows) else (),
-        unit="mm", form="Fanuc positions",
-    )  # fmt: skip
+        name,
+        table[:, :3],
+        table[:, 3:],
+        rotation="euler_xyz",
+        angles="deg",
+        ids=_unique(ids) if len(ids) == len(rows) else (),
+        unit="mm",
+        form="Fanuc positions",
+    )
 
 
 def _transforms(text: str, name: str) -> Listing | None:
@@ -107,9 +116,14 @@ def _transforms(text: str, name: str) -> Listing | None:
         return None
     at = np.array([float(t) for t in times]) if len(times) == len(p) else None
     return listing_of(
-        name, np.array([_floats(v) for v in p]), np.array([_floats(v) for v in q]), rotation="quaternion_xyzw", times=at, unit="m",
+        name,
+        np.array([_floats(v) for v in p]),
+        np.array([_floats(v) for v in q]),
+        rotation="quaternion_xyzw",
+        times=at,
+        unit="m",
         form="transforms of tf2_echo",
-    )  # fmt: skip
+    )
 
 
 def _ur(text: str, name: str) -> Listing | None:
@@ -158,8 +172,8 @@ def _yaskawa(text: str, name: str) -> Listing | None:
             rows += [_floats(m) for m in _JOB.findall(block)]
     if not rows:
         raise DatasetError(
-            f"'{name}' holds pulses of the joints, not poses. Convert the job to a relative job in base coordinates on the pendant, or write "
-            "the poses that the pendant shows in base coordinates as a table x,y,z,rx,ry,rz."
+            f"'{name}' holds pulses of the joints, not poses. Convert the job to a relative job in base coordinates on"
+            " the pendant, or write the poses that the pendant shows in base coordinates as a table x,y,z,rx,ry,rz."
         )
     table = np.array(rows)
     return listing_of(
@@ -197,7 +211,8 @@ def _halcon(text: str, name: str) -> Listing | None:
     code = found[0][0]
     if code not in _HALCON_TYPES:
         raise DatasetError(
-            f"'{name}' is a HALCON pose of type {code[:9]}; write it as type 0 with convert_pose_type (Rp+T, gba, point)."
+            f"'{name}' is a HALCON pose of type {code[:9]}; write it as type 0 with convert_pose_type (Rp+T, gba,"
+            " point)."
         )
     p, r = (np.array([_floats(m[k]) for m in found]) for k in (2, 1))
     usual = _HALCON_TYPES[code]
@@ -214,9 +229,15 @@ def _kawasaki(text: str, name: str) -> Listing | None:
         return None
     table = np.array([_floats(m[1]) for m in found])
     return listing_of(
-        name, table[:, :3], table[:, 3:], rotation="euler_ZYZ", angles="deg", ids=_unique([m[0] for m in found]), unit="mm",
+        name,
+        table[:, :3],
+        table[:, 3:],
+        rotation="euler_ZYZ",
+        angles="deg",
+        ids=_unique([m[0] for m in found]),
+        unit="mm",
         form="Kawasaki transformations",
-    )  # fmt: skip
+    )
 
 
 def list_of_program(text: str, name: str) -> Listing | None:
@@ -226,14 +247,24 @@ def list_of_program(text: str, name: str) -> Listing | None:
         DatasetError: it holds joint angles and no poses.
     """
     for program in (
-        _rapid, _kuka, _fanuc, _yaskawa, _staubli, _kawasaki, _ur_waypoints, _halcon, _transforms, _ur, _calls
-    ):  # fmt: skip
+        _rapid,
+        _kuka,
+        _fanuc,
+        _yaskawa,
+        _staubli,
+        _kawasaki,
+        _ur_waypoints,
+        _halcon,
+        _transforms,
+        _ur,
+        _calls,
+    ):
         found = program(text, name)
         if found is not None:
             return found
     if _JOINTS.search(text):
         raise DatasetError(
-            f"'{name}' holds joint angles and no poses: store the points as Cartesian positions in the robot's base, or write the poses that "
-            "the controller shows as a table x,y,z,rx,ry,rz."
+            f"'{name}' holds joint angles and no poses: store the points as Cartesian positions in the robot's base, or"
+            " write the poses that the controller shows as a table x,y,z,rx,ry,rz."
         )
     return None

@@ -1,4 +1,5 @@
-"""Enumerate the plausible readings of a list of poses: notation of the rotation, unit and order of its numbers, transposition."""
+"""Enumerate the plausible readings of a list of poses: notation of the rotation, unit and order of its numbers,
+transposition."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -15,12 +16,17 @@ from weldcal.calibration.geometry.se3 import inverse, nearest_rotation, pose
 from weldcal.models.arrays import Array
 
 _ALIASES = {
-    "roll_pitch_yaw": "euler_xyz", "rpy": "euler_xyz", "fanuc_wpr": "euler_xyz", "kuka_abc": "euler_ZYX",
-    "ur": "rotation_vector", "axis_angle": "rotation_vector", "quaternion_ros": "quaternion_xyzw",
-}  # fmt: skip
+    "roll_pitch_yaw": "euler_xyz",
+    "rpy": "euler_xyz",
+    "fanuc_wpr": "euler_xyz",
+    "kuka_abc": "euler_ZYX",
+    "ur": "rotation_vector",
+    "axis_angle": "rotation_vector",
+    "quaternion_ros": "quaternion_xyzw",
+}
 _NOTATIONS = (
-    "rotation_vector, quaternion_wxyz, quaternion_xyzw, euler_xyz (fixed axes, lower case), euler_ZYX (moving axes, upper case), "
-    "kuka_abc or fanuc_wpr"
+    "rotation_vector, quaternion_wxyz, quaternion_xyzw, euler_xyz (fixed axes, lower case), euler_ZYX (moving axes,"
+    " upper case), kuka_abc or fanuc_wpr"
 )
 CHANGES = ("transposed", "left_handed", "inverse")
 """What a form may add to a notation: rotations transposed, a left-handed frame (y mirrored), poses inverted."""
@@ -28,7 +34,8 @@ _TURN_RAD = 7.0  # a whole turn and a little: larger numbers are degrees
 _LEAST_DEG = 0.02  # rad: angles that are all below it move too little to be radians or degrees for sure
 _LEAST_ANGLE = 0.1  # largest angle of a motion that is worth a calibration, rad: as degrees it would be none
 _QUATERNION = 0.05  # deviation of a quaternion's length from 1 that few printed digits explain
-_ORTHOGONAL = 0.05  # deviation of a rotation's columns from orthonormal that two printed decimals explain (0.01 sqrt 3, and a margin)
+# Deviation of a rotation's columns from orthonormal that two printed decimals explain (0.01 sqrt 3, and a margin)
+_ORTHOGONAL = 0.05
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 _CARDAN = tuple("".join(axes) for axes in permutations("xyz"))
 _EULER = ("xyx", "xzx", "yxy", "yzy", "zxz", "zyz")
@@ -106,7 +113,8 @@ def apply_change(X: Array, change: str) -> Array:
 
 
 def readings(numbers: PoseNumbers) -> list[PoseReading]:
-    """The readings of a list that its numbers and statements allow, the usual one first, without changes beyond the stated ones.
+    """The readings of a list that its numbers and statements allow, the usual one first, without changes beyond the
+    stated ones.
 
     Raises:
         DatasetError: no reading is possible, or a stated one contradicts the numbers.
@@ -187,7 +195,8 @@ def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
     largest = float(np.abs(numbers.r).max(initial=0.0))
     if numbers.angles == "rad" and largest > _TURN_RAD:
         raise DatasetError(
-            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a whole turn in radians: they look like degrees; state deg."
+            f"The angles of '{numbers.source}' reach {largest:.0f}, more than a whole turn in radians: they look like"
+            " degrees; state deg."
         )
     if numbers.angles == "deg" and len(numbers.r) > 2 and _LEAST_ANGLE < largest <= np.pi + 1e-3:
         raise DatasetError(
@@ -215,7 +224,8 @@ def _vectors(numbers: PoseNumbers) -> Iterator[tuple[str, str, Array]]:
 def _angle_readings() -> tuple[tuple[str, str, str, list[int]], ...]:
     """Form, words, axes for SciPy and columns of every convention of three angles; the usual ones first.
 
-    Fixed axes in the columns' order, moving axes in the columns' order, and named axes (the columns are x, y, z) turned in any other order.
+    Fixed axes in the columns' order, moving axes in the columns' order, and named axes (the columns are x, y, z) turned
+    in any other order.
     """
     found = []
     for axes in (*_CARDAN, *_EULER):

@@ -84,9 +84,10 @@ def files_of_poses(folder: Path) -> tuple[Path, ...]:
 
 def _files(folder: Path) -> list[Path]:
     found = [
-        p for p in folder.iterdir()
+        p
+        for p in folder.iterdir()
         if p.suffix.lower() in READ and p.name != "dataset.yaml" and not p.name.startswith((".", "_"))
-    ]  # fmt: skip
+    ]
     return sorted(found, key=lambda p: natural(p.name))
 
 
@@ -97,7 +98,8 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
         many = next((p for p, found in zip(source, lists, strict=True) if len(found) != 1 or len(found[0]) != 1), None)
         if many is not None:
             raise DatasetError(
-                f"'{many.name}' holds more than one pose, and there are {len(source)} such files; give one or the other."
+                f"'{many.name}' holds more than one pose, and there are {len(source)} such files; give one or the"
+                " other."
             )
         name = f"{source[0].name} ... {source[-1].name}"
         found = stacked([one[0] for one in lists], name, tuple(p.stem for p in source))
@@ -121,7 +123,8 @@ def read_poses(source: Path | tuple[Path, ...], form: PoseForm) -> PoseList:
 
 
 def robot_list(lists: list[Listing], name: str, form: PoseForm) -> Listing:
-    """The list of the flange's poses among those of a file: the only one, the one of the flange's frame, or the one that names the robot."""
+    """The list of the flange's poses among those of a file: the only one, the one of the flange's frame, or the one
+    that names the robot."""
     if len(lists) == 1:
         return lists[0]
     frames = {tuple(one.name.rpartition(", ")[2].split(" to ")): one for one in lists if " to " in one.name}
@@ -138,8 +141,8 @@ def robot_list(lists: list[Listing], name: str, form: PoseForm) -> Listing:
                     return frames[base, flange]
         pairs = ", ".join(f"{a} to {b}" for a, b in list(frames)[:6])
         raise DatasetError(
-            f"'{name}' holds the transforms {pairs}, none from the base to the flange; set poses.base_frame and poses.flange_frame in "
-            "dataset.yaml, or record the pose topic of the driver."
+            f"'{name}' holds the transforms {pairs}, none from the base to the flange; set poses.base_frame and"
+            " poses.flange_frame in dataset.yaml, or record the pose topic of the driver."
         )
     mine = [one for one in lists if whose(one.name) == "robot"]
     if len(mine) == 1:
@@ -155,11 +158,13 @@ def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str
     base_in_flange, and a TCP (``form.tcp``, m and rad) is taken off.
 
     Raises:
-        DatasetError: the unit contradicts what the file states; an unknown frame; a TCP that is not six numbers in metres and radians.
+        DatasetError: the unit contradicts what the file states; an unknown frame; a TCP that is not six numbers in
+            metres and radians.
     """
     if found.unit and unit not in ("auto", found.unit):
         raise DatasetError(
-            f"'{found.source}' is in {found.unit} ({found.read_as}), and dataset.yaml says poses: {unit}; correct units in dataset.yaml."
+            f"'{found.source}' is in {found.unit} ({found.read_as}), and dataset.yaml says poses: {unit}; correct units"
+            " in dataset.yaml."
         )
     if form.frame not in _FRAMES:
         raise DatasetError(f"dataset.yaml names the frame '{form.frame[:40]}'; write {' or '.join(_FRAMES)}.")
@@ -176,7 +181,8 @@ def metric_poses(found: PoseList, unit: str, form: PoseForm) -> tuple[Array, str
             or np.abs(tcp[3:]).max() > 7.0
         ):
             raise DatasetError(
-                "poses.tcp in dataset.yaml must be x, y, z, rx, ry, rz in metres and radians, as the controller shows them."
+                "poses.tcp in dataset.yaml must be x, y, z, rx, ry, rz in metres and radians, as the controller shows"
+                " them."
             )
         X = X @ inverse(pose(exp_rotation(tcp[3:]), tcp[:3]))
     return X, unit

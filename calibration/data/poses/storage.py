@@ -1,7 +1,7 @@
 """Read YAML, JSON, XML and MATLAB files as a tree, with the matrices of OpenCV FileStorage as arrays.
 
-MATLAB files of version 5 to 7 are read bounded in time and memory whatever their bytes are: SciPy's reader ends the process on some
-damaged ones. Source: MATLAB, "MAT-File Format".
+MATLAB files of version 5 to 7 are read bounded in time and memory whatever their bytes are: SciPy's reader ends the
+process on some damaged ones. Source: MATLAB, "MAT-File Format".
 """
 
 import math
@@ -41,7 +41,10 @@ def read_tree(path: Path) -> Any:
 
 
 def tree_of_text(text: str, name: str, kind: str = "YAML") -> Any:
-    """The contents of a text of YAML or JSON; several YAML documents, or a JSON object a line, are a list. Raises InputError."""
+    """The contents of a text of YAML or JSON; several YAML documents, or a JSON object a line, are a list.
+
+    Raises InputError.
+    """
     text = text.lstrip("\ufeff")
     if kind == "JSON":
         lines = [line for line in text.splitlines() if line.strip()]
@@ -110,7 +113,8 @@ def _element(path: Path, element: ElementTree.Element, level: int) -> Any:
 
 
 def matlab_arrays(content: bytes, name: str) -> dict[str, Any]:
-    """The variables of a file: arrays without axes of length 1, cells as lists, structs as mappings; texts and objects are left out.
+    """The variables of a file: arrays without axes of length 1, cells as lists, structs as mappings; texts and objects
+    are left out.
 
     Raises:
         DatasetError: another version, or a damaged file; the sentence says what to change.

@@ -1,4 +1,5 @@
-"""Find lists of poses in text: tables with or without a header, blocks of numbers, robot programs and what ROS prints."""
+"""Find lists of poses in text: tables with or without a header, blocks of numbers, robot programs and what ROS
+prints."""
 
 import re
 from collections import defaultdict
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.columns import Column, columns_of
+from weldcal.calibration.data.poses.columns import PoseColumn, columns_of
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
 from weldcal.calibration.data.poses.names import whose
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
@@ -58,15 +59,16 @@ def lists_of_text(text: str, name: str) -> list[Listing]:
     require_short_numbers(text, name)
     if re.search(r"IMAGE_ID,\s*QW|two lines of data per image", text):
         raise DatasetError(
-            f"'{name}' is COLMAP's images.txt: its poses lead from the world to the camera and have no unit of length. Write the inverse "
-            "poses in metres, scaled by a known length, as a table x,y,z,qw,qx,qy,qz."
+            f"'{name}' is COLMAP's images.txt: its poses lead from the world to the camera and have no unit of length."
+            " Write the inverse poses in metres, scaled by a known length, as a table x,y,z,qw,qx,qy,qz."
         )
     found = list_of_program(text, name)
     return [found] if found is not None else _keyed(text, name) or _numbers(text, name)
 
 
 def _keyed(text: str, name: str) -> list[Listing]:
-    """The lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each; empty where it has none."""
+    """The lists of lines such as ``x: 0.1, y: 0.2 ...`` or ``X=1 Y=2 ...`` with the same names in each; empty where it
+    has none."""
     rows = [found for line in text.splitlines() if len(found := _KEYED.findall(line)) >= 6]
     names = [key for key, _ in rows[0]] if len(rows) > 1 else []
     if not names or any([key for key, _ in row] != names for row in rows) or len(columns_of(names)[0]) < 6:
@@ -105,8 +107,8 @@ def _numbers(text: str, name: str) -> list[Listing]:
         rows = [_Line(lines[0].number, [line.cells[0] for line in lines])]  # a number a line
     if not rows:
         raise DatasetError(
-            f"'{name}' holds no poses: no row of it has numbers. A table of poses has columns x,y,z with qw,qx,qy,qz or rx,ry,rz, or 6, 7 or "
-            "16 numbers a row."
+            f"'{name}' holds no poses: no row of it has numbers. A table of poses has columns x,y,z with qw,qx,qy,qz or"
+            " rx,ry,rz, or 6, 7 or 16 numbers a row."
         )
     commented = next(
         (c for c in reversed(comments) if c.number < rows[0].number and len(columns_of(c.cells)[0]) >= 6), None
@@ -176,7 +178,8 @@ def _filled(line: _Line) -> int:
 
 
 def _captioned(lines: Sequence[_Line]) -> dict[str, list[_Line]] | None:
-    """The rows of numbers below captions of two kinds, such as ``robot:`` and ``camera:``; None where the captions are not of two lists."""
+    """The rows of numbers below captions of two kinds, such as ``robot:`` and ``camera:``; None where the captions are
+    not of two lists."""
     groups: dict[str, list[_Line]] = defaultdict(list)
     label = ""
     for line in lines:
@@ -204,8 +207,8 @@ def _bare(rows: list[list[float]], name: str, ids: tuple[str, ...]) -> Listing:
     uneven = next((k for k, row in enumerate(rows) if len(row) != n), None)
     if uneven is not None:
         raise DatasetError(
-            f"'{name}' has {n} numbers in its first row and {len(rows[uneven])} in row {uneven + 1}. Remove the rows that hold no pose, such as a "
-            "result below the poses."
+            f"'{name}' has {n} numbers in its first row and {len(rows[uneven])} in row {uneven + 1}. Remove the rows"
+            " that hold no pose, such as a result below the poses."
         )
     table = np.array(rows)
     if n == 4 and len(table) % 4 and len(table) % 3 == 0:
@@ -302,8 +305,8 @@ def _table(header: list[str], rows: Sequence[_Line], name: str) -> list[Listing]
     long = next((r for r in kept if any(c for c in r.cells[len(header) :])), None)
     if long is not None:
         raise DatasetError(
-            f"'{name}', line {long.number}: {len(long.cells)} cells, and the header names {len(header)} columns; decimal commas need "
-            "semicolons or tabs between the columns."
+            f"'{name}', line {long.number}: {len(long.cells)} cells, and the header names {len(header)} columns;"
+            " decimal commas need semicolons or tabs between the columns."
         )
     table = np.full((len(kept), len(header)), np.nan)
     for k, row in enumerate(kept):
@@ -352,7 +355,7 @@ def table_lists(header: list[str], table: Array, name: str, ids: tuple[str, ...]
     return found
 
 
-def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...], times: Array | None) -> Listing:
+def _columns(name: str, columns: list[PoseColumn], table: Array, ids: tuple[str, ...], times: Array | None) -> Listing:
     at = {c.role: c.index for c in columns}
     units = {c.role: c.unit for c in columns if c.unit}
     length = units.get("x", "")
@@ -376,6 +379,6 @@ def _columns(name: str, columns: list[Column], table: Array, ids: tuple[str, ...
             angles = {} if roles[0].startswith("q") else {"angles": angle or stated.get("angles", "")}
             return listing_of(name, p, take(*roles), **{**stated, **angles, **more})
     raise DatasetError(
-        f"'{name}' has positions and no rotation that it names: add qw,qx,qy,qz, or rx,ry,rz, or roll,pitch,yaw. It names "
-        f"{', '.join(sorted(at))}."
+        f"'{name}' has positions and no rotation that it names: add qw,qx,qy,qz, or rx,ry,rz, or roll,pitch,yaw. It"
+        f" names {', '.join(sorted(at))}."
     )

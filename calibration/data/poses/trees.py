@@ -16,11 +16,20 @@ from weldcal.models.arrays import Array
 from weldcal.models.documents import as_number
 
 _PARTNERS = {
-    "rotations": "translations", "rotation": "translation", "rots": "trans", "rot": "trans", "rvecs": "tvecs", "rvec": "tvec",
-    "orientations": "positions", "orientation": "position", "r": "t", "q": "t",
-}  # fmt: skip
+    "rotations": "translations",
+    "rotation": "translation",
+    "rots": "trans",
+    "rot": "trans",
+    "rvecs": "tvecs",
+    "rvec": "tvec",
+    "orientations": "positions",
+    "orientation": "position",
+    "r": "t",
+    "q": "t",
+}
 _NO_POSES = re.compile(
-    r"(?i)^(q|joint.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(camera|intrinsic|projection|rectif)\w*matrix|.*(coeffs?|distortion)|covariance.*)$"
+    r"(?i)^(q|joint.*|img|obj|corners?|imgpoints|objpoints|k|d|dist|.*(camera|intrinsic|projection"
+    r"|rectif)\w*matrix|.*(coeffs?|distortion)|covariance.*)$"
 )
 _VECTOR = re.compile(r"(?i)(rvec|rotvec|rotation_?vector|axis_?angle|rodrigues)")
 _QUATERNION = re.compile(r"(?i)(^q$|quat|rotation|^ori|wxyz|xyzw)")
@@ -88,7 +97,8 @@ def _of_samples(node: list[Mapping[Any, Any]], name: str, at: str, label: str) -
     for key in node[0]:
         values = [item.get(key) for item in node]
         if all(isinstance(v, Mapping) for v in values) and not _has_columns(values[0]):
-            yield from _of_samples(values, name, f"{at}/{key}", f"{name}, {at.strip('/')}/{key}".replace(", /", ", "))  # type: ignore[arg-type]
+            full = f"{name}, {at.strip('/')}/{key}".replace(", /", ", ")
+            yield from _of_samples(values, name, f"{at}/{key}", full)  # type: ignore[arg-type]
         elif not _NO_POSES.match(str(key)):
             poses = _stack(values, f"{name}, {key}", label)
             if poses is not None:
@@ -97,7 +107,9 @@ def _of_samples(node: list[Mapping[Any, Any]], name: str, at: str, label: str) -
 
 
 def _stack(values: list[Any], name: str, label: str) -> Array | None:
-    """The poses of samples, (n, 4, 4), (n, 3, 4), (n, 6) or (n, 7); NaN where a sample has none. None where most are no poses.
+    """The poses of samples, (n, 4, 4), (n, 3, 4), (n, 6) or (n, 7); NaN where a sample has none.
+
+    None where most are no poses.
 
     Raises:
         DatasetError: a sample has other numbers than most.
@@ -110,7 +122,8 @@ def _stack(values: list[Any], name: str, label: str) -> Array | None:
     for k, (value, array) in enumerate(zip(values, arrays, strict=True)):
         if value is not None and (array is None or array.size != size):
             raise DatasetError(
-                f"Sample {k + 1} of '{label}' is no pose of {size} numbers, as the others of '{name}' are; correct or remove it."
+                f"Sample {k + 1} of '{label}' is no pose of {size} numbers, as the others of '{name}' are; correct or"
+                " remove it."
             )
     shape = (-1, 4) if size in (12, 16) else (-1,)
     return np.stack([np.full(size, np.nan).reshape(shape) if a is None else a.reshape(shape) for a in arrays])
@@ -159,7 +172,8 @@ def _of_mapping(node: Mapping[Any, Any], name: str, at: str, label: str) -> Iter
 
 
 def _numbered(node: Mapping[Any, Any]) -> list[Mapping[Any, Any]]:
-    """The samples of a mapping with a numbered key each, such as 0, 1, 2 or frame_0, frame_1; empty where it has none."""
+    """The samples of a mapping with a numbered key each, such as 0, 1, 2 or frame_0, frame_1; empty where it has
+    none."""
     found = {str(k): v for k, v in node.items() if isinstance(v, Mapping) and re.search(r"\d", str(k))}
     if len(found) < 3 or len({_stem(k) for k in found}) > 1 or len(found) < len(node) - 3:
         return []
@@ -202,10 +216,20 @@ def stacked(lists: list[Listing], name: str, ids: tuple[str, ...] = ()) -> Listi
         p = np.concatenate([one.numbers[k].p for one in lists])
         r = np.concatenate([one.numbers[k].r for one in lists])
         p[list(bad)] = np.nan
-        found.append(listing_of(
-            name, p, r, rotation=first.rotation, angles=first.angles, usual=first.usual, vector=first.vector, ids=ids,
-            unit=lists[0].unit if len(units) == 1 else "", form=lists[0].form,
-        ))  # fmt: skip
+        found.append(
+            listing_of(
+                name,
+                p,
+                r,
+                rotation=first.rotation,
+                angles=first.angles,
+                usual=first.usual,
+                vector=first.vector,
+                ids=ids,
+                unit=lists[0].unit if len(units) == 1 else "",
+                form=lists[0].form,
+            )
+        )
     left_out = tuple((k, bad.get(k, why)) for k, why in found[0].left_out)
     return replace(found[0], numbers=tuple(n for one in found for n in one.numbers), left_out=left_out)
 

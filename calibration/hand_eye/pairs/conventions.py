@@ -22,7 +22,8 @@ _POSITION_FLOOR = 1e-6  # share of the positions: six printed digits
 _AGREE = 0.1  # of the motion: beyond it there is no agreement that deserves the name
 _SAME_SCALE = 0.02
 _NEAR_UNIT = 0.08  # of the logarithm of a factor: attenuation by noise of short motions
-_MOST = 160  # pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
+# Pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
+_MOST = 160
 _SURE_TURN = 2.8  # rad
 _ONE_AXIS = 0.1  # share of the turns off the main axis below which rotations do not determine X about it
 _STEPS = 6
@@ -30,7 +31,7 @@ _TRIAL_STEPS = 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Agreement:
+class ReadingAgreement:
     """How well two lists agree under one reading of each.
 
     Attributes:
@@ -78,7 +79,7 @@ class Agreement:
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
+class ReadingDecision:
     """The readings of two lists that the data select.
 
     Attributes:
@@ -88,10 +89,10 @@ class Decision:
         next: the best of the rejected readings; None where there is no other.
     """
 
-    best: Agreement
-    rivals: tuple[Agreement, ...]
-    same: tuple[Agreement, ...]
-    next: Agreement | None
+    best: ReadingAgreement
+    rivals: tuple[ReadingAgreement, ...]
+    same: tuple[ReadingAgreement, ...]
+    next: ReadingAgreement | None
 
     @property
     def determined(self) -> bool:
@@ -101,13 +102,14 @@ class Decision:
 
 def decide(
     robot: Sequence[PoseReading], camera: Sequence[PoseReading], *, eye_in_hand: bool, changes: bool = True
-) -> Decision:
+) -> ReadingDecision:
     """Compare all readings of two lists of n poses and keep those that the data do not reject.
 
-    With F = X_BF (eye in hand) or its inverse (eye on base) and G = X_CM, F X G = Y for one X and one Y. Pairs of poses give the angle of each
-    relative rotation, which is equal on both sides whatever X is: it selects the notations. A least-squares solution of those
-    that remain gives rotation and position residuals with 3 n - 6 degrees of freedom each. If reading r were right, its squared residuals
-    would exceed those of any other by more than the quantile of F(dof, dof) with probability CHANCE at most: readings beyond it are rejected.
+    With F = X_BF (eye in hand) or its inverse (eye on base) and G = X_CM, F X G = Y for one X and one Y. Pairs of poses
+    give the angle of each relative rotation, which is equal on both sides whatever X is: it selects the notations. A
+    least-squares solution of those that remain gives rotation and position residuals with 3 n - 6 degrees of freedom
+    each. If reading r were right, its squared residuals would exceed those of any other by more than the quantile of
+    F(dof, dof) with probability CHANCE at most: readings beyond it are rejected.
 
     Args:
         robot, camera: the candidates, usual ones first.
@@ -119,7 +121,7 @@ def decide(
     return _judge(agreements(tried, eye_in_hand=eye_in_hand, all_of_them=False), len(tried))
 
 
-def _judge(tried: list[Agreement], count: int) -> Decision:
+def _judge(tried: list[ReadingAgreement], count: int) -> ReadingDecision:
     best = min(tried, key=lambda t: t.cost)
     if best.changed:
         # a list that need not be changed is not changed
@@ -128,8 +130,8 @@ def _judge(tried: list[Agreement], count: int) -> Decision:
         if not _rejected(first, best, _limit(best.dof, count)):
             best, tried = first, plain
     limit = _limit(best.dof, count)
-    alive: list[Agreement] = []
-    dead: list[Agreement] = []
+    alive: list[ReadingAgreement] = []
+    dead: list[ReadingAgreement] = []
     for one in tried:
         if one is not best and (best.changed or not one.changed or one.cost < best.cost):
             (dead if _rejected(one, best, limit) else alive).append(one)
@@ -137,7 +139,7 @@ def _judge(tried: list[Agreement], count: int) -> Decision:
     dead.sort(key=lambda t: t.cost)
     same = [one for one in alive if _same(one, best)]
     rivals = [one for one in alive if not _same(one, best)]
-    return Decision(best, tuple(rivals), tuple(same), dead[0] if dead else None)
+    return ReadingDecision(best, tuple(rivals), tuple(same), dead[0] if dead else None)
 
 
 def _limit(dof: int, tried: int) -> float:
@@ -145,12 +147,13 @@ def _limit(dof: int, tried: int) -> float:
     return float(np.sqrt(f_quantile(1.0 - CHANCE / (2.0 * max(tried - 1, 1)), dof, dof)))
 
 
-def _rejected(one: Agreement, best: Agreement, limit: float) -> bool:
+def _rejected(one: ReadingAgreement, best: ReadingAgreement, limit: float) -> bool:
     return one.rotation / one.turn * best.turn > limit * best.rotation or one.position > limit * best.position
 
 
-def _same(one: Agreement, other: Agreement) -> bool:
-    """Whether two readings have the same rotations, or lead to the same X and Y, within the residuals of the better one."""
+def _same(one: ReadingAgreement, other: ReadingAgreement) -> bool:
+    """Whether two readings have the same rotations, or lead to the same X and Y, within the residuals of the better
+    one."""
     if abs(np.log(one.scale / other.scale)) > _SAME_SCALE:
         return False
     gaps = [
@@ -205,10 +208,11 @@ def _relative_angles(R: Array, i: NDArray[np.intp], j: NDArray[np.intp]) -> Arra
 
 def agreements(
     variants: list[tuple[PoseReading, PoseReading, int]], *, eye_in_hand: bool, all_of_them: bool = True
-) -> list[Agreement]:
+) -> list[ReadingAgreement]:
     """Solve F X G = Y for each pair of readings, all at once.
 
-    Without ``all_of_them``, readings that their rotations reject are left out, but the best of them and the best without a change.
+    Without ``all_of_them``, readings that their rotations reject are left out, but the best of them and the best
+    without a change.
     """
     tried, changes = [(a, b) for a, b, _ in variants], [c for _, _, c in variants]
     F = np.stack([one.X if eye_in_hand else inverse(one.X) for one, _ in tried])
@@ -238,7 +242,7 @@ def agreements(
     for k, (one, other) in enumerate(tried):
         X, Y = np.eye(4), np.eye(4)
         X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3] = RX[k], tX[k], RY[k], tY[k]
-        agreement = Agreement(
+        agreement = ReadingAgreement(
             robot=one,
             camera=other,
             scale=float(scale[k]),
@@ -280,8 +284,8 @@ def _weights(size: Array, kept: int) -> Array:
 
 
 def _rotation(F: Array, G: Array, kept: int) -> tuple[Array, Array, Array]:
-    """R_X and R_Y of F R_X G = R_Y and the residual angles (m, n) rad, for (m, n, 3, 3): the better of two linear starts, then alternating
-    robust means."""
+    """R_X and R_Y of F R_X G = R_Y and the residual angles (m, n) rad, for (m, n, 3, 3): the better of two linear
+    starts, then alternating robust means."""
     back = np.ascontiguousarray(np.swapaxes(F, 2, 3)), np.ascontiguousarray(np.swapaxes(G, 2, 3))
     one, other = (_alternate(R, F, G, back, kept, _TRIAL_STEPS) for R in _starts(F, G))
     better = _trimmed(other[2], kept) < _trimmed(one[2], kept)
@@ -326,9 +330,11 @@ def _starts(F: Array, G: Array) -> list[Array]:
 
 
 def _about_one_axis(F: Array, G: Array, RX: Array, RY: Array, kept: int) -> tuple[Array, Array]:
-    """R_X and R_Y turned about the robot's axis where it turns about one only: rotations leave that angle open, and positions fix it.
+    """R_X and R_Y turned about the robot's axis where it turns about one only: rotations leave that angle open, and
+    positions fix it.
 
-    F X G = Y is linear in t_X, t_Y and, with v = R_X t_G and the axis a, in the factors of v along a, of v across a, and of a x v.
+    F X G = Y is linear in t_X, t_Y and, with v = R_X t_G and the axis a, in the factors of v along a, of v across a,
+    and of a x v.
     """
     mean = nearest_rotation(F[..., :3, :3].sum(axis=1))
     turns = log_rotation((np.swapaxes(mean, 1, 2)[:, None] @ F[..., :3, :3]).reshape(-1, 3, 3)).reshape(*F.shape[:2], 3)
@@ -365,7 +371,8 @@ def _pairs(n: int, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _translation(F: Array, turned: Array, kept: int, scale: Array | None) -> tuple[Array, Array, Array, Array, Array]:
-    """t_X, t_Y (m, 3), the scale (m,) of the camera's positions, the residuals (m, n, 3) of F X G = Y, in F's unit, and the scale's sigma.
+    """t_X, t_Y (m, 3), the scale (m,) of the camera's positions, the residuals (m, n, 3) of F X G = Y, in F's unit, and
+    the scale's sigma.
 
     ``turned``: R_F R_X t_G (m, n, 3). ``scale``: fixed, or None to estimate it.
     """

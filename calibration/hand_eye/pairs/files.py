@@ -1,4 +1,5 @@
-"""Read pose pairs: npz, tables, documents and samples of other tools, with corners and joint angles where a file has them."""
+"""Read pose pairs: npz, tables, documents and samples of other tools, with corners and joint angles where a file has
+them."""
 
 import re
 from collections.abc import Mapping
@@ -32,11 +33,11 @@ LENGTHS = UNITS
 
 @dataclass(frozen=True, kw_only=True)
 class PosePairs:
-    """Pose pairs in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE
-    of a second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
+    """Pose pairs in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE of a
+    second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
     published answer where there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where
-    given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how each list was
-    understood; ``notes``: sentences about it; ``ids``: names of the rows, or empty."""
+    given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how
+    each list was understood; ``notes``: sentences about it; ``ids``: names of the rows, or empty."""
 
     source: str
     robot: Array
@@ -83,8 +84,8 @@ def read_pairs(
     Args:
         path: the file or folder.
         mounting: what the file does not state (and must not contradict).
-        length: the unit of all positions (m, mm, cm, inch) where the file does not state it; else the robot's follows from its reach and the
-            camera's from the ratio of the motions.
+        length: the unit of all positions (m, mm, cm, inch) where the file does not state it; else the robot's follows
+            from its reach and the camera's from the ratio of the motions.
         stated: forms and names of the two lists, where the user states them.
 
     Raises:
@@ -120,12 +121,7 @@ def _read(path: Path, mounting: str | None, length: str | None, stated: StatedFo
 
 
 def _pairs(
-    path: Path,
-    lists: list[Listing],
-    raw: dict[str, Any],
-    mounting: str | None,
-    length: str | None,
-    stated: StatedForms,
+    path: Path, lists: list[Listing], raw: dict[str, Any], mounting: str | None, length: str | None, stated: StatedForms
 ) -> PosePairs:
     more: dict[str, Listing] = {}
     for who, names in _MORE.items():
@@ -196,24 +192,28 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
         if not lists:
             raise DatasetError(_no_lists(path))
         return lists, {
-            "mode": raw.get("configuration"), "unit": units.get("poses") if isinstance(units, dict) else None, "poses": raw.get("poses")
-        }  # fmt: skip
+            "mode": raw.get("configuration"),
+            "unit": units.get("poses") if isinstance(units, dict) else None,
+            "poses": raw.get("poses"),
+        }
     file_size(path)
     ending = path.suffix.lower()
     if ending in (".bag", ".db3", ".mcap"):
         raise DatasetError(
-            f"'{path.name}' is a ROS recording: write the robot's and the camera's poses as robot.csv and camera.csv into a folder "
-            "(rostopic echo -p, or ros2 topic echo --csv) and give that folder."
+            f"'{path.name}' is a ROS recording: write the robot's and the camera's poses as robot.csv and camera.csv"
+            " into a folder (rostopic echo -p, or ros2 topic echo --csv) and give that folder."
         )
     if ending in (".pkl", ".pickle"):
         raise DatasetError(
-            f"'{path.name}' is a pickle, which may run code: save the two arrays with numpy.savez(file, robot=..., camera=...)."
+            f"'{path.name}' is a pickle, which may run code: save the two arrays with numpy.savez(file, robot=...,"
+            " camera=...)."
         )
     if ending == ".npz":
         arrays = read_npz(path)
         if "hand" in arrays and "eye" in arrays:
             raise DatasetError(
-                f"'{path.name}' holds two streams of poses, not pairs: bring them to one clock and write pairs, A and B (n, 4, 4)."
+                f"'{path.name}' holds two streams of poses, not pairs: bring them to one clock and write pairs, A and B"
+                " (n, 4, 4)."
             )
         raw = {k: arrays[k] for k in _EXTRAS if k in arrays}
         raw["mode"], raw["unit"] = (
@@ -237,8 +237,8 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
         lists = lists_of_tree(tree, path.name)
         if len(lists) == 1 and len(lists[0]) == 1:
             raise DatasetError(
-                f"'{path.name}' holds one pose: it looks like the result of a calibration, and samples are needed. Give the file of the "
-                "samples, or judge this result on them with 'weldcal verify'."
+                f"'{path.name}' holds one pose: it looks like the result of a calibration, and samples are needed. Give"
+                " the file of the samples, or judge this result on them with 'weldcal verify'."
             )
         return lists, raw
     lists = read_lists(path)
@@ -250,8 +250,8 @@ def _contents(path: Path) -> tuple[list[Listing], dict[str, Any]]:
 
 def _pictures(folder: Path, n: int) -> str:
     return (
-        f"'{folder.name}' holds {n} pictures and no camera poses: name the board in them, for example --board chessboard:9x6:25 (inner "
-        "corners and the side of a square in mm)."
+        f"'{folder.name}' holds {n} pictures and no camera poses: name the board in them, for example --board"
+        " chessboard:9x6:25 (inner corners and the side of a square in mm)."
     )
 
 
@@ -263,12 +263,13 @@ def _no_lists(folder: Path) -> str:
     closed = next((n for n in names if n.lower().endswith(".zdf")), None)
     if closed is not None:
         return (
-            f"'{folder.name}' holds Zivid captures ({closed}), a closed format: put the board's pose in each capture into camera01.yaml ... "
-            "(4 x 4, from Zivid's detectCalibrationBoard), or scan the bare flange and use weldcal calibrate."
+            f"'{folder.name}' holds Zivid captures ({closed}), a closed format: put the board's pose in each capture"
+            " into camera01.yaml ... (4 x 4, from Zivid's detectCalibrationBoard), or scan the bare flange and use"
+            " weldcal calibrate."
         )
     return (
-        f"'{folder.name}' holds no poses: give robot.csv and camera.csv, folders robot/ and camera/ with one file per pose, or one file with "
-        "both lists. Scans of a flange with poses go to 'weldcal calibrate'."
+        f"'{folder.name}' holds no poses: give robot.csv and camera.csv, folders robot/ and camera/ with one file per"
+        " pose, or one file with both lists. Scans of a flange with poses go to 'weldcal calibrate'."
     )
 
 

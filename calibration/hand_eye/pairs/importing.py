@@ -1,4 +1,5 @@
-"""Import pairs of robot and camera poses: find the two lists, pair their rows, and let the data choose how they are read."""
+"""Import pairs of robot and camera poses: find the two lists, pair their rows, and let the data choose how they are
+read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import named_inverse, together, two_lists
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.hand_eye.pairs.conventions import UNITS, Agreement, Decision, decide
+from weldcal.calibration.hand_eye.pairs.conventions import UNITS, ReadingAgreement, ReadingDecision, decide
 from weldcal.models.arrays import Array
 
 _MOST_COMPARED = 60  # poses that decide the reading: more do not make it surer
@@ -25,7 +26,8 @@ SCALE_SIGMA = 4.0
 """A ratio of lengths is known where this many of its standard deviations are below LEAST_SCALE."""
 _OTHER_UNIT = 0.1  # of the logarithm: how near a factor must be to that of another unit than the robot's
 LEAST_SCALE = 0.2
-"""Of the logarithm of a factor on lengths: a factor that is nearer to a unit is a matter of the result, which names it."""
+"""Of the logarithm of a factor on lengths: a factor that is nearer to a unit is a matter of the result, which names
+it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +86,8 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
 
     Raises:
         DatasetError: a list is missing, the rows do not pair, a unit cannot be told.
-        InconsistentPoses: several readings agree with the data and differ in the result, or one factor scales the camera's positions.
+        InconsistentPoses: several readings agree with the data and differ in the result, or one factor scales the
+            camera's positions.
     """
     robot, camera = two_lists(lists, source, stated.robot_poses, stated.camera_poses)
     robot = robot.stated(_with_name(robot, stated.robot), "--robot-form")
@@ -105,8 +108,8 @@ def import_pairs(lists: list[Listing], source: str, mounting: str, stated: State
         A, B = a[0], b[0]
         if len(a) > 1 or len(b) > 1:
             notes.append(
-                f"{n} pairs do not show how the poses are written; they were read as {A.words} and {B.words}. State it with --robot-form and "
-                "--camera-form."
+                f"{n} pairs do not show how the poses are written; they were read as {A.words} and {B.words}. State it"
+                " with --robot-form and --camera-form."
             )
         units = _units(A, B, robot, camera, None, stated, source)
     else:
@@ -189,12 +192,14 @@ def _check_motion(reading: PoseReading, listing: Listing, who: str) -> None:
     X = reading.X
     if len(X) > 1 and float(np.abs(X - X[0]).max()) <= _DISTINCT * max(float(np.abs(X[:, :3, 3]).max()), 1.0):
         raise InconsistentPoses(
-            f"The {who} has the same pose in all {len(X)} rows of '{listing.name}': it does not change while the other list does. Check that "
-            "each sample stores the present pose."
+            f"The {who} has the same pose in all {len(X)} rows of '{listing.name}': it does not change while the other"
+            " list does. Check that each sample stores the present pose."
         )
 
 
-def decided(a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int) -> tuple[Decision | None, int]:
+def decided(
+    a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: int
+) -> tuple[ReadingDecision | None, int]:
     """The decision, and by how many rows the camera's list is shifted; None where the data decide nothing."""
     if n < _FEWEST:
         return None, 0
@@ -213,7 +218,7 @@ def decided(a: list[PoseReading], b: list[PoseReading], eye_in_hand: bool, n: in
     return (best, by) if best.best.agrees or len(a) > 1 or len(b) > 1 else (None, 0)
 
 
-def _require_one(decision: Decision, source: str, mounting: str, camera_known: bool) -> None:
+def _require_one(decision: ReadingDecision, source: str, mounting: str, camera_known: bool) -> None:
     """Refuses readings that agree equally and differ in the result. Raises InconsistentPoses."""
     best = decision.best
     other = "eye_on_base" if mounting == "eye_in_hand" else "eye_in_hand"
@@ -221,30 +226,31 @@ def _require_one(decision: Decision, source: str, mounting: str, camera_known: b
         if decision.rivals or best.changed:
             runner = decision.rivals[0] if decision.rivals else best
             raise InconsistentPoses(
-                f"The poses of '{source}' contradict each other in every known reading. Best: {_pair_words(best)}, "
-                f"{_residual(best)}; then {_pair_words(runner)}, {_residual(runner)}. Check that row k of both lists is of the same moment, "
-                f"or state the forms with --robot-form and --camera-form."
+                f"The poses of '{source}' contradict each other in every known reading. Best: {_pair_words(best)},"
+                f" {_residual(best)}; then {_pair_words(runner)}, {_residual(runner)}. Check that row k of both lists"
+                " is of the same moment, or state the forms with --robot-form and --camera-form."
             )
         return
     if camera_known and best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
         form = best.robot.form if best.robot.form.endswith(",inverse") else f"{best.robot.form},inverse"
         raise InconsistentPoses(
-            f"The robot poses of '{source}' contradict the pictures as given ({mounting}), and agree ({_residual(best)}) in two ways that the "
-            f"data cannot tell apart: the camera is mounted {other} (--mounting {other}), or the robot poses are inverted (--robot-form {form}). "
-            "State the one that is true."
+            f"The robot poses of '{source}' contradict the pictures as given ({mounting}), and agree"
+            f" ({_residual(best)}) in two ways that the data cannot tell apart: the camera is mounted {other}"
+            f" (--mounting {other}), or the robot poses are inverted (--robot-form {form}). State the one that is true."
         )
     if best.changed and any(one.form.endswith(",inverse") for one in (best.robot, best.camera)):
         raise InconsistentPoses(
-            f"The poses of '{source}' contradict each other as given ({mounting}), and agree ({_residual(best)}) in three ways that the data "
-            f"cannot tell apart: the camera is mounted {other} (--mounting {other}), the robot poses are inverted (--robot-form "
-            f"{_option(best.robot, 'inverse')}), or the camera poses are inverted (--camera-form {_option(best.camera, 'inverse')}). State "
-            "the one that is true."
+            f"The poses of '{source}' contradict each other as given ({mounting}), and agree ({_residual(best)}) in"
+            f" three ways that the data cannot tell apart: the camera is mounted {other} (--mounting {other}), the"
+            f" robot poses are inverted (--robot-form {_option(best.robot, 'inverse')}), or the camera poses are"
+            f" inverted (--camera-form {_option(best.camera, 'inverse')}). State the one that is true."
         )
     if decision.rivals:
         rival = decision.rivals[0]
         raise InconsistentPoses(
-            f"The poses of '{source}' agree in more than one reading, and the results differ: {_pair_words(best)} ({_residual(best)}), or "
-            f"{_pair_words(rival)} ({_residual(rival)}). State the right one: {_options(best)}, or {_options(rival)}."
+            f"The poses of '{source}' agree in more than one reading, and the results differ: {_pair_words(best)}"
+            f" ({_residual(best)}), or {_pair_words(rival)} ({_residual(rival)}). State the right one:"
+            f" {_options(best)}, or {_options(rival)}."
         )
 
 
@@ -253,20 +259,20 @@ def _option(reading: PoseReading, change: str) -> str:
     return f"{plain},{change}"
 
 
-def _options(one: Agreement) -> str:
+def _options(one: ReadingAgreement) -> str:
     return f"--robot-form {one.robot.form} --camera-form {one.camera.form}"
 
 
-def _pair_words(one: Agreement) -> str:
+def _pair_words(one: ReadingAgreement) -> str:
     return f"robot as {one.robot.words}, camera as {one.camera.words}"
 
 
-def _residual(one: Agreement) -> str:
+def _residual(one: ReadingAgreement) -> str:
     share = 100.0 * one.position / max(one.extent, 1e-12)
     return f"residuals {np.degrees(one.rotation):.3g} degrees and {share:.2g} % of the motion"
 
 
-def _sentences(decision: Decision, robot: Listing, camera: Listing, shift: int) -> list[str]:
+def _sentences(decision: ReadingDecision, robot: Listing, camera: Listing, shift: int) -> list[str]:
     """What was chosen where there was a choice."""
     best, found = decision.best, []
     chosen = [
@@ -285,7 +291,8 @@ def _sentences(decision: Decision, robot: Listing, camera: Listing, shift: int) 
     if shift:
         later = "later" if shift > 0 else "earlier"
         found.append(
-            f"The camera's rows belong to robot poses {abs(shift)} row{'s' if abs(shift) > 1 else ''} {later}: they were shifted."
+            f"The camera's rows belong to robot poses {abs(shift)} row{'s' if abs(shift) > 1 else ''} {later}: they"
+            " were shifted."
         )
     return found
 
@@ -295,7 +302,7 @@ def _units(
     B: PoseReading,
     robot: Listing,
     camera: Listing,
-    best: Agreement | None,
+    best: ReadingAgreement | None,
     stated: StatedForms,
     source: str,
 ) -> tuple[tuple[float, str], tuple[float, str]]:
@@ -307,7 +314,8 @@ def _units(
     for listing in (robot, camera):
         if listing.unit and stated.unit and listing.unit != stated.unit:
             raise DatasetError(
-                f"'{listing.name}' states lengths in {listing.unit}, and --unit states {stated.unit}; correct one of them."
+                f"'{listing.name}' states lengths in {listing.unit}, and --unit states {stated.unit}; correct one of"
+                " them."
             )
     median = float(np.median(np.linalg.norm(A.X[:, :3, 3], axis=1)))
     if not words[0]:
@@ -317,13 +325,14 @@ def _units(
             words[0] = "m"
         else:
             raise DatasetError(
-                f"The robot positions of '{source}' have a median of {median:.3g} from the base: that is neither metres nor millimetres of an "
-                "arm. State the unit with --unit m, mm, cm or inch."
+                f"The robot positions of '{source}' have a median of {median:.3g} from the base: that is neither metres"
+                " nor millimetres of an arm. State the unit with --unit m, mm, cm or inch."
             )
     unit_r = UNITS[words[0]]
     if median * unit_r > FARTHEST_M or (words[0] != "m" and median * unit_r < _NEAREST_M):
         raise DatasetError(
-            f"The robot positions of '{source}' have a median of {median * unit_r:.3g} m from the base, in {words[0]}; correct --unit."
+            f"The robot positions of '{source}' have a median of {median * unit_r:.3g} m from the base, in {words[0]};"
+            " correct --unit."
         )
     ratio = None
     if best is not None and best.agrees and best.scale_sigma * SCALE_SIGMA < LEAST_SCALE:
@@ -351,13 +360,13 @@ def _refuse_scale(ratio: float, unit: str, source: str) -> None:
     near = min(UNITS, key=lambda u: abs(np.log(ratio / UNITS[u])))
     if near != unit and abs(np.log(ratio / UNITS[near])) < _OTHER_UNIT:
         raise InconsistentPoses(
-            f"The camera positions of '{source}' are in {near} by the robot's motion, and in {unit} as stated. Correct the unit, or multiply the "
-            f"positions by {UNITS[near] / UNITS[unit]:g}."
+            f"The camera positions of '{source}' are in {near} by the robot's motion, and in {unit} as stated. Correct"
+            f" the unit, or multiply the positions by {UNITS[near] / UNITS[unit]:g}."
         )
     squares = f", or the distances count squares of {ratio:.4g} m" if ratio < 0.2 else ""
     raise WrongScale(
         factor,
-        f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g} (from {unit} to the right length): "
-        f"the size of the board's squares or of the marker is wrong by that factor{squares}, or they have another unit. Correct the size, "
-        f"or multiply the positions by {factor:.4g}.",
+        f"The camera positions of '{source}' fit the robot's motion when they are multiplied by {factor:.4g} (from"
+        f" {unit} to the right length): the size of the board's squares or of the marker is wrong by that"
+        f" factor{squares}, or they have another unit. Correct the size, or multiply the positions by {factor:.4g}.",
     )

@@ -107,10 +107,11 @@ def judge_pose(
 ) -> tuple[int, Judgement]:
     """Judge a stated X of F X G = Y; of several readings of one pose, the one that the pairs contradict least.
 
-    With X fixed, Y is the mean of F X G. The new solution has X and Y free; its X and the stated one differ by e with the covariance C of the
-    new solution (plus the stated one). If the stated pose is right, e' C^-1 e / 6 has the distribution F(6, degrees of freedom): for a linear
-    problem it is the F test of the six more unknowns. The pairs show an error of six numbers with the probability POWER where its
-    non-centrality is that of the non-central F distribution; the longest displacement of the target with this non-centrality is ``shown_mm``.
+    With X fixed, Y is the mean of F X G. The new solution has X and Y free; its X and the stated one differ by e with
+    the covariance C of the new solution (plus the stated one). If the stated pose is right, e' C^-1 e / 6 has the
+    distribution F(6, degrees of freedom): for a linear problem it is the F test of the six more unknowns. The pairs
+    show an error of six numbers with the probability POWER where its non-centrality is that of the non-central F
+    distribution; the longest displacement of the target with this non-centrality is ``shown_mm``.
 
     Args:
         problem: full poses, X and Y free.
@@ -136,11 +137,22 @@ def judge_pose(
     e = difference(measure.X, X)
     other = measure.other(X) if measure.critical < T else None
     return k, Judgement(
-        X=X, rotation_rad=base.rotation_rad, translation_m=base.translation_m, held_rotation_rad=base.held_rotation_rad,
-        held_translation_m=base.held_translation_m, used=base.used, new=new, off_mm=1e3 * measure.size(e),
-        off_deg=float(np.degrees(np.linalg.norm(e[:3]))), uncertain_mm=1e3 * measure.uncertain, shown_mm=1e3 * measure.shown, statistic=T,
-        critical=measure.critical, chance=float(fdtrc(6.0, measure.freedom, T)), other=other,
-    )  # fmt: skip
+        X=X,
+        rotation_rad=base.rotation_rad,
+        translation_m=base.translation_m,
+        held_rotation_rad=base.held_rotation_rad,
+        held_translation_m=base.held_translation_m,
+        used=base.used,
+        new=new,
+        off_mm=1e3 * measure.size(e),
+        off_deg=float(np.degrees(np.linalg.norm(e[:3]))),
+        uncertain_mm=1e3 * measure.uncertain,
+        shown_mm=1e3 * measure.shown,
+        statistic=T,
+        critical=measure.critical,
+        chance=float(fdtrc(6.0, measure.freedom, T)),
+        other=other,
+    )
 
 
 class _Measure:
@@ -197,7 +209,8 @@ class _Measure:
 
 
 def _other_forms(X: Array) -> Iterator[tuple[str, Array]]:
-    """Other poses that the same numbers may mean: inverted, another unit, transposed, axes of camera or of its parent turned."""
+    """Other poses that the same numbers may mean: inverted, another unit, transposed, axes of camera or of its parent
+    turned."""
     yield "the inverse of RESULT", inverse(X)
     for words, scale in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254), ("metres", 1e3)):
         scaled = X.copy()
@@ -274,6 +287,11 @@ def _residuals_only(problem: Problem, X: Array, used: Flags, missing: str) -> Ju
             rest = label == k
             held_w[rest], held_d[rest] = residuals(problem.pick(rest), (X, _target(problem, X, others), IDENTITY))
     return Judgement(
-        X=X, rotation_rad=np.linalg.norm(w, axis=1), translation_m=np.linalg.norm(d, axis=1), held_rotation_rad=np.linalg.norm(held_w, axis=1),
-        held_translation_m=np.linalg.norm(held_d, axis=1), used=used, missing=missing,
-    )  # fmt: skip
+        X=X,
+        rotation_rad=np.linalg.norm(w, axis=1),
+        translation_m=np.linalg.norm(d, axis=1),
+        held_rotation_rad=np.linalg.norm(held_w, axis=1),
+        held_translation_m=np.linalg.norm(held_d, axis=1),
+        used=used,
+        missing=missing,
+    )

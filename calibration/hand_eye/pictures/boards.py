@@ -55,7 +55,7 @@ class Board:
         inner: side of a marker (charuco) or gap between tags (tags), m.
         dictionary: name of the markers' dictionary, or empty.
         id: number of the tag (kind tag).
-        layout: 1 for OpenCV's ChArUco layout before 4.6; for tags the order of the numbers and the first corner, see ``layouts``.
+        layout: 1 for OpenCV's ChArUco layout before 4.6; for tags order of numbers and first corner, see ``layouts``.
         radius: of circles, m, as the pictures show it; 0 until then.
     """
 
@@ -92,7 +92,7 @@ class Board:
 
     @cached_property
     def points(self) -> Array:
-        """Points (m, 3) of the board in its frame, m; row by row, for tags the four corners clockwise from the upper left."""
+        """Points (m, 3) m of the board in its frame, row by row; of tags four corners clockwise from the upper left."""
         xy: NDArray[np.floating[Any]]
         j, i = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         if self.kind == "charuco":
@@ -140,7 +140,7 @@ class Board:
 
 
 def dictionary(name: str) -> Any:
-    """OpenCV's dictionary of markers by its name, such as 5X5_100 or APRILTAG_36h11. Raises DatasetError for another."""
+    """OpenCV's dictionary of markers by its name, such as APRILTAG_36h11. Raises DatasetError for another."""
     plain = re.sub(r"^DICT_", "", name.strip(), flags=re.IGNORECASE).lower()
     family = re.fullmatch(r"(tag)?(16h5|25h9|36h10|36h11)", plain)
     plain = f"apriltag_{family[2]}" if family else plain
@@ -206,12 +206,12 @@ def _check(kind: str, found: dict[str, Any], text: str) -> None:
         needed = {"tag": found.get("id", 0) + 1, "charuco": grid[0] * grid[1] // 2}.get(kind, grid[0] * grid[1])
         if needed > most:
             raise DatasetError(
-                f"--board '{text[:60]}': the dictionary {found['dictionary']} has {most} markers, and {needed} are needed."
+                f"--board '{text[:60]}': the dictionary {found['dictionary']} has {most} markers of {needed} needed."
             )
 
 
 def find_board(grey: Grey, board: Board) -> Array:
-    """Points (m, 2) px of a board in a picture, centre of the first pixel at (0, 0); NaN where a point was not found."""
+    """Points (m, 2) px of a board in a picture, NaN where not found; the first pixel's centre is (0, 0)."""
     none = np.full((len(board.points), 2), np.nan)
     found: Array | None
     if board.kind == "chessboard":
@@ -292,7 +292,7 @@ def _smaller(grey: Grey, scale: float) -> Grey:
 
 
 def _search(grey: Grey, size: tuple[int, int], scale: float, flags: int) -> Array | None:
-    """Corners (m, 2) px of a chessboard that is searched in a picture reduced by ``scale``, in pixels of the whole one."""
+    """Corners (m, 2) px of a chessboard, in the whole picture, searched in a picture reduced by ``scale``."""
     found, points = cv2.findChessboardCornersSB(_smaller(grey, scale), size, flags=flags)
     return (np.asarray(points, dtype=float)[:, 0] + 0.5) / scale - 0.5 if found else None
 
@@ -329,7 +329,7 @@ def _charuco(grey: Grey, board: Board) -> Array | None:
 
 
 def _markers(grey: Grey, board: Board) -> dict[int, Array]:
-    """Corners (4, 2) px of every marker of the board's dictionary by its number; where the border is two cells wide, of that kind."""
+    """Corners (4, 2) px of every marker of the board's dictionary and border width, by its number."""
     found: dict[int, Array] = {}
     near = {"minMarkerDistanceRate": 0.02}  # of tags whose edge is near that of the paper
     for more, border in (({}, 1), ({}, 2), (near, 1)):
@@ -344,7 +344,7 @@ def _markers(grey: Grey, board: Board) -> dict[int, Array]:
 
 
 def _by_sides(grey: Grey, corners: Array) -> Array:
-    """Corners (4, 2) px as the meets of lines along the sides: a corner alone is pulled inwards by the picture's blur."""
+    """Corners (4, 2) px where lines along the sides meet: blur pulls a corner alone inwards."""
     side = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     reach = float(np.clip(0.06 * side.min(), 2.0, 5.0))
     s, t = np.linspace(-reach, reach, int(8 * reach) | 1), SIDE
@@ -379,7 +379,7 @@ def degree_of(a: Array, b: Array) -> int:
 
 
 def tangents(a: Array, b: Array, curve: Array) -> list[Array]:
-    """Lines (3,) along the ends of a tag's side from a to b px, which is ``curve`` (a polynomial of 0 to 1) px outside of its chord."""
+    """Lines (3,) along the ends of a tag's side a to b px, ``curve`` (polynomial of 0 to 1) px outside its chord."""
     out = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
     feet = [a + e * (b - a) + np.polyval(curve, e) * out for e in (0.0, 1.0)]
     ways = [b - a + np.polyval(np.polyder(curve), e) * out for e in (0.0, 1.0)]
@@ -446,7 +446,7 @@ def _blobs(grey: Grey, colour: int) -> Any:
 
 
 def _centres(grey: Grey, points: Array, colour: int) -> tuple[Array, Array]:
-    """Centroids (m, 2) px of the contrast of circles in the whole picture, and their areas (m,) px^2, NaN where they are not clear."""
+    """Centroids (m, 2) px of circles' contrast in the whole picture, and areas (m,) px^2; NaN where not clear."""
     far = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(far, np.inf)
     out, areas = points.copy(), np.full(len(points), np.nan)

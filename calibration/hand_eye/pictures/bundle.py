@@ -1,4 +1,5 @@
-"""Bundle adjustment of camera, hand-eye pose and target by the reprojection of a board, with errors of the robot's poses."""
+"""Bundle adjustment of camera, hand-eye pose and target by the reprojection of a board, with errors of the robot's
+poses."""
 
 from dataclasses import dataclass
 
@@ -43,7 +44,8 @@ class Bundle:
         X, Y: hand-eye pose and target of F X G = Y, (4, 4) each.
         K, distortion: the camera.
         covariance: of X and Y (12, 12), each as (exp(a) R, p + b).
-        camera_sigma: standard deviations of the camera's free numbers: fx, fy, cx, cy, then distortion; empty where it was given.
+        camera_sigma: standard deviations of the camera's free numbers: fx, fy, cx, cy, then distortion; empty where it
+            was given.
         sigma_px: of one coordinate of a corner.
         sigma_rad, sigma_m: of the robot's pose, per axis, at the flange.
         rms_px: rms reprojection error (n,) of each picture, with the robot's pose as corrected.
@@ -177,10 +179,12 @@ def adjust(
     sigma_rad: float,
     sigma_m: float,
 ) -> Bundle:
-    """Minimise the reprojection errors over camera, X, Y and an error of each robot pose, whose sizes are estimated, too.
+    """Minimise the reprojection errors over camera, X, Y and an error of each robot pose, whose sizes are estimated,
+    too.
 
-    Each robot pose has a normal error of its own at the flange, with one standard deviation for all rotations and one for all displacements.
-    The variances follow from the restricted likelihood (MacKay 1992: squares over the numbers that the data determine).
+    Each robot pose has a normal error of its own at the flange, with one standard deviation for all rotations and one
+    for all displacements. The variances follow from the restricted likelihood (MacKay 1992: squares over the numbers
+    that the data determine).
 
     Args:
         X, Y, K, distortion: start.
@@ -217,10 +221,19 @@ def adjust(
     square = (r**2).sum(axis=1)
     rms = np.array([np.sqrt(square[a:b].mean()) for a, b in zip(work.bounds[:-1], work.bounds[1:], strict=True)])
     return Bundle(
-        X=state.X, Y=state.Y, K=state.K, distortion=state.dist, covariance=covariance,
-        camera_sigma=np.sqrt(np.diag(S)[: len(free)]), sigma_px=px, sigma_rad=rad, sigma_m=m, rms_px=rms, off=state.off,
+        X=state.X,
+        Y=state.Y,
+        K=state.K,
+        distortion=state.dist,
+        covariance=covariance,
+        camera_sigma=np.sqrt(np.diag(S)[: len(free)]),
+        sigma_px=px,
+        sigma_rad=rad,
+        sigma_m=m,
+        rms_px=rms,
+        off=state.off,
         degrees_of_freedom=dof,
-    )  # fmt: skip
+    )
 
 
 def _moved(sigma: float, square: float, least: float) -> float:

@@ -1,4 +1,5 @@
-"""Find the pictures and the camera file of a folder, search a board in them, and estimate the camera from what was found."""
+"""Find the pictures and the camera file of a folder, search a board in them, and estimate the camera from what was
+found."""
 
 import re
 from collections.abc import Sequence
@@ -31,10 +32,12 @@ from weldcal.models.arrays import Array
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 _OTHER = re.compile(
-    r"(?i)(depth|disparity|mask|detected|corners|result|output|annotated|debug|visuali[sz]ation|overlay|undistort|rectified)"
+    r"(?i)(depth|disparity|mask|detected|corners|result|output|annotated|debug|visuali[sz]ation|overlay"
+    r"|undistort|rectified)"
 )
 _CAMERA = re.compile(
-    r"(?i)^(camera|cam|camera_?info|camera_?(params?|parameters|matrix|calib\w*|intrinsics?)|camchain.*|.*intrinsics?.*|.*ost|calibration|calib"
+    r"(?i)^(camera|cam|camera_?info|camera_?(params?|parameters|matrix|calib\w*|intrinsics?)|camchain.*"
+    r"|.*intrinsics?.*|.*ost|calibration|calib"
     r"|sensor|param|params)$"
 )
 _CAMERA_ENDINGS = (".yaml", ".yml", ".xml", ".json", ".txt", ".npz")
@@ -115,7 +118,8 @@ def picture_files(folder: Path, named: str | None = None) -> list[Path]:
     if len(kinds) > 1:
         names = ", ".join(repr(k[0].relative_to(folder).as_posix()) for k in kinds[:4])
         raise DatasetError(
-            f"'{folder.name}' holds several kinds of pictures ({names}): name the right ones with --camera-poses, by a part of their path."
+            f"'{folder.name}' holds several kinds of pictures ({names}): name the right ones with --camera-poses, by a"
+            " part of their path."
         )
     return sorted(kinds[0], key=lambda p: natural(p.name))
 
@@ -257,8 +261,9 @@ def _estimate(
     if file is not None:
         if file.size is not None and file.size != size:
             raise DatasetError(
-                f"The camera file {named or ''} is for pictures of {file.size[0]} x {file.size[1]} pixels, and these have {size[0]} x {size[1]}: "
-                "give the file of this resolution, or leave it out to estimate the camera."
+                f"The camera file {named or ''} is for pictures of {file.size[0]} x {file.size[1]} pixels, and these"
+                f" have {size[0]} x {size[1]}: give the file of this resolution, or leave it out to estimate the"
+                " camera."
             )
         return file.K, file.distortion, np.zeros(0, dtype=np.int64), pictures
     start = np.array(
@@ -295,8 +300,8 @@ def _estimate(
             free = np.append(free, 8)
     if not (0.2 * max(size) < K[0, 0] < 50.0 * max(size)) or not np.isfinite(dist).all():
         raise DatasetError(
-            f"The pictures do not determine the camera (focal length {K[0, 0]:.0f} px of {size[0]} pixels): tilt the board by 20 to 40 degrees in "
-            "some pictures, or give the camera with --intrinsics FILE."
+            f"The pictures do not determine the camera (focal length {K[0, 0]:.0f} px of {size[0]} pixels): tilt the"
+            " board by 20 to 40 degrees in some pictures, or give the camera with --intrinsics FILE."
         )
     return K, dist, free.astype(np.int64), pictures
 
@@ -304,8 +309,8 @@ def _estimate(
 def offsets(board: Board, C: Array, K: Array, dist: Array) -> Array:
     """Points (m, 2) px as they are measured without noise, less the pictures of the board's points.
 
-    The picture of a circle is no circle about the picture of its centre. Straight lines along a tag's sides, which the lens bends, meet
-    beside the picture of its corner.
+    The picture of a circle is no circle about the picture of its centre. Straight lines along a tag's sides, which the
+    lens bends, meet beside the picture of its corner.
 
     Args:
         board: circles with their radius, or tags; other boards have none.

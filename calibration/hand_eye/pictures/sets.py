@@ -1,4 +1,5 @@
-"""Read pictures of a board with the robot's poses: pair them, and turn symmetric boards as the robot's rotations say."""
+"""Read pictures of a board with the robot's poses: pair them, and turn symmetric boards as the robot's rotations
+say."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -67,8 +68,8 @@ def read_pictures(
     """The pictures of a folder with the robot's poses.
 
     Args:
-        folder: it holds the pictures and the robot's poses in any form of docs/datasets.md; ``--camera-poses`` of ``stated`` names the
-            pictures, where there are several kinds.
+        folder: it holds the pictures and the robot's poses in any form of docs/datasets.md; ``--camera-poses`` of
+            ``stated`` names the pictures, where there are several kinds.
         board: the board in them.
         mounting: eye_in_hand or eye_on_base.
         unit: of the robot's positions.
@@ -86,7 +87,8 @@ def read_pictures(
     mode = "" if mounting is None else mounting_name(mounting)
     if mode not in ("eye_in_hand", "eye_on_base"):
         raise DatasetError(
-            f"'{folder.name}' does not say where the camera is; add --mounting eye_in_hand (on the flange) or eye_on_base (fixed)."
+            f"'{folder.name}' does not say where the camera is; add --mounting eye_in_hand (on the flange) or"
+            " eye_on_base (fixed)."
         )
     if unit is not None and unit not in UNITS:
         raise DatasetError(f"There is no unit '{unit}'; use {', '.join(UNITS)}.")
@@ -129,9 +131,17 @@ def picture_set(
     file = None if camera is None else camera[1]
     K, dist, free, pictures = estimate_camera(pictures, board, size, file, named is not None and named.name)
     return _paired(
-        pictures=pictures, board=board, robot=robot, mode=mode, stated=stated or StatedForms(), source=source, K=K, dist=dist, free=free,
+        pictures=pictures,
+        board=board,
+        robot=robot,
+        mode=mode,
+        stated=stated or StatedForms(),
+        source=source,
+        K=K,
+        dist=dist,
+        free=free,
         camera="" if camera is None or len(free) else camera[0].name,
-    )  # fmt: skip
+    )
 
 
 def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str | None) -> Listing:
@@ -142,12 +152,13 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
         lists = [one for one in lists if stated.robot_poses in one.name]
         if len(lists) != 1:
             raise DatasetError(
-                f"--robot-poses {stated.robot_poses} names {len(lists)} of the lists of '{folder.name}': {known or 'none'}."
+                f"--robot-poses {stated.robot_poses} names {len(lists)} of the lists of '{folder.name}':"
+                f" {known or 'none'}."
             )
     if not lists:
         raise DatasetError(
-            f"'{folder.name}' holds pictures and no robot poses: add robot.csv with the header id,x,y,z,qx,qy,qz,qw, one row per picture, or "
-            "one file per picture."
+            f"'{folder.name}' holds pictures and no robot poses: add robot.csv with the header id,x,y,z,qx,qy,qz,qw,"
+            " one row per picture, or one file per picture."
         )
     if len(lists) > 1:
         mine = [one for one in lists if whose(one.name) == "robot"]
@@ -155,7 +166,8 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
         lists = mine if len(mine) == 1 else others if len(others) == 1 else lists
     if len(lists) > 1:
         raise DatasetError(
-            f"The names of the lists of '{folder.name}' do not tell the robot's poses: {known}. Name them with --robot-poses."
+            f"The names of the lists of '{folder.name}' do not tell the robot's poses: {known}. Name them with"
+            " --robot-poses."
         )
     return replace(lists[0], unit=lists[0].unit or unit or "")
 
@@ -197,8 +209,9 @@ def _paired(
             except WrongScale as why:
                 size = 1e3 * board.size * why.factor
                 problem = InconsistentPoses(
-                    f"The board in the pictures of '{source}' fits the robot's motion with its lengths multiplied by {why.factor:.4g}: a size of "
-                    f"{size:.4g} mm in place of {1e3 * board.size:g} mm. Measure the board and correct --board, or correct --unit of the robot."
+                    f"The board in the pictures of '{source}' fits the robot's motion with its lengths multiplied by"
+                    f" {why.factor:.4g}: a size of {size:.4g} mm in place of {1e3 * board.size:g} mm. Measure the board"
+                    " and correct --board, or correct --unit of the robot."
                 )
                 break
             except (InconsistentPoses, DatasetError) as why:
@@ -210,9 +223,17 @@ def _paired(
 
 
 def _set(
-    found: ImportedPairs, pictures: list[Picture], labels: NDArray[np.int64], board: Board, mode: str, source: str, K: Array, dist: Array,
-    free: NDArray[np.int64], camera: str,
-) -> PictureSet:  # fmt: skip
+    found: ImportedPairs,
+    pictures: list[Picture],
+    labels: NDArray[np.int64],
+    board: Board,
+    mode: str,
+    source: str,
+    K: Array,
+    dist: Array,
+    free: NDArray[np.int64],
+    camera: str,
+) -> PictureSet:
     rows = np.asarray(found.rows[1], dtype=np.int64)
     turned = [replace(p, points=p.points[board.symmetries[int(f)]]) for p, f in zip(pictures, labels, strict=True)]
     paired = set(rows.tolist())
@@ -220,23 +241,38 @@ def _set(
         p if p.why or k in paired else replace(p, why="No robot pose belongs to it.") for k, p in enumerate(turned)
     ]
     pairs = PosePairs(
-        source=source, robot=found.robot, camera=found.camera, mode=mode,
-        img=np.stack([turned[k].points for k in rows]), obj=board.points, K=K, dist=dist, reading=found.reading,
-        notes=found.notes, ids=tuple(turned[k].name for k in rows),
-    )  # fmt: skip
+        source=source,
+        robot=found.robot,
+        camera=found.camera,
+        mode=mode,
+        img=np.stack([turned[k].points for k in rows]),
+        obj=board.points,
+        K=K,
+        dist=dist,
+        reading=found.reading,
+        notes=found.notes,
+        ids=tuple(turned[k].name for k in rows),
+    )
     return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=camera, free=free)
 
 
 def _listing(name: str, pictures: Sequence[Picture], C: Array) -> Listing:
     out = tuple((k, p.why) for k, p in enumerate(pictures) if p.why)
     found = listing_of(
-        name, C[:, :3, 3], C[:, :3, :3], rotation="matrix", ids=tuple(Path(p.name).stem for p in pictures), unit="m", form="pictures of a board"
-    )  # fmt: skip
+        name,
+        C[:, :3, 3],
+        C[:, :3, :3],
+        rotation="matrix",
+        ids=tuple(Path(p.name).stem for p in pictures),
+        unit="m",
+        form="pictures of a board",
+    )
     return replace(found, left_out=out)
 
 
 def _numbered(robot: Listing, pictures: Sequence[Picture]) -> list[Listing]:
-    """The robot's poses with the numbers of the pictures, where rows have no names and there are more rows than pictures: counted from 0 or 1."""
+    """The robot's poses with the numbers of the pictures, where rows have no names and there are more rows than
+    pictures: counted from 0 or 1."""
     numbers = [number_of(Path(p.name).stem) for p in pictures]
     if robot.ids or len(robot) == len(pictures) or None in numbers:
         return [robot]
@@ -265,7 +301,8 @@ def _turn(board: Board, order: NDArray[np.int64]) -> Array:
 
 
 def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: Board) -> list[NDArray[np.int64]]:
-    """Orders of the points of each picture that agree best with the angles of the robot's relative rotations, most likely first."""
+    """Orders of the points of each picture that agree best with the angles of the robot's relative rotations, most
+    likely first."""
     rows_r, rows_c, _ = together(robot, camera)
     good = robot.good[rows_r] & camera.good[rows_c]
     rows_r, rows_c = rows_r[good], rows_c[good]
@@ -303,7 +340,8 @@ def angles(R: Array) -> Array:
 
 
 def _least(cost: Array) -> tuple[NDArray[np.int64], float]:
-    """Labels (n,) of least total cost[a, b, label a, label b]: coordinate descent from the labels that each picture alone suggests."""
+    """Labels (n,) of least total cost[a, b, label a, label b]: coordinate descent from the labels that each picture
+    alone suggests."""
     n = len(cost)
     best: tuple[NDArray[np.int64], float] | None = None
     each = np.arange(n)

@@ -44,8 +44,14 @@ class PictureResult:
         used = [p for p in self.pictures if not p.why]
         b = self.bundle
         lines = [
-            f"{len(used)} of {len(self.pictures)} pictures used, {self.board}, reprojection {self.reprojection_px:.3f} px rms.",
-            f"Robot poses as found: {np.degrees(b.sigma_rad):.4f} degrees and {1e3 * b.sigma_m:.3f} mm per axis (1 sigma, at the flange).",
+            (
+                f"{len(used)} of {len(self.pictures)} pictures used, {self.board}, reprojection"
+                f" {self.reprojection_px:.3f} px rms."
+            ),
+            (
+                f"Robot poses as found: {np.degrees(b.sigma_rad):.4f} degrees and {1e3 * b.sigma_m:.3f} mm per axis (1"
+                " sigma, at the flange)."
+            ),
         ]
         lines += [f"{p.name} is not used. {p.why}" for p in self.pictures if p.why]
         K, s = b.K, b.camera_sigma
@@ -65,10 +71,12 @@ class PictureResult:
 def solve_pictures(
     data: PictureSet, solve: Callable[[PosePairs], HandEyeResult]
 ) -> tuple[HandEyeResult, PosePairs, PictureResult]:
-    """Hand-eye pose, target and camera from pictures: the poses' solution as the start, then the adjustment of the corners.
+    """Hand-eye pose, target and camera from pictures: the poses' solution as the start, then the adjustment of the
+    corners.
 
     Returns:
-        The result, with X, Y and covariance of the adjustment; the pairs under the camera that was found; what the pictures add.
+        The result, with X, Y and covariance of the adjustment; the pairs under the camera that was found; what the
+            pictures add.
 
     Raises:
         as ``solve``; DatasetError: too few pictures agree.
@@ -102,15 +110,21 @@ def solve_pictures(
     weight = np.isfinite(pairs.img[keep][..., 0]).sum(axis=1) if pairs.img is not None else np.ones(int(keep.sum()))
     total = float(np.sqrt((weight * bundle.rms_px**2).sum() / weight.sum()))
     found = PictureResult(
-        board=data.board, pictures=tuple(pictures), bundle=bundle, camera=data.camera, free=data.free,
+        board=data.board,
+        pictures=tuple(pictures),
+        bundle=bundle,
+        camera=data.camera,
+        free=data.free,
         reprojection_px=total,
-    )  # fmt: skip
+    )
     if not result.unobservable:
         result = replace(
-            result, poses={"X": as_transform(bundle.X), "Y": as_transform(bundle.Y)},
+            result,
+            poses={"X": as_transform(bundle.X), "Y": as_transform(bundle.Y)},
             covariance={"X": bundle.covariance[:6, :6], "Y": bundle.covariance[6:, 6:]},
-            joint_covariance=bundle.covariance, degrees_of_freedom=bundle.degrees_of_freedom,
-        )  # fmt: skip
+            joint_covariance=bundle.covariance,
+            degrees_of_freedom=bundle.degrees_of_freedom,
+        )
     return replace(result, inliers=keep), pairs, found
 
 
@@ -119,14 +133,23 @@ def _adjusted(pairs: PosePairs, result: HandEyeResult, keep: NDArray[np.bool_], 
     assert pairs.K is not None
     assert pairs.dist is not None
     return adjust(
-        Corners(robot=pairs.robot[keep], img=pairs.img[keep], obj=data.board.points, eye_in_hand=pairs.mode == "eye_in_hand"),
-        np.asarray(result.X.GetAsMatrix4()), np.asarray(result.Y.GetAsMatrix4()), pairs.K, pairs.dist, free=data.free,
-        sigma_px=0.3, sigma_rad=result.sigma_rotation_rad, sigma_m=result.sigma_translation,
-    )  # fmt: skip
+        Corners(
+            robot=pairs.robot[keep], img=pairs.img[keep], obj=data.board.points, eye_in_hand=pairs.mode == "eye_in_hand"
+        ),
+        np.asarray(result.X.GetAsMatrix4()),
+        np.asarray(result.Y.GetAsMatrix4()),
+        pairs.K,
+        pairs.dist,
+        free=data.free,
+        sigma_px=0.3,
+        sigma_rad=result.sigma_rotation_rad,
+        sigma_m=result.sigma_translation,
+    )
 
 
 def _nearest(pairs: PosePairs, result: HandEyeResult, board: Board) -> tuple[PosePairs, bool]:
-    """The pairs with, for each picture, the solution that lies nearest to what the result predicts: a plane and a symmetric board have several."""
+    """The pairs with, for each picture, the solution that lies nearest to what the result predicts: a plane and a
+    symmetric board have several."""
     assert pairs.img is not None
     assert pairs.K is not None
     assert pairs.dist is not None

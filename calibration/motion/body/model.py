@@ -24,7 +24,8 @@ _FEWEST = 300
 
 @dataclass(frozen=True, eq=False)
 class BodyModel:
-    """A body's surface in its own frame L: points (n, 3) m, outward unit normals (n, 3), and the middle (3,) m of the points."""
+    """A body's surface in its own frame L: points (n, 3) m, outward unit normals (n, 3), and the middle (3,) m of the
+    points."""
 
     points: Array
     normals: Array
@@ -63,11 +64,11 @@ def model_from_solids(solids: Sequence[TriMesh], *, seed: int = 0) -> BodyModel:
 
 
 def fused_model(frames: Iterable[tuple[Array, RigidTransform]], middle: Array, radius_m: float) -> BodyModel:
-    """Fuse scans to the surface of what moves with a frame L: ``frames`` are clouds (N, 3) or (H, W, 3) m in C with the pose X_LC by
-    calibration and robot. Only points within ``radius_m`` of ``middle`` (3,) m in L count.
+    """Fuse scans to the surface of what moves with a frame L: ``frames`` are clouds (N, 3) or (H, W, 3) m in C with the
+    pose X_LC by calibration and robot. Only points within ``radius_m`` of ``middle`` (3,) m in L count.
 
-    A surfel is the mean of all points in a voxel of 1.5 mm (or 1.5 pixels) that half of the frames saw: what stands still or belongs to
-    another link sweeps through the voxels. Raises InputError where too little is left.
+    A surfel is the mean of all points in a voxel of 1.5 mm (or 1.5 pixels) that half of the frames saw: what stands
+    still or belongs to another link sweeps through the voxels. Raises InputError where too little is left.
     """
     keys: list[Array] = []
     sums: list[Array] = []

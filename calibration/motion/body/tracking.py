@@ -1,4 +1,5 @@
-"""Tracks a body of known surface in a scan by ICP, and turns its poses into observations of a point and a direction on it."""
+"""Tracks a body of known surface in a scan by ICP, and turns its poses into observations of a point and a direction on
+it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,8 +31,8 @@ pairs = o3d.pipelines.registration
 
 @dataclass(frozen=True, eq=False)
 class TrackedBody:
-    """Pose X_CL of a body in a scan, its covariance (6, 6) [rotation; translation] in axes of C about the body's middle, the rms
-    distance (m) and the number of the points on its surface."""
+    """Pose X_CL of a body in a scan, its covariance (6, 6) [rotation; translation] in axes of C about the body's
+    middle, the rms distance (m) and the number of the points on its surface."""
 
     X_CL: RigidTransform
     covariance: Array
@@ -66,9 +67,13 @@ class BodyTracker:
         for reach, steps in _STAGES[0 if coarse else 1 :]:
             kernel = pairs.TukeyLoss(k=reach)
             found = pairs.registration_icp(
-                source, self._target, reach, X_LC, pairs.TransformationEstimationPointToPlane(kernel),
+                source,
+                self._target,
+                reach,
+                X_LC,
+                pairs.TransformationEstimationPointToPlane(kernel),
                 pairs.ICPConvergenceCriteria(1e-9, 1e-9, steps),
-            )  # fmt: skip
+            )
             X_LC = found.transformation
             first = first or len(found.correspondence_set)
         match = np.asarray(found.correspondence_set)
@@ -98,7 +103,8 @@ class BodyTracker:
 
 
 def link_motion(stream: RobotStream, arm: ArmModel, link: int) -> ContinuousMotion:
-    """Continuous motion of a link (its index in ``arm.link_names``) from a stream of joints; of the last link also from poses.
+    """Continuous motion of a link (its index in ``arm.link_names``) from a stream of joints; of the last link also from
+    poses.
 
     Raises InputError: the stream has no joints, and the link is not the last.
     """
@@ -106,7 +112,8 @@ def link_motion(stream: RobotStream, arm: ArmModel, link: int) -> ContinuousMoti
         return ContinuousMotion(stream)
     if stream.joints is None:
         raise InputError(
-            f"The stream holds flange poses, which do not say where the {arm.link_names[link]} is; record joint angles (q1,...,q6)."
+            f"The stream holds flange poses, which do not say where the {arm.link_names[link]} is; record joint angles"
+            " (q1,...,q6)."
         )
     poses = np.array([link_frames(arm, q)[link].GetAsMatrix4() for q in stream.joints])
     return ContinuousMotion(RobotStream(stream.time, poses, None, stream.robot))
@@ -122,14 +129,19 @@ def observed_point(model: BodyModel, X_CL: RigidTransform) -> RigidTransform:
 
 
 def see_body(
-    data: MotionDataset, model: BodyModel, motion: ContinuousMotion, X_BC: RigidTransform, delay_s: float,
-    *, tell: Callable[[float], None] = lambda fraction: None,
-) -> tuple[ObservedFrames, RigidTransform, list[tuple[str, str]]]:  # fmt: skip
-    """Track a body through a recording: its middle and one of its directions as observations, their place X_LR on the body, and
-    (id, reason) of frames without it.
+    data: MotionDataset,
+    model: BodyModel,
+    motion: ContinuousMotion,
+    X_BC: RigidTransform,
+    delay_s: float,
+    *,
+    tell: Callable[[float], None] = lambda fraction: None,
+) -> tuple[ObservedFrames, RigidTransform, list[tuple[str, str]]]:
+    """Track a body through a recording: its middle and one of its directions as observations, their place X_LR on the
+    body, and (id, reason) of frames without it.
 
-    ``motion`` is the body's by the robot; ``delay_s`` is about how long before its arrival a frame was captured. The next
-    frame is looked for where the robot and the frame before say. Raises InputError where no frame shows the body.
+    ``motion`` is the body's by the robot; ``delay_s`` is about how long before its arrival a frame was captured. The
+    next frame is looked for where the robot and the frame before say. Raises InputError where no frame shows the body.
     """
     tracker = BodyTracker(model)
     X_LR: RigidTransform | None = None
@@ -143,9 +155,13 @@ def see_body(
             refused.append((frame.id, "The robot's stream has no data at its capture."))
             continue
         predicted = X_BC.inverse() @ _rigid(X_BL)
-        guess = predicted if last is None else RigidTransform(
-            predicted.rotation(), predicted.translation() + last[1].translation() - last[0].translation()
-        )  # fmt: skip
+        guess = (
+            predicted
+            if last is None
+            else RigidTransform(
+                predicted.rotation(), predicted.translation() + last[1].translation() - last[0].translation()
+            )
+        )
         try:
             cloud = data.cloud(frame.id)
         except CloudError as e:

@@ -1,4 +1,5 @@
-"""Tells a moved scanner from a moved base by what stands still in the scans: it moves in the camera with the one, not with the other."""
+"""Tells a moved scanner from a moved base by what stands still in the scans: it moves in the camera with the one, not
+with the other."""
 
 import warnings
 from collections.abc import Sequence
@@ -25,8 +26,8 @@ SCANNER, BASE = "the scanner moved", "the robot's base moved, and the scanner di
 
 @dataclass(frozen=True)
 class BackgroundMove:
-    """``share`` of the predicted move that the still background made in the camera, with its sigma, from so many pixels: 1 where
-    the scanner moved, 0 where the base did."""
+    """``share`` of the predicted move that the still background made in the camera, with its sigma, from so many
+    pixels: 1 where the scanner moved, 0 where the base did."""
 
     share: float
     sigma: float
@@ -43,12 +44,13 @@ class BackgroundMove:
 
 
 def background_move(before: Sequence[Array], after: Sequence[Array], X_AB: RigidTransform) -> BackgroundMove | None:
-    """Compare organised clouds (H, W, 3) m of before and after a change, a still thing at p before being at X_AB p in the camera
-    after it if the scanner moved.
+    """Compare organised clouds (H, W, 3) m of before and after a change, a still thing at p before being at X_AB p in
+    the camera after it if the scanner moved.
 
-    Each pixel's median over the frames shows what stands still; the arm passes through. Along the normal, a still surface at p
-    moves by n . (X_AB p - p) under its ray, and the share of it that shows is a weighted mean over all pixels. What the
-    scanner errs at a pixel is the same before and after. None where the clouds are not organised or little stands still.
+    Each pixel's median over the frames shows what stands still; the arm passes through. Along the normal, a still
+    surface at p moves by n . (X_AB p - p) under its ray, and the share of it that shows is a weighted mean over all
+    pixels. What the scanner errs at a pixel is the same before and after. None where the clouds are not organised or
+    little stands still.
     """
     clouds = [*before, *after]
     if not before or not after or any(c.ndim != 3 or c.shape != clouds[0].shape for c in clouds):

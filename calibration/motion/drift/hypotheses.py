@@ -13,7 +13,8 @@ from weldcal.models.arrays import Array
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """How a systematic error of scanner and arm varies: its sigma per axis (m, rad) and its lengths (m, and rad of the normal).
+    """How a systematic error of scanner and arm varies: its sigma per axis (m, rad) and its lengths (m, and rad of the
+    normal).
 
     ``novelty`` is the share of the variance that the features may leave unexplained before one more is added, up to
     ``largest`` features.
@@ -31,8 +32,8 @@ class PoseField:
     """Features phi(x) with k(x, y) ~ phi(x) . phi(y) for a squared-exponential kernel, grown where poses are new.
 
     The features are those of the inducing poses so far: phi(x) = L^-1 k(Z, x) with L L' = k(Z, Z). A new inducing pose
-    appends one feature and leaves the others as they are, so that coefficients learnt before keep their meaning, and the new
-    one is independent of them a priori (Csato and Opper 2002, with the basis of a Cholesky factor).
+    appends one feature and leaves the others as they are, so that coefficients learnt before keep their meaning, and
+    the new one is independent of them a priori (Csato and Opper 2002, with the basis of a Cholesky factor).
     """
 
     def __init__(self, config: FieldConfig) -> None:
@@ -56,7 +57,8 @@ class PoseField:
         return out
 
     def features(self, p_C: Array, n_C: Array) -> tuple[Array, float]:
-        """Features (m,) at a centre (3,) m with normal (3,), grown by one where the pose is new, and the unexplained share."""
+        """Features (m,) at a centre (3,) m with normal (3,), grown by one where the pose is new, and the unexplained
+        share."""
         x = np.concatenate([p_C, n_C]) * self._scale
         d = self._poses - x
         k = np.exp(-0.5 * np.einsum("ij,ij->i", d, d))
@@ -86,8 +88,8 @@ _HOURS = 3600.0
 
 @dataclass(frozen=True, kw_only=True)
 class FilterConfig:
-    """What is known before: the sigmas of clock (s) and scale, and how far pose (m, rad per root hour), clock and scale wander
-    in a cell in which nothing happens; ``change`` (SIZE,) is how large a change may be."""
+    """What is known before: the sigmas of clock (s) and scale, and how far pose (m, rad per root hour), clock and scale
+    wander in a cell in which nothing happens; ``change`` (SIZE,) is how large a change may be."""
 
     clock_s: float = 5e-3
     scale: float = 3e-4
@@ -100,11 +102,13 @@ class FilterConfig:
 
 
 class DriftFilter:
-    """State x: the calibration's error [rotation; translation] about the pivot, clock (s), scale, coefficients of the field.
+    """State x: the calibration's error [rotation; translation] about the pivot, clock (s), scale, coefficients of the
+    field.
 
-    Beside the estimate under "nothing happened" it carries, for each hypothesis "a change theta (SIZE,) from frame s on",
-    the sensitivity F of the estimate to theta, and the information C and the vector d of theta in the innovations (Willsky and
-    Jones 1976): innovation_k = (H_k - G_k F) theta + noise. A step adds H theta from s on, a creep H theta (t - t_s) / RAMP_S.
+    Beside the estimate under "nothing happened" it carries, for each hypothesis "a change theta (SIZE,) from frame s
+    on", the sensitivity F of the estimate to theta, and the information C and the vector d of theta in the innovations
+    (Willsky and Jones 1976): innovation_k = (H_k - G_k F) theta + noise. A step adds H theta from s on, a creep H theta
+    (t - t_s) / RAMP_S.
     """
 
     def __init__(self, covariance: Array, config: FilterConfig) -> None:
@@ -180,8 +184,8 @@ class DriftFilter:
     def update(self, rows: Rows, i: int, noise: FrameNoise, *, spawn: bool = True) -> None:
         """Take frame i of the rows. With ``spawn``, hypotheses are added as they are due.
 
-        A frame at a pose that the features of a full field do not reach says nothing: scanner and arm err there as they do in every lap, and
-        taken for noise that would become a move within some hundred frames.
+        A frame at a pose that the features of a full field do not reach says nothing: scanner and arm err there as they
+        do in every lap, and taken for noise that would become a move within some hundred frames.
         """
         t = float(rows.times[i])
         if self._time is not None:
@@ -211,7 +215,8 @@ class DriftFilter:
         w, K, D = whitened[:, 0], whitened[:, 1 : 1 + n].T, whitened[:, 1 + n :]  # K: P G' L^-T
         excess = float(w @ w) / _INFLUENCE
         if excess > 1.0 and self.favourite is not None:
-            # a frame is judged by the hypothesis that it fits better: else those that show a change best would count least
+            # a frame is judged by the hypothesis that it fits better: else those that show a change best would count
+            # least
             k, change = self.favourite
             e = w - D.reshape(_ROWS, -1, SIZE)[:, k] @ change
             excess = min(excess, float(e @ e) / _INFLUENCE)
@@ -223,8 +228,8 @@ class DriftFilter:
         P -= K @ K.T
 
     def renew_field(self) -> None:
-        """Forget what was learnt of the field, and the hypotheses, where the arm works at poses that its features do not reach;
-        what is known of error, clock and scale stays."""
+        """Forget what was learnt of the field, and the hypotheses, where the arm works at poses that its features do
+        not reach; what is known of error, clock and scale stays."""
         self._x[SIZE:] = 0.0
         known = self._P[:SIZE, :SIZE].copy()
         self._P[:] = 0.0
@@ -268,8 +273,8 @@ class DriftFilter:
         self.frames[on] += 1
 
     def absorb(self, k: int, change: Array, covariance: Array) -> None:
-        """Take hypothesis k, with its change (SIZE,) and covariance (SIZE, SIZE), for the truth: the estimate is from then on
-        that of the pose after the change; the field that was learnt before it stays. Clears the hypotheses."""
+        """Take hypothesis k, with its change (SIZE,) and covariance (SIZE, SIZE), for the truth: the estimate is from
+        then on that of the pose after the change; the field that was learnt before it stays. Clears the hypotheses."""
         n = self._n
         share = 1.0
         if self.kind[k] == RAMP:

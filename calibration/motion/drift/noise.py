@@ -28,7 +28,8 @@ class FrameNoise:
     jitter_s: float = 0.0
 
     def covariance(self, fit: Array, motion: Array) -> Array:
-        """Covariance (5, 5) of a residual with the fit's (5, 5) and its derivative (5,) by the time: S + sigma_j^2 u u'."""
+        """Covariance (5, 5) of a residual with the fit's (5, 5) and its derivative (5,) by the time: S + sigma_j^2 u
+        u'."""
         factors = np.array([self.center] * 3 + [self.normal] * 2)
         return np.asarray(fit * np.outer(factors, factors) + self.jitter_s**2 * np.outer(motion, motion))
 
@@ -36,9 +37,10 @@ class FrameNoise:
 class NoiseMemory:
     """The noise to test with, from windows of some hundred frames that are measured one after another.
 
-    A window's factors vary by a tenth, with its few triples and wrong fits. A statistic that counts in sigmas of the window that happens
-    to be the quietest is too large, and a test of many frames meets such windows. So the noise is the newest window's, but in no part less
-    than the geometric mean over the windows of the last ``frames``, to which a moment of wrong fits adds little.
+    A window's factors vary by a tenth, with its few triples and wrong fits. A statistic that counts in sigmas of the
+    window that happens to be the quietest is too large, and a test of many frames meets such windows. So the noise is
+    the newest window's, but in no part less than the geometric mean over the windows of the last ``frames``, to which a
+    moment of wrong fits adds little.
     """
 
     def __init__(self, frames: int) -> None:
@@ -57,10 +59,10 @@ class NoiseMemory:
 def measured_noise(rows: Rows, *, clock_s: float = 0.0) -> FrameNoise | None:
     """The noise in rows (n) in the order of their times; None where fewer than LEAST triples follow each other.
 
-    Second differences of neighbours cancel what varies slowly: the calibration's error, a change of the pose, the scanner's
-    warp along the path. ``clock_s`` is a known error of the clock, which acceleration would leave in them. The jitter is taken
-    from the motion's direction and the fits' noise from the two directions across it. Differences are clipped at four robust
-    sigmas: a skewed jitter counts whole, a wrong fit does not.
+    Second differences of neighbours cancel what varies slowly: the calibration's error, a change of the pose, the
+    scanner's warp along the path. ``clock_s`` is a known error of the clock, which acceleration would leave in them.
+    The jitter is taken from the motion's direction and the fits' noise from the two directions across it. Differences
+    are clipped at four robust sigmas: a skewed jitter counts whole, a wrong fit does not.
     """
     if len(rows) < LEAST + 2:
         return None

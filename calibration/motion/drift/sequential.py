@@ -28,12 +28,13 @@ _PARSIMONY = 0.01  # a simpler change is named unless the data refuse it at this
 class DriftConfig:
     """Settings of the test. ``false_alarms_per_hour`` bounds the alarms in a cell in which nothing happens.
 
-    ``floor_m`` and ``floor_rad`` are sigmas per axis, at the pivot, of what no model here explains and no number of frames
-    averages away; ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a change that is
-    as old as the first frame; it is tested for ``stated_s``. Changes older than ``longest_s`` are not tested. An alarm waits
-    ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a warm-up explains a slow change as well.
-    The noise is that of the last ``noise_frames``, and no less than the mean of the last ``noise_memory``.
-    Where ``novel_frames`` of the last 80 or so are at poses that the field's features do not reach, the field is learnt anew.
+    ``floor_m`` and ``floor_rad`` are sigmas per axis, at the pivot, of what no model here explains and no number of
+    frames averages away; ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a
+    change that is as old as the first frame; it is tested for ``stated_s``. Changes older than ``longest_s`` are not
+    tested. An alarm waits ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a warm-up
+    explains a slow change as well. The noise is that of the last ``noise_frames``, and no less than the mean of the
+    last ``noise_memory``. Where ``novel_frames`` of the last 80 or so are at poses that the field's features do not
+    reach, the field is learnt anew.
     """
 
     false_alarms_per_hour: float = 1e-3
@@ -55,11 +56,13 @@ class DriftConfig:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DriftEvent:
-    """A change: its kind (moved, creep or warm-up), its time and when it was found (robot clock, s), and the move of the scanner
-    about its own origin in the base: translation (3,) m, rotation vector (3,) rad, their covariance (6, 6) [rotation;
-    translation], the pose after it, the test statistic and its threshold. ``model`` says what of the move is significant:
-    translation, rotation or both, and ``cause`` what residuals of the flange can tell of the cause. ``since_start`` holds where
-    the change is as old as the first frame. Of a warm-up, ``scale`` is the change of the scanner's scale; the move is zero."""
+    """A change: its kind (moved, creep or warm-up), its time and when it was found (robot clock, s), and the move of
+    the scanner about its own origin in the base: translation (3,) m, rotation vector (3,) rad, their covariance (6, 6)
+    [rotation; translation], the pose after it, the test statistic and its threshold. ``model`` says what of the move is
+    significant: translation, rotation or both, and ``cause`` what residuals of the flange can tell of the cause.
+    ``since_start`` holds where the change is as old as the first frame. Of a warm-up, ``scale`` is the change of the
+    scanner's scale; the move is zero.
+    """
 
     kind: str
     time_s: float
@@ -80,15 +83,20 @@ class DriftEvent:
 class DriftTest:
     """Feeds residuals of frames, in the order of their times, to the filter, raises alarms and turns them into events.
 
-    ``X_BC`` and its ``covariance`` (6, 6) [rotation; translation] about the camera's origin are the calibration's; ``pivot``
-    (3,) m in B is a point in the middle of the work. Rows are residuals against that calibration about that pivot. The noise is
-    measured from the frames themselves unless it is given. Theory: docs/drift.md.
+    ``X_BC`` and its ``covariance`` (6, 6) [rotation; translation] about the camera's origin are the calibration's;
+    ``pivot`` (3,) m in B is a point in the middle of the work. Rows are residuals against that calibration about that
+    pivot. The noise is measured from the frames themselves unless it is given. Theory: docs/drift.md.
     """
 
     def __init__(
-        self, X_BC: RigidTransform, covariance: Array, pivot: Array, config: DriftConfig | None = None,
-        noise: FrameNoise | None = None, frame_rate_hz: float = 20.0,
-    ) -> None:  # fmt: skip
+        self,
+        X_BC: RigidTransform,
+        covariance: Array,
+        pivot: Array,
+        config: DriftConfig | None = None,
+        noise: FrameNoise | None = None,
+        frame_rate_hz: float = 20.0,
+    ) -> None:
         self.config = config or DriftConfig()
         self._X_BC, self._pivot = X_BC, np.asarray(pivot, dtype=float)
         self._lever = self._pivot - np.asarray(X_BC.translation())
@@ -122,8 +130,8 @@ class DriftTest:
         return self._alarm_s is not None
 
     def current(self) -> tuple[RigidTransform, Array]:
-        """The scanner's pose as it is now, and its covariance (6, 6) [rotation; translation] about the camera's origin: the
-        calibration, corrected by what all frames since the last change say. This is the recalibration."""
+        """The scanner's pose as it is now, and its covariance (6, 6) [rotation; translation] about the camera's origin:
+        the calibration, corrected by what all frames since the last change say. This is the recalibration."""
         X = moved_about(self._X_BC, self.filter.error[MOVE], self._pivot)
         return X, about(self.filter.covariance[MOVE, MOVE], -self._lever)
 
@@ -156,8 +164,10 @@ class DriftTest:
         return out
 
     def finish(self) -> list[DriftEvent]:
-        """No more frames: settle an alarm that stands. Frames too few for their noise to be measured are tested with the stated
-        one."""
+        """No more frames: settle an alarm that stands.
+
+        Frames too few for their noise to be measured are tested with the stated one.
+        """
         out: list[DriftEvent] = []
         if self.noise is None and self._waiting:
             self.noise = FrameNoise()
@@ -196,7 +206,8 @@ class DriftTest:
         return theta, C, gain, np.maximum(left, 1.0)
 
     def _statistics(self, now: float) -> tuple[Array, Array, Array, Array]:
-        """Test statistic (k,) of a move of every hypothesis, in terms of one with six unknowns, its estimate (k, 7), covariance (k, 7, 7) and variance factor."""
+        """Test statistic (k,) of a move of every hypothesis, in terms of one with six unknowns, its estimate (k, 7),
+        covariance (k, 7, 7) and variance factor."""
         f, c = self.filter, self.config
         theta, C, _, left = self._changes(_RIGID)
         C = C * left[:, None, None]
@@ -230,7 +241,10 @@ class DriftTest:
             self._alarm_s, self._settles_s = t, t + self.config.confirm_s
 
     def _settle(self, t: float, *, last: bool = False) -> list[DriftEvent]:
-        """The event of the best hypothesis; the filter goes on from the pose after it. An alarm that has faded is withdrawn."""
+        """The event of the best hypothesis; the filter goes on from the pose after it.
+
+        An alarm that has faded is withdrawn.
+        """
         found = self._alarm_s
         assert found is not None
         self._alarm_s, self._settles_s = None, np.inf
@@ -320,8 +334,8 @@ class DriftTest:
         return event
 
     def _simplest(self, move: Array, cov: Array) -> tuple[str, Array, Array]:
-        """The move about the pivot and its covariance, as a pure translation or a pure rotation about the scanner's origin where
-        the data do not refuse it."""
+        """The move about the pivot and its covariance, as a pure translation or a pure rotation about the scanner's
+        origin where the data do not refuse it."""
         c = self.config
         S = cov + np.diag(np.repeat([c.floor_rad**2, c.floor_m**2], 3))
         W = np.linalg.inv(S)
@@ -336,7 +350,8 @@ class DriftTest:
         return ("both", move, S) if best is None else best[1:]
 
     def _when(self, k: int, gain: Array, left: Array) -> tuple[float, float]:
-        """Time (s) of the change and its sigma: mean over the hypotheses of the same kind, weighted by their likelihood."""
+        """Time (s) of the change and its sigma: mean over the hypotheses of the same kind, weighted by their
+        likelihood."""
         f = self.filter
         least = self.config.least_frames if f.kind[k] == STEP else self.config.creep_frames
         same = np.flatnonzero((f.kind == f.kind[k]) & f.used & (f.frames >= least))

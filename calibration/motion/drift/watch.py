@@ -1,4 +1,5 @@
-"""Watches a calibration over a recording in motion: synchronises its frames, tests for drift, recalibrates from what follows."""
+"""Watches a calibration over a recording in motion: synchronises its frames, tests for drift, recalibrates from what
+follows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -28,15 +29,15 @@ _ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show i
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Watched:
+class DriftHistory:
     """What a recording says of a calibration, for its N tracked frames in the order of their times.
 
-    ``rows`` are the residuals against the calibration at the nominal capture times; ``residuals`` (N, 3) m and ``tilts`` (N, 2)
-    rad those after each frame's own time is taken out as far as the jitter allows; ``offsets`` (N,) s is by how much each frame was
-    later than nominal. ``before`` (N, 3) m are the residuals of frames taken for as old as their arrival, ``after`` (N, 3) m those
-    against the pose that held at the time. ``gross`` (N,) frames show something else. ``statistic`` (N,) is the drift test's
-    largest, over ``threshold``. ``X_BC`` and ``covariance`` (6, 6) are those at the end; ``since_s`` is from when on they hold.
-    ``dropped`` lists (id, reason).
+    ``rows`` are the residuals against the calibration at the nominal capture times; ``residuals`` (N, 3) m and
+    ``tilts`` (N, 2) rad those after each frame's own time is taken out as far as the jitter allows; ``offsets`` (N,) s
+    is by how much each frame was later than nominal. ``before`` (N, 3) m are the residuals of frames taken for as old
+    as their arrival, ``after`` (N, 3) m those against the pose that held at the time. ``gross`` (N,) frames show
+    something else. ``statistic`` (N,) is the drift test's largest, over ``threshold``. ``X_BC`` and ``covariance`` (6,
+    6) are those at the end; ``since_s`` is from when on they hold. ``dropped`` lists (id, reason).
     """
 
     ids: tuple[str, ...]
@@ -76,8 +77,11 @@ def watch(
     X_FR: RigidTransform | None = None,
     dropped: Sequence[tuple[str, str]] = (),
     config: DriftConfig | None = None,
-) -> Watched:
-    """Watch a calibration over the frames of a recording. Raises InputError where no frame lies within the robot's stream."""
+) -> DriftHistory:
+    """Watch a calibration over the frames of a recording.
+
+    Raises InputError where no frame lies within the robot's stream.
+    """
     frames = _corrected(result, frames)
     clock = synchronise(frames, motion, result.X_BC, X_FR=X_FR, known=result.clock)
     found = _tested(result, frames, motion, clock, X_FR, dropped, config)
@@ -96,7 +100,8 @@ def watch(
 def drift_config(
     sigma_position_m: float, clock_sigma_s: float | None, config: DriftConfig | None = None
 ) -> DriftConfig:
-    """The test's settings for a calibration: its spread of scanner and arm is that of the field, where it states a larger one."""
+    """The test's settings for a calibration: its spread of scanner and arm is that of the field, where it states a
+    larger one."""
     config = config or DriftConfig()
     spread = float(np.clip(sigma_position_m, config.filter.field.sigma_m, _MOST_SPREAD_M))
     clock = max(_CLOCK_S, 3.0 * (clock_sigma_s if clock_sigma_s is not None else 10.0 * _CLOCK_S))
@@ -105,9 +110,14 @@ def drift_config(
 
 
 def _tested(
-    result: CalibrationResult, frames: ObservedFrames, motion: ContinuousMotion, clock: Synchronised,
-    X_FR: RigidTransform | None, dropped: Sequence[tuple[str, str]], config: DriftConfig | None,
-) -> Watched:  # fmt: skip
+    result: CalibrationResult,
+    frames: ObservedFrames,
+    motion: ContinuousMotion,
+    clock: Synchronised,
+    X_FR: RigidTransform | None,
+    dropped: Sequence[tuple[str, str]],
+    config: DriftConfig | None,
+) -> DriftHistory:
     at = motion.feature(clock.times, X_FR)
     inside = np.isfinite(at.p).all(axis=1) & np.isfinite(at.v).all(axis=1)
     order = np.flatnonzero(inside)[np.argsort(clock.times[inside], kind="stable")]
@@ -119,9 +129,18 @@ def _tested(
     ]
     pivot = at.p[order].mean(axis=0)
     rows = rows_of(
-        result.X_BC, pivot, clock.times[order], at.p[order], at.n[order], at.v[order], at.turn[order], frames.p_C[order],
-        frames.n_C[order], frames.covariance[order], frames.normal_sigma[order],
-    )  # fmt: skip
+        result.X_BC,
+        pivot,
+        clock.times[order],
+        at.p[order],
+        at.n[order],
+        at.v[order],
+        at.turn[order],
+        frames.p_C[order],
+        frames.n_C[order],
+        frames.covariance[order],
+        frames.normal_sigma[order],
+    )
     usual = clock.jitter_s or (_DEVICE_JITTER_S if clock.clock.kind == DEVICE else _ARRIVAL_JITTER_S)
     noise = measured_noise(rows) or FrameNoise(jitter_s=usual)
     interval = float(np.median(np.diff(rows.times))) if len(rows) > 1 else 0.05
@@ -142,16 +161,25 @@ def _tested(
     moves = [e for e in events if e.kind != WARM_UP]
     p_C, n_C = _as_before(result.X_BC, moves, clock.times, frames)
     held = rows_of(
-        result.X_BC, pivot, clock.times[order], at.p[order], at.n[order], at.v[order], at.turn[order], p_C[order], n_C[order],
-        frames.covariance[order], frames.normal_sigma[order],
-    )  # fmt: skip
+        result.X_BC,
+        pivot,
+        clock.times[order],
+        at.p[order],
+        at.n[order],
+        at.v[order],
+        at.turn[order],
+        p_C[order],
+        n_C[order],
+        frames.covariance[order],
+        frames.normal_sigma[order],
+    )
     late, gross = _lateness(held, noise)
     moved = late[:, None] * rows.derivatives[:, :, CLOCK]
     residuals, tilts = (rows.residuals - moved)[:, :3], (rows.residuals - moved)[:, 3:]
     at_arrival = motion.feature(clock.clock.base[order], X_FR).p
     before = rows.residuals[:, :3] + at.p[order] - at_arrival
     after = held.residuals[:, :3] - moved[:, :3]
-    return Watched(
+    return DriftHistory(
         ids=tuple(frames.ids[k] for k in order),
         rows=rows,
         residuals=residuals,
@@ -173,7 +201,8 @@ def _tested(
 
 
 def _lateness(rows: Rows, noise: FrameNoise) -> tuple[Array, NDArray[np.bool_]]:
-    """How much later than nominal each frame was most probably taken (N,) s, and which frames show something else (N,)."""
+    """How much later than nominal each frame was most probably taken (N,) s, and which frames show something else
+    (N,)."""
     u = rows.derivatives[:, :, CLOCK]
     factors = np.repeat([noise.center, noise.normal], [3, 2])
     S = rows.covariances * np.outer(factors, factors)
@@ -192,7 +221,10 @@ def _lateness(rows: Rows, noise: FrameNoise) -> tuple[Array, NDArray[np.bool_]]:
 def _as_before(
     X_BC: RigidTransform, moves: Sequence[DriftEvent], times: Array, frames: ObservedFrames
 ) -> tuple[Array, Array]:
-    """Centres and normals (N, 3) as the scanner would have seen them from X_BC, had it not moved. A creep counts from its middle."""
+    """Centres and normals (N, 3) as the scanner would have seen them from X_BC, had it not moved.
+
+    A creep counts from its middle.
+    """
     p_C, n_C = frames.p_C.copy(), frames.n_C.copy()
     for e, following in zip(moves, [*moves[1:], None], strict=False):
         now = times >= e.time_s

@@ -26,7 +26,8 @@ def extract_edge(profile: ArrayLike, kind: Kind, side: Literal["left", "right"] 
 
     Args:
         profile: (n, 2) [x, z] m, z growing away from the sensor; NaN where nothing returned.
-        kind: `bar` (a jump of 5 mm or more), `step` (0.5 mm or more), `apex` (two flanks meeting nearest to the sensor).
+        kind: `bar` (a jump of 5 mm or more), `step` (0.5 mm or more), `apex` (two flanks meeting nearest to the
+            sensor).
         side: at which end of the near face the edge is; for an apex, which flank is the steep one (either will do).
 
     Raises:

@@ -1,8 +1,8 @@
 """Estimates X_FS from one straight edge seen in any poses, in one least-squares problem without an initial guess.
 
-Every measured profile point is compared with where the edge crosses the scan plane, in units of its own sigma (sensor and
-robot), with a Cauchy loss that keeps 95 % of what least squares would get; the covariance is the Cramer-Rao bound over that
-share, where the stated sigmas are right.
+Every measured profile point is compared with where the edge crosses the scan plane, in units of its own sigma (sensor
+and robot), with a Cauchy loss that keeps 95 % of what least squares would get; the covariance is the Cramer-Rao bound
+over that share, where the stated sigmas are right.
 """
 
 from dataclasses import dataclass
@@ -89,7 +89,8 @@ def edge_joint(
 def edge_optima(
     poses: FlangePoses, p: Floats, sigma_robot_m: float, sigmas: Floats, init: EdgeState | None = None
 ) -> list[tuple[EdgeState, float]]:
-    """The optima of a robust loss from the 24 orientations of a cube, or the one from ``init``, and their costs, best first.
+    """The optima of a robust loss from the 24 orientations of a cube, or the one from ``init``, and their costs, best
+    first.
 
     Raises:
         TooFewTranslations: fewer than six poses.
@@ -104,19 +105,21 @@ def edge_optima(
 
 
 def _refuse_rivals(estimate: EdgeEstimate, others: list[EdgeState]) -> None:
-    """Another mounting that explains the points as well is not to be told from the best by its covariance, which is local."""
+    """Another mounting that explains the points as well is not to be told from the best by its covariance, which is
+    local."""
     sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
     for other in others:
         cosine = 0.5 * (np.trace(estimate.rotation.T @ other.rotation) - 1.0)
         angle = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         if angle > max(APART_RAD, 5.0 * sigma):
             raise DegenerateMotion(
-                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these points alike: tilt the flange "
-                "more, about two axes, and let the edge cross the laser line at different places."
+                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these points alike: tilt"
+                " the flange more, about two axes, and let the edge cross the laser line at different places."
             )
     if sigma > OPEN_RAD:
         raise DegenerateMotion(
-            f"These motions leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange further, about two axes."
+            f"These motions leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange"
+            " further, about two axes."
         )
 
 
@@ -138,7 +141,8 @@ def _fitted(
     sigmas: Floats,
     inliers: NDArray[np.bool_] | None = None,
 ) -> tuple[EdgeState, float]:
-    """Levenberg-Marquardt with a Cauchy loss on each coordinate, of all poses or of the inliers; the state and its cost."""
+    """Levenberg-Marquardt with a Cauchy loss on each coordinate, of all poses or of the inliers; the state and its
+    cost."""
     damping = 1e-3
     _, r, J = _system(state, poses, p, sigma_robot_m, sigmas)
     cost = _cost(r, inliers)
@@ -166,17 +170,12 @@ def _fitted(
 
 
 def _settled(
-    state: EdgeState,
-    poses: FlangePoses,
-    p: Floats,
-    sigma_robot_m: float,
-    sigmas: Floats,
-    inliers: NDArray[np.bool_],
+    state: EdgeState, poses: FlangePoses, p: Floats, sigma_robot_m: float, sigmas: Floats, inliers: NDArray[np.bool_]
 ) -> EdgeState:
     """Where the weighted residuals balance: full steps, each with the covariances of the state before.
 
-    The descent compares costs whose covariances change with the state, which favours states in which the robot's error looks
-    large; the balance does not. Where the steps do not shrink (an open direction), the state is left as it was.
+    The descent compares costs whose covariances change with the state, which favours states in which the robot's error
+    looks large; the balance does not. Where the steps do not shrink (an open direction), the state is left as it was.
     """
     at, size = state, np.inf
     for _ in range(ITERATIONS):
@@ -220,8 +219,8 @@ def _estimate(state: EdgeState, poses: FlangePoses, p: Floats, sigma_robot_m: fl
     chi2_all = float(np.median(_square(r)) / (2.0 * np.log(2.0)))  # the median of chi-square with 2 degrees is 2 ln 2
     if kept < MINIMUM_POSES or (kept < CONSISTENT_SHARE * len(poses) and chi2_all > 1.0):
         text = (
-            f"Only {kept} of {len(poses)} points lie on one edge: scan one edge only, state the sigmas of robot and scanner, "
-            "and check unit and convention of the poses."
+            f"Only {kept} of {len(poses)} points lie on one edge: scan one edge only, state the sigmas of robot and"
+            " scanner, and check unit and convention of the poses."
         )
         raise InconsistentData(text)
     Ji = J[inliers].reshape(-1, 10)
@@ -253,7 +252,8 @@ def _estimate(state: EdgeState, poses: FlangePoses, p: Floats, sigma_robot_m: fl
 def edge_crb(
     state: EdgeState, rotation: ArrayLike, translation: ArrayLike, *, sigma_robot_m: float, sigma_xz_m: ArrayLike
 ) -> Floats:
-    """Cramer-Rao bound (6, 6) of [rotation in F; translation] for these poses and sigmas: no unbiased method does better."""
+    """Cramer-Rao bound (6, 6) of [rotation in F; translation] for these poses and sigmas: no unbiased method does
+    better."""
     poses = FlangePoses.checked(rotation, translation)
     p, _, _ = predicted(state, poses)
     _, _, J = _system(state, poses, p, sigma_robot_m, np.asarray(sigma_xz_m, float))

@@ -1,7 +1,8 @@
 """The straight-edge paper's method: X_FS in two linear steps from a grid of rotations and translations.
 
-As published it answers some degenerate motions with confident nonsense (collinear translations: 93 degrees off), because the
-rank of its matrix does not show them in noise; here these motions are named and refused. Kept beside edge_joint to compare.
+As published it answers some degenerate motions with confident nonsense (collinear translations: 93 degrees off),
+because the rank of its matrix does not show them in noise; here these motions are named and refused. Kept beside
+edge_joint to compare.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,8 @@ ONE_EDGE = 2.0  # and over the rms within orientations, which noise and outliers
 
 @dataclass(frozen=True, eq=False)
 class EdgeLinear:
-    """The paper's result: R_FS (3, 3), p_FS (3,) m, the edge's unit direction (3,) in B and the distances (n,) m to it."""
+    """The paper's result: R_FS (3, 3), p_FS (3,) m, the edge's unit direction (3,) in B and the distances (n,) m to
+    it."""
 
     rotation: Floats
     translation: Floats
@@ -72,7 +74,8 @@ def edge_linear(
 def _refuse_degenerate(poses: FlangePoses, groups: list[np.ndarray]) -> None:
     if len(groups) < MINIMUM_GROUPS:
         raise TooFewRotations(
-            f"{len(groups)} orientations of the flange are too few: take {MINIMUM_GROUPS} or more, turned about different axes."
+            f"{len(groups)} orientations of the flange are too few: take {MINIMUM_GROUPS} or more, turned about"
+            " different axes."
         )
     if min(len(g) for g in groups) < MINIMUM_TRANSLATIONS:
         raise TooFewTranslations(
@@ -85,7 +88,8 @@ def _refuse_degenerate(poses: FlangePoses, groups: list[np.ndarray]) -> None:
         flat += bool(s[1] < max(PLANAR * s[0], SMALL_M * np.sqrt(len(g))))
     if len(groups) - flat < MINIMUM_GROUPS:
         raise DegenerateMotion(
-            "The positions of the flange lie on a line, or within a millimetre, in (nearly) every orientation: move along an arc or in a plane."
+            "The positions of the flange lie on a line, or within a millimetre, in (nearly) every orientation: move"
+            " along an arc or in a plane."
         )
     if rotation_axes_spread(poses.rotation[[g[0] for g in groups]]) < ONE_AXIS:
         raise DegenerateMotion(
@@ -99,8 +103,8 @@ def _refuse_two_edges(off: Floats, groups: list[np.ndarray]) -> None:
     between = float(np.sqrt((middles**2).sum(axis=1).mean()))
     if between > max(ONE_EDGE_M, ONE_EDGE * float(np.sqrt((within**2).sum(axis=1).mean()))):
         raise InconsistentData(
-            f"The orientations do not see one edge: they differ by {1e3 * between:.1f} mm (rms). Take one straight edge that stays in "
-            "place, and the flange poses of these profiles."
+            f"The orientations do not see one edge: they differ by {1e3 * between:.1f} mm (rms). Take one straight edge"
+            " that stays in place, and the flange poses of these profiles."
         )
 
 

@@ -1,6 +1,7 @@
 """Predicts where a straight edge meets the scan plane, with derivatives and covariance.
 
-Frames: B robot base, F flange, S scan plane (a profile point [x, z] is p_S = (x, 0, z)). Derivation in docs/profiler.md.
+Frames: B robot base, F flange, S scan plane (a profile point [x, z] is p_S = (x, 0, z)). Derivation in
+docs/profiler.md.
 """
 
 from __future__ import annotations

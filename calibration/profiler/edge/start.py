@@ -1,7 +1,7 @@
 """Initial estimates of the edge problem: point-to-line least squares from the 24 orientations of a cube.
 
-The distance of a point to a line has no division by the angle between edge and scan plane, so that this converges from any
-orientation, where the reprojection of edge_joint would not.
+The distance of a point to a line has no division by the angle between edge and scan plane, so that this converges from
+any orientation, where the reprojection of edge_joint would not.
 """
 
 import itertools
@@ -121,7 +121,8 @@ def _tangents(e: Floats) -> Floats:
 def _linearised(
     poses: FlangePoses, R: Floats, t: Floats, mean: Floats, e: Floats, p_S: Floats
 ) -> tuple[Floats, Floats]:
-    """Distances (m, n, 3) and their Jacobian (m, n, 3, 10) by [turn in S; p_FS; line's point and direction across it]."""
+    """Distances (m, n, 3) and their Jacobian (m, n, 3, 10) by [turn in S; p_FS; line's point and direction across
+    it]."""
     m, n = len(R), len(p_S)
     points = _in_base(poses, R, t, p_S)
     off = points - mean[:, None]

@@ -26,7 +26,8 @@ class Frustum:
     Attributes:
         normals: (6, 3) outwards: base, top, then the four sides around the top; distances_m: (6,).
         corners_top, corners_base: (4, 3) m, each between two sides; hips_m: (4,) lengths of the slanted edges.
-        dihedrals_rad: (4,) between each side and the top, as the slope of the side; labels: (n,) plane of each point, -1 none.
+        dihedrals_rad: (4,) between each side and the top, as the slope of the side; labels: (n,) plane of each point,
+            -1 none.
         rms_m: of the points off their planes.
     """
 
@@ -41,7 +42,8 @@ class Frustum:
 
 
 def fit_frustum(points: ArrayLike) -> Frustum:
-    """Fit the frustum in a cloud (n, 3) m that shows its base plate, its top and its four sides, whatever its orientation.
+    """Fit the frustum in a cloud (n, 3) m that shows its base plate, its top and its four sides, whatever its
+    orientation.
 
     Raises:
         FeatureNotFound: fewer planes, or not like a frustum. InputError: not a cloud.
@@ -77,7 +79,8 @@ def _normals(p: Floats) -> Floats:
 
 
 def _main_direction(normals: Floats) -> Floats:
-    """The direction that most normals have: base and top are parallel; the sides' mean outward direction says which way is up."""
+    """The direction that most normals have: base and top are parallel; the sides' mean outward direction says which way
+    is up."""
     outer = normals.T @ normals
     _, vectors = np.linalg.eigh(outer)
     up = vectors[:, 2]
@@ -135,7 +138,8 @@ def _across(p: Floats, up: Floats) -> Floats:
 
 
 def _refined(p: Floats, labels: NDArray[np.intp]) -> list[Floats]:
-    """Planes (4,) [normal, d] by Tukey's weights; labels of points near a neighbouring plane are taken away, in place."""
+    """Planes (4,) [normal, d] by Tukey's weights; labels of points near a neighbouring plane are taken away, in
+    place."""
     planes = [_plane(p[labels == k]) for k in range(6)]
     for _ in range(3):
         distance = np.abs(np.column_stack([p @ q[:3] - q[3] for q in planes]))

@@ -1,7 +1,7 @@
 """Extracts the edges and the root of a V-groove from a raw profile, as intersections of four robust lines.
 
-Where the seam turns under the laser line its walls are curved in the profile: a bend that the samples show is followed, and one
-that they may hide is in the sigmas.
+Where the seam turns under the laser line its walls are curved in the profile: a bend that the samples show is followed,
+and one that they may hide is in the sigmas.
 """
 
 from dataclasses import dataclass
@@ -36,7 +36,8 @@ class GrooveFeatures:
 
 
 def groove_features(profile: ArrayLike) -> GrooveFeatures:
-    """The features of a V-groove in a profile (n, 2) [x, z] m, z growing away from the sensor, NaN where nothing returned.
+    """The features of a V-groove in a profile (n, 2) [x, z] m, z growing away from the sensor, NaN where nothing
+    returned.
 
     Raises:
         FeatureNotFound: no V-groove with both walls and the plate on both sides. InputError: not a profile.
@@ -76,10 +77,11 @@ def groove_features(profile: ArrayLike) -> GrooveFeatures:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Line:
-    """z, a polynomial of u = (x - x0) / reach: its coefficients (k,) and their covariance, and the sigma of a sample across it.
+    """z, a polynomial of u = (x - x0) / reach: its coefficients (k,) and their covariance, and the sigma of a sample
+    across it.
 
-    Straight where the samples show no bend; `unseen` are then the squares (m) that coefficients of higher powers may still have,
-    each with what of its power (m, 4) the polynomial leaves.
+    Straight where the samples show no bend; `unseen` are then the squares (m) that coefficients of higher powers may
+    still have, each with what of its power (m, 4) the polynomial leaves.
     """
 
     x0: float
@@ -105,7 +107,8 @@ class _Line:
 
 
 def _start(x: Floats, z: Floats) -> Floats:
-    """Where the four lines meet, roughly: the plate from the outer samples, the root deepest, the edges where it leaves."""
+    """Where the four lines meet, roughly: the plate from the outer samples, the root deepest, the edges where it
+    leaves."""
     k = max(int(OUTER * len(x)), MINIMUM_SAMPLES)
     ends = np.r_[:k, len(x) - k : len(x)]
     slope, level = np.polyfit(x[ends], z[ends], 1)

@@ -1,7 +1,7 @@
 """Estimates X_FS from raw profiles of a sphere in any poses, and from touches, in one least-squares problem.
 
-Every profile point lies on the sphere, and so does the tip at every touch. The sensor's scale and shear in its plane and,
-where the joint angles are given, the arm's offsets and sag may be estimated with it, each held by a prior.
+Every profile point lies on the sphere, and so does the tip at every touch. The sensor's scale and shear in its plane
+and, where the joint angles are given, the arm's offsets and sag may be estimated with it, each held by a prior.
 """
 
 from dataclasses import dataclass, field, replace
@@ -13,10 +13,16 @@ from scipy.optimize import OptimizeResult
 
 from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
+from weldcal.calibration.profiler.arm_errors import DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
-from weldcal.calibration.profiler.sphere.model import Layout, Problem, SphereData, SphereSigmas, corrected
+from weldcal.calibration.profiler.sphere.model import (
+    ParameterLayout,
+    SphereData,
+    SphereProblem,
+    SphereSigmas,
+    corrected,
+)
 from weldcal.calibration.profiler.sphere.start import sphere_starts
 from weldcal.models.errors import InputError
 
@@ -45,7 +51,7 @@ class SphereEstimate(ProfilerEstimate):
     tip: Floats | None = None
     affine: Floats = field(default_factory=lambda: np.zeros(3))
     origin: Floats = field(default_factory=lambda: np.zeros(2))
-    arm_errors: ArmErrors = field(default_factory=ArmErrors.none)
+    arm_errors: ProfilerArmErrors = field(default_factory=ProfilerArmErrors.none)
     wrong_poses: tuple[int, ...] = ()
     radius_change_m: float = 0.0
     radius_sigma_m: float = float("nan")
@@ -85,8 +91,8 @@ def sphere_joint(
     """
     s = sigmas or SphereSigmas()
     _check(data, model)
-    layout = Layout(tip=data.touches is not None, affine=model != "rigid", joints=model == "affine+joints")
-    problem = Problem(data, layout, s)
+    layout = ParameterLayout(tip=data.touches is not None, affine=model != "rigid", joints=model == "affine+joints")
+    problem = SphereProblem(data, layout, s)
     rivals: list[Floats] = []
     if init is not None:
         R, result = problem.solved(init.rotation, init.translation, _started(init, data, layout))
@@ -95,7 +101,8 @@ def sphere_joint(
         found = sphere_optima(data, s)
         R, result = found[0]
         about = _turned(R, result.x)
-        # soft_l1's cost is half of chi-square where residuals are small; sigmas that are too small exaggerate differences
+        # soft_l1's cost is half of chi-square where residuals are small; sigmas that are too small exaggerate
+        # differences
         excess = max(1.0, 2.0 * float(result.cost) / max(len(result.fun) - len(result.x), 1))
         rivals = [
             _turned(one[0], one[1].x) for one in found if 2.0 * float(one[1].cost - result.cost) < RIVAL**2 * excess
@@ -113,20 +120,21 @@ def sphere_joint(
 
 
 def sphere_optima(data: SphereData, sigmas: SphereSigmas) -> list[tuple[Floats, OptimizeResult]]:
-    """The optima of the rigid model from the 24 orientations of a cube, best first: a rotation R_FS (3, 3), and the solution about it.
+    """The optima of the rigid model from the 24 orientations of a cube, best first: a rotation R_FS (3, 3), and the
+    solution about it.
 
     Raises:
         InputError, TooFewTranslations: as sphere_joint.
     """
     _check(data, "rigid")
-    layout = Layout(tip=data.touches is not None, affine=False, joints=False)
-    problem = Problem(data, layout, sigmas)
+    layout = ParameterLayout(tip=data.touches is not None, affine=False, joints=False)
+    problem = SphereProblem(data, layout, sigmas)
     starts = sphere_starts(data.poses, problem.profiles, data.radius_m)
     found = [problem.solved(R, t, np.concatenate([np.zeros(6), c, np.zeros(3 * layout.tip)])) for R, t, c in starts]
     return sorted(found, key=lambda one: float(one[1].cost))
 
 
-def _started(init: SphereEstimate, data: SphereData, layout: Layout) -> Floats:
+def _started(init: SphereEstimate, data: SphereData, layout: ParameterLayout) -> Floats:
     """The unknowns of an estimate, but for its pose."""
     parts = [np.zeros(6), init.center]
     if layout.tip:
@@ -149,13 +157,13 @@ def _refuse_open(estimate: SphereEstimate, best: Floats, rivals: list[Floats]) -
         angle = float(np.arccos(np.clip(0.5 * (np.trace(best.T @ other) - 1.0), -1.0, 1.0)))
         if angle > max(APART_RAD, 5.0 * sigma):
             raise DegenerateMotion(
-                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these scans alike: tilt the flange "
-                "more, about two axes, and cut the sphere on both sides of its middle."
+                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these scans alike: tilt the"
+                " flange more, about two axes, and cut the sphere on both sides of its middle."
             )
     if sigma > OPEN_RAD:
         raise DegenerateMotion(
-            f"These scans leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange further, about two axes, "
-            "and cut the sphere on both sides of its middle."
+            f"These scans leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange"
+            " further, about two axes, and cut the sphere on both sides of its middle."
         )
 
 
@@ -177,10 +185,10 @@ def leave_one_out_m(data: SphereData, model: Model, sigmas: SphereSigmas | None 
 def choose_model(data: SphereData, sigmas: SphereSigmas | None = None) -> ModelChoice:
     """The model that held-out scans ask for, by the one-standard-error rule on paired squared errors of the same scans.
 
-    Rigid or affine: the simpler one, unless affine predicts held-out scans better by more than one standard error of the
-    differences. The arm's own errors: their priors are what is known of the arm, so that leaving them out is the assumption (an
-    exact arm), and scans of one sphere hardly show them though they move the flange elsewhere. The model that has them is
-    taken, unless it predicts held-out scans worse by more than one standard error.
+    Rigid or affine: the simpler one, unless affine predicts held-out scans better by more than one standard error of
+    the differences. The arm's own errors: their priors are what is known of the arm, so that leaving them out is the
+    assumption (an exact arm), and scans of one sphere hardly show them though they move the flange elsewhere. The model
+    that has them is taken, unless it predicts held-out scans worse by more than one standard error.
 
     Source: one standard error, Breiman, Friedman, Olshen and Stone, "Classification and Regression Trees", 1984, 3.4.3.
     """
@@ -199,8 +207,8 @@ def choose_model(data: SphereData, sigmas: SphereSigmas | None = None) -> ModelC
             why += f", and affine+joints is clearly worse than {chosen}"
         else:
             why = (
-                f"affine+joints is not clearly worse than {chosen}: scans of one sphere hardly show the arm's errors, and to leave them out is "
-                "to call the arm exact"
+                f"affine+joints is not clearly worse than {chosen}: scans of one sphere hardly show the arm's errors,"
+                " and to leave them out is to call the arm exact"
             )
             chosen = "affine+joints"
     figures = ", ".join(f"{name} {1e3 * v:.4f} mm" for name, v in errors.items())
@@ -231,7 +239,7 @@ def _check(data: SphereData, model: Model) -> None:
             raise InputError(f"Profile {k} has fewer than five points of the sphere: exclude that scan.")
 
 
-def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
+def _estimate(problem: SphereProblem, R0: Floats, x: Floats) -> SphereEstimate:
     """The result with its covariance, and whether it may be believed."""
     # linearised about itself: a large rotation vector's own covariance is not that of a turn in F
     R = exp_rotation(x[:3]) @ R0
@@ -247,7 +255,8 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
     if condition < SINGULAR:
         of_pose = H[:6, :6] - H[:6, 6:] @ np.linalg.pinv(H[6:, 6:]) @ H[6:, :6]
         raise DegenerateMotion(
-            f"These scans leave the {worst_direction(of_pose)} open: turn the flange about two different axes between them."
+            f"These scans leave the {worst_direction(of_pose)} open: turn the flange about two different axes between"
+            " them."
         )
     m = len(problem.p)
     distance = np.linalg.norm(problem.off(x)[0], axis=1) - problem.data.radius_m
@@ -259,8 +268,9 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
             f" and touches {1e3 * problem.sigmas.touch_m * float(np.median(np.abs(felt))):.2f} mm" if felt.size else ""
         )
         raise InconsistentData(
-            f"Profiles lie {1e3 * float(np.median(np.abs(distance))):.2f} mm{touched} off any sphere of "
-            f"{1e3 * problem.data.radius_m:.2f} mm: check the radius, the poses and that only the sphere is in the profiles."
+            f"Profiles lie {1e3 * float(np.median(np.abs(distance))):.2f} mm{touched} off any sphere of"
+            f" {1e3 * problem.data.radius_m:.2f} mm: check the radius, the poses and that only the sphere is in the"
+            " profiles."
         )
     every = [distance[problem.of == k] for k in range(len(problem.count))]
     mean, rms = np.array([d.mean() for d in every]), np.array([np.sqrt(np.mean(d**2)) for d in every])
@@ -285,7 +295,7 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
         tip=None if problem.data.tip is None else problem.data.tip + tip,
         affine=np.asarray(affine),
         origin=problem.origin,
-        arm_errors=ArmErrors.of(arm),
+        arm_errors=ProfilerArmErrors.of(arm),
         wrong_poses=wrong,
         radius_change_m=step,
         radius_sigma_m=sigma * float(np.sqrt(max(1.0, float(r @ r) / freedom))),

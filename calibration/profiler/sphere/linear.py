@@ -32,7 +32,8 @@ class SphereLinear:
 
 @dataclass(frozen=True, eq=False)
 class TouchSphere:
-    """A sphere felt with the tip: its centre (3,) m in B, the tip (3,) m in F, the radius and the rms of the touches in m."""
+    """A sphere felt with the tip: its centre (3,) m in B, the tip (3,) m in F, the radius and the rms of the touches in
+    m."""
 
     center: Floats
     tip: Floats
@@ -41,7 +42,8 @@ class TouchSphere:
 
 
 def sphere_center(circle: ArrayLike, radius_m: float, sign: float) -> Floats:
-    """Centre (3,) m in S of the sphere whose cut is the circle [x, z, r] m; sign: on which side of the scan plane (y) it is.
+    """Centre (3,) m in S of the sphere whose cut is the circle [x, z, r] m; sign: on which side of the scan plane (y)
+    it is.
 
     Raises:
         RadiusError: the cut is larger than the sphere.
@@ -49,7 +51,8 @@ def sphere_center(circle: ArrayLike, radius_m: float, sign: float) -> Floats:
     x, z, r = np.asarray(circle, float)
     if r > radius_m + RADIUS_TOLERANCE_M:
         raise RadiusError(
-            f"An arc of radius {1e3 * r:.2f} mm is no cut of a sphere of {1e3 * radius_m:.2f} mm: check the sphere's radius."
+            f"An arc of radius {1e3 * r:.2f} mm is no cut of a sphere of {1e3 * radius_m:.2f} mm: check the sphere's"
+            " radius."
         )
     return np.array([x, np.sign(sign) * np.sqrt(max(radius_m**2 - r**2, 0.0)), z])
 
@@ -64,7 +67,8 @@ def sphere_linear(
         translated: (n,) bool, which poses share the first one's orientation.
 
     Raises:
-        TooFewTranslations, TooFewRotations, DegenerateMotion: the motion does not determine the answer. InputError: shapes.
+        TooFewTranslations, TooFewRotations, DegenerateMotion: the motion does not determine the answer. InputError:
+            shapes.
 
     Source: sphere and touch paper, Eq. 2-8.
     """
@@ -102,10 +106,11 @@ def sphere_linear(
 def wrong_sides(
     rotation: ArrayLike, translation: ArrayLike, centers: ArrayLike, translated: ArrayLike
 ) -> tuple[int, ...]:
-    """Scans whose centre is on the other side of the scan plane than was said: with it mirrored, all centres agree far better.
+    """Scans whose centre is on the other side of the scan plane than was said: with it mirrored, all centres agree far
+    better.
 
-    One after the other, the most telling first, as long as each helps by itself: one wrong side is found, several may not be,
-    and all of them wrong cannot be told. Arguments as for `sphere_linear`.
+    One after the other, the most telling first, as long as each helps by itself: one wrong side is found, several may
+    not be, and all of them wrong cannot be told. Arguments as for `sphere_linear`.
     """
     P = np.array(centers, float)
     found: list[int] = []
@@ -148,8 +153,8 @@ def fit_touch_sphere(
         rotation: (n, 3, 3) R_BF; translation: (n, 3) p_BF m, at each touch; tip: (3,) m in F, as far as it is known.
 
     Raises:
-        InputError: fewer than four touches. DegenerateMotion: the touches lie on one spot or circle, or the tip is asked for and the
-            orientations do not vary.
+        InputError: fewer than four touches. DegenerateMotion: the touches lie on one spot or circle, or the tip is
+            asked for and the orientations do not vary.
         RadiusError: the freed radius is off by more than four of its sigmas.
     """
     poses = FlangePoses.checked(rotation, translation)
@@ -169,7 +174,8 @@ def fit_touch_sphere(
     spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False)[-1] / (np.sqrt(len(at)) * radius_m)
     if not (singular[-1] > ONE_SPOT * singular[0] and spread > ONE_SPOT):
         raise DegenerateMotion(
-            "The touches lie on one spot or one circle of the sphere, which leaves its centre open: touch it from above and all around."
+            "The touches lie on one spot or one circle of the sphere, which leaves its centre open: touch it from above"
+            " and all around."
         )
 
     def unpack(x: Floats) -> tuple[Floats, Floats, float]:
@@ -189,7 +195,10 @@ def fit_touch_sphere(
         J = np.asarray(found.jac)
         sigma = float(np.sqrt(np.linalg.pinv(J.T @ J)[-1, -1] * (found.fun @ found.fun) / freedom))
         if abs(r - radius_m) > max(4.0 * sigma, 1e-6):
-            text = f"The touches fit a sphere of {1e3 * r:.3f} mm, not of {1e3 * radius_m:.3f} mm: check the radius and the tip."
+            text = (
+                f"The touches fit a sphere of {1e3 * r:.3f} mm, not of {1e3 * radius_m:.3f} mm: check the radius and"
+                " the tip."
+            )
             raise RadiusError(text)
     return TouchSphere(np.asarray(center), np.asarray(t), float(r), rms)
 

@@ -1,7 +1,8 @@
 """The sphere problem: measurements, unknowns, and whitened residuals with derivatives.
 
 Every profile point lies on the sphere, and so does the tip at every touch. The error of the robot's position, which all
-points of a scan share, is taken out by whitening with it rather than by unknowns of its own; docs/profiler.md derives it.
+points of a scan share, is taken out by whitening with it rather than by unknowns of its own; docs/profiler.md derives
+it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, OFFSET_JOINTS, SAG_JOINTS, ArmErrors, DhArm
+from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, OFFSET_JOINTS, SAG_JOINTS, DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, left_jacobian
 
 POINTS_PER_POSE = 120
@@ -23,7 +24,8 @@ ROBUST: dict[str, Any] = {"loss": "soft_l1", "f_scale": 3.0, "max_nfev": 60}
 
 @dataclass(frozen=True, kw_only=True)
 class SphereSigmas:
-    """What is known before: of the sensor's points, the robot's position at a scan and at a touch (m), and the priors."""
+    """What is known before: of the sensor's points, the robot's position at a scan and at a touch (m), and the
+    priors."""
 
     sensor_m: float = 0.05e-3
     robot_m: float = 0.03e-3  # per axis: a repeatability of 0.05 mm by ISO 9283 is a radius
@@ -83,7 +85,7 @@ def corrected(p: Floats, affine: Floats, origin: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ParameterLayout:
     """Where each unknown stands in the vector: pose, centre, tip, affine, joints."""
 
     tip: bool
@@ -113,8 +115,9 @@ class Layout:
 class _Points(NamedTuple):
     """Where the unknowns `x`, with the turn `R0` before them, place everything.
 
-    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches; `rotation` (m, 3, 3):
-    of the flange at each point; `R`: of the sensor; `turned` (m, 3): the points about the sensor's origin, by F's axes.
+    `at` (m, 3) and `felt` (k, 3): from the centre to all profile points, and to the tip at all touches; `rotation` (m,
+    3, 3): of the flange at each point; `R`: of the sensor; `turned` (m, 3): the points about the sensor's origin, by
+    F's axes.
     """
 
     x: Floats
@@ -128,10 +131,10 @@ class _Points(NamedTuple):
     turned: Floats
 
 
-class Problem:
+class SphereProblem:
     """The whitened residuals of one model on one set of measurements."""
 
-    def __init__(self, data: SphereData, layout: Layout, sigmas: SphereSigmas) -> None:
+    def __init__(self, data: SphereData, layout: ParameterLayout, sigmas: SphereSigmas) -> None:
         self.data, self.layout, self.sigmas = data, layout, sigmas
         self.profiles = [_thinned(p[np.isfinite(p).all(axis=1)]) for p in data.profiles]
         self.count = np.array([len(p) for p in self.profiles])
@@ -177,7 +180,7 @@ class Problem:
         assert data.arm is not None
         assert data.q is not None
         assert self._loads is not None
-        errors, touches = ArmErrors.of(values), None
+        errors, touches = ProfilerArmErrors.of(values), None
         if data.touch_q is not None and self._touch_loads is not None:
             touches = data.arm.with_errors(data.touch_q, errors, self._touch_loads)
         return data.arm.with_errors(data.q, errors, self._loads), touches
@@ -188,7 +191,10 @@ class Problem:
         return points.at, points.felt, points.poses
 
     def _points(self, x: Floats) -> _Points:
-        """The points placed by x. The last answer is kept: a solver asks for residuals and derivatives at the same x."""
+        """The points placed by x.
+
+        The last answer is kept: a solver asks for residuals and derivatives at the same x.
+        """
         last = self._placed
         if last is not None and last.R0 is self._R0 and np.array_equal(last.x, x):
             return last
@@ -237,7 +243,8 @@ class Problem:
         return np.asarray(out)
 
     def shared(self, r: Floats) -> float:
-        """Sum of squares of what the whitened residuals (m,) of each scan share with an error of the robot's position."""
+        """Sum of squares of what the whitened residuals (m,) of each scan share with an error of the robot's
+        position."""
         ends = np.cumsum(self.count)
         parts = zip(self._whiten or [], ends - self.count, ends, strict=False)
         return float(sum(np.sum((U.T @ r[a:b]) ** 2) for (U, _), a, b in parts))
@@ -264,7 +271,7 @@ class Problem:
             touch.append(np.zeros((m, 3)))
         if self.layout.joints:
             assert self.data.arm is not None
-            errors = ArmErrors.of(arm)
+            errors = ProfilerArmErrors.of(arm)
             for q, loads, p_B, normal, of, columns in (
                 (self.data.q, self._loads, at + c, n_B, self.of, scan),
                 (self.data.touch_q, self._touch_loads, felt + c, m_B, np.arange(m), touch),

@@ -6,7 +6,7 @@ import numpy as np
 
 from weldcal.calibration.errors import RadiusError
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, last_step
-from weldcal.calibration.profiler.sphere.model import Layout, Problem, SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.model import ParameterLayout, SphereData, SphereProblem, SphereSigmas
 from weldcal.calibration.profiler.sphere.start import sphere_starts
 
 SCALE_SIGMAS = 3.0  # of the prior of the profiler's scale: what a sensor may be off, its radius may be
@@ -35,14 +35,14 @@ def free_radius(data: SphereData, start_m: float, sigmas: SphereSigmas) -> FreeR
     Gauss-Newton in the radius, all other unknowns solved at each step.
     """
     scans, radius = SphereData(poses=data.poses, profiles=data.profiles, radius_m=start_m), start_m
-    layout = Layout(tip=False, affine=False, joints=False)
-    problem = Problem(scans, layout, sigmas)
+    layout = ParameterLayout(tip=False, affine=False, joints=False)
+    problem = SphereProblem(scans, layout, sigmas)
     starts = sphere_starts(data.poses, problem.profiles, start_m)
     if not starts:
         return None
     R, x = starts[0][0], np.concatenate([np.zeros(3), starts[0][1], starts[0][2]])
     for _ in range(ROUNDS):
-        problem = Problem(replace(scans, radius_m=radius), layout, sigmas)
+        problem = SphereProblem(replace(scans, radius_m=radius), layout, sigmas)
         _, found = problem.solved(R, np.zeros(3), x)
         x = np.asarray(found.x)
         r = problem.residual(x)
@@ -57,7 +57,8 @@ def free_radius(data: SphereData, start_m: float, sigmas: SphereSigmas) -> FreeR
 def check_radius(data: SphereData, sigmas: SphereSigmas, stated: SphereEstimate | None) -> None:
     """Refuse a stated radius that the profiles contradict; `stated`: the rigid fit with it, None where there is none.
 
-    A profiler's scale error shows as another radius: up to three sigmas of its prior is its error, more is another sphere.
+    A profiler's scale error shows as another radius: up to three sigmas of its prior is its error, more is another
+    sphere.
 
     Raises:
         RadiusError: the profiles determine the radius, and it is another one.
@@ -75,8 +76,8 @@ def check_radius(data: SphereData, sigmas: SphereSigmas, stated: SphereEstimate 
         if stated is None or near:
             return  # whatever the fit itself refuses for
         raise RadiusError(
-            f"The profiles contradict a sphere of {1e3 * R:.2f} mm radius and show no other one. Check the radius, the poses and that "
-            "only the sphere is in the profiles."
+            f"The profiles contradict a sphere of {1e3 * R:.2f} mm radius and show no other one. Check the radius, the"
+            " poses and that only the sphere is in the profiles."
         )
     worse = np.inf if stated is None else stated.reduced_chi2
     if abs(best.radius_m - R) <= allowed + NOISE_SIGMAS * best.sigma_m or best.reduced_chi2 > BETTER * worse:

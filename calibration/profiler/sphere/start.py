@@ -64,8 +64,8 @@ def sphere_starts(
 def _translations(poses: FlangePoses, profiles: Sequence[Floats], R: Floats, radius_m: float) -> tuple[Floats, Floats]:
     """p_FS (m, 3) and the sphere's centre in B (m, 3) for rotations R_FS (m, 3, 3), by linear least squares.
 
-    The sphere's centre in S is taken as that of the profile's circle: its distance from the scan plane, unknown in sign, is left out.
-    From p_FS = 0 the search ended in another optimum in up to half of the sets of six scans.
+    The sphere's centre in S is taken as that of the profile's circle: its distance from the scan plane, unknown in
+    sign, is left out. From p_FS = 0 the search ended in another optimum in up to half of the sets of six scans.
     """
     circles = np.array([fit_circle(p)[0] for p in profiles])
     means = np.array([p.mean(axis=0) for p in profiles])

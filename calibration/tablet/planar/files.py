@@ -16,9 +16,17 @@ from weldcal.models.files import LARGEST_NUMBER
 
 # keys of the file and their dimensions for one visit; one more in front where visits differ in it
 DIMENSIONS = {
-    "uv": 2, "depth": 1, "hand": 2, "theta_deg": 1, "delta_px": 2, "tablet_px": 2, "mm_per_px": 0, "f": 0, "c": 1,
+    "uv": 2,
+    "depth": 1,
+    "hand": 2,
+    "theta_deg": 1,
+    "delta_px": 2,
+    "tablet_px": 2,
+    "mm_per_px": 0,
+    "f": 0,
+    "c": 1,
     "hand_capture": 1,
-}  # fmt: skip
+}
 QUERY_DIMENSIONS = {"uv_q": 2, "theta_q": 1, "hand_q": 2}
 ROWS = ("uv", "hand", "theta_deg", "delta_px", "tablet_px")
 STEPS_MM = (1.0, 0.5)
@@ -29,7 +37,8 @@ _LEAST_READINGS = (
 
 @dataclass(frozen=True)
 class Queries:
-    """Points of the tablet that were seen but not used: pixel (q, 2), turn (q,) rad and the hand (q, 2) m that touches them."""
+    """Points of the tablet that were seen but not used: pixel (q, 2), turn (q,) rad and the hand (q, 2) m that touches
+    them."""
 
     uv_px: Array
     theta_rad: Array
@@ -38,7 +47,8 @@ class Queries:
 
 @dataclass(frozen=True)
 class PlanarVisit:
-    """One visit: its touches, its queries where it has any, the rows of its landmarks in the file, and the rows excluded."""
+    """One visit: its touches, its queries where it has any, the rows of its landmarks in the file, and the rows
+    excluded."""
 
     name: str
     touches: TabletTouches
@@ -60,9 +70,9 @@ def load_planar(path: Path) -> PlanarFile:
     mm_per_px, f (px; one number or two), c (2) px, hand_capture (3) mm; optionally uv_q (q, 2), theta_q (q) rad, hand_q
     (q, 2) mm. Where uv is (m, n, 2) there are m visits, and every other key may have that dimension in front, too.
 
-    A landmark with a value that is not a number is excluded; a depth that is missing (or the key) is the tablet's plane by PnP.
-    Raises TabletDataError: unreadable, a key missing, a shape that does not fit; and what refuses a visit where none is left:
-    TooFewLandmarks, CollinearLandmarks, EqualRotations (radians for degrees), LandmarksNotFound.
+    A landmark with a value that is not a number is excluded; a depth that is missing (or the key) is the tablet's plane
+    by PnP. Raises TabletDataError: unreadable, a key missing, a shape that does not fit; and what refuses a visit where
+    none is left: TooFewLandmarks, CollinearLandmarks, EqualRotations (radians for degrees), LandmarksNotFound.
     """
     d = _read(path)
     if d["uv"].ndim not in (2, 3) or d["uv"].shape[-1] != 2:
@@ -87,7 +97,8 @@ def load_planar(path: Path) -> PlanarFile:
 
 
 def hand_step_m(visits: tuple[PlanarVisit, ...]) -> float:
-    """The step (m) to which hands were rounded when they were read off: 5, 2, 1 or 0.5 mm, or 0 where they are finer."""
+    """The step (m) to which hands were rounded when they were read off: 5, 2, 1 or 0.5 mm, or 0 where they are
+    finer."""
     mm = 1e3 * np.concatenate([v.touches.hand_m.ravel() for v in visits])
     if mm.size < _LEAST_READINGS:
         return 0.0

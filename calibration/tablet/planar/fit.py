@@ -22,9 +22,9 @@ class PlanarFit:
 
     p: point of the tablet (m) that a pixel shows by ``X_CT``. ``parameters`` (6,) = phi (rad), t_x, t_y, x_p, y_p (m),
     scale (1 unless it was freed); ``covariance`` (6, 6) from the residuals of the touches, zero for a fixed scale;
-    ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted from the image minus measured, the second by a fit that
-    saw that landmark neither touched nor in the image. ``free_scale``: (value, standard deviation) of a scale that the
-    touches alone would like, a check of the tablet's pixels per inch.
+    ``residuals_m`` and ``leave_one_out_m`` (n, 2): hand predicted from the image minus measured, the second by a fit
+    that saw that landmark neither touched nor in the image. ``free_scale``: (value, standard deviation) of a scale that
+    the touches alone would like, a check of the tablet's pixels per inch.
     """
 
     X_CT: RigidTransform
@@ -47,8 +47,8 @@ class PlanarFit:
 
 @dataclass(frozen=True)
 class PlanarConfig:
-    """``sign`` of the touching error; ``free_scale`` where the tablet's pixel pitch is not to be trusted; ``step_m`` to which
-    the hand's position was rounded when it was read off (0: not), and ``noise_m`` per axis of a touch besides."""
+    """``sign`` of the touching error; ``free_scale`` where the tablet's pixel pitch is not to be trusted; ``step_m`` to
+    which the hand's position was rounded when it was read off (0: not), and ``noise_m`` per axis of a touch besides."""
 
     sign: Sign = Sign.CORRECTED
     free_scale: bool = False
@@ -66,8 +66,8 @@ def hand_over(parameters: Array, points_m: Array, theta_rad: Array) -> Array:
 def fit_plane_motion(points_m: Array, hand_m: Array, theta_rad: Array, free_scale: bool = False) -> Array:
     """Parameters (6,) minimising the squared differences of hand_over to ``hand_m`` (n, 2) m.
 
-    Translation and pen are linear and projected out; what remains is a quadratic in scale (cos phi, sin phi): solved as it
-    is with a free scale, else on the unit circle by Newton's method in phi.
+    Translation and pen are linear and projected out; what remains is a quadratic in scale (cos phi, sin phi): solved as
+    it is with a free scale, else on the unit circle by Newton's method in phi.
     """
     n = len(points_m)
     B = np.concatenate([np.broadcast_to(np.eye(2), (n, 2, 2)), _pen_matrix(theta_rad)], axis=2).reshape(2 * n, 4)
@@ -94,8 +94,9 @@ def fit_plane_motion(points_m: Array, hand_m: Array, theta_rad: Array, free_scal
 def refine_rounded(start: Array, points_m: Array, hand_m: Array, theta_rad: Array, config: PlanarConfig) -> Array:
     """Parameters (6,) most likely for hands that were read off in steps of ``config.step_m``.
 
-    A rounded reading says "within half a step", which squares do not: the likelihood is the rounding's interval smoothed by
-    a normal error of ``noise_m``. On hands in whole millimetres it takes 4 to 10 % off the error of least squares.
+    A rounded reading says "within half a step", which squares do not: the likelihood is the rounding's interval
+    smoothed by a normal error of ``noise_m``. On hands in whole millimetres it takes 4 to 10 % off the error of least
+    squares.
     """
     half, noise = 0.5 * config.step_m, config.noise_m
     free = slice(0, 6 if config.free_scale else 5)

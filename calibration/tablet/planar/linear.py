@@ -67,8 +67,8 @@ def _design(rays: Array, theta_rad: Array) -> Array:
 def solve_closed_form(rays: Array, hand: Array, theta_rad: Array) -> ClosedForm:
     """The least squares itself, nothing checked: rays (2, n), hand (2, n) m, theta (n,) rad.
 
-    Normal equations: with rays instead of millimetres the design's condition is below 1e2, so that squaring it costs four
-    of sixteen digits. Left-out errors come from the leverages: e_i of the fit without both rows of landmark i is
+    Normal equations: with rays instead of millimetres the design's condition is below 1e2, so that squaring it costs
+    four of sixteen digits. Left-out errors come from the leverages: e_i of the fit without both rows of landmark i is
     (I - H_ii)^-1 e_i.
     """
     A = _design(rays, theta_rad)
@@ -87,8 +87,8 @@ def solve_closed_form(rays: Array, hand: Array, theta_rad: Array) -> ClosedForm:
 def touched_rays(touches: TabletTouches, sign: Sign = Sign.CORRECTED) -> Array:
     """Viewing rays (n, 2) of the points that were touched: the landmark's ray moved by the touching error.
 
-    The move is turned into the image by the affine map from tablet to rays that the landmarks themselves give, so that no
-    parameter of the calibration is needed for it. With the printed sign of Eq. 20 it goes the other way.
+    The move is turned into the image by the affine map from tablet to rays that the landmarks themselves give, so that
+    no parameter of the calibration is needed for it. With the printed sign of Eq. 20 it goes the other way.
     """
     n = len(touches.uv_px)
     affine = np.linalg.lstsq(np.c_[touches.landmark_px, np.ones(n)], touches.rays, rcond=None)[0]
@@ -126,7 +126,8 @@ def fit_linear(touches: TabletTouches, sign: Sign = Sign.CORRECTED) -> LinearFit
 
 
 def _left_out_together(rays: Array, hand: Array, theta_rad: Array, number: NDArray[np.int64]) -> Array:
-    """Leave-one-out errors (n, 2) m, all touches of a landmark held out together; NaN where the rest determines nothing."""
+    """Leave-one-out errors (n, 2) m, all touches of a landmark held out together; NaN where the rest determines
+    nothing."""
     errors = np.full((rays.shape[1], 2), np.nan)
     for k in range(number.max() + 1):
         keep, one = number != k, number == k

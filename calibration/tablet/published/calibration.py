@@ -31,8 +31,8 @@ _STEP = 1e-5  # of the central differences, mm or degrees
 
 @dataclass(frozen=True)
 class DistanceMinimum:
-    """Where the sum of the two mean distances is smallest: ``parameters`` (p,), ``residuals`` (2 n, 2) mm, how often the
-    residuals of one parameter set were computed."""
+    """Where the sum of the two mean distances is smallest: ``parameters`` (p,), ``residuals`` (2 n, 2) mm, how often
+    the residuals of one parameter set were computed."""
 
     parameters: Array
     residuals: Array
@@ -42,8 +42,8 @@ class DistanceMinimum:
 def minimise_distances(residuals: Residuals, start: Array, search_range: Array) -> DistanceMinimum:
     """Minimise mean |e_1..n| + mean |e_n+1..2n| (Eqs. 17-19) within a range (p, 2) from a start (p,).
 
-    A mean of distances has kinks where a point is met exactly; the smoothing shrinks until it is far below a digit of the
-    published figures. Derivatives are central differences of all parameters in one call.
+    A mean of distances has kinks where a point is met exactly; the smoothing shrinks until it is far below a digit of
+    the published figures. Derivatives are central differences of all parameters in one call.
     """
     low, high = search_range[:, 0], search_range[:, 1]
     unit = 0.5 * (high - low)
@@ -68,14 +68,7 @@ def minimise_distances(residuals: Residuals, start: Array, search_range: Array) 
     def flat_slope(x: Array) -> Array:
         return slope(x).reshape(len(x), -1).T
 
-    squares = least_squares(
-        flat,
-        np.clip(start, low, high),
-        flat_slope,
-        bounds=(low, high),
-        x_scale=unit,
-        xtol=1e-10,
-    )
+    squares = least_squares(flat, np.clip(start, low, high), flat_slope, bounds=(low, high), x_scale=unit, xtol=1e-10)
     x = np.asarray(squares.x)
     for smooth in _SMOOTH_MM:
 
@@ -126,8 +119,8 @@ def tablet_stage1(
 ) -> StageResult:
     """Stage 1 (Eqs. 17-20): the twelve parameters of a chain.
 
-    Raises what check_touches raises. (alpha_t, beta_t) and their negatives are the same minimum: a plane seen in x and y
-    only.
+    Raises what check_touches raises. (alpha_t, beta_t) and their negatives are the same minimum: a plane seen in x and
+    y only.
     """
     check_touches(touches)
     found = minimiser(lambda x: stage1_residuals(touches, x, model, sign, dh_offset_in_error), search_range(model))

@@ -12,13 +12,38 @@ Model = Literal["htm", "dh"]
 
 HTM_NAMES = ("x_c", "y_c", "alpha_c", "beta_c", "gamma_c", "x_t", "y_t", "alpha_t", "beta_t", "gamma_t", "x_p", "y_p")
 DH_NAMES = (
-    "theta1_c", "a1_c", "alpha_c", "beta_c", "gamma_c", "theta1_t", "a1_t", "alpha_t", "beta_t", "gamma_t", "x_p", "y_p",
-)  # fmt: skip
+    "theta1_c",
+    "a1_c",
+    "alpha_c",
+    "beta_c",
+    "gamma_c",
+    "theta1_t",
+    "a1_t",
+    "alpha_t",
+    "beta_t",
+    "gamma_t",
+    "x_p",
+    "y_p",
+)
 # Search ranges of Tables 5 and 6, mm and degrees, in the order of the names above.
-HTM_RANGE = np.array([[-20, 20], [20, 50], *[[-30, 30]] * 3, [100, 200], [0, 100], *[[-30, 30]] * 3, [-20, 20], [-40, -10]], float)  # fmt: skip
+HTM_RANGE = np.array(
+    [[-20, 20], [20, 50], *[[-30, 30]] * 3, [100, 200], [0, 100], *[[-30, 30]] * 3, [-20, 20], [-40, -10]], float
+)
 DH_RANGE = np.array(
-    [[-30, 30], [20, 100], *[[-30, 30]] * 3, [0, 90], [80, 200], [-45, 45], [-30, 30], [-30, 30], [-20, 20], [-40, -10]], float
-)  # fmt: skip
+    [
+        [-30, 30],
+        [20, 100],
+        *[[-30, 30]] * 3,
+        [0, 90],
+        [80, 200],
+        [-45, 45],
+        [-30, 30],
+        [-30, 30],
+        [-20, 20],
+        [-40, -10],
+    ],
+    float,
+)
 
 _FLIP = np.array([-1.0, 1.0])  # Ry(180) of Eq. 1, x and y
 
@@ -48,8 +73,8 @@ def place_landmarks(
     """Landmarks in the base for parameter sets (k, 12) in the paper's own units, mm and degrees.
 
     HTM: Eqs. 1-11. DH: Eqs. 12-16, with the camera's and the tablet's translation (a, 0) as in modified DH.
-    ``dh_offset_in_error``: Eq. 20 of the DH chain as the published figures have it, with the tablet's translation added to a
-    difference of points (homogeneous 1 in place of 0); False restores the 0. It changes nothing for HTM.
+    ``dh_offset_in_error``: Eq. 20 of the DH chain as the published figures have it, with the tablet's translation added
+    to a difference of points (homogeneous 1 in place of 0); False restores the 0. It changes nothing for HTM.
     """
     v = np.atleast_2d(parameters).T[:, :, None]
     zero = np.zeros_like(v[0])

@@ -56,7 +56,8 @@ def stage2_residuals(touches: TabletTouches, affine: Array, stage1: Landmarks, s
 
 
 def apply_affine(a: Array, points: Array, about: Array | None = None) -> Array:
-    """Eq. 24 on points (k, n, 2) mm for a (k, 5) = X, Y, Sx, Sy (1), theta (deg), about a point (k, 2) or landmark 4."""
+    """Eq. 24 on points (k, n, 2) mm for a (k, 5) = X, Y, Sx, Sy (1), theta (deg), about a point (k, 2) or landmark
+    4."""
     X, Y, Sx, Sy, theta = np.asarray(a).T[:, :, None]
     centre = points[:, CENTRE : CENTRE + 1] if about is None else np.asarray(about)[:, None, :]
     d = points - centre

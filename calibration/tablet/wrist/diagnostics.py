@@ -16,8 +16,11 @@ _GOOD_TOUCH_M = 3e-3  # what the others must come to where one landmark alone is
 _LEAST_TO_DOUBT = 6  # landmarks
 _BETTER = 0.4  # what a change must leave of the residuals to be told
 _REFUSED_M = 3e-3
-"""Rms of the touches, or of the image on the page, beyond which nothing is written. A touch scatters by 0.3 mm an axis and an
-arm is 1 mm off over a page: 1.1 mm together, of which nine touches exceed 2.1 times once in 1e9 (chi-square, 18 free)."""
+"""Rms of the touches, or of the image on the page, beyond which nothing is written.
+
+A touch scatters by 0.3 mm an axis and an arm is 1 mm off over a page: 1.1 mm together, of which nine touches exceed 2.1
+times once in 1e9 (chi-square, 18 free).
+"""
 _BEHIND_M, _BEHIND_SIGMAS = 1e-2, 4.0  # how far behind the page the pen may seem to be when the picture is taken
 
 
@@ -34,14 +37,16 @@ def check_wrist(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> No
     X_TB = fit.X_BT.inverse()
     p_TC = (X_TB @ X_BF @ fit.X_FC).translation()
     across = float(X_TB.multiply(X_BF.multiply(fit.p_FP))[2])
-    # by how much an open pen length moves the tip, where the flange leaned otherwise for the picture than for the touches
+    # by how much an open pen length moves the tip, where the flange leaned otherwise for the picture than for the
+    # touches
     n_B = fit.X_BT.rotation().matrix()[:, 2]
     lean = n_B @ X_BF.rotation().matrix() - np.mean([n_B @ X.rotation().matrix() for X in data.X_BF], axis=0)
     unsure = float(np.sqrt(max(lean @ fit.pen_covariance @ lean, 0.0)))
     if -np.sign(p_TC[2]) * across > _BEHIND_M + _BEHIND_SIGMAS * unsure:
         raise TabletDataError(
-            f"Camera and pen are on different sides of the page ({1e3 * abs(p_TC[2]):.0f} and {1e3 * abs(across):.0f} mm from it), so it is "
-            "mirrored in touches or image: check that x is before y in touches and landmarks, and u before v in the image."
+            f"Camera and pen are on different sides of the page ({1e3 * abs(p_TC[2]):.0f} and {1e3 * abs(across):.0f}"
+            " mm from it), so it is mirrored in touches or image: check that x is before y in touches and landmarks,"
+            " and u before v in the image."
         )
     pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))
     depth = float(np.linalg.norm(p_TC - np.r_[data.landmark_m.mean(axis=0), 0.0]))
@@ -55,8 +60,8 @@ def wrist_diagnostics(data: WristTouches, fit: WristFit, names: tuple[str, ...])
     scale, deviation = touched_scale(data)
     if abs(scale - 1.0) > max(_SCALE_SIGMAS * deviation, _SCALE_LEAST) and deviation < 0.02:
         found.append(
-            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (deviation {100 * deviation:.1f} %): check the "
-            "page's size with a card, or mm_per_px."
+            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (deviation {100 * deviation:.1f} %):"
+            " check the page's size with a card, or mm_per_px."
         )
     touch = float(np.sqrt((fit.touch_residuals_m**2).sum(axis=1).mean()))
     if touch > _BAD_TOUCH_M and not found:
@@ -70,8 +75,8 @@ def wrist_diagnostics(data: WristTouches, fit: WristFit, names: tuple[str, ...])
 def touched_scale(data: WristTouches) -> tuple[float, float]:
     """How much farther the hand moved than the tablet says, by touches alone: (value, standard deviation).
 
-    R p_FP + p_BF = x a + y b + p_BT is linear in a, b (3,), p_BT and p_FP; a and b are as long as the scale. Infinite deviation
-    where the touches are too few for it, or leave the pen open.
+    R p_FP + p_BF = x a + y b + p_BT is linear in a, b (3,), p_BT and p_FP; a and b are as long as the scale. Infinite
+    deviation where the touches are too few for it, or leave the pen open.
     """
     n = len(data.X_BF)
     unknowns = 12
@@ -124,13 +129,14 @@ def _why_touches(data: WristTouches, left_m: float, names: tuple[str, ...]) -> s
 
 def _why_pixels(pixel: float) -> str:
     return (
-        f"The image shows the landmarks {pixel:.1f} px from the positions of the fit: check the camera's intrinsics, its distortion, "
-        "and that image and page belong together."
+        f"The image shows the landmarks {pixel:.1f} px from the positions of the fit: check the camera's intrinsics,"
+        " its distortion, and that image and page belong together."
     )
 
 
 def _misfit(data: WristTouches) -> float:
-    """Rms distance (m) that the best affine plane and pen leave between touches and hands; infinite where they are too few."""
+    """Rms distance (m) that the best affine plane and pen leave between touches and hands; infinite where they are too
+    few."""
     n = len(data.X_BF)
     if n < MIN_LANDMARKS + 1:
         return np.inf

@@ -32,8 +32,8 @@ _MORE_ROWS = 8  # rows below the last touched one that are looked for in the ima
 def grid_columns(shown_px: Mapping[int, Array]) -> tuple[int, int]:
     """Columns of the page, and rows down to its last touched landmark, from coordinates (2,) px by landmark number.
 
-    A landmark's number is its row times the columns plus its column; x goes with the column and y with the row, evenly, in
-    whichever way the page is turned. Raises TabletDataError where no number of columns explains the coordinates.
+    A landmark's number is its row times the columns plus its column; x goes with the column and y with the row, evenly,
+    in whichever way the page is turned. Raises TabletDataError where no number of columns explains the coordinates.
     """
     numbers = np.array(sorted(shown_px))
     at = np.array([shown_px[k] for k in numbers])
@@ -50,7 +50,8 @@ def grid_columns(shown_px: Mapping[int, Array]) -> tuple[int, int]:
         if square and right[0] * down[1] - right[1] * down[0] > 0.0:
             return columns, int(row.max()) + 1
     raise TabletDataError(
-        "The numbers and coordinates of the landmarks make no grid row by row from 0; give --seen instead of the picture."
+        "The numbers and coordinates of the landmarks make no grid row by row from 0; give --seen instead of the"
+        " picture."
     )
 
 
@@ -111,8 +112,9 @@ _MATRIX, _DISTORTION = ("camera_matrix", "K", "k", "M"), ("distortion_coefficien
 
 
 @dataclass(frozen=True)
-class Intrinsics:
-    """Pinhole camera: focal lengths and principal point (px, centre of the first pixel at (0, 0)), OpenCV distortion."""
+class WristIntrinsics:
+    """Pinhole camera: focal lengths and principal point (px, centre of the first pixel at (0, 0)), OpenCV
+    distortion."""
 
     focal_px: Array
     centre_px: Array
@@ -124,7 +126,7 @@ class Intrinsics:
         return np.asarray(cv2.undistortPoints(uv_px[:, None], K, self.distortion)[:, 0], dtype=float)
 
 
-def load_intrinsics(path: Path) -> Intrinsics:
+def load_intrinsics(path: Path) -> WristIntrinsics:
     """Intrinsics from a YAML file: fx, fy, cx, cy and optionally distortion (OpenCV's order), or camera_matrix (K) and
     distortion_coefficients (D) as lists or with their `data`. Raises TabletDataError."""
     try:
@@ -149,7 +151,7 @@ def load_intrinsics(path: Path) -> Intrinsics:
         raise TabletDataError(
             f"'{path.name}' holds a focal length that is not positive, or a value that is not a number."
         )
-    return Intrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion if distortion.size else np.zeros(5))
+    return WristIntrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion if distortion.size else np.zeros(5))
 
 
 def _document(path: Path, text: str) -> dict[str, Any]:
@@ -180,8 +182,8 @@ _NAMES_OF_CAMERA = (CAMERA_ROW, "image", "picture")
 
 @dataclass(frozen=True)
 class WristVisit:
-    """Touches for fit_wrist, warnings about the files, the landmarks' names, and the image (h, w) with where all landmarks of
-    the page were found in it (n, 2) px, where there is one."""
+    """Touches for fit_wrist, warnings about the files, the landmarks' names, and the image (h, w) with where all
+    landmarks of the page were found in it (n, 2) px, where there is one."""
 
     data: WristTouches
     warnings: tuple[str, ...]
@@ -210,10 +212,10 @@ def load_visit(
 ) -> WristVisit:
     """Touches of the page's CSV, with the flange's poses and what the camera saw (an image, or positions in a CSV).
 
-    ``poses``: landmark,x,y,z,qw,qx,qy,qz of X_BF in metres at each touch, and one row whose landmark is `camera` for where
-    the image was taken. Of a landmark touched twice the last touch and the last pose count. Landmarks without a pose are left
-    out and named in the warnings. ``tip_radius_m`` of a round pen tip. Raises TabletDataError with the file and what to change
-    (touches that are not at their landmarks too), LandmarksNotFound for the image.
+    ``poses``: landmark,x,y,z,qw,qx,qy,qz of X_BF in metres at each touch, and one row whose landmark is `camera` for
+    where the image was taken. Of a landmark touched twice the last touch and the last pose count. Landmarks without a
+    pose are left out and named in the warnings. ``tip_radius_m`` of a round pen tip. Raises TabletDataError with the
+    file and what to change (touches that are not at their landmarks too), LandmarksNotFound for the image.
     """
     rows = {landmark(r, touches): r for r in read_table(touches, TOUCH_COLUMNS)}
     if not rows:
@@ -295,7 +297,7 @@ def _warnings(
     rows: Mapping[int, Row],
     used: list[int],
     poses: Path,
-    intrinsics: Intrinsics,
+    intrinsics: WristIntrinsics,
     picture: NDArray[np.uint8] | None,
     camera: Path,
 ) -> tuple[str, ...]:
@@ -310,9 +312,9 @@ def _warnings(
         off = np.abs(intrinsics.centre_px - 0.5 * (size - 1)) / size
         if off.max() > _OFF_CENTRE:
             found.append(
-                f"The image has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at "
-                f"{intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these intrinsics seem to belong to images of another "
-                "size, or turned."
+                f"The image has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at"
+                f" {intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these intrinsics seem to belong to"
+                " images of another size, or turned."
             )
     return tuple(found)
 

@@ -28,8 +28,8 @@ class WristTouches:
 
     ``X_BF`` flange in the base at each of n touches; ``touched_m`` and ``landmark_m`` (n, 2) on the tablet; ``views``:
     for each image the flange's pose when it was taken and the rays (n, 2) of the landmarks; ``focal_px`` of the camera
-    (mean of both axes), which turns rays into pixels. ``tip_radius_m`` of a round pen tip, whose centre is what p_FP then
-    means: however the pen leans, the centre stands that far above the point it touches.
+    (mean of both axes), which turns rays into pixels. ``tip_radius_m`` of a round pen tip, whose centre is what p_FP
+    then means: however the pen leans, the centre stands that far above the point it touches.
     """
 
     X_BF: tuple[RigidTransform, ...]
@@ -52,8 +52,8 @@ class WristFit:
 
     ``covariance`` (6, 6) of X_FC, [rotation; translation] on the flange side about the camera's origin, and
     ``pen_covariance`` (3, 3) m^2, from the residuals. ``touch_residuals_m`` (n, 3), ``pixel_residuals`` (v, n, 2).
-    ``leave_one_out_m`` (n,): how far the pen would touch from what the first image shows, in the tablet's plane, by a fit
-    without that landmark. ``unobservable``: sentences on what the touches left open.
+    ``leave_one_out_m`` (n,): how far the pen would touch from what the first image shows, in the tablet's plane, by a
+    fit without that landmark. ``unobservable``: sentences on what the touches left open.
     """
 
     X_FC: RigidTransform
@@ -72,8 +72,8 @@ class WristFit:
 def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_one_out: bool = True) -> WristFit:
     """Fit tablet, pen and camera together; ``pen_length_m`` along the flange's z where it is known.
 
-    Start: touches are linear in two columns of R_BT, p_BT and p_FP; the camera follows from PnP. Then least squares over
-    all fifteen unknowns, touches and pixels each weighted by their own scatter. Raises TooFewLandmarks,
+    Start: touches are linear in two columns of R_BT, p_BT and p_FP; the camera follows from PnP. Then least squares
+    over all fifteen unknowns, touches and pixels each weighted by their own scatter. Raises TooFewLandmarks,
     CollinearLandmarks, EqualRotations, LandmarksNotFound (PnP), TabletDataError (no image).
     """
     if not data.views:
@@ -112,7 +112,8 @@ def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_on
 
 
 def _touch_sigmas(touch_T: Array) -> Array:
-    """Scatter (3,) m of touch residuals (n, 3) in the tablet's frame: in its plane as the glass feels, across it as the arm stands.
+    """Scatter (3,) m of touch residuals (n, 3) in the tablet's frame: in its plane as the glass feels, across it as the
+    arm stands.
 
     Nine unknowns are the touches', six of them in the plane. Few touches say little of each: both lean to what all say.
     """
@@ -127,7 +128,8 @@ def _touch_sigmas(touch_T: Array) -> Array:
 
 
 def seen_point(fit: WristFit, X_BF: RigidTransform, ray: Array) -> Array:
-    """Point (3,) m in the base where a ray (2,) of the camera, with the flange at ``X_BF``, meets the tablet's plane."""
+    """Point (3,) m in the base where a ray (2,) of the camera, with the flange at ``X_BF``, meets the tablet's
+    plane."""
     X_BC = X_BF @ fit.X_FC
     direction = X_BC.rotation().multiply(np.array([ray[0], ray[1], 1.0]))
     normal = fit.X_BT.rotation().matrix()[:, 2]
@@ -231,7 +233,9 @@ def _open_directions(p_FP: Array, pen_covariance: Array, spread: float) -> tuple
         return ()
     axis = "xyz"[int(np.abs(vectors[:, -1]).argmax())]
     return (
-        f"The pen's length along the flange's {axis} and the camera's height over the pen's tip are not fixed by these "
-        f"touches (the hand's axis tilts by {np.degrees(spread):.0f} deg): tilt the hand by 10 deg or more in some, or give the "
-        "pen's length. Positions in the tablet's plane do not need it.",
+        (
+            f"The pen's length along the flange's {axis} and the camera's height over the pen's tip are not fixed by"
+            f" these touches (the hand's axis tilts by {np.degrees(spread):.0f} deg): tilt the hand by 10 deg or more"
+            " in some, or give the pen's length. Positions in the tablet's plane do not need it."
+        ),
     )

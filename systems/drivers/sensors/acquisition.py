@@ -1,4 +1,5 @@
-"""Acquisition: a worker thread that opens a device, takes its frames, reconnects, and knows at any time what is wrong."""
+"""Acquisition: a worker thread that opens a device, takes its frames, reconnects, and knows at any time what is
+wrong."""
 
 import threading
 import time
@@ -38,9 +39,10 @@ class Garbage(WeldcalError):
 class Delivery(Generic[Datum]):
     """A frame as a source takes it from its device.
 
-    `arrived` s (host, monotonic). `device_time` s of the device's clock, `unix_time` s of the capture by this computer's clock;
-    None where the frame has no such stamp. `number` of the frame as the device counts, None: it does not.
-    `request`: the number of the request that it answers, 0: none. `lost`: frames that the source knows to be lost before it.
+    `arrived` s (host, monotonic). `device_time` s of the device's clock, `unix_time` s of the capture by this
+    computer's clock; None where the frame has no such stamp. `number` of the frame as the device counts, None: it does
+    not. `request`: the number of the request that it answers, 0: none. `lost`: frames that the source knows to be lost
+    before it.
     """
 
     datum: Datum
@@ -62,7 +64,10 @@ class Source(Protocol[Datum]):
         """Connect. Raises DeviceLost."""
 
     def next(self, timeout_s: float) -> "Delivery[Datum] | None":
-        """The next frame; None where none came in time. Raises DeviceLost, or Garbage for a frame that cannot be used."""
+        """The next frame; None where none came in time.
+
+        Raises DeviceLost, or Garbage for a frame that cannot be used.
+        """
 
     def ask(self, request: int) -> None:
         """Trigger the device. Raises DeviceLost. A device that runs freely does nothing."""
@@ -76,8 +81,9 @@ class Source(Protocol[Datum]):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Frame(Generic[Datum]):
-    """A frame with its own number (from 1, gaps where frames were lost) and its stamp; `arrived` s (host, monotonic)."""
+class AcquiredFrame(Generic[Datum]):
+    """A frame with its own number (from 1, gaps where frames were lost) and its stamp; `arrived` s (host,
+    monotonic)."""
 
     number: int
     datum: Datum
@@ -105,7 +111,8 @@ class Rules:
 
 @dataclass(frozen=True)
 class Counts:
-    """What has come so far: frames, those lost or never looked at, those that could not be read, connections after the first."""
+    """What has come so far: frames, those lost or never looked at, those that could not be read, connections after the
+    first."""
 
     received: int = 0
     lost: int = 0  # the device's own count has a gap
@@ -132,7 +139,8 @@ class _Seen:
 
 
 class Acquisition(Generic[Datum]):
-    """Takes a source's frames in a thread of its own; the newest `kept` of them can be read at any time without waiting.
+    """Takes a source's frames in a thread of its own; the newest `kept` of them can be read at any time without
+    waiting.
 
     `prepare` is applied to each frame in that thread. Whether the device is silent or late is judged by `time`.
     """
@@ -150,7 +158,7 @@ class Acquisition(Generic[Datum]):
         self._kept, self._latency_s, self._prepare = kept, latency_s, prepare
         self.clock = DeviceClock(latency_s, rules.late_s)
         self._unix = UnixClock()
-        self._frames: tuple[Frame[Datum], ...] = ()
+        self._frames: tuple[AcquiredFrame[Datum], ...] = ()
         self._seen = _Seen()
         self._read = self._wanted = self._number = 0
         self._wanted_at = 0.0
@@ -184,7 +192,8 @@ class Acquisition(Generic[Datum]):
             DeviceFault: it is not within `wait_s`; the thread has ended.
         """
         self._seen = _Seen(lost_since=self.time.now(), good_at=self.time.now())
-        # the thread must not keep its own object alive: a station that nobody closed ends its threads when it is forgotten
+        # the thread must not keep its own object alive: a station that nobody closed ends its threads when it is
+        # forgotten
         self._thread = threading.Thread(target=_work, args=(weakref.ref(self), self._stop), daemon=True)
         self._thread.start()
 
@@ -208,23 +217,24 @@ class Acquisition(Generic[Datum]):
             self._wanted_at = self.time.now()
             self._wanted = number
 
-    def frames(self) -> tuple[Frame[Datum], ...]:
+    def frames(self) -> tuple[AcquiredFrame[Datum], ...]:
         """The newest frames, oldest first. Never waits."""
         found = self._frames
         if found:
             self._read = max(self._read, found[-1].number)
         return found
 
-    def answer(self, number: int) -> Frame[Datum] | None:
+    def answer(self, number: int) -> AcquiredFrame[Datum] | None:
         """The frame that answers a request; None where there is none yet. Never waits."""
         self.frames()
         return self._find(number)
 
-    def _find(self, number: int) -> Frame[Datum] | None:
+    def _find(self, number: int) -> AcquiredFrame[Datum] | None:
         return next((f for f in reversed(self._frames) if f.request == number), None)
 
-    def wait_for_answer(self, number: int) -> Frame[Datum] | None:
-        """The frame that answers a request, waited for until the device is at fault: only where the Diagram may wait."""
+    def wait_for_answer(self, number: int) -> AcquiredFrame[Datum] | None:
+        """The frame that answers a request, waited for until the device is at fault: only where the Diagram may
+        wait."""
         while (found := self.answer(number)) is None and self.fault(self.time.now()) is None:
             with self._news:
                 self._news.wait(0.05)
@@ -344,7 +354,7 @@ class Acquisition(Generic[Datum]):
             gap = max(gap, d.number - self._device_number - 1)
         self._device_number = d.number
         self._number += 1 + gap
-        frame = Frame(
+        frame = AcquiredFrame(
             number=self._number,
             datum=d.datum,
             arrived=d.arrived,

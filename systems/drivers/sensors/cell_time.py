@@ -1,4 +1,5 @@
-"""The clock by which devices are judged to be silent or late: the host's, or that of an emulated robot that the cell follows."""
+"""The clock by which devices are judged to be silent or late: the host's, or that of an emulated robot that the cell
+follows."""
 
 import math
 import threading
@@ -39,7 +40,8 @@ class HostTime:
 
 
 class FollowedTime:
-    """The clock of a robot that the cell follows: its world may be slower than real time, and stands while it waits for the cell.
+    """The clock of a robot that the cell follows: its world may be slower than real time, and stands while it waits for
+    the cell.
 
     The threads of the acquisition and of the Diagram both ask it.
     """

@@ -14,9 +14,10 @@ from weldcal.systems.drivers.station_build import StationBuild
 class FolderScanner(WiredScanner):
     """`!FolderScanner`: the folder, and how the program that writes into it is told to scan.
 
-    Files are ply, pcd, npz, npy, xyz, pts or asc as `calibrate` reads them. Beside NAME.ply a file NAME.json, written before it, may hold
-    `capture_time` (Unix time, s), `request` (the number of the trigger that it answers) and `device_time` (s of the scanner's own
-    clock, by which a motion job orders its frames; write `capture_time` too, by which a late frame is known).
+    Files are ply, pcd, npz, npy, xyz, pts or asc as `calibrate` reads them. Beside NAME.ply a file NAME.json, written
+    before it, may hold `capture_time` (Unix time, s), `request` (the number of the trigger that it answers) and
+    `device_time` (s of the scanner's own clock, by which a motion job orders its frames; write `capture_time` too, by
+    which a late frame is known).
     """
 
     folder: str = ""

@@ -33,9 +33,9 @@ class OnTrigger(LeafSystem, Generic[Shown]):
         output_ports:
         - scan
 
-    The output port has the name `port`, such as scan or profile. The Diagram does not wait for the answer, unless it may
-    (`waits`). The capture time is that of the datum's stamp, and at the earliest that of its trigger: from then on the arm is
-    at rest.
+    The output port has the name `port`, such as scan or profile. The Diagram does not wait for the answer, unless it
+    may (`waits`). The capture time is that of the datum's stamp, and at the earliest that of its trigger: from then on
+    the arm is at rest.
     """
 
     def __init__(

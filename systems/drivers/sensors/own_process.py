@@ -1,4 +1,5 @@
-"""A source in a process of its own: a device's library that crashes, or keeps Python's lock, does not touch the control loop."""
+"""A source in a process of its own: a device's library that crashes, or keeps Python's lock, does not touch the control
+loop."""
 
 import multiprocessing
 import os
@@ -17,7 +18,7 @@ OPEN_S = 30.0  # the process imports its libraries first
 END_S = 1.0
 
 
-class OwnProcess(Source[Datum]):
+class SourceProcess(Source[Datum]):
     """What `make(*arguments)` returns, used from a spawned process; frames come through a pipe.
 
     The process stays over a lost device and opens it again. One that has ended is started again.

@@ -12,7 +12,7 @@ from weldcal.models.depth_noise import DepthNoise
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.drivers.sensors.acquisition import Delivery, DeviceLost, Garbage, Source
-from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud
 from weldcal.systems.drivers.station_build import StationBuild
@@ -23,7 +23,8 @@ QUEUE = 4
 
 
 def _stereo(name: str, fov_deg: float, near: float, far: float, optimum: float, sigma: float) -> ScannerPreset:
-    """A stereo camera of 1280 x 720; its field of view and range are those of Intel's data sheet, its noise is typical."""
+    """A stereo camera of 1280 x 720; its field of view and range are those of Intel's data sheet, its noise is
+    typical."""
     f = 640.0 / np.tan(np.deg2rad(0.5 * fov_deg))
     noise = DepthNoise(sigma_m=sigma, reference_m=optimum, edge_step_m=0.01, flying=0.5, edge_dropout=0.2)
     return ScannerPreset(
@@ -78,7 +79,7 @@ class RealSense(WiredScanner):
         """The camera in a process of its own. Raises InputError where pyrealsense2 is not installed."""
         require_realsense()
         self.scanner()
-        return OwnProcess(title(self), RealSenseClouds, self)
+        return SourceProcess(title(self), RealSenseClouds, self)
 
 
 def title(config: RealSense) -> str:

@@ -19,7 +19,8 @@ RELEARN_S = 3.0  # frames that stay late for so long belong to another offset: t
 
 @dataclass(frozen=True)
 class Stamp:
-    """When a frame was captured (s, host monotonic), by which clock, and how much later than the earliest frames it came (s)."""
+    """When a frame was captured (s, host monotonic), by which clock, and how much later than the earliest frames it
+    came (s)."""
 
     captured: float
     clock: str  # device, host or arrival
@@ -34,8 +35,8 @@ def unix_now() -> float:
 class UnixClock:
     """Maps Unix time to the host's monotonic time, also while somebody sets the host's clock.
 
-    A frame on its way when the clock is set has a stamp of the clock as it was before. For SET_KEPT_S both are tried: the stamp
-    that makes the frame the least late is right, because no frame comes before its time.
+    A frame on its way when the clock is set has a stamp of the clock as it was before. For SET_KEPT_S both are tried:
+    the stamp that makes the frame the least late is right, because no frame comes before its time.
     """
 
     def __init__(self, unix: Callable[[], float] = unix_now, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -68,11 +69,13 @@ class UnixClock:
 
 
 class EarliestLine:
-    """The line below all (device time, arrival - device time), s, that is nearest to them: offset and drift of two clocks.
+    """The line below all (device time, arrival - device time), s, that is nearest to them: offset and drift of two
+    clocks.
 
-    A frame can only be late. Of the lines that no frame undercuts, the one with the smallest mean distance is an edge of the
-    lower convex hull, above the mean time (Moon, Skelly and Towsley, Estimation and removal of clock skew from network delay
-    measurements, INFOCOM 1999). The hull is taken of the earliest frame of each half second of the last minute.
+    A frame can only be late. Of the lines that no frame undercuts, the one with the smallest mean distance is an edge
+    of the lower convex hull, above the mean time (Moon, Skelly and Towsley, Estimation and removal of clock skew from
+    network delay measurements, INFOCOM 1999). The hull is taken of the earliest frame of each half second of the last
+    minute.
     """
 
     def __init__(self) -> None:
@@ -126,9 +129,9 @@ def _turns_down(a: tuple[float, float], b: tuple[float, float], c: tuple[float, 
 class DeviceClock:
     """Capture times of frames with stamps of a clock that is not the host's.
 
-    The earliest arrivals give the clock's offset and drift; `latency_s` is the time from the capture to the arrival of the
-    earliest frames, which stamps alone cannot tell. A frame that comes more than `late_s` after its time is late, and is not
-    used for the clock.
+    The earliest arrivals give the clock's offset and drift; `latency_s` is the time from the capture to the arrival of
+    the earliest frames, which stamps alone cannot tell. A frame that comes more than `late_s` after its time is late,
+    and is not used for the clock.
     """
 
     def __init__(self, latency_s: float, late_s: float) -> None:
@@ -180,7 +183,8 @@ class DiagramTime:
         self._diagram.append(diagram_s)
 
     def at(self, host_s: float) -> float:
-        """The Diagram's time (s) at a host time; minus infinity before the first note, the newest note's after the last."""
+        """The Diagram's time (s) at a host time; minus infinity before the first note, the newest note's after the
+        last."""
         k = bisect_right(self._host, host_s)
         if k == 0:
             return float("-inf")

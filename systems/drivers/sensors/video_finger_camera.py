@@ -32,7 +32,7 @@ _START, _END = b"\xff\xd8", b"\xff\xd9"
 
 
 @dataclass(frozen=True)
-class Part:
+class StreamedPicture:
     """One picture, as JPEG, with its headers (names in lower case) and its arrival (s, host monotonic)."""
 
     jpeg: bytes
@@ -94,8 +94,11 @@ class MjpegStream:
         boundary = kind.split("boundary=", 1)[1].split(";")[0].strip().strip('"')
         self._boundary = b"--" + boundary.removeprefix("--").encode("latin-1")
 
-    def next(self, timeout_s: float) -> Part | None:
-        """The next whole part; None where none came in time. Raises DeviceLost, and Garbage for a part that is no JPEG."""
+    def next(self, timeout_s: float) -> StreamedPicture | None:
+        """The next whole part; None where none came in time.
+
+        Raises DeviceLost, and Garbage for a part that is no JPEG.
+        """
         until = time.monotonic() + timeout_s
         while (found := self._part()) is None:
             left = until - time.monotonic()
@@ -125,7 +128,7 @@ class MjpegStream:
         self._unread += found
         return True
 
-    def _part(self) -> Part | None:
+    def _part(self) -> StreamedPicture | None:
         """The first whole part of what is unread."""
         start = self._unread.find(self._boundary)
         if start < 0:
@@ -154,7 +157,7 @@ class MjpegStream:
         del self._unread[:stop]
         if not jpeg.startswith(_START) or not jpeg.rstrip(b"\x00\r\n").endswith(_END):
             raise Garbage("it sent a picture that is not a whole JPEG")
-        return Part(jpeg, headers, time.monotonic())
+        return StreamedPicture(jpeg, headers, time.monotonic())
 
     def _shorten(self) -> None:
         """Refuse a stream that never comes to a part's end."""
@@ -178,9 +181,10 @@ UNDECODED = "it sent a picture that cannot be decoded"
 class VideoFingerCamera(WiredFingerCamera):
     """`!VideoFingerCamera`: where the pictures come from.
 
-    `source`: http://HOST:PORT/PATH (MJPEG), rtsp://..., the number or path of a video device (0, /dev/video0), or a video file.
-    `stamps` of an MJPEG stream's header X-Timestamp (s): host, of this computer's clock (Unix time); device, of a clock of its
-    own, whose offset is found from the earliest arrivals; none. Without stamps a picture was taken `latency_s` before it came.
+    `source`: http://HOST:PORT/PATH (MJPEG), rtsp://..., the number or path of a video device (0, /dev/video0), or a
+    video file. `stamps` of an MJPEG stream's header X-Timestamp (s): host, of this computer's clock (Unix time);
+    device, of a clock of its own, whose offset is found from the earliest arrivals; none. Without stamps a picture was
+    taken `latency_s` before it came.
     """
 
     source: str = ""
@@ -190,14 +194,16 @@ class VideoFingerCamera(WiredFingerCamera):
         """The source of pictures that `source` names. Raises InputError where it names none."""
         if not self.source:
             raise InputError(
-                "Write the camera's source in the scenario: finger_camera: !VideoFingerCamera {source: http://HOST:PORT/PATH}."
+                "Write the camera's source in the scenario: finger_camera: !VideoFingerCamera {source:"
+                " http://HOST:PORT/PATH}."
             )
         if self.stamps not in STAMPS:
             raise InputError(f"finger_camera.stamps must be {', '.join(STAMPS)}, not '{self.stamps}'.")
         if self.source.startswith("http://"):
             if self.exposure_ms is not None or self.gain is not None:
                 raise InputError(
-                    "The exposure of an MJPEG stream is set at its camera: leave finger_camera.exposure_ms and gain at null."
+                    "The exposure of an MJPEG stream is set at its camera: leave finger_camera.exposure_ms and gain at"
+                    " null."
                 )
             return MjpegSource(self)
         if self.stamps != "none":

@@ -1,4 +1,5 @@
-"""DeviceWatch: a device's fault becomes the robot's: the arm stops, the process goes off, and the fault stays until the run ends."""
+"""DeviceWatch: a device's fault becomes the robot's: the arm stops, the process goes off, and the fault stays until the
+run ends."""
 
 import dataclasses as dc
 from collections.abc import Callable
@@ -16,7 +17,7 @@ PERIOD_S = 0.008
 STOOD_S = 0.1  # a longer time between two looks: the Diagram computed, with the arm at rest
 
 
-class Watched(Protocol):
+class SelfTestingDevice(Protocol):
     """A device that knows what is wrong with it, by a clock of its own."""
 
     time: CellTime
@@ -42,11 +43,11 @@ class DeviceWatch(LeafSystem):
         output_ports:
         - status
 
-    Everything that stops for a robot's fault stops for a device's: the process first, then the arm, and the job holds by that
-    sentence. A device that works again changes nothing before the next run.
+    Everything that stops for a robot's fault stops for a device's: the process first, then the arm, and the job holds
+    by that sentence. A device that works again changes nothing before the next run.
     """
 
-    def __init__(self, device: Watched, clock: Callable[[], float] | None = None) -> None:
+    def __init__(self, device: SelfTestingDevice, clock: Callable[[], float] | None = None) -> None:
         super().__init__()
         self._device, self._clock = device, clock or device.time.now
         self._looked = self._clock()
@@ -74,7 +75,7 @@ class DeviceWatch(LeafSystem):
         output.set_value(status)
 
 
-def watch(build: StationBuild, device: Watched, name: str) -> None:
+def watch(build: StationBuild, device: SelfTestingDevice, name: str) -> None:
     """Let the station close a device, and let the robot's status show the device's faults."""
     build.closables.append(device)
     watching = build.builder.AddSystem(DeviceWatch(device))

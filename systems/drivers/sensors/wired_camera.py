@@ -74,8 +74,8 @@ class WiredFingerCamera(FingerCameraConfig):
         for name in ("silent_s", "frozen_s", "late_s"):
             if not getattr(self, name) >= least:
                 raise InputError(
-                    f"finger_camera.{name} must be at least {least:.3g}, three pictures at {self.rate_hz:g} Hz, and it is "
-                    f"{getattr(self, name):g}."
+                    f"finger_camera.{name} must be at least {least:.3g}, three pictures at {self.rate_hz:g} Hz, and it"
+                    f" is {getattr(self, name):g}."
                 )
         return Rules(self.silent_s, self.frozen_s, self.late_s, lost_s=self.silent_s)
 

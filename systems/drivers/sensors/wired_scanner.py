@@ -1,4 +1,5 @@
-"""What all scanners by wire share: their configuration, the system that asks for scans, and the one that shows a stream."""
+"""What all scanners by wire share: their configuration, the system that asks for scans, and the one that shows a
+stream."""
 
 import dataclasses as dc
 import time
@@ -12,7 +13,7 @@ from pydrake.systems.framework import Context, DiscreteValues
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig
-from weldcal.systems.drivers.sensors.acquisition import Acquisition, Frame, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.acquisition import AcquiredFrame, Acquisition, Garbage, Rules, Source
 from weldcal.systems.drivers.sensors.cell_time import cell_time
 from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
@@ -101,8 +102,8 @@ def checked_cloud(points: NDArray[Any], metres: float, far_m: float) -> Cloud:
     middle = float(np.median(z))
     if not 0.0 < middle <= FAR * far_m:
         raise Garbage(
-            f"the middle of the cloud is {middle:.3g} m away, and the scanner sees {far_m:.3g} m far: set scanner.unit to "
-            "the unit of its points, and let it send them in the frame of its camera"
+            f"the middle of the cloud is {middle:.3g} m away, and the scanner sees {far_m:.3g} m far: set scanner.unit"
+            " to the unit of its points, and let it send them in the frame of its camera"
         )
     return cloud
 
@@ -118,9 +119,9 @@ class WiredScanStream(LeafSystem):
         output_ports:
         - stream
 
-    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's own, less
-    what the Diagram had lost on its ``clock`` when the frame was taken: the two stay together while the computer is late. Where
-    the cell follows an emulated robot's time, a host that is late does not make a frame late.
+    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's
+    own, less what the Diagram had lost on its ``clock`` when the frame was taken: the two stay together while the
+    computer is late. Where the cell follows an emulated robot's time, a host that is late does not make a frame late.
     """
 
     def __init__(self, acquisition: Acquisition[Cloud], clock: WallClock | None = None) -> None:
@@ -144,7 +145,7 @@ class WiredScanStream(LeafSystem):
                 newest = new[-1].number
         discrete.set_value([float(newest)])
 
-    def _streamed(self, frame: Frame[Cloud], now: float) -> StreamedScan:
+    def _streamed(self, frame: AcquiredFrame[Cloud], now: float) -> StreamedScan:
         device = frame.device_time
         if device is not None and self._clock is not None:
             device -= self._clock.lost_by(self.acquisition.time.at(frame.stamp.captured))

@@ -1,4 +1,5 @@
-"""Draws the true kinematics of a simulated arm, which differs a little from the model that its controller reports by."""
+"""Draws the true kinematics of a simulated arm, which differs a little from the model that its controller reports
+by."""
 
 from dataclasses import replace
 

@@ -1,4 +1,5 @@
-"""A separate scene graph for a camera, and a stand that is knocked; its poses are updated only when a picture is taken."""
+"""A separate scene graph for a camera, and a stand that is knocked; its poses are updated only when a picture is
+taken."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -34,8 +35,8 @@ class PicturePoses(LeafSystem):
         output_ports:
         - frame_poses
 
-    The poses are calculated only when a picture is taken. A renderer on the contact model's scene graph would be updated at
-    every plant step (500 Hz), which costs as much as the contact computation.
+    The poses are calculated only when a picture is taken. A renderer on the contact model's scene graph would be
+    updated at every plant step (500 Hz), which costs as much as the contact computation.
     """
 
     def __init__(self, plant: MultibodyPlant, frames: dict[BodyIndex, FrameId]) -> None:
@@ -65,11 +66,7 @@ class PictureScene(Message):
 
 
 def add_picture_scene(
-    builder: DiagramBuilder,
-    plant: MultibodyPlant,
-    drawn: SceneGraph,
-    renderer: str,
-    mount: str | None = None,
+    builder: DiagramBuilder, plant: MultibodyPlant, drawn: SceneGraph, renderer: str, mount: str | None = None
 ) -> PictureScene:
     """Add a scene with the visual geometry that the bodies of `plant` have in the scene graph `drawn`.
 
@@ -136,7 +133,8 @@ class KnockedStand(LeafSystem):
 
 
 def add_stand(builder: DiagramBuilder, scene: PictureScene, time_s: float, displacement: RigidTransform) -> FrameId:
-    """Add a stand at the base's frame that jumps by ``displacement`` at ``time_s``; returns its frame in the camera's scene."""
+    """Add a stand at the base's frame that jumps by ``displacement`` at ``time_s``; returns its frame in the camera's
+    scene."""
     graph = scene.scene_graph
     source = graph.RegisterSource("stand")
     frame = graph.RegisterFrame(source, GeometryFrame("stand"))

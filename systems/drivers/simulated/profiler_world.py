@@ -21,7 +21,8 @@ MASS_KG = 0.9
 
 @dataclass(frozen=True, eq=False)
 class ProfilerTruth(Message):
-    """Ground truth of the simulation: X_FS, the torch's tip in F, the edge (point, direction) and the sphere's centre in B."""
+    """Ground truth of the simulation: X_FS, the torch's tip in F, the edge (point, direction) and the sphere's centre
+    in B."""
 
     X_FS: RigidTransform
     p_FTip: Array
@@ -33,7 +34,8 @@ class ProfilerTruth(Message):
 
 @dataclass(frozen=True, eq=False)
 class ProfilerFixture(Message):
-    """Ground truth and job, the pose of the straightedge, and the ray-cast objects: (mesh in B, darkness 0 to 1) each."""
+    """Ground truth and job, the pose of the straightedge, and the ray-cast objects: (mesh in B, darkness 0 to 1)
+    each."""
 
     truth: ProfilerTruth
     X_BE: RigidTransform
@@ -52,7 +54,8 @@ class TouchPair(Message):
 
 
 def straightedge_mesh(length_m: float, width_m: float) -> TriMesh:
-    """A bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, both sides bevelled inwards."""
+    """A bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, both sides bevelled
+    inwards."""
     section = np.array([[0.0, 0.0], [width_m, 0.0], [width_m - BEVEL_M, -BEVEL_M], [BEVEL_M, -BEVEL_M]])
     ends = [np.column_stack([np.full(4, x), section]) for x in (-0.5 * length_m, 0.5 * length_m)]
     triangles = [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]]
@@ -75,7 +78,8 @@ def under_straightedge(X_BE: RigidTransform, width_m: float) -> Array:
 
 def box_mesh(center: list[float], size: list[float]) -> TriMesh:
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6,
+        4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
     return TriMesh(corners * size + center, np.array(faces))
 
 
@@ -99,7 +103,12 @@ def add_fixture(
     plate = plant.AddRigidBody("profiler_plate", rig, inertia)
     plant.WeldFrames(plant.GetFrameByName("flange", arm), plate.body_frame())
     ground = plant.world_body()
-    steel, dark, red, copper = ((0.62, 0.64, 0.67, 1.0), (0.16, 0.18, 0.21, 1.0), (0.9, 0.15, 0.1, 0.35), (0.8, 0.45, 0.2, 1.0))  # fmt: skip
+    steel, dark, red, copper = (
+        (0.62, 0.64, 0.67, 1.0),
+        (0.16, 0.18, 0.21, 1.0),
+        (0.9, 0.15, 0.1, 0.35),
+        (0.8, 0.45, 0.2, 1.0),
+    )
 
     def show(body: object, X: RigidTransform, shape: Shape, name: str, rgba: tuple[float, ...]) -> None:
         plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
@@ -109,7 +118,13 @@ def add_fixture(
     show(plate, truth.X_FS @ RigidTransform([0.0, 0.0, -0.0175]), Box(0.08, 0.036, 0.035), "profiler_body", steel)
     show(plate, truth.X_FS @ RigidTransform([0.0, 0.0, 0.045]), Box(0.034, 0.0004, 0.09), "plane_of_light", red)
     _show_torch(show, plate, truth.p_FTip, copper)
-    show(ground, fixture.X_BE, _shape(straightedge_mesh(1e-3 * job.straightedge.length_mm, 1e-3 * job.straightedge.width_mm)), "straightedge", steel)  # fmt: skip
+    show(
+        ground,
+        fixture.X_BE,
+        _shape(straightedge_mesh(1e-3 * job.straightedge.length_mm, 1e-3 * job.straightedge.width_mm)),
+        "straightedge",
+        steel,
+    )
     for k, top in enumerate((under_straightedge(fixture.X_BE, 1e-3 * job.straightedge.width_mm), truth.center)):
         height = float(top[2]) - table_z_m
         show(ground, RigidTransform(top - [0.0, 0.0, 0.5 * height]), Cylinder(POST_RADIUS_M, height), f"post{k}", dark)
@@ -132,7 +147,10 @@ def _show_torch(show: object, plate: object, tip: Array, rgba: tuple[float, ...]
     d = tip / length
     R = RollPitchYaw(0.0, float(np.arctan2(np.hypot(d[0], d[1]), d[2])), 0.0).ToRotationMatrix()
     R = RollPitchYaw(0.0, 0.0, float(np.arctan2(d[1], d[0]))).ToRotationMatrix() @ R
-    for name, start, end, radius in (("torch_body", 0.0, length - 0.02, 0.008), ("torch_needle", length - 0.02, length, 0.0008)):  # fmt: skip
+    for name, start, end, radius in (
+        ("torch_body", 0.0, length - 0.02, 0.008),
+        ("torch_needle", length - 0.02, length, 0.0008),
+    ):
         show(plate, RigidTransform(R, 0.5 * (start + end) * d), Cylinder(radius, end - start), name, rgba)
 
 

@@ -58,7 +58,8 @@ _NO_IMAGE = Image()
 
 @lru_cache(maxsize=4)
 def _noise_table(sigma: float) -> np.ndarray:
-    """65536 equally likely values of Gaussian noise, rounded to whole grey levels as by a camera; a draw is one look-up."""
+    """65536 equally likely values of Gaussian noise, rounded to whole grey levels as by a camera; a draw is one
+    look-up."""
     return np.asarray(np.floor(sigma * ndtri((np.arange(65536) + 0.5) / 65536)), dtype=np.int16)
 
 
@@ -81,8 +82,8 @@ class StreamingCamera(LeafSystem):
         - image
         - capture_time
 
-    A frame shows the world at the plant's last step, and its capture time is the time of that step. `body_poses`: the plant's;
-    `draw` makes the grey picture (H, W) of them. A frame arrives after the camera's latency.
+    A frame shows the world at the plant's last step, and its capture time is the time of that step. `body_poses`: the
+    plant's; `draw` makes the grey picture (H, W) of them. A frame arrives after the camera's latency.
     """
 
     def __init__(

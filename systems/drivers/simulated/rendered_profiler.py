@@ -28,8 +28,8 @@ FORCE_N = 0.02  # contact force above which a touch is reported
 class RenderedProfiler(DriverConfig):
     """`!RenderedProfiler`: nominal pose of the profiler on the flange, its deviation, and its measurement model.
 
-    The numbers are those of the profiler in the straight-edge paper: 40 mm wide at 60 mm to 160 mm at 350 mm, rounded to
-    0.1 mm, and 0.16 mm of noise, here divided between each sample and the whole profile.
+    The numbers are those of the profiler in the straight-edge paper: 40 mm wide at 60 mm to 160 mm at 350 mm, rounded
+    to 0.1 mm, and 0.16 mm of noise, here divided between each sample and the whole profile.
     """
 
     FOR: ClassVar[tuple[str, ...]] = ("profiler",)
@@ -169,8 +169,8 @@ class ProfilerSensor(LeafSystem):
         output_ports:
         - profile
 
-    `trigger` (1) is the number of the newest requested profile. A profile shows the world at the plant's last step, and its
-    capture time is the time of that step. It appears on `profile` after the exposure.
+    `trigger` (1) is the number of the newest requested profile. A profile shows the world at the plant's last step, and
+    its capture time is the time of that step. It appears on `profile` after the exposure.
     """
 
     def __init__(
@@ -210,8 +210,8 @@ class ProfilerSensor(LeafSystem):
 
 
 class TouchSensor(LeafSystem):
-    """Detects contact of the torch's tip with the sphere from the plant's contact results; it takes the place of the sphere
-    paper's microcontroller.
+    """Detects contact of the torch's tip with the sphere from the plant's contact results; it takes the place of the
+    sphere paper's microcontroller.
 
     .. pydrake_system::
 

@@ -57,8 +57,8 @@ class RenderedScanner(ScannerConfig):
     warp_mm: float = 0.0
     # base, or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
     mounted_on: str = "base"
-    # the stand is knocked at knock_s (null: never): the scanner then stands this far from its true pose, turned about its own
-    # origin by this rotation vector, both along the axes of the base
+    # the stand is knocked at knock_s (null: never): the scanner then stands this far from its true pose, turned about
+    # its own origin by this rotation vector, both along the axes of the base
     knock_s: float | None = None
     knock_mm: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
     knock_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -126,8 +126,9 @@ class DepthSensor(LeafSystem):
         output_ports:
         - scan
 
-    `trigger` (1) is the sequence number of the newest requested scan (open: none). When it increases, the depth image is rendered and the
-    scanner's noise is added from the seed and the sequence number. The cloud appears on `scan` after the exposure.
+    `trigger` (1) is the sequence number of the newest requested scan (open: none). When it increases, the depth image
+    is rendered and the scanner's noise is added from the seed and the sequence number. The cloud appears on `scan`
+    after the exposure.
     """
 
     def __init__(self, preset: ScannerPreset, seed: int, exposure_s: float, period_s: float = 0.02) -> None:
@@ -208,7 +209,8 @@ class TrueScanner(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class MountedScanner:
-    """A scanner at its true pose ``X_LC`` in its carrier's frame, its device's errors, and what renders its pictures."""
+    """A scanner at its true pose ``X_LC`` in its carrier's frame, its device's errors, and what renders its
+    pictures."""
 
     X_LC: RigidTransform
     device: ScannerPreset

@@ -24,7 +24,8 @@ _NEAR_M, _FAR_M = 0.05, 2.0
 
 @dc.dataclass(kw_only=True)
 class RenderedWristCamera(DriverConfig):
-    """`!RenderedWristCamera`: nominal pose of the camera on the flange, the deviation of the true pose, and its noise."""
+    """`!RenderedWristCamera`: nominal pose of the camera on the flange, the deviation of the true pose, and its
+    noise."""
 
     FOR: ClassVar[tuple[str, ...]] = ("wrist_camera",)
     SIMULATED: ClassVar[bool] = True

@@ -1,4 +1,5 @@
-"""Adds the tablet job's bodies to the simulated world: plate, camera and sprung pen on the flange, tablet on the table."""
+"""Adds the tablet job's bodies to the simulated world: plate, camera and sprung pen on the flange, tablet on the
+table."""
 
 import dataclasses as dc
 from dataclasses import dataclass
@@ -162,8 +163,8 @@ def tablet_fittings(
 ) -> TabletFittings:
     """Draw the true poses of camera, pen and tablet from the seed.
 
-    A device without a simulated driver has its nominal pose. The tablet lies flat; its error is a translation in the plane
-    and a rotation about the normal.
+    A device without a simulated driver has its nominal pose. The tablet lies flat; its error is a translation in the
+    plane and a rotation about the normal.
     """
     X_FC, X_BT = RigidTransform(), tablet.pose()
     if isinstance(camera, RenderedWristCamera):

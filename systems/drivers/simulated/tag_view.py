@@ -1,4 +1,5 @@
-"""Draws what the finger camera sees: the perspective image of the printed tag on its white plate, before the membrane."""
+"""Draws what the finger camera sees: the perspective image of the printed tag on its white plate, before the
+membrane."""
 
 import cv2
 import numpy as np
@@ -33,7 +34,8 @@ class TagView:
         )
 
     def picture(self, X_FM: RigidTransform) -> Pixels:
-        """The grey picture (H, W) of the tag whose frame M (x right, y up, z out of the print) is at X_FM in the flange frame."""
+        """The grey picture (H, W) of the tag whose frame M (x right, y up, z out of the print) is at X_FM in the flange
+        frame."""
         X_KM = self._X_KF @ X_FM
         found = np.full(self._size, round(255 * SOFT[1]), dtype=np.uint8)
         plate = np.round(self._pixels(X_KM, self._plate_M) * 2**_SUBPIXEL_BITS).astype(np.int32)

@@ -64,22 +64,18 @@ class SpeedJointServo(LeafSystem):
         - sample_time
         - status
 
-    Inputs: velocity (6) rad/s, arm state (12) rad, rad/s, its acceleration (6) rad/s^2. What is measured is the arm at the end of the
-    plant's step at this tick, so that a sample is not a tick old: the state after one semi-implicit step of ``plant_period_s``. An open
-    `arm_acceleration` says that `arm_state` has made that step already. Outputs depend on the discrete state only: no feedthrough, one
-    tick of latency. Speeds and accelerations above the arm's limits are clamped as by the controller. A reference that differs
-    from the arm by more than the following error latches a fault and freezes the reference. With a repeatability above zero
-    the measured joints differ from the true ones by a small offset. It is constant while the arm is at rest and is drawn
-    anew, from ``seed`` and the number of the stop, when the arm starts to move.
+    Inputs: velocity (6) rad/s, arm state (12) rad, rad/s, its acceleration (6) rad/s^2. What is measured is the arm at
+    the end of the plant's step at this tick, so that a sample is not a tick old: the state after one semi-implicit step
+    of ``plant_period_s``. An open `arm_acceleration` says that `arm_state` has made that step already. Outputs depend
+    on the discrete state only: no feedthrough, one tick of latency. Speeds and accelerations above the arm's limits are
+    clamped as by the controller. A reference that differs from the arm by more than the following error latches a fault
+    and freezes the reference. With a repeatability above zero the measured joints differ from the true ones by a small
+    offset. It is constant while the arm is at rest and is drawn anew, from ``seed`` and the number of the stop, when
+    the arm starts to move.
     """
 
     def __init__(
-        self,
-        arm: ArmModel,
-        config: SimulatedUr,
-        q_start: np.ndarray,
-        seed: int = 0,
-        plant_period_s: float = 0.002,
+        self, arm: ArmModel, config: SimulatedUr, q_start: np.ndarray, seed: int = 0, plant_period_s: float = 0.002
     ) -> None:
         super().__init__()
         self._arm = arm
@@ -159,7 +155,8 @@ class SpeedJointServo(LeafSystem):
 
 @compiled()
 def _follow(reference: Array, fault: Array, measured: Array, command: Array, limits: Array, dt: float) -> bool:
-    """Advance the servo's reference (12,), position and velocity, and its fault (1,), in place; whether the arm starts to move.
+    """Advance the servo's reference (12,), position and velocity, and its fault (1,), in place; whether the arm starts
+    to move.
 
     ``limits`` (5, 6): velocity, acceleration, lower and upper position, following error; rad and s.
     """

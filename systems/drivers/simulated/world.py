@@ -1,4 +1,5 @@
-"""Builds the simulated world: arm, tool with its soft tip, table and workpiece in one MultibodyPlant and scene graph."""
+"""Builds the simulated world: arm, tool with its soft tip, table and workpiece in one MultibodyPlant and scene
+graph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,7 +51,8 @@ SERVO_EFFORT = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)  # N m, of that arm: anot
 
 
 def servo_gains(arm: ArmModel) -> tuple[list[float], list[float]]:
-    """Stiffness (6) N m / rad and damping (6) N m s / rad of an arm's joint servos, in proportion to its joints' torques."""
+    """Stiffness (6) N m / rad and damping (6) N m s / rad of an arm's joint servos, in proportion to its joints'
+    torques."""
     share = arm.effort_limit / np.array(SERVO_EFFORT)
     return list(share * JOINT_STIFFNESS), list(share * JOINT_DAMPING)
 
@@ -73,7 +75,8 @@ class Fittings(Protocol):
     """Further bodies of a scenario, on the flange and on the table."""
 
     def add(self, plant: MultibodyPlant, arm: ModelInstanceIndex) -> ModelInstanceIndex:
-        """Add them before the plant is finalised; returns the model instance whose springs have their rest position at zero."""
+        """Add them before the plant is finalised; returns the model instance whose springs have their rest position at
+        zero."""
 
 
 def compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: list[ModelInstanceIndex]) -> None:
@@ -120,9 +123,11 @@ def build_world(
         MultibodyPlantConfig(
             time_step=time_step_s,
             contact_model="hydroelastic" if profiler is None else "point",
-            # A plant with sampled ports steps in an unrestricted update: at each step Drake would copy the state of the whole Diagram.
+            # A plant with sampled ports steps in an unrestricted update: at each step Drake would copy the state of the
+            # whole Diagram.
             use_sampled_output_ports=contacts_read,
-            discrete_contact_approximation="lagged",  # with `sap` the tip's rest position would depend on the sliding speed
+            # With `sap` the tip's rest position would depend on the sliding speed
+            discrete_contact_approximation="lagged",
         ),
         builder,
     )

@@ -1,4 +1,5 @@
-"""The cell's side of the robot link: starts the worker, shares memory with it without blocking, and ends the program."""
+"""The cell's side of the robot link: starts the worker, shares memory with it without blocking, and ends the
+program."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, S
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
 from weldcal.systems.drivers.ur.wire.dashboard import stop_program
-from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
+from weldcal.systems.drivers.ur.worker import WorkerConfig, WorkerPhase
 from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus
 
@@ -40,7 +41,10 @@ class StartFailed(RobotRefused):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinkState:
-    """The worker's newest state. Times in s of the host's monotonic clock, except `robot_time` (the controller's clock)."""
+    """The worker's newest state.
+
+    Times in s of the host's monotonic clock, except `robot_time` (the controller's clock).
+    """
 
     q: NDArray[np.float64]
     qd: NDArray[np.float64]
@@ -78,7 +82,8 @@ class LinkState:
 
 @lru_cache(maxsize=64)
 def status_of(codes: tuple[float, ...]) -> UrStatus:
-    """The state of the controller in words, from robot mode, safety mode, running (0 or 1), speed scaling, fault and its detail."""
+    """The state of the controller in words, from robot mode, safety mode, running (0 or 1), speed scaling, fault and
+    its detail."""
     robot_mode, safety_mode, running, scaling, code, detail = codes
     fault = Fault(int(code))
     return UrStatus(
@@ -122,7 +127,9 @@ class UrLink:
 
     @classmethod
     def start(cls, host: str, arm: ArmModel, limits: Limits, **options: Any) -> UrLink:
-        """Start the worker, upload the guard, and wait until it is active. The arm does not move, the process output is off.
+        """Start the worker, upload the guard, and wait until it is active.
+
+        The arm does not move, the process output is off.
 
         `options` are the other fields of WorkerConfig.
 
@@ -135,7 +142,7 @@ class UrLink:
         while time.monotonic() < until:
             found = link._memory.state.read()
             if found is not None:
-                if found.phase == Phase.OBEYING:
+                if found.phase == WorkerPhase.OBEYING:
                     return link
                 if found.fault:
                     fault = Fault(found.fault)
@@ -152,7 +159,10 @@ class UrLink:
         raise StartFailed(f"{sentence(Fault.START_FAILED)} {ended}" + (f" It said: {said}" if said else ""))
 
     def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
-        """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number. Never blocks."""
+        """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number.
+
+        Never blocks.
+        """
         self._give(qd, process=process)
         return self._number
 
@@ -166,7 +176,8 @@ class UrLink:
         self.command(np.zeros(6))
 
     def joints_at(self, host_time: float) -> NDArray[np.float64] | None:
-        """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds; None where there is no sample."""
+        """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds; None where there is no
+        sample."""
         return self._memory.ring.at(host_time)
 
     def robot_time(self) -> float:
@@ -188,7 +199,7 @@ class UrLink:
             raise RuntimeError("the link has not started")
         now = time.monotonic()
         fault, detail, fault_time = Fault(found.fault), found.detail, found.fault_time
-        if fault is Fault.NONE and self._died is None and found.phase != Phase.ENDED:
+        if fault is Fault.NONE and self._died is None and found.phase != WorkerPhase.ENDED:
             limits = self._config.limits
             quiet = now - found.heartbeat > max(HEARTBEAT_LIMIT_S / limits.pace, limits.stale_s)
             if quiet or self._process.poll() is not None:

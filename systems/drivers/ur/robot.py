@@ -39,9 +39,9 @@ STEP_S = 0.005  # more than this off the line for a whole bin: the controller st
 class ClockMap:
     """host time = robot time / pace + offset + drift * robot time.
 
-    A package can only be late, so the minimum of (host - robot) in each half second is the best estimate of the offset. An
-    unweighted line through these minima gives offset and drift; its residual is a measure of the accuracy.
-    Where a whole bin is off the line by more than STEP_S, all earlier data are dropped. Where the slope exceeds the drift of
+    A package can only be late, so the minimum of (host - robot) in each half second is the best estimate of the offset.
+    An unweighted line through these minima gives offset and drift; its residual is a measure of the accuracy. Where a
+    whole bin is off the line by more than STEP_S, all earlier data are dropped. Where the slope exceeds the drift of
     two quartz clocks, the controller does not keep its pace, and only the last bin is used.
     """
 
@@ -125,8 +125,9 @@ class Refused(Exception):
 def guard_script(
     upper_registers: bool, output: int | None = None, gas: int | None = None, levels: Sequence[Level] = ()
 ) -> str:
-    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share; `output` and
-    `gas`: the standard digital outputs of the process and of the gas valve, None where none is wired; `levels`: set points.
+    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share;
+    `output` and `gas`: the standard digital outputs of the process and of the gas valve, None where none is wired;
+    `levels`: set points.
     """
     analog = {level.output: int(level.volts) for level in levels}
     text = files("weldcal.systems.drivers.ur").joinpath("guard.script").read_text(encoding="utf-8")
@@ -144,11 +145,12 @@ def guard_script(
 
 
 def _without(text: str, mark: str) -> str:
-    """The script without the lines of a mark: a controller may refuse a program for the name of a function that it never calls."""
+    """The script without the lines of a mark: a controller may refuse a program for the name of a function that it
+    never calls."""
     return "".join(line for line in text.splitlines(keepends=True) if mark not in line)
 
 
-class Robot:
+class ControllerStream:
     """The stream to and from the controller, the clock map and the newest complete package."""
 
     def __init__(
@@ -256,8 +258,8 @@ class Robot:
         self._stream.send(command, *arguments, *points)
 
     def _read_back(self, found: dict[str, Value], wrong: list[str], mass_kg: float, cog_m: list[float]) -> None:
-        """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the guard
-        waits for a package.
+        """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the
+        guard waits for a package.
         """
         until = time.monotonic() + READ_BACK_LIMIT_S / self._pace
         try:
@@ -325,7 +327,8 @@ class Robot:
         )
 
     def excuse(self, seconds: float) -> None:
-        """Do not count this time, in which the process was suspended, as silence of the robot; at most EXCUSED_S in a row."""
+        """Do not count this time, in which the process was suspended, as silence of the robot; at most EXCUSED_S in a
+        row."""
         seconds = min(seconds, max(EXCUSED_S - self._excused, 0.0))
         self._excused += seconds
         self._fresh_at += seconds
@@ -342,8 +345,8 @@ class Robot:
             self._first_unheard = min(self._sent.values(), default=now)
 
     def send(self, qd: np.ndarray, acceleration: float, process: bool = False, armed: bool = False) -> bool:
-        """Send one velocity, numbered for the guard's watchdog; a negative number enables the process, `armed` the set points.
-        Returns False where the program does not run.
+        """Send one velocity, numbered for the guard's watchdog; a negative number enables the process, `armed` the set
+        points. Returns False where the program does not run.
         """
         self._number = (abs(self._number) % 1_000_000.0 + 1.0) * (-1.0 if process else 1.0)
         now = time.monotonic()

@@ -54,17 +54,17 @@ class UrRtde(DriverConfig):
     payload_kg: float = 1.4  # of the welding tool
     payload_cog_m: list[float] = dc.field(default_factory=lambda: [0.03, 0.0, 0.05])
     process_output: int | None = None  # standard digital output (0 to 7) that switches the torch; null: none is wired
-    # standard digital inputs (0 to 7) of the power source; null: not wired. Without an established arc the weld does not move,
-    # and a fault ends it
+    # standard digital inputs (0 to 7) of the power source; null: not wired. Without an established arc the weld does
+    # not move, and a fault ends it
     arc_input: int | None = None
     arc_fault_input: int | None = None
-    # standard digital output of the gas valve; null: the power source does it. Gas flows gas_before_s before the torch is on,
-    # for which the weld stands only where arc_input is wired, and gas_after_s after it
+    # standard digital output of the gas valve; null: the power source does it. Gas flows gas_before_s before the torch
+    # is on, for which the weld stands only where arc_input is wired, and gas_after_s after it
     gas_output: int | None = None
     gas_before_s: float = 0.5
     gas_after_s: float = 1.0
-    # the power source's wire feed at an analog output of the controller; null: not wired. A set point needs process_output and
-    # arc_input, and is given after the gas and before the torch
+    # the power source's wire feed at an analog output of the controller; null: not wired. A set point needs
+    # process_output and arc_input, and is given after the gas and before the torch
     wire_feed: AnalogSetPoint | None = None
     arc_voltage: AnalogSetPoint | None = None  # the same for its voltage
 
@@ -113,14 +113,13 @@ class UrRtdeArm(LeafSystem):
         - status
         - arc_established
 
-    Units as in the simulated arm. `sample_time` is the time of the robot's sample on the Diagram's clock: the time of the
-    update less the sample's age, computed from robot time mapped to host time; of a robot that the Diagram follows, its own time.
-    `desired_state` (12) rad, rad/s is the
-    predicted state of the arm at the next tick, which the simulated arm follows. Outputs depend on the state only: no
-    feedthrough.
-    On a computer that is late the clock's `rate` is below 1: velocities are sent, and read, in proportion to it.
-    `arc_established` (1): 1 while the power source reports an arc, or where its input is not wired.
-    `process_on` (1) switches the torch's digital output, where one is wired; unconnected means off.
+    Units as in the simulated arm. `sample_time` is the time of the robot's sample on the Diagram's clock: the time of
+    the update less the sample's age, computed from robot time mapped to host time; of a robot that the Diagram follows,
+    its own time. `desired_state` (12) rad, rad/s is the predicted state of the arm at the next tick, which the
+    simulated arm follows. Outputs depend on the state only: no feedthrough. On a computer that is late the clock's
+    `rate` is below 1: velocities are sent, and read, in proportion to it. `arc_established` (1): 1 while the power
+    source reports an arc, or where its input is not wired. `process_on` (1) switches the torch's digital output, where
+    one is wired; unconnected means off.
     """
 
     def __init__(
@@ -131,8 +130,8 @@ class UrRtdeArm(LeafSystem):
         found = link.state()
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._process = self.DeclareVectorInputPort("process_on", 1)
-        # Numbers only, because an update of abstract state would make Drake copy and compute everything anew, 500 times a second.
-        # One group for each port, which Drake then fills without Python.
+        # Numbers only, because an update of abstract state would make Drake copy and compute everything anew, 500 times
+        # a second. One group for each port, which Drake then fills without Python.
         self._desired = self.DeclareDiscreteState(np.concatenate([found.q, np.zeros(6)]))
         self._position = self.DeclareDiscreteState(found.q)
         self._velocity = self.DeclareDiscreteState(6)
@@ -216,7 +215,8 @@ def chosen_transport(config: UrRtde, version: tuple[int, ...], upper: bool) -> t
 
 
 def start_link(start: Callable[..., UrLink], config: UrRtde, transport: str, why: str) -> tuple[UrLink, str]:
-    """The link over this transport, and why over this one: where `auto` took ur_rtde and it does not start, native follows.
+    """The link over this transport, and why over this one: where `auto` took ur_rtde and it does not start, native
+    follows.
 
     Raises:
         RobotRefused: the link does not start.
@@ -232,7 +232,8 @@ def start_link(start: Callable[..., UrLink], config: UrRtde, transport: str, why
 
 
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
-    """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not move.
+    """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not
+    move.
 
     Raises:
         InputError: the scenario names no host, or a pace other than 1 or lockstep for a real robot.
@@ -258,7 +259,8 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     if config.gas_output is not None:
         if config.process_output is None or config.arc_input is None or not 0 <= config.gas_output < N_OUTPUTS:
             raise InputError(
-                "robot.gas_output must be a standard digital output from 0 to 7, and it needs process_output and arc_input."
+                "robot.gas_output must be a standard digital output from 0 to 7, and it needs process_output and"
+                " arc_input."
             )
         if config.gas_output == config.process_output:
             raise InputError("robot.gas_output and robot.process_output must be two outputs.")
@@ -268,8 +270,12 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     if levels and (config.process_output is None or config.arc_input is None):
         raise InputError("robot.wire_feed and robot.arc_voltage need process_output and arc_input.")
     report = preflight(
-        config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load(), set_points=config.set_points
-    )  # fmt: skip
+        config.host,
+        upper_registers=config.upper_registers,
+        nominal=nominal,
+        load=config.load(),
+        set_points=config.set_points,
+    )
     require_ready(report)
     arm = report.arm
     if arm is None:

@@ -27,8 +27,8 @@ class TornRead(RuntimeError):
 class Block:
     """Numbers with one writer and any number of readers: a seqlock over two slots.
 
-    A writer that is preempted during a write leaves the other slot intact. The count is the number of complete writes; its
-    last bit selects the newest slot. The checksum covers machines that reorder stores.
+    A writer that is preempted during a write leaves the other slot intact. The count is the number of complete writes;
+    its last bit selects the newest slot. The checksum covers machines that reorder stores.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, names: tuple[str, ...]) -> None:

@@ -22,10 +22,12 @@ OBEYING, STALE_REGISTER = 1, 2
 MADE_UP_FOR_S = 0.03  # of the cell's time
 # of the controller's time: the guard shows a pass in every frame
 GUARD_SILENT_S = 0.08
-# The guard writes its number and the output in the same frame. A terminal may follow 5 frames later, and number and output may
-# be of two packages, 2 frames apart: after 10 frames an output that is on without being asked for is somebody else's.
+# The guard writes its number and the output in the same frame. A terminal may follow 5 frames later, and number and
+# output may be of two packages, 2 frames apart: after 10 frames an output that is on without being asked for is
+# somebody else's.
 OUTPUT_ON_S = 0.020
-# The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after 25.
+# The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after
+# 25.
 OUTPUT_OFF_S = 0.050
 # The guard writes the analog outputs in every frame, too.
 SET_POINT_S = 0.050
@@ -71,8 +73,9 @@ class Limits:
     late_s: float = 0.050
     lost_s: float = 0.5  # the arm is at rest since late_s
     deaf_s: float = 0.200  # later than the guard, which latches after 150 ms without a number
-    # States that come so long after the commands that they answer, for so long: no gap shows that a connection has become slow. The guard
-    # waits 150 ms for a number, and one that reaches it 120 ms late is no fault: that is 40 ms above behind_s.
+    # States that come so long after the commands that they answer, for so long: no gap shows that a connection has
+    # become slow. The guard waits 150 ms for a number, and one that reaches it 120 ms late is no fault: that is 40 ms
+    # above behind_s.
     behind_s: float = 0.080
     behind_for_s: float = 0.100
     jump_s: float = 0.5
@@ -105,7 +108,8 @@ class Limits:
         )
 
     def in_lockstep(self, patience_s: float = PATIENCE_S, held_s: float = HELD_S) -> Limits:
-        """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no stop."""
+        """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no
+        stop."""
         return replace(
             self,
             stale_s=max(self.stale_s, patience_s),
@@ -156,7 +160,7 @@ class RobotSample:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Command:
+class VelocityCommand:
     """The newest velocity command of the cell; `given_at` is host time."""
 
     number: int = 0
@@ -189,7 +193,7 @@ class Supervisor:
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._last: RobotSample | None = None
-        self._command = Command()
+        self._command = VelocityCommand()
         self._stepped_at = 0.0
         self._reference: Array | None = None
         self._referred_at = 0.0
@@ -204,7 +208,7 @@ class Supervisor:
         self._seen_time, self._seen_number = -np.inf, 0
         self.latched = Decision(Action.SEND)
 
-    def step(self, now: float, robot: RobotSample, command: Command) -> Decision:
+    def step(self, now: float, robot: RobotSample, command: VelocityCommand) -> Decision:
         """Compute the decision of this pass. `now` is host time, s."""
         if robot.robot_time != self._seen_time:
             self._seen_time, self._seen_number = robot.robot_time, command.number
@@ -226,7 +230,7 @@ class Supervisor:
         """Forget where the commands lead: for some time none was sent, and the guard has slowed the arm."""
         self._reference = None
 
-    def _look(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+    def _look(self, now: float, robot: RobotSample, command: VelocityCommand) -> tuple[Fault, float]:
         for look in (self._link(now, robot, command), self._safety(robot), self._program(robot), self._output(robot)):
             if look[0] is not Fault.NONE:
                 return look
@@ -238,7 +242,7 @@ class Supervisor:
             return Fault.ARC_INPUT, 0.0
         return self._motion(now, robot, command)
 
-    def _link(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+    def _link(self, now: float, robot: RobotSample, command: VelocityCommand) -> tuple[Fault, float]:
         limits, last = self._limits, self._last
         if not robot.connected:
             return Fault.LINK_CLOSED, 0.0
@@ -304,7 +308,8 @@ class Supervisor:
         return Fault.NONE, 0.0
 
     def _set_points(self, robot: RobotSample) -> float | None:
-        """The share (%) that an analog output shows in place of what the guard gives it, of one package; None: as it should."""
+        """The share (%) that an analog output shows in place of what the guard gives it, of one package; None: as it
+        should."""
         wrong = [shown for asked, shown in robot.set_points if apart(asked, shown)]
         if not wrong:
             self._apart_since = None
@@ -313,7 +318,8 @@ class Supervisor:
         return 100.0 * wrong[0] if robot.robot_time - self._apart_since > SET_POINT_S else None
 
     def _arc_unasked(self, robot: RobotSample) -> bool:
-        """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the torch."""
+        """Whether an arc is reported that nothing asks for: the input sticks or is noisy, or somebody else burns the
+        torch."""
         if robot.arc is None or robot.process_on is None:
             return False
         if robot.process_asked or robot.process_on:
@@ -325,7 +331,7 @@ class Supervisor:
         self._arc_since = min(self._arc_since, robot.robot_time)
         return robot.robot_time > self._arc_ends_at and robot.robot_time - self._arc_since >= ARC_ON_S
 
-    def _motion(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+    def _motion(self, now: float, robot: RobotSample, command: VelocityCommand) -> tuple[Fault, float]:
         limits = self._limits
         if robot.unheard_s > limits.deaf_s:
             return Fault.CONTROLLER_DEAF, 1e3 * robot.unheard_s
@@ -352,12 +358,14 @@ class Supervisor:
         if share.max() > 1.0 + 1e-9:
             return Fault.COMMAND_TOO_FAST, float(np.abs(command.qd)[int(np.argmax(share))])
         late = now - command.given_at
-        # a late command slows the arm to rest within late_s; a torch may not burn there, and may not come on again by itself
+        # a late command slows the arm to rest within late_s; a torch may not burn there, and may not come on again by
+        # itself
         longest = limits.late_s if command.process else limits.lost_s
         if (command.process or command.qd.any()) and late > longest and not (command.stop or command.orphaned):
             return Fault.COMMAND_LATE, 1e3 * late
         if command.number != self._command.number:
-            # a cell catches up after a delay of up to 20 ms and restarts its clock after a longer one; passes may skip commands
+            # a cell catches up after a delay of up to 20 ms and restarts its clock after a longer one; passes may skip
+            # commands
             passed = limits.pace * max(command.given_at - self._command.given_at, 0.0)
             if passed > MADE_UP_FOR_S:
                 passed = limits.pace * (now - self._stepped_at)
@@ -372,7 +380,7 @@ class Supervisor:
             return Fault.JOINT_LIMIT, float(np.argmax(outside) + 1)
         return self._tracking(now, robot, command)
 
-    def _tracking(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+    def _tracking(self, now: float, robot: RobotSample, command: VelocityCommand) -> tuple[Fault, float]:
         """Check the arm's position against the integral of the recent commands, which decays in half a second."""
         limits = self._limits
         if self._reference is None:

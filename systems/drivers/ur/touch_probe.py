@@ -1,4 +1,5 @@
-"""Touch probe at a digital input of a UR controller: `!UrTouchProbe` reads every RTDE sample, so that a touch has the joints of its sample."""
+"""Touch probe at a digital input of a UR controller: `!UrTouchProbe` reads every RTDE sample, so that a touch has the
+joints of its sample."""
 
 import dataclasses as dc
 from collections import deque
@@ -29,8 +30,9 @@ FIRST_LIMIT_S = 2.0
 FIRST_LOOKS, LOOK_S = 5, 0.01
 SILENT_S = 0.2  # of the cell's time, without a new sample
 PERIOD_S = 0.004
-# Of the controller's time. A touch is on for HELD_S, and its bounce leaves it off for less than BOUNCE_S; a contact that opens has
-# opened when it is off for RELEASED_S. A sound probe changes a few times when it closes and when it opens.
+# Of the controller's time. A touch is on for HELD_S, and its bounce leaves it off for less than BOUNCE_S; a contact
+# that opens has opened when it is off for RELEASED_S. A sound probe changes a few times when it closes and when it
+# opens.
 HELD_S, BOUNCE_S, RELEASED_S = 0.004, 0.006, 0.020
 CHATTER_S, CHATTER_CHANGES = 0.5, 12
 
@@ -45,8 +47,8 @@ class UrTouchProbe(DriverConfig):
     input: int = 0  # digital input: 0 to 7 standard, 8 to 15 configurable, 16 and 17 of the tool connector
     # true: the input is on while nothing is touched, and a broken cable holds the job at once
     normally_closed: bool = False
-    # from the contact to the sample that shows it: a touch has the joints of so long before. What is left out puts each touch
-    # too deep by the descent's speed times it: 0.006 mm for each ms at 6 mm/s
+    # from the contact to the sample that shows it: a touch has the joints of so long before. What is left out puts each
+    # touch too deep by the descent's speed times it: 0.006 mm for each ms at 6 mm/s
     latency_s: float = 0.0
 
     def check(self) -> None:
@@ -67,7 +69,8 @@ class UrTouchProbe(DriverConfig):
 class Touches:
     """Counts the touches in an input's samples: bounce belongs to its touch, and a spike of one sample is none.
 
-    `number` of the newest touch; `time` (s, of the controller) and `q` (6,) rad of its first sample; `down`: it is held.
+    `number` of the newest touch; `time` (s, of the controller) and `q` (6,) rad of its first sample; `down`: it is
+    held.
     """
 
     number: int = 0
@@ -139,8 +142,8 @@ class ProbeInput:
         n, host = self._config.input, self._config.host
         if self.touches.chatters:
             return (
-                f"TOUCH PROBE: digital input {n} changed more than {CHATTER_CHANGES} times in {CHATTER_S:g} s; look for a loose plug, a "
-                "broken shield or a worn contact of the probe, and start again."
+                f"TOUCH PROBE: digital input {n} changed more than {CHATTER_CHANGES} times in {CHATTER_S:g} s; look for"
+                " a loose plug, a broken shield or a worn contact of the probe, and start again."
             )
         if self._stream.not_finite:
             return sentence(Fault.STATE_NOT_FINITE, reported_as(self._stream.not_finite))
@@ -150,8 +153,8 @@ class ProbeInput:
             )
         if now - self._heard > SILENT_S:
             return (
-                f"TOUCH PROBE: no new state of the probe's input from {host} for {1e3 * (now - self._heard):.0f} ms; check the network "
-                "cable and start again."
+                f"TOUCH PROBE: no new state of the probe's input from {host} for {1e3 * (now - self._heard):.0f} ms;"
+                " check the network cable and start again."
             )
         return None
 
@@ -213,8 +216,8 @@ def preflight(config: UrTouchProbe) -> Sensed:
     if on == config.normally_closed:
         return Sensed((Check("input", True, found),))
     action = (
-        f"Digital input {config.input} is {'on' if on else 'off'}, as in a touch: free the probe, look at its cable, and compare "
-        "touch_probe.input and normally_closed with the wiring."
+        f"Digital input {config.input} is {'on' if on else 'off'}, as in a touch: free the probe, look at its cable,"
+        " and compare touch_probe.input and normally_closed with the wiring."
     )
     return Sensed((Check("input", False, f"digital input {config.input} is {'on' if on else 'off'}", action),))
 

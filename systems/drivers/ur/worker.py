@@ -19,17 +19,17 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.precedence import take_priority
-from weldcal.systems.drivers.ur.robot import Refused, Robot
+from weldcal.systems.drivers.ur.robot import ControllerStream, Refused
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import (
     PLAYING,
     STOPPING,
     Action,
-    Command,
     Decision,
     Limits,
     RobotSample,
     Supervisor,
+    VelocityCommand,
 )
 from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas, Level, SetPoints, apart
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
@@ -68,7 +68,7 @@ RESTS_S = 5.0  # for which an arm at rest waits for a cell that computes
 LEFT = 3  # exit code of a worker that exited because of the link
 
 
-class Phase(IntEnum):
+class WorkerPhase(IntEnum):
     """The phase of the worker process."""
 
     STARTING = 0
@@ -106,7 +106,7 @@ class Worker:
         self._config, self._memory = config, memory
         self._supervisor = Supervisor(config.limits)
         self._scale = TimeScale(config.limits.pace)
-        self._phase = Phase.STARTING
+        self._phase = WorkerPhase.STARTING
         self._fault_time = 0.0
         self._worst = 0.0
         self._late = 0
@@ -120,10 +120,10 @@ class Worker:
         self._rest_since: float | None = None
         self._braking_since: float | None = None
 
-    def run(self, robot: Robot) -> int:
+    def run(self, robot: ControllerStream) -> int:
         """Run until the cell requests a stop or the link fails; returns the process's exit code."""
         period = 1.0 / self._config.rate_hz
-        self._phase = Phase.OBEYING
+        self._phase = WorkerPhase.OBEYING
         deadline = last = time.monotonic()
         while True:
             now = time.monotonic()
@@ -149,24 +149,24 @@ class Worker:
             if decision.action is Action.LEAVE:
                 self._publish(now, robot, sample, decision)
                 return LEFT
-            if self._phase is Phase.OBEYING:
+            if self._phase is WorkerPhase.OBEYING:
                 self._drive(now, robot, sample, command, decision)
             self._publish(now, robot, sample, decision)
-            if (command.stop or command.orphaned) and self._phase is not Phase.OBEYING:
+            if (command.stop or command.orphaned) and self._phase is not WorkerPhase.OBEYING:
                 self._valve(robot, False)
                 self._await_the_end(robot, period)
-                self._phase = Phase.ENDED
+                self._phase = WorkerPhase.ENDED
                 self._publish(now, robot, sample, decision)
                 return 0
 
-    def _command(self) -> Command:
+    def _command(self) -> VelocityCommand:
         orphaned = os.getppid() != self._config.parent
         with contextlib.suppress(TornRead):
             self._newest = self._memory.command.read() or self._newest
         found = self._newest
         if found is None:
-            return Command(orphaned=orphaned)
-        return Command(
+            return VelocityCommand(orphaned=orphaned)
+        return VelocityCommand(
             number=found.number,
             given_at=found.host_time,
             qd=found.qd,
@@ -175,7 +175,7 @@ class Worker:
             process=found.process,
         )
 
-    def _with_torch(self, command: Command, robot: Robot, sample: RobotSample) -> Command:
+    def _with_torch(self, command: VelocityCommand, robot: ControllerStream, sample: RobotSample) -> VelocityCommand:
         """The command whose torch waits for the gas and then for the set points, where they are wired."""
         torch, armed = command.process, False
         if self._config.gas_output is not None:
@@ -187,18 +187,21 @@ class Worker:
             armed, torch = self._points.step(sample.robot_time, torch, right)
         return replace(command, process=torch, armed=armed)
 
-    def _valve(self, robot: Robot, on: bool) -> None:
+    def _valve(self, robot: ControllerStream, on: bool) -> None:
         if on != self._gas_on:
             robot.gas(on)
             self._gas_on = on
 
-    def _scaled(self, command: Command, now: float, sample: RobotSample) -> Command:
-        """The command with the factor that slows the arm while command or state is late, but not under a burning torch, which goes out first."""
+    def _scaled(self, command: VelocityCommand, now: float, sample: RobotSample) -> VelocityCommand:
+        """The command with the factor that slows the arm while command or state is late, but not under a burning torch,
+        which goes out first."""
         factor = self._scale.step(now, now - min(command.given_at, sample.fresh_at))
         kept = command.process or self._config.limits.waits
         return command if kept else replace(command, scale=factor)
 
-    def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
+    def _drive(
+        self, now: float, robot: ControllerStream, sample: RobotSample, command: VelocityCommand, decision: Decision
+    ) -> None:
         if decision.action is Action.SEND:
             old = command.number == self._driven and now - command.given_at > self._config.limits.hold_s
             # a cell that follows the controller is waited for at rest too, so that its devices' time is its own
@@ -206,17 +209,18 @@ class Worker:
             if old and (command.qd.any() or waited_for):
                 return  # the controller waits for the cell's next command
             self._driven = command.number
-            # The supervisor ends a late command with the torch on. Set points that wait for the torch are no fault: they go to zero.
+            # The supervisor ends a late command with the torch on. Set points that wait for the torch are no fault:
+            # they go to zero.
             armed = command.armed and now - command.given_at <= self._config.limits.late_s
             if not robot.send(command.scaled_qd, ACCELERATION, command.process, armed):
-                self._phase = Phase.STOPPED  # the next sample shows the cause
+                self._phase = WorkerPhase.STOPPED  # the next sample shows the cause
         elif decision.action is Action.STOP:
             robot.forget()
-            self._phase = Phase.STOPPED
+            self._phase = WorkerPhase.STOPPED
         else:
             self._brake(now, robot, sample)
 
-    def _brake(self, now: float, robot: Robot, sample: RobotSample) -> None:
+    def _brake(self, now: float, robot: ControllerStream, sample: RobotSample) -> None:
         """Send zero velocity until the arm is at rest, then end the program."""
         self._braking_since = now if self._braking_since is None else self._braking_since
         robot.send(np.zeros(6), self._config.limits.braking)
@@ -225,15 +229,16 @@ class Worker:
         rested = self._rest_since is not None and now - self._rest_since > 0.05 / self._config.limits.pace
         if rested or now - self._braking_since > STOP_LIMIT_S / self._config.limits.pace:
             robot.end_program()
-            self._phase = Phase.STOPPED
+            self._phase = WorkerPhase.STOPPED
 
-    def _await_the_end(self, robot: Robot, period: float) -> None:
-        """Wait until the controller says that the program has ended, so that nothing of it runs on after this process."""
+    def _await_the_end(self, robot: ControllerStream, period: float) -> None:
+        """Wait until the controller says that the program has ended, so that nothing of it runs on after this
+        process."""
         until = time.monotonic() + ENDS_S / self._config.limits.pace
         while (now := time.monotonic()) < until and robot.sample(now).runtime_state in (PLAYING, STOPPING):
             time.sleep(period)
 
-    def _publish(self, now: float, robot: Robot, sample: RobotSample, decision: Decision) -> None:
+    def _publish(self, now: float, robot: ControllerStream, sample: RobotSample, decision: Decision) -> None:
         host_time = robot.clock.to_host(sample.robot_time)
         if sample.robot_time != self._ringed:
             self._memory.ring.append(host_time, sample.q.tolist())
@@ -270,7 +275,9 @@ class Worker:
     def refuse(self, refused: Refused) -> None:
         """Publish the fault that made the start fail."""
         fault, detail = refused.fault, refused.detail
-        self._memory.state.write(Published(heartbeat=time.monotonic(), phase=Phase.ENDED, fault=fault, detail=detail))
+        self._memory.state.write(
+            Published(heartbeat=time.monotonic(), phase=WorkerPhase.ENDED, fault=fault, detail=detail)
+        )
 
 
 def main() -> None:
@@ -281,7 +288,7 @@ def main() -> None:
     take_priority()
     worker = Worker(config, memory)
     try:
-        robot = Robot(
+        robot = ControllerStream(
             config.host,
             upper=config.upper_registers,
             pace=config.limits.pace,

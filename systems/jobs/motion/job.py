@@ -1,4 +1,5 @@
-"""The motion job: calibrates a streaming scanner and its clock, or watches a calibration, while the flange moves in a cube."""
+"""The motion job: calibrates a streaming scanner and its clock, or watches a calibration, while the flange moves in a
+cube."""
 
 import dataclasses as dc
 from pathlib import Path
@@ -70,7 +71,8 @@ _TRIES = 40  # leans drawn for a corner
 
 @dc.dataclass(frozen=True, eq=False)
 class MotionPlanned:
-    """Joint angles (6,) rad of the corners, the scanner's delay (s) as known from its data sheet, and what is watched, if anything."""
+    """Joint angles (6,) rad of the corners, the scanner's delay (s) as known from its data sheet, and what is watched,
+    if anything."""
 
     corners: tuple[Array, ...]
     q_home: Array
@@ -127,7 +129,7 @@ def _stream_delay_s(scenario: Scenario) -> float | None:
     return None if scanner is None else scanner.stream_delay_s()
 
 
-class Motion(Job[MotionPlanned]):
+class MotionCalibrationJob(Job[MotionPlanned]):
     """The job of a scenario with a `motion` part."""
 
     key = "motion"
@@ -141,7 +143,8 @@ class Motion(Job[MotionPlanned]):
                 getattr(scenario, key, None) is not None for key in ("mounting", "profiler_job", "tablet")
             ):
                 raise InputError(
-                    "A scanner that streams, such as !StreamingScanner, belongs to a motion job or to the weld job: write motion: {} or another scanner."
+                    "A scanner that streams, such as !StreamingScanner, belongs to a motion job or to the weld job:"
+                    " write motion: {} or another scanner."
                 )
             return
         check_motion(job)
@@ -170,7 +173,8 @@ class Motion(Job[MotionPlanned]):
         watched = plan.watched
         factor = scenario.job.speed_factor
         maximum_time_s = scenario.job.maximum_time_s / factor
-        # legs between corners are slower than the other moves: what moves the flange at the wanted speed on the fastest leg
+        # legs between corners are slower than the other moves: what moves the flange at the wanted speed on the fastest
+        # leg
         share = min(joint_speed(station.arm, plan.corners, job.speed_m_s) / self.move_speed, 1.0)
         procedure = wiring.add(
             "motion_procedure",
@@ -242,8 +246,8 @@ class Motion(Job[MotionPlanned]):
 def plan_corners(
     scenario: Scenario, station: Station, job: MotionJob, q_home: Array, rng: np.random.Generator
 ) -> tuple[Array, ...]:
-    """Joint angles (6,) rad that bring the feature to the cube's corners, leaning another way at each, with free moves between
-    all of them.
+    """Joint angles (6,) rad that bring the feature to the cube's corners, leaning another way at each, with free moves
+    between all of them.
 
     Raises:
         InputError: a corner is out of reach, or the arm would touch the table or itself on the way.
@@ -264,8 +268,8 @@ def plan_corners(
                 break
         else:
             raise InputError(
-                f"The flange cannot be moved to the corner at {np.round(p, 3).tolist()} m without touching the table or the arm itself: "
-                "move motion.centre_m, or make motion.edge_mm smaller."
+                f"The flange cannot be moved to the corner at {np.round(p, 3).tolist()} m without touching the table or"
+                " the arm itself: move motion.centre_m, or make motion.edge_mm smaller."
             )
     return tuple(found)
 
@@ -273,8 +277,8 @@ def plan_corners(
 def facing(
     p: Array, X_BC: RigidTransform, q_home: Array, arm: ArmModel, X_FR: RigidTransform | None = None
 ) -> RotationMatrix:
-    """The rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m, turned about its axis as near to
-    that at home as can be."""
+    """The rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m, turned about its
+    axis as near to that at home as can be."""
     z = X_BC.translation() - p
     z = z / np.linalg.norm(z)
     x_home = (forward_kinematics(arm, q_home) @ (X_FR or RigidTransform())).rotation().matrix()[:, 0]
@@ -294,4 +298,4 @@ def joint_speed(arm: ArmModel, corners: tuple[Array, ...], speed_m_s: float) -> 
     return float(slowest)
 
 
-JOB = Motion()
+JOB = MotionCalibrationJob()

@@ -1,4 +1,5 @@
-"""MotionProcedure: moves the flange between the corners of a cube until enough frames are collected, then asks for the result."""
+"""MotionProcedure: moves the flange between the corners of a cube until enough frames are collected, then asks for the
+result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -62,7 +63,8 @@ class MotionInputs(Inputs):
 
 
 class MotionProcedure(Procedure[MotionState, MotionInputs]):
-    """Runs the procedure; a robot fault, a goal that is not reached, or a scanner that shows nothing holds it with a reason.
+    """Runs the procedure; a robot fault, a goal that is not reached, or a scanner that shows nothing holds it with a
+    reason.
 
     .. pydrake_system::
 
@@ -78,8 +80,8 @@ class MotionProcedure(Procedure[MotionState, MotionInputs]):
         - state
         - streaming
 
-    A procedure that does not calibrate ends at home, and its port `calibration` stays open. `hold` (1) is the operator's stop
-    request. `streaming` (1) turns the scanner on from the first corner to the last.
+    A procedure that does not calibrate ends at home, and its port `calibration` stays open. `hold` (1) is the
+    operator's stop request. `streaming` (1) turns the scanner on from the first corner to the last.
     """
 
     inputs = MotionInputs

@@ -1,4 +1,5 @@
-"""MountingCalibrator: estimates the unknown poses of any mounting from scans of a circle, and proposes the next pose."""
+"""MountingCalibrator: estimates the unknown poses of any mounting from scans of a circle, and proposes the next
+pose."""
 
 import dataclasses as dc
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.mounting.procedure import HeldOut, MountingState, MountingStatus, NextBest
+from weldcal.systems.jobs.mounting.procedure import HeldOutScan, MountingState, MountingStatus, NextBest
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
@@ -41,7 +42,8 @@ class MountingFitConfig:
 
 
 class MountingCalibrator(BackgroundSystem):
-    """Fits the circle in each scan near its predicted position, and solves the mounting's equation with all observations.
+    """Fits the circle in each scan near its predicted position, and solves the mounting's equation with all
+    observations.
 
     .. pydrake_system::
 
@@ -106,7 +108,7 @@ def digest(
         return dc.replace(status, refused=(*status.refused, (job.label, str(error))), message=str(error))
     if job.purpose == "verify":
         off = off_prediction(belief, seen, None if status.result is None else status.result.correction)
-        return dc.replace(status, held_out=(*status.held_out, HeldOut(job.label, *off)))
+        return dc.replace(status, held_out=(*status.held_out, HeldOutScan(job.label, *off)))
     status = dc.replace(status, seen=(*status.seen, seen), message="")
     if len(status.seen) < fewest(scene):
         return status
@@ -129,8 +131,8 @@ def digest(
 def next_best(
     belief: MountingScene, result: MountingResult, seen: Sequence[SeenCircle], plan: Sequence[MountingPose]
 ) -> NextBest | None:
-    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work point most; None where
-    all were visited."""
+    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work
+    point most; None where all were visited."""
     left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
     if not left:
         return None

@@ -22,7 +22,8 @@ CARRIED = {
 
 @dc.dataclass
 class SecondArm:
-    """The nominal pose of a co-manipulation's second robot, and the deviation of its true pose (from the run's seed)."""
+    """The nominal pose of a co-manipulation's second robot, and the deviation of its true pose (from the run's
+    seed)."""
 
     arm: str = "ur10e"
     xyz_m: list[float] = dc.field(default_factory=lambda: [1.5, 0.0, 0.0])  # X_BD, its base in the first arm's base
@@ -38,7 +39,8 @@ class SecondArm:
 
 @dc.dataclass
 class MountingJob:
-    """A calibration with a circle of the robot as its target: the flange, the base circle, or the flange of a second arm."""
+    """A calibration with a circle of the robot as its target: the flange, the base circle, or the flange of a second
+    arm."""
 
     target_known: bool = True  # the circle's pose is known from the drawing; false: it is estimated too
     second_arm: SecondArm | None = None

@@ -68,7 +68,7 @@ class AddedMounting(AddedJob):
         )
 
 
-class Mounting(Job[MountingPlanned]):
+class MountingCalibrationJob(Job[MountingPlanned]):
     """The job of a scenario with a `mounting` part."""
 
     key = "mounting"
@@ -146,7 +146,8 @@ class Mounting(Job[MountingPlanned]):
 
 
 def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, FlangeStandard]:
-    """The scene as known before the first scan, from drawings and rough measurements; and the dimensions of the circle."""
+    """The scene as known before the first scan, from drawings and rough measurements; and the dimensions of the
+    circle."""
     job, c, scanner = scenario.part(MountingJob), scenario.calibration, scenario.scanner_config()
     if job is None or scanner is None:
         raise InputError("A mounting job needs a scanner and a mounting part: write mounting: {} in the scenario.")
@@ -200,4 +201,4 @@ def true_poses(scene: MountingScene, station: Station) -> dict[str, RigidTransfo
     return found
 
 
-JOB = Mounting()
+JOB = MountingCalibrationJob()

@@ -1,4 +1,5 @@
-"""MountingProcedure: visits the planned poses with one arm or two, scans at each, holds out some scans, returns home."""
+"""MountingProcedure: visits the planned poses with one arm or two, scans at each, holds out some scans, returns
+home."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +33,7 @@ class MountingState(ProcedureState):
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutScan:
     """Errors of the calibration's prediction of the circle in a held-out scan."""
 
     label: str
@@ -42,8 +43,8 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class NextBest:
-    """A pose to add: joints (6,) rad, X_BF of the first arm, and the predicted sigma (3-D, m) of a scanned point without and
-    with it."""
+    """A pose to add: joints (6,) rad, X_BF of the first arm, and the predicted sigma (3-D, m) of a scanned point
+    without and with it."""
 
     q: Array
     q_2: Array | None
@@ -57,8 +58,9 @@ class NextBest:
         second = "" if self.q_2 is None else f", second arm [{', '.join(f'{v:.0f}' for v in np.degrees(self.q_2))}] deg"
         p = 1e3 * self.X_BF.translation()
         return (
-            f"joints [{joints}] deg{second} (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the "
-            f"sigma of a scanned point from {1e3 * self.sigma_before_m:.4f} to {1e3 * self.sigma_after_m:.4f} mm."
+            f"joints [{joints}] deg{second} (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would"
+            f" reduce the sigma of a scanned point from {1e3 * self.sigma_before_m:.4f} to"
+            f" {1e3 * self.sigma_after_m:.4f} mm."
         )
 
 
@@ -73,7 +75,7 @@ class MountingStatus(Message):
     sigma_work_m: float = np.inf  # expected error (3-D, rms) of a point at the scanner's best distance
     error_95_m: float = np.inf  # and the bound that it keeps with 95 %
     history: tuple[tuple[int, float], ...] = ()  # of that bound, by the number of scans
-    held_out: tuple[HeldOut, ...] = ()
+    held_out: tuple[HeldOutScan, ...] = ()
     next_best: NextBest | None = None
     done: bool = False
     message: str = ""
@@ -108,10 +110,11 @@ class MountingProcedure(Procedure[MountingState, MountingInputs]):
         - state
         - trigger
 
-    One arm moves at a time: towards a pose the second arm first, towards home the first arm first, so that the move home is
-    the reversed move from home. An arm that is not at home moves there first. `hold` (1) is the operator's stop request. The
-    first `scans` poses of the plan are for the calibration (fewer where the required error is reached earlier), the next
-    `held_out` poses for its verification. The ports of the second arm stay open where there is one arm.
+    One arm moves at a time: towards a pose the second arm first, towards home the first arm first, so that the move
+    home is the reversed move from home. An arm that is not at home moves there first. `hold` (1) is the operator's stop
+    request. The first `scans` poses of the plan are for the calibration (fewer where the required error is reached
+    earlier), the next `held_out` poses for its verification. The ports of the second arm stay open where there is one
+    arm.
     """
 
     inputs = MountingInputs

@@ -1,4 +1,5 @@
-"""Configuration of the profiler job: nominal torch, straightedge and sphere, their deviations, and the stages in order."""
+"""Configuration of the profiler job: nominal torch, straightedge and sphere, their deviations, and the stages in
+order."""
 
 import dataclasses as dc
 
@@ -78,7 +79,8 @@ class SeamStage:
 
 @dc.dataclass(kw_only=True)
 class ProfilerJob:
-    """The stages of the job: edge, sphere and seam in this order; the seam stage uses the result of the sphere stage."""
+    """The stages of the job: edge, sphere and seam in this order; the seam stage uses the result of the sphere
+    stage."""
 
     stages: list[str] = dc.field(default_factory=lambda: ["edge", "sphere", "seam"])
     torch: Torch = dc.field(default_factory=Torch)

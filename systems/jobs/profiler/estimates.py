@@ -34,7 +34,7 @@ WIDER_M = 0.5e-3  # noise may make a circle larger than the sphere
 
 
 @dataclass(frozen=True, eq=False)
-class Taken(Message):
+class TakenProfile(Message):
     """One profile with the joints (6,) rad that the controller reported at its capture time."""
 
     kind: str
@@ -44,7 +44,8 @@ class Taken(Message):
 
 @dataclass(frozen=True, eq=False)
 class EdgeFound(Message):
-    """X_FS from the edge; scans without an edge; held-out scans: distance from the edge (n,) mm, whitened residuals (n, 2)."""
+    """X_FS from the edge; scans without an edge; held-out scans: distance from the edge (n,) mm, whitened residuals (n,
+    2)."""
 
     estimate: EdgeEstimate
     poses: FlangePoses
@@ -56,7 +57,8 @@ class EdgeFound(Message):
 
 @dataclass(frozen=True, eq=False)
 class SphereFound(Message):
-    """X_FS and the tip from the sphere; the selected model; held-out scans: rms distance (n,) mm of points from the sphere."""
+    """X_FS and the tip from the sphere; the selected model; held-out scans: rms distance (n,) mm of points from the
+    sphere."""
 
     estimate: SphereEstimate
     data: SphereData
@@ -100,7 +102,7 @@ def sphere_sigmas(p: RenderedProfiler, job: ProfilerJob) -> SphereSigmas:
     )
 
 
-def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple[Taken, ...]) -> EdgeFound:
+def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple[TakenProfile, ...]) -> EdgeFound:
     """Estimate X_FS from the scans of kind `scan`, and its errors at those of kind `held_out`.
 
     Raises:
@@ -133,7 +135,7 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
     return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1), r)
 
 
-def _enough(found: int, taken: tuple[Taken, ...], what: str) -> None:
+def _enough(found: int, taken: tuple[TakenProfile, ...], what: str) -> None:
     wanted = sum(one.kind == "scan" for one in taken)
     if found < 0.5 * wanted:
         raise FeatureNotFound(
@@ -142,7 +144,8 @@ def _enough(found: int, taken: tuple[Taken, ...], what: str) -> None:
 
 
 def _one_background(points: Array, behind_m: float) -> Array:
-    """The profile with all samples far behind its nearest face set to one depth, so that post and table have no edges."""
+    """The profile with all samples far behind its nearest face set to one depth, so that post and table have no
+    edges."""
     p = points[np.isfinite(points).all(axis=1)]
     if not len(p):
         return p
@@ -160,7 +163,7 @@ def find_sphere(
     arm: ArmModel,
     p: RenderedProfiler,
     job: ProfilerJob,
-    taken: tuple[Taken, ...],
+    taken: tuple[TakenProfile, ...],
     touches: tuple[Array, ...] = (),
     tip: Array | None = None,
     first: SphereEstimate | None = None,
@@ -208,7 +211,8 @@ def find_sphere(
 
 
 def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate) -> tuple[Model, SphereEstimate]:
-    """Select the rigid model, or the affine one where it predicts held-out scans better by more than 2 %; with its estimate."""
+    """Select the rigid model, or the affine one where it predicts held-out scans better by more than 2 %; with its
+    estimate."""
     names: tuple[Model, ...] = ("rigid", "affine")
     estimates = {name: sphere_joint(data, name, sigmas, rigid) for name in names}
     errors = {}
@@ -224,9 +228,10 @@ def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate)
 
 
 def find_seam(
-    arm: ArmModel, estimate: SphereEstimate, drawn: SeamCurve, taken: tuple[Taken, ...], every_m: float
+    arm: ArmModel, estimate: SphereEstimate, drawn: SeamCurve, taken: tuple[TakenProfile, ...], every_m: float
 ) -> SeamFound:
-    """Measure the groove's root in B with the calibration: points of all passes, merged along the nominal seam and smoothed.
+    """Measure the groove's root in B with the calibration: points of all passes, merged along the nominal seam and
+    smoothed.
 
     Points far from their neighbours are rejected.
 
@@ -269,7 +274,8 @@ def _means(p: Array, place: NDArray[np.int_]) -> Array:
 
 
 def pose_sigmas(error: RigidTransform, covariance: Array) -> tuple[Array, float]:
-    """An error exp(w), t (estimate to truth, in F) in sigmas of the prediction: each of its six parts, and w^T C^-1 w of all."""
+    """An error exp(w), t (estimate to truth, in F) in sigmas of the prediction: each of its six parts, and w^T C^-1 w
+    of all."""
     angle = error.rotation().ToAngleAxis()
     e = np.concatenate([angle.angle() * np.asarray(angle.axis()), error.translation()])
     return e / np.sqrt(np.diag(covariance)), float(e @ np.linalg.solve(covariance, e))

@@ -1,4 +1,5 @@
-"""The profiler job: calibrates a laser profiler by an edge and by a touched sphere, measures a seam, moves the torch along."""
+"""The profiler job: calibrates a laser profiler by an edge and by a touched sphere, measures a seam, moves the torch
+along."""
 
 from dataclasses import dataclass
 
@@ -39,8 +40,8 @@ class RobotError(LeafSystem):
         output_ports:
         - position
 
-    Both positions (6) rad. The error of the flange's position is `sigma_m` per axis, the orientation has none. It is constant
-    for one goal, including the touch after a move and a whole pass.
+    Both positions (6) rad. The error of the flange's position is `sigma_m` per axis, the orientation has none. It is
+    constant for one goal, including the touch after a move and a whole pass.
     """
 
     def __init__(self, arm: ArmModel, sigma_m: float, seed: int) -> None:
@@ -116,8 +117,8 @@ class Profiler(Job[PlanningContext]):
         job = scenario.part(ProfilerJob)
         if job is not None and "sphere" in job.stages and not station.diagram.HasOutputPort("torch.touch"):
             raise InputError(
-                "Nothing tells when the torch touches the sphere in this cell: add touch_probe: !UrTouchProbe {host: ..., input: ...}, or "
-                "write profiler_job: {stages: [edge]}."
+                "Nothing tells when the torch touches the sphere in this cell: add touch_probe: !UrTouchProbe {host:"
+                " ..., input: ...}, or write profiler_job: {stages: [edge]}."
             )
         return planning_context(scenario, station)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.interpolate import CubicSpline
 
-from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, path_clearance
 from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses
@@ -42,7 +42,8 @@ FASTER = 1.2  # than the mean speed in a step of STEP_RAD: no point of the rig i
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlanningContext:
-    """Nominal or, later, calibrated poses: X_FS, the tip in F, the sphere's centre in B; the nominal workpiece at X_BP."""
+    """Nominal or, later, calibrated poses: X_FS, the tip in F, the sphere's centre in B; the nominal workpiece at
+    X_BP."""
 
     arm: ArmModel
     job: ProfilerJob
@@ -65,7 +66,7 @@ class PlanningContext:
         """The depth range of the calibration."""
         return Field(1e-3 * self.job.half_width_mm, 1e-3 * self.job.near_mm, 1e-3 * self.job.far_mm)
 
-    def bodies(self) -> list[Body]:
+    def bodies(self) -> list[LinkCapsule]:
         """The arm with the rig on its flange."""
         at = np.array(self.X_FS.translation())
         capsules = [
@@ -105,8 +106,8 @@ class PlanningContext:
         return lowest > self.table_z_m and gap > 0.0
 
     def _keeps_gap(self, q_a: Array, q_b: Array, least_m: float) -> bool:
-        """Whether torch and profiler keep `least_m` (m) on a straight move in joint space; from each checked configuration on by no more
-        than what they have left there.
+        """Whether torch and profiler keep `least_m` (m) on a straight move in joint space; from each checked
+        configuration on by no more than what they have left there.
         """
         n = max(2, int(np.ceil(float(np.abs(q_b - q_a).max()) / STEP_RAD)) + 1)
         rig, _ = rig_points(self.p_FTip, self.X_FS)
@@ -136,7 +137,8 @@ class PlanningContext:
         return np.array(q).reshape(-1, 6), np.array(which, dtype=np.intp)
 
     def route(self, q_from: Array, goals: Array) -> list[tuple[Array, int]]:
-        """A route through all goals (n, 6), each time to the nearest remaining one: (joints, goal's index or -1 for home).
+        """A route through all goals (n, 6), each time to the nearest remaining one: (joints, goal's index or -1 for
+        home).
 
         Raises:
             InputError: a goal has no clear move, not even from home.
@@ -232,7 +234,8 @@ class Goal(Message):
 
 
 def plan_edge(planning: PlanningContext, q_from: Array, seed: int, sigma_xz_m: Array) -> list[Goal]:
-    """Plan the scans of the straightedge: those that minimise the predicted covariance, and held-out ones among the rest.
+    """Plan the scans of the straightedge: those that minimise the predicted covariance, and held-out ones among the
+    rest.
 
     Raises:
         InputError: too few poses are reachable and clear.
@@ -266,14 +269,22 @@ def plan_sphere(planning: PlanningContext, q_from: Array, seed: int, sigmas: Sph
     q, poses = _standing(planning, candidates, "sphere")
     first, rest = _split(poses, stage.scans + stage.held_out)
     plan = plan_sphere_poses(
-        R, t, planning.center, planning.radius_m, poses[first], poses[rest], stage.scans - FIRST, sigmas=sigmas, field=planning.field
-    )  # fmt: skip
+        R,
+        t,
+        planning.center,
+        planning.radius_m,
+        poses[first],
+        poses[rest],
+        stage.scans - FIRST,
+        sigmas=sigmas,
+        field=planning.field,
+    )
     return _scans(planning, q_from, q, first, rest, plan.chosen, stage.held_out)
 
 
 def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Goal]:
-    """Plan touches at points spread over the sphere's upper part, with a different inclination and rotation of the torch at
-    each.
+    """Plan touches at points spread over the sphere's upper part, with a different inclination and rotation of the
+    torch at each.
 
     Raises:
         InputError: too few of them can be reached.
@@ -307,7 +318,8 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
 
 
 def _descends(planning: PlanningContext, q: Array, way: Array) -> bool:
-    """Whether the guard lets the torch descend along ``way`` (3,) from joints q (6,) rad to the deepest place of a touch."""
+    """Whether the guard lets the torch descend along ``way`` (3,) from joints q (6,) rad to the deepest place of a
+    touch."""
     stage, X_FP = planning.job.sphere, RigidTransform(planning.p_FTip)
     way = 1e-3 * (stage.gap_mm + stage.deepest_mm) * way
     X_BP = forward_kinematics(planning.arm, q) @ X_FP
@@ -319,7 +331,8 @@ def _descends(planning: PlanningContext, q: Array, way: Array) -> bool:
 
 
 def plan_pass(planning: PlanningContext, q_from: Array) -> list[Goal]:
-    """Plan the profiler's passes along the nominal seam, perpendicular to the plate, with the laser line across the groove."""
+    """Plan the profiler's passes along the nominal seam, perpendicular to the plate, with the laser line across the
+    groove."""
     assert planning.cad is not None
     assert planning.X_BP is not None
     stage = planning.job.seam
@@ -365,7 +378,8 @@ def _standing(planning: PlanningContext, candidates: FlangePoses, what: str) -> 
 def _split(poses: FlangePoses, wanted: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     if len(poses) < wanted + FIRST:
         raise InputError(
-            f"Only {len(poses)} poses are clear and reachable, too few for {wanted} scans: ask for fewer or for less tilt."
+            f"Only {len(poses)} poses are clear and reachable, too few for {wanted} scans: ask for fewer or for less"
+            " tilt."
         )
     return np.arange(FIRST), np.arange(FIRST, len(poses))
 

@@ -1,4 +1,5 @@
-"""ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along it."""
+"""ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along
+it."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -15,7 +16,7 @@ from weldcal.systems.jobs.profiler.estimates import (
     EdgeFound,
     SeamFound,
     SphereFound,
-    Taken,
+    TakenProfile,
     feature_sigmas,
     find_edge,
     find_seam,
@@ -52,14 +53,14 @@ class ProfilerState(ProcedureState):
     seen: int = 0  # number of the newest received profile
     before: int = 0  # number of profiles at the start of the pass
     felt: int = 0  # number of touches at the start of the descent
-    taken: tuple[Taken, ...] = ()
+    taken: tuple[TakenProfile, ...] = ()
     touches: tuple[Array, ...] = ()
     edge: EdgeFound | None = None
     sphere: SphereFound | None = None
     seam: SeamFound | None = None
-    edge_scans: tuple[Taken, ...] = ()
-    sphere_scans: tuple[Taken, ...] = ()
-    seam_scans: tuple[Taken, ...] = ()
+    edge_scans: tuple[TakenProfile, ...] = ()
+    sphere_scans: tuple[TakenProfile, ...] = ()
+    seam_scans: tuple[TakenProfile, ...] = ()
     torch_from_s: float = np.inf
     torch_until_s: float = np.inf
     planning: PlanningContext | None = None
@@ -175,8 +176,8 @@ class ProfilerProcedure(Procedure[ProfilerState, ProfilerInputs]):
         - trigger
         - creep
 
-    `job` selects the FlangeMover between goals (mode move), or `creep` (6) rad/s (mode weld): the descent to a touch, the
-    profiler's pass and the torch's. `trigger` (1) is the number of the newest requested profile; `hold` (1) is the
+    `job` selects the FlangeMover between goals (mode move), or `creep` (6) rad/s (mode weld): the descent to a touch,
+    the profiler's pass and the torch's. `trigger` (1) is the number of the newest requested profile; `hold` (1) is the
     operator's stop request.
     """
 
@@ -266,7 +267,7 @@ class ProfilerProcedure(Procedure[ProfilerState, ProfilerInputs]):
         q = now.history.joints_at(scan.capture_time) if scan.sequence > s.seen else None
         if q is None:
             return s
-        return replace(s, seen=scan.sequence, taken=(*s.taken, Taken(s.goals[0].kind, q, scan.points)))
+        return replace(s, seen=scan.sequence, taken=(*s.taken, TakenProfile(s.goals[0].kind, q, scan.points)))
 
     def _descend(self, s: ProfilerState, now: ProfilerInputs) -> ProfilerState:
         touch, stage = now.touch, self._planning.job.sphere
@@ -276,8 +277,9 @@ class ProfilerProcedure(Procedure[ProfilerState, ProfilerInputs]):
         if now.time - s.since > (stage.gap_mm + stage.deepest_mm) / stage.descent_mm_s:
             number = len(s.touches) + 1
             reason = (
-                f"The torch did not touch the sphere at touch {number}, and stopped {stage.deepest_mm:g} mm below the surface expected: check "
-                "the sphere's position and radius, and the touch probe's cable and input. Jog the torch away from the sphere before the next start."
+                f"The torch did not touch the sphere at touch {number}, and stopped {stage.deepest_mm:g} mm below the"
+                " surface expected: check the sphere's position and radius, and the touch probe's cable and input. Jog"
+                " the torch away from the sphere before the next start."
             )
             return self.held(s, now, reason)
         return s

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.planning.clearance import Body, arm_bodies
+from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
@@ -50,7 +50,8 @@ def camera_of(scenario: Scenario) -> RenderedWristCamera:
 
 
 def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
-    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included; raises InputError where out of reach."""
+    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included; raises InputError where out of
+    reach."""
     found = inverse_kinematics(arm, X_BF)
     if len(found) == 0:
         raise InputError("The arm cannot reach the tablet at its nominal pose; move it nearer in the scenario.")
@@ -107,14 +108,14 @@ def check_moves(scenario: Scenario, station: Station, plan: TabletPlan) -> None:
         InputError: one does not; nothing has moved.
     """
     pen = Capsule(6, np.zeros(3), plan.p_FP, PEN_BODY_M)
-    bodies: list[Body] = arm_bodies(station.arm, (pen,))
+    bodies: list[LinkCapsule] = arm_bodies(station.arm, (pen,))
     goals = [plan.q_home, plan.q_look, *plan.q_above, plan.q_home]
     names = ["home", "the look", *(f"landmark {k + 1}" for k in range(len(plan.q_above))), "home"]
     for k in range(len(goals) - 1):
         if not clear_move(scenario, station, bodies, goals[k], goals[k + 1]):
             raise InputError(
-                f"The move from {names[k]} to {names[k + 1]} would touch the table, the surroundings or the arm itself: choose another home_deg, "
-                "a smaller tablet.turn_deg, or another place for the tablet."
+                f"The move from {names[k]} to {names[k + 1]} would touch the table, the surroundings or the arm itself:"
+                " choose another home_deg, a smaller tablet.turn_deg, or another place for the tablet."
             )
 
 

@@ -1,4 +1,5 @@
-"""TabletProcedure: takes one picture of the tablet, then lowers the pen onto each landmark until the tablet detects it."""
+"""TabletProcedure: takes one picture of the tablet, then lowers the pen onto each landmark until the tablet detects
+it."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -81,8 +82,8 @@ class TabletProcedure(Procedure[TabletState, TabletInputs]):
         - trigger
         - descent
 
-    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the pen descends; `descent`
-    (6) rad/s moves the pen straight down, zero otherwise; `hold` (1) is the operator's stop request.
+    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the pen descends;
+    `descent` (6) rad/s moves the pen straight down, zero otherwise; `hold` (1) is the operator's stop request.
     """
 
     inputs = TabletInputs

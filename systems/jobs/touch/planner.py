@@ -56,8 +56,8 @@ def check_touch(scenario: Scenario) -> None:
         return
     if scenario.job.calibrate or scenario.job.weld:
         raise InputError(
-            "The touch job neither calibrates nor welds: write job: {calibrate: false, weld: false}, or run it with weldcal verify RESULT "
-            "--scenario NAME."
+            "The touch job neither calibrates nor welds: write job: {calibrate: false, weld: false}, or run it with"
+            " weldcal verify RESULT --scenario NAME."
         )
     if not touch.result or not Path(touch.result).exists():
         raise InputError(f"touch.result must be a result of weldcal calibrate, and there is none at '{touch.result}'.")
@@ -82,8 +82,9 @@ Joints = Array
 
 
 @dc.dataclass(frozen=True, eq=False)
-class Place(Message):
-    """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal in the base."""
+class TouchPlace(Message):
+    """A place to touch: joints above it, the scanned plane (raw, camera frame; sigma m), its point and outward normal
+    in the base."""
 
     q_above: Joints
     p_C: Array
@@ -98,13 +99,14 @@ class PlannedTouches(Message):
     """The places of a scan, or the reason why there are none."""
 
     sequence: int = 0
-    places: tuple[Place, ...] = ()
+    places: tuple[TouchPlace, ...] = ()
     reason: str | None = None
 
 
 @dc.dataclass(frozen=True, eq=False)
 class TouchPlanning:
-    """What touches are planned from: part, tool and arm as for a seam, the calibration to judge, and the job's numbers."""
+    """What touches are planned from: part, tool and arm as for a seam, the calibration to judge, and the job's
+    numbers."""
 
     seam: SeamPlanning
     X_BC: RigidTransform
@@ -151,7 +153,7 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
             points_B, seam.workpiece, seam.X_BP_guess, seam.method, X_BC.translation(), seam.arm.up
         )
         root = SeamCurve.from_points(found.root, up=np.broadcast_to(found.up, found.root.shape))
-        places: list[Place] = []
+        places: list[TouchPlace] = []
         for k in range(config.points):
             frame = root.frame(root.length * (k + 0.5) / config.points)
             side = 1.0 if k % 2 == 0 else -1.0
@@ -178,7 +180,7 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
                 seam.tool.X_FT,
             )
             check_path(seam.arm, q, [descent])
-            places.append(Place(q, face[0], face[1], face[2], np.asarray(p_B), np.asarray(n_B)))
+            places.append(TouchPlace(q, face[0], face[1], face[2], np.asarray(p_B), np.asarray(n_B)))
         if found.X_BP is not None:
             _check_moves(planning, found.X_BP, [seam.q_near, *(p.q_above for p in places), seam.q_near])
     except WeldcalError as error:
@@ -187,7 +189,8 @@ def plan_touches(planning: TouchPlanning, scan: Scan) -> PlannedTouches:
 
 
 def _face(raw: Array, points_B: Array, p_B: Array, up: Array) -> tuple[Array, Array, float]:
-    """Plane of the face on the line through p_B along ``up``: point and normal towards the scanner as scanned, and the sigma, m."""
+    """Plane of the face on the line through p_B along ``up``: point and normal towards the scanner as scanned, and the
+    sigma, m."""
     away = points_B - p_B
     height = away @ up
     column = (np.linalg.norm(away - height[:, None] * up, axis=1) < _COLUMN_M) & (np.abs(height) < 0.03)

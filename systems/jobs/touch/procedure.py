@@ -10,7 +10,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
-from weldcal.systems.jobs.touch.planner import Place, PlannedTouches
+from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchPlace
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.messages import JobCommand, Message
 
@@ -46,7 +46,7 @@ class TouchMotion:
 class Felt(Message):
     """One touch: the place, joints (6,) rad at rest, and the tip's deflection (3,) m in T against its free reading."""
 
-    place: Place
+    place: TouchPlace
     q: Array
     deflection_T: Array
 
@@ -60,7 +60,7 @@ class TouchState(ProcedureState):
     seen_at: float = 0.0
     frames: tuple[Array, ...] = ()
     zero: Array | None = None
-    places: tuple[Place, ...] = ()
+    places: tuple[TouchPlace, ...] = ()
     felt: tuple[Felt, ...] = ()
 
 
@@ -93,9 +93,9 @@ class TouchProcedure(Procedure[TouchState, TouchInputs]):
         - descent
         - streaming
 
-    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the tip descends; `descent` (6) rad/s moves
-    the tip against the face's normal, zero otherwise; `trigger` (1) and `streaming` (1) go to the station; `hold` (1) is the
-    operator's stop request.
+    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the tip descends;
+    `descent` (6) rad/s moves the tip against the face's normal, zero otherwise; `trigger` (1) and `streaming` (1) go to
+    the station; `hold` (1) is the operator's stop request.
     """
 
     inputs = TouchInputs

@@ -1,4 +1,5 @@
-"""Plans the arm's way to a seam, along it and back, and searches for the change that makes an infeasible one feasible."""
+"""Plans the arm's way to a seam, along it and back, and searches for the change that makes an infeasible one
+feasible."""
 
 import dataclasses as dc
 import itertools
@@ -26,7 +27,7 @@ from weldcal.welding.servo.tool_axes import tool_path
 from weldcal.welding.servo.touch import touch_start_pose
 
 CHECKED_EVERY = 5  # places of the seam, against the surroundings: 20 mm
-CLEAR_OF_PART_M = 0.002
+CLEAR_OF_PART_M = 0.002  # twice the tool's own clearance: the arm's links are capsules, with errors of their own
 HIGHER = (1.0, 2.0, 4.0)  # of the clearance above the seam, until the moves are clear
 LEAN_STEP_DEG, LEAN_MOST_DEG = 2.0, 10.0
 MOVES_MM, TURNS_DEG = (25.0, 50.0, 100.0, 150.0, 200.0, 300.0), (15.0, 30.0, 45.0, 60.0, 90.0, 180.0)
@@ -45,7 +46,8 @@ class SeamOutOfReach(InfeasiblePath):
 
 
 class ArmWay(NamedTuple):
-    """Joints (6,) rad at the touch's start, above it and above the far end; how far the tool leans, rad; and the seam in joints."""
+    """Joints (6,) rad at the touch's start, above it and above the far end; how far the tool leans, rad; and the seam
+    in joints."""
 
     q_start: Array
     q_above: Array
@@ -91,7 +93,8 @@ def leaning(config: ServoConfig, lean_rad: float, touch_arc_m: float | None = No
 
 
 def leans_with_room(welder: Welder, seam: SeamCurve, X_BP: RigidTransform) -> list[float]:
-    """Leans, rad, that the job may use and with which the tool's body fits the part; the upright tool's only where that fits.
+    """Leans, rad, that the job may use and with which the tool's body fits the part; the upright tool's only where that
+    fits.
 
     Raises:
         NoRoom: none fits, with the least lean that would.
@@ -158,7 +161,10 @@ def _offer(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, may_deg
     still = RigidTransform()
     for lean in LEANS:
         if abs(math.degrees(lean)) > may_deg and works(still, lean):
-            return f"set welding.lean_deg: {abs(math.degrees(lean)):.0f}, with which the tool leans sideways so far where it must"
+            return (
+                f"set welding.lean_deg: {abs(math.degrees(lean)):.0f}, with which the tool leans sideways so far where"
+                " it must"
+            )
     if not welder.any_posture and any(works(still, lean, seed) for lean, seed in _postures(welder, seam, True)):
         return "set welding.posture: any, with which the arm changes to another branch above the part"
     for X, words in _displacements(seam.frame(0.5 * seam.length).position, welder.arm.up):
@@ -184,7 +190,8 @@ def _displacements(centre: Array, up: Array) -> Iterator[tuple[RigidTransform, s
 
 
 def _postures(welder: Welder, seam: SeamCurve, any_branch: bool) -> Iterator[tuple[float, Array]]:
-    """Every branch above the seam's start, whole turns of a joint included, or whole turns of wrist 3 only, the nearest to home first."""
+    """Every branch above the seam's start, whole turns of a joint included, or whole turns of wrist 3 only, the nearest
+    to home first."""
     arm, home = welder.arm, welder.q_near
     above = _lifted(arm, seam, touch_start_pose(seam, welder.config), welder.clearance_m) @ welder.tool.X_FT.inverse()
     near, found = nearest_solution(arm, above, home), []
@@ -255,7 +262,8 @@ def seam_motions(tool: WeldingTool, seam: SeamCurve, config: ServoConfig) -> lis
 
 
 def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsewhere: bool) -> None:
-    """Check that the whole way keeps the arm and its tool clear of the surroundings and of itself, and the moves clear of the part.
+    """Check that the whole way keeps the arm and its tool clear of the surroundings and of itself, and the moves clear
+    of the part.
 
     The moves to another branch and back are also checked against the table.
 
@@ -288,7 +296,8 @@ def _check_clear(welder: Welder, way: ArmWay, X_BP: RigidTransform | None, elsew
 
 
 def _lifted(arm: ArmModel, seam: SeamCurve, X_BT: RigidTransform, height_m: float, s: float = 0.0) -> RigidTransform:
-    """The tool's pose at X_BT raised out of the joint at arc length s m: up on a level face, else along the bisector."""
+    """The tool's pose at X_BT raised out of the joint at arc length s m: up on a level face, else along the
+    bisector."""
     up = seam.frame(s).up
     return RigidTransform(
         X_BT.rotation(), X_BT.translation() + height_m * (arm.up if float(up @ arm.up) > _LEVEL else up)

@@ -1,4 +1,5 @@
-"""ArucoDeformationEstimator: measures the soft tip's displacement from its rest position in the finger camera's images."""
+"""ArucoDeformationEstimator: measures the soft tip's displacement from its rest position in the finger camera's
+images."""
 
 import dataclasses as dc
 from typing import Any
@@ -22,7 +23,8 @@ IMAGES_KEPT = 10  # 1/3 s of images; after a longer gap the servo has stopped
 
 @dc.dataclass(frozen=True, eq=False)
 class Deformation(Message):
-    """The newest deflection of the tip (p_T(tip) - p_T(rest), m, in T) and the pose at its time; None before the first."""
+    """The newest deflection of the tip (p_T(tip) - p_T(rest), m, in T) and the pose at its time; None before the
+    first."""
 
     sequence: int = 0
     sample: DeflectionSample | None = None
@@ -32,7 +34,8 @@ class Deformation(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class _Work(Message):
-    """The last result, the newest image's number, and the images that wait for the arm's pose at their capture time, oldest first."""
+    """The last result, the newest image's number, and the images that wait for the arm's pose at their capture time,
+    oldest first."""
 
     found: Deformation = dc.field(default_factory=Deformation)
     newest_sequence: int = 0
@@ -54,11 +57,11 @@ class ArucoDeformationEstimator(LeafSystem):
         - deformation
         - deflection
 
-    `deformation` carries a `Deformation`; `deflection` (5) is [tangential, normal, axial] in m, valid (1 or 0) and age s.
-    A frame without a reliable tag is reported as invalid with its reason, not as an old value. Images wait for poses that
-    arrive later than they do; if only the newest image were used, its pose would never be known. The tag is detected beside
-    the control loop; a detection that takes longer than a frame skips the frames between. Poses are those of the arm with refined
-    kinematics, where `calibration_status` (may stay open) has one.
+    `deformation` carries a `Deformation`; `deflection` (5) is [tangential, normal, axial] in m, valid (1 or 0) and age
+    s. A frame without a reliable tag is reported as invalid with its reason, not as an old value. Images wait for poses
+    that arrive later than they do; if only the newest image were used, its pose would never be known. The tag is
+    detected beside the control loop; a detection that takes longer than a frame skips the frames between. Poses are
+    those of the arm with refined kinematics, where `calibration_status` (may stay open) has one.
     """
 
     def __init__(
@@ -127,7 +130,8 @@ class ArucoDeformationEstimator(LeafSystem):
 def measure_deformation(
     image: Image, X_BF: RigidTransform, tool: WeldingTool, tag: TagModel, camera_matrix: np.ndarray
 ) -> Deformation:
-    """Tag detection and rest-pose difference for one image (grey (H, W)); invalid with a reason where the tag is not seen."""
+    """Tag detection and rest-pose difference for one image (grey (H, W)); invalid with a reason where the tag is not
+    seen."""
     seen = detect_tag(image.pixels, camera_matrix, tag)
     X_BT = X_BF @ tool.X_FT
     if not seen.valid or seen.X_KM is None:

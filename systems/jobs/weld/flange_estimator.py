@@ -43,10 +43,10 @@ class FlangeEstimator(BackgroundSystem):
         output_ports:
         - flange_estimate
 
-    It takes the scan that the job ordered, and every frame of a streaming scanner. The search sphere is centred at the feature's
-    position predicted from the newest X_BC (at first the nominal one) and the arm's pose at the capture time. A streamed
-    frame's capture time is taken from its stamp and `delay_s`, the nominal time from
-    capture to arrival; the prediction is corrected by what the frame before it showed. The fit runs beside the control loop.
+    It takes the scan that the job ordered, and every frame of a streaming scanner. The search sphere is centred at the
+    feature's position predicted from the newest X_BC (at first the nominal one) and the arm's pose at the capture time.
+    A streamed frame's capture time is taken from its stamp and `delay_s`, the nominal time from capture to arrival; the
+    prediction is corrected by what the frame before it showed. The fit runs beside the control loop.
     """
 
     def __init__(
@@ -112,7 +112,8 @@ class FlangeEstimator(BackgroundSystem):
 
 
 def believed_capture(scan: StreamedScan, newest: FlangeEstimate, delay_s: float) -> float:
-    """When a frame was captured, s: by the device's time since the frame before where both have one, else by its arrival."""
+    """When a frame was captured, s: by the device's time since the frame before where both have one, else by its
+    arrival."""
     by_arrival = scan.arrival_time - delay_s
     if scan.device_time is None or newest.device_time is None:
         return by_arrival
@@ -124,7 +125,8 @@ def believed_capture(scan: StreamedScan, newest: FlangeEstimate, delay_s: float)
 def streamed_guess(
     X_CR: RigidTransform, before: FlangeEstimate, radius_m: float, standard: FlangeStandard
 ) -> FlangeGuess:
-    """Where to look in a frame: at the robot's X_CR, shifted as the frame before was; in ``radius_m`` where that shows nothing."""
+    """Where to look in a frame: at the robot's X_CR, shifted as the frame before was; in ``radius_m`` where that shows
+    nothing."""
     expected = X_CR.translation()
     if before.fit is not None and before.center_expected_C is not None:
         expected = expected + before.fit.center_C - before.center_expected_C
@@ -133,8 +135,8 @@ def streamed_guess(
 
 
 def seen_about(points_C: NDArray[np.float32], center_C: Array, radius_m: float) -> NDArray[np.float32]:
-    """The rows and columns (h, w, 3) of a scan (H, W, 3) m that hold all its points within ``radius_m`` of a place, and some more;
-    the whole scan where a coarse look finds none."""
+    """The rows and columns (h, w, 3) of a scan (H, W, 3) m that hold all its points within ``radius_m`` of a place, and
+    some more; the whole scan where a coarse look finds none."""
     coarse = points_C[::_COARSE, ::_COARSE]
     with np.errstate(invalid="ignore"):
         near = np.square(coarse - np.asarray(center_C, dtype=np.float32)).sum(axis=2) < (1.2 * radius_m) ** 2
@@ -152,7 +154,8 @@ def _as_it_is(estimate: FlangeEstimate) -> FlangeEstimate:
 def estimate_streamed(
     base: FlangeEstimate, points_C: NDArray[np.float32], guess: FlangeGuess, standard: FlangeStandard
 ) -> FlangeEstimate:
-    """Fit the feature in a streamed frame near the guess; without a fit, the reason is given and no exception is raised."""
+    """Fit the feature in a streamed frame near the guess; without a fit, the reason is given and no exception is
+    raised."""
     try:
         return dc.replace(base, fit=fit_flange(points_C.astype(float), standard, guess=guess, config=STREAM_FIT))
     except FlangeNotFound as error:

@@ -38,7 +38,8 @@ TIME_S = 120.0  # for which the job waits, at rest, for the folds beside a robot
 
 
 def refined_status(status: CalibrationStatus, kind: str, arm: ArmModel, correct_scanner: bool) -> CalibrationStatus:
-    """The status with its estimate refined by ``kind`` of LIVE_KINDS, or as it was with the reason; ``arm`` is the one that observed.
+    """The status with its estimate refined by ``kind`` of LIVE_KINDS, or as it was with the reason; ``arm`` is the one
+    that observed.
 
     Live scans have no hole patterns.
     """
@@ -76,7 +77,7 @@ def _message(kind: str, found: Refined, arm: ArmModel) -> Refinement:
 
 
 @dc.dataclass(frozen=True, eq=False)
-class NextPose(Message):
+class PoseRequest(Message):
     """The pose to visit after the calibration status with this sequence number; q (6,) rad, None when none is left."""
 
     after_sequence: int = -1
@@ -96,8 +97,8 @@ class CalibrationPosePlanner(LeafSystem):
         output_ports:
         - next_pose
 
-    The plan is made before any motion (and raises where the scanner cannot be reached). pose_planning orders it greedily by
-    the information that each pose adds, so that each prefix is the greedy set of that size.
+    The plan is made before any motion (and raises where the scanner cannot be reached). pose_planning orders it
+    greedily by the information that each pose adds, so that each prefix is the greedy set of that size.
     """
 
     def __init__(self, plan: tuple[PlannedPose, ...], period_s: float = 0.02) -> None:
@@ -105,26 +106,26 @@ class CalibrationPosePlanner(LeafSystem):
         self._plan = plan
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(
-            AbstractValue.Make(NextPose(-1, 0, "pose01", plan[0].q if plan else None))
+            AbstractValue.Make(PoseRequest(-1, 0, "pose01", plan[0].q if plan else None))
         )
         self.DeclareStateOutputPort("next_pose", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
         status: CalibrationStatus = self._status.Eval(context)
-        newest: NextPose = context.get_abstract_state(self._state).get_value()
+        newest: PoseRequest = context.get_abstract_state(self._state).get_value()
         if status.sequence <= newest.after_sequence:
             return
         index = status.sequence  # one pose per scan
         q = self._plan[index].q if index < len(self._plan) else None
-        new = NextPose(status.sequence, index, f"pose{index + 1:02d}", q)
+        new = PoseRequest(status.sequence, index, f"pose{index + 1:02d}", q)
         state.get_mutable_abstract_state(self._state).set_value(new)
 
 
 @dc.dataclass(frozen=True, kw_only=True)
 class CalibratorConfig:
-    """The stop criterion of the live calibration (m) and the work point p_BWork (3,) in B at which the error is evaluated; the
-    cost of Algorithm 1 (section 4.2: work radius, m, and axes)."""
+    """The stop criterion of the live calibration (m) and the work point p_BWork (3,) in B at which the error is
+    evaluated; the cost of Algorithm 1 (section 4.2: work radius, m, and axes)."""
 
     required_error_m: float
     minimum_scans: int
@@ -149,11 +150,11 @@ class IterativeCalibrator(BackgroundSystem):
         output_ports:
         - calibration_status
 
-    The estimate is that of `weldcal calibrate` (calibration/calibrate.py): it contains a correction of the scanner's own errors where the
-    scans show one, unless `correct_scanner` is off. It is done when the
-    expected error at the work point is within the required one; then it is refined (`refine`), and what the status says of the arm
-    holds for the verification and all that follows. Algorithm 1's figure is kept
-    for display only, because it does not measure the remaining error (docs/calibration.md).
+    The estimate is that of `weldcal calibrate` (calibration/calibrate.py): it contains a correction of the scanner's
+    own errors where the scans show one, unless `correct_scanner` is off. It is done when the expected error at the work
+    point is within the required one; then it is refined (`refine`), and what the status says of the arm holds for the
+    verification and all that follows. Algorithm 1's figure is kept for display only, because it does not measure the
+    remaining error (docs/calibration.md).
     """
 
     def __init__(
@@ -195,7 +196,8 @@ def digest(
     q: Array | None = None,
     arm: ArmModel | None = None,
 ) -> CalibrationStatus:
-    """Compute the status after one more flange estimate; an unusable scan is listed as refused with its label and the reason.
+    """Compute the status after one more flange estimate; an unusable scan is listed as refused with its label and the
+    reason.
 
     ``q`` (6,) rad are the joint angles of ``arm`` at the scan; a refinement needs both.
     """
@@ -243,7 +245,8 @@ def digest(
 
 
 def expected_error(estimate: CalibrationEstimate, p_BWork: Array) -> float:
-    """Expected error (m, rms) of the base position of a point seen at the work point, from the estimate's covariance."""
+    """Expected error (m, rms) of the base position of a point seen at the work point, from the estimate's
+    covariance."""
     return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BWork))))
 
 
@@ -273,7 +276,8 @@ def _algorithm_1(
 
 @dc.dataclass(frozen=True, eq=False)
 class NextScan(Message):
-    """A planned pose that was not visited, and the expected error (m) of a scanned point at the work point without and with it."""
+    """A planned pose that was not visited, and the expected error (m) of a scanned point at the work point without and
+    with it."""
 
     pose: PlannedPose
     error_now_m: float
@@ -284,14 +288,14 @@ class NextScan(Message):
         joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.pose.q))
         p = 1e3 * self.pose.X_BF.translation()
         return (
-            f"joints [{joints}] deg (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the expected "
-            f"error at the work point from {1e3 * self.error_now_m:.3f} to {1e3 * self.error_then_m:.3f} mm."
+            f"joints [{joints}] deg (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the"
+            f" expected error at the work point from {1e3 * self.error_now_m:.3f} to {1e3 * self.error_then_m:.3f} mm."
         )
 
 
 def next_scan(status: CalibrationStatus, poses: tuple[PlannedPose, ...], p_BWork: np.ndarray) -> NextScan | None:
-    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work point
-    most; None before the first estimate, or where all were visited.
+    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work
+    point most; None before the first estimate, or where all were visited.
 
     The gain is computed by the planner; the present error is the estimate's.
     """

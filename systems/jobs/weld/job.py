@@ -64,7 +64,8 @@ def add_stream(
     queue: FrameQueue,
     status: OutputPort,
 ) -> tuple[OutputPort, OutputPort]:
-    """Add a queue of the streaming scanner's frames and an estimator called `name`; returns its estimates, and the queue's frames."""
+    """Add a queue of the streaming scanner's frames and an estimator called `name`; returns its estimates, and the
+    queue's frames."""
     scenario, station = wiring.scenario, wiring.station
     wiring.add("frame_queue", queue)
     estimator = wiring.add(
@@ -343,7 +344,8 @@ def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> 
 def _add_welding(
     wiring: Wiring, spine: Spine, config: ServoConfig, sequencer: JobSequencer, status: OutputPort
 ) -> WeldingPorts:
-    """Add seam planner, deformation estimator, servo and guard; constant sources replace them in a cell without a tool."""
+    """Add seam planner, deformation estimator, servo and guard; constant sources replace them in a cell without a
+    tool."""
     station, scenario = wiring.station, wiring.scenario
     tool, spec = station.tool, scenario.workpiece
     if (
@@ -363,7 +365,8 @@ def _add_welding(
         is_felt(numbered(station.cad, k), tool) for k in range(seam_count(station.cad))
     ):
         raise InputError(
-            "A seam that the tip does not feel is located by the scan, for a drawing states no sigma: write workpiece.located_by: scan."
+            "A seam that the tip does not feel is located by the scan, for a drawing states no sigma: write"
+            " workpiece.located_by: scan."
         )
     planner = wiring.add(
         "seam_planner",

@@ -68,7 +68,7 @@ def plan_root_anyhow(
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
-OVERLAP_M = 5e-3
+OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
 RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
 UNFELT = "followed from the scan and the drawing; not felt"
 
@@ -82,7 +82,8 @@ TIP_AHEAD = 1.5  # in a bend the arc between torch and tip is longer than the ch
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
 class SeamPlanning(Welder):
-    """What a seam is planned from besides the scan: what follows it, the nominal part and its expected pose, and the job's limits."""
+    """What a seam is planned from besides the scan: what follows it, the nominal part and its expected pose, and the
+    job's limits."""
 
     workpiece: WeldPart
     X_BP_guess: RigidTransform
@@ -106,7 +107,8 @@ class SeamPlanning(Welder):
         return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
 
     def field_at(self, points_B: Array) -> Array:
-        """The local field (n, 3) m at points (n, 3) m of the part, for the orientation in which the flange would weld them as drawn.
+        """The local field (n, 3) m at points (n, 3) m of the part, for the orientation in which the flange would weld
+        them as drawn.
 
         Where that orientation is none of the calibration's, or the points lie far from its poses, this is zero.
         """
@@ -122,8 +124,8 @@ class SeamPlanning(Welder):
     def way(self, seam: SeamCurve, X_BP: RigidTransform | None) -> ArmWay:
         """The arm's way to the seam, along it and back; checked as a whole before anything moves.
 
-        Where the upright tool on the branch of home cannot follow, the job leans it or changes the branch as far as the scenario allows.
-        Beside a high part the approach is higher above the seam than the clearance.
+        Where the upright tool on the branch of home cannot follow, the job leans it or changes the branch as far as the
+        scenario allows. Beside a high part the approach is higher above the seam than the clearance.
 
         Raises:
             InfeasiblePath: with the place, the joint, and the change that makes the seam feasible, where one was found.
@@ -153,9 +155,9 @@ class SeamPlanner(BackgroundSystem):
         output_ports:
         - planned_seam
 
-    Without calibration in the job, `X_BC_known` is used, with the scan as it is. For a scanner on the flange `X_FC_known` is used, and
-    `history` (else it may stay open) gives the flange's pose at the scan. Where the job takes several scans, one plan is made from all
-    of them after the last. The plan is made beside the control loop.
+    Without calibration in the job, `X_BC_known` is used, with the scan as it is. For a scanner on the flange
+    `X_FC_known` is used, and `history` (else it may stay open) gives the flange's pose at the scan. Where the job takes
+    several scans, one plan is made from all of them after the last. The plan is made beside the control loop.
     """
 
     def __init__(
@@ -222,18 +224,18 @@ def _points_in_base(planning: SeamPlanning, scan: Scan, X_BC: RigidTransform, co
 
 
 def plan_seam(
-    planning: SeamPlanning,
-    scan: Scan,
-    X_BC: RigidTransform | None,
-    correction: ScannerCorrection,
-    views: Views = (),
+    planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection, views: Views = ()
 ) -> PlannedSeam:
-    """Plan the seam from a scan of the part and the views before it; a plan that fails holds the reason, nothing is raised."""
+    """Plan the seam from a scan of the part and the views before it; a plan that fails holds the reason, nothing is
+    raised."""
     known = [(view.scan, view.X_BC) for view in (*views, ScanView(scan, X_BC)) if view.X_BC is not None]
     if len(known) <= len(views):
         return PlannedSeam(
             sequence=scan.sequence,
-            reason="The seam cannot be computed in the base: the scanner is not calibrated, or the arm's pose at the scan is not known.",
+            reason=(
+                "The seam cannot be computed in the base: the scanner is not calibrated, or the arm's pose at the scan"
+                " is not known."
+            ),
         )
     scans = [_points_in_base(planning, one, X, correction) for one, X in known]
     eyes, points_B = np.array([X.translation() for _, X in known]), np.concatenate(scans)
@@ -284,7 +286,8 @@ def plan_seam(
 def interrupted(
     planning: SeamPlanning, seam: SeamCurve, stops: list[float], record: SeamRecord
 ) -> tuple[SeamPlanning, SeamCurve, SeamRecord, bool]:
-    """The piece of an interrupted seam whose turn it is: its planning, its line, its record, and whether another one follows.
+    """The piece of an interrupted seam whose turn it is: its planning, its line, its record, and whether another one
+    follows.
 
     Raises:
         NoRoom: nothing is left of the seam.
@@ -307,8 +310,9 @@ def interrupted(
 def unfelt_sigma(planning: SeamPlanning, found: RootPlan, seam: SeamCurve, plan: PlannedSeam) -> tuple[float, str]:
     """The largest sigma of the torch across a seam that is not felt, m, and the plan's summary with it.
 
-    It is that of the root in the scan, with those of the scanner's pose and of the arm. Of a calibration by the same arm the spread of its
-    residuals counts for the arm; of a known pose its stated sigma, or else an arm as its maker leaves it.
+    It is that of the root in the scan, with those of the scanner's pose and of the arm. Of a calibration by the same
+    arm the spread of its residuals counts for the arm; of a known pose its stated sigma, or else an arm as its maker
+    leaves it.
 
     Raises:
         UncertainSeam: it is over the tolerance.
@@ -358,7 +362,8 @@ def _planned(planning: SeamPlanning, sequence: int, seam: SeamCurve, X_BP: Rigid
 
 
 def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The path of the seated tip's centre, in B; where `length_m` of arc is given the seam ends there, and the path goes on."""
+    """The path of the seated tip's centre, in B; where `length_m` of arc is given the seam ends there, and the path
+    goes on."""
     seated = workpiece.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
     line = workpiece.seam_P + seated.above_m * workpiece.up_P
     R = X_BP.rotation().matrix()
@@ -367,7 +372,8 @@ def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, lengt
 
 
 def _cut(line: Array, ups: Array, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is still in it.
+    """The seam along points (N,3) m: where it is cut short, the groove goes on in front of the torch, and the tip is
+    still in it.
 
     A ring is welded on over its start by OVERLAP_M, and the tip goes round ahead of the torch.
     """

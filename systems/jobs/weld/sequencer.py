@@ -1,4 +1,5 @@
-"""JobSequencer: the state machine of the weld job: home, calibrate, verify, scan, plan, approach, weld, retract, hold."""
+"""JobSequencer: the state machine of the weld job: home, calibrate, verify, scan, plan, approach, weld, retract,
+hold."""
 
 import dataclasses as dc
 from collections.abc import Callable
@@ -6,13 +7,13 @@ from typing import Any, ClassVar
 
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
-from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import PoseRequest
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
 from weldcal.systems.motion.clear_moves import stands_at
 from weldcal.systems.motion.drift_monitor import DriftStatus
 
-SCAN_TIMEOUT_S = 8.0
+SCAN_TIMEOUT_S = 8.0  # above a scanner driver's own limit of 6 s (scan_timeout_s), which names the device's fault first
 WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "home")
 """Phases in which the scanner streams, if it can: its calibration is done, and no scan is wanted."""
 WELDED = ("weld", "retract", "home")
@@ -70,7 +71,7 @@ class JobState(ProcedureState):
 class JobInputs(Inputs):
     """Inputs of the sequencer at one tick."""
 
-    next_pose: NextPose
+    next_pose: PoseRequest
     calibration_status: CalibrationStatus
     planned_seam: PlannedSeam
     servo_report: ServoReport
@@ -86,13 +87,14 @@ def unreached_reason(status: CalibrationStatus, plan: JobPlan) -> str:
         return f"No calibration after {status.calibration_scans} scans: {why}"
     if status.predicted_error_m <= plan.required_error_m:  # so that the scans are too few
         return (
-            f"Only {len(status.observations)} of {status.calibration_scans} scans could be used, and the calibration needs "
-            f"{plan.minimum_scans} (it expects {status.predicted_error_m * 1e3:.3f} mm at the work point, within the required "
-            f"{required:.3f} mm); allow more scans, or a pose from which the scanner sees the feature."
+            f"Only {len(status.observations)} of {status.calibration_scans} scans could be used, and the calibration"
+            f" needs {plan.minimum_scans} (it expects {status.predicted_error_m * 1e3:.3f} mm at the work point, within"
+            f" the required {required:.3f} mm); allow more scans, or a pose from which the scanner sees the feature."
         )
     return (
-        f"The calibration did not reach the required {required:.3f} mm: after {status.calibration_scans} scans it expects "
-        f"{status.predicted_error_m * 1e3:.3f} mm at the work point; allow more scans, a wider workspace or a better scanner."
+        f"The calibration did not reach the required {required:.3f} mm: after {status.calibration_scans} scans it"
+        f" expects {status.predicted_error_m * 1e3:.3f} mm at the work point; allow more scans, a wider workspace or a"
+        " better scanner."
     )
 
 
@@ -127,11 +129,11 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         - streaming
         - scanner_streaming
 
-    `drift` (may stay open) carries the DriftMonitor's status: a scanner that has moved holds the job before the weld and is a
-    warning from then on. `hold` (1) is the operator's stop request; `arm_stopped` (1) of the ProcessSwitch is 1 after the guard stopped a weld.
-    `job` carries the `JobCommand`, `job_state` the whole
-    `JobState` with its log; `scan_trigger` and `streaming` (1) go to the station, and so does `scanner_streaming` (1) where
-    the scanner streams: after the calibration it does, except while it scans.
+    `drift` (may stay open) carries the DriftMonitor's status: a scanner that has moved holds the job before the weld
+    and is a warning from then on. `hold` (1) is the operator's stop request; `arm_stopped` (1) of the ProcessSwitch is
+    1 after the guard stopped a weld. `job` carries the `JobCommand`, `job_state` the whole `JobState` with its log;
+    `scan_trigger` and `streaming` (1) go to the station, and so does `scanner_streaming` (1) where the scanner streams:
+    after the calibration it does, except while it scans.
     """
 
     inputs = JobInputs
@@ -164,7 +166,7 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         self._plan = plan
         self.read(
             "drift",
-            next_pose=NextPose(),
+            next_pose=PoseRequest(),
             calibration_status=CalibrationStatus(),
             planned_seam=PlannedSeam(),
             servo_report=ServoReport(),
@@ -231,7 +233,8 @@ class JobSequencer(Procedure[JobState, JobInputs]):
         return self.go(s, now, phase, now.next_pose.q)
 
     def _digested(self, s: JobState, now: JobInputs) -> JobState:
-        """Continue after each calibration scan: more poses, verification, or hold where the required error is not reached."""
+        """Continue after each calibration scan: more poses, verification, or hold where the required error is not
+        reached."""
         status = now.calibration_status
         if status.sequence < s.trigger:
             return s
@@ -253,7 +256,8 @@ class JobSequencer(Procedure[JobState, JobInputs]):
             return self.held(
                 s,
                 now,
-                f"The calibration is {worst.error_m * 1e3:.2f} mm off at the held-out pose '{worst.label}' (limit {limit:.2f} mm).",
+                f"The calibration is {worst.error_m * 1e3:.2f} mm off at the held-out pose '{worst.label}' (limit"
+                f" {limit:.2f} mm).",
             )
         return self._homeward(s, now, "park")
 

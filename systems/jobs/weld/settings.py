@@ -35,13 +35,14 @@ from weldcal.welding.servo.settings import (
     ServoConfig,
     ToolGeometry,
     TorchControl,
-    TouchConfig,
+    TouchOnConfig,
 )
 
 _POOL = (3, 2)
 """Times the poses: how many to choose from, as many as the cell allows."""
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
-# a torch nearer to the tip turns the tool faster for the same error: the pitch is ramped, so that no joint lags behind the others
+# a torch nearer to the tip turns the tool faster for the same error: the pitch is ramped, so that no joint lags behind
+# the others
 NEAR_M, NEAR_PITCH_RAD_S2 = 0.060, 1.0
 _UNPRESSED_M = 1e-9  # of a tip that is not used
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
@@ -81,7 +82,7 @@ def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoCo
     )
     return ServoConfig(
         tool=geometry,
-        touch=TouchConfig(zero_frames=ZERO_FRAMES, offset_m=entry.aside_m),
+        touch=TouchOnConfig(zero_frames=ZERO_FRAMES, offset_m=entry.aside_m),
         gap=GapConfig(end_window_m=cad.end_window_m),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
@@ -102,7 +103,8 @@ def seated_tip(station: Station, seam: int = 0) -> Seated:
 
 
 def plan_poses(scenario: Scenario, station: Station, seed: int, *, count: int | None = None) -> tuple[PlannedPose, ...]:
-    """Plan all calibration and verification poses, or ``count``, best first, checked for reach, visibility and clearance.
+    """Plan all calibration and verification poses, or ``count``, best first, checked for reach, visibility and
+    clearance.
 
     Raises:
         UnreachableScanner: no such set of poses exists for the scanner at its nominal pose.
@@ -176,13 +178,13 @@ def check_scan_poses(scenario: Scenario) -> None:
     on_flange = scanner is not None and scanner.mounted_on == "flange"
     if poses and not on_flange:
         raise InputError(
-            "planning.scan_poses_deg is for a scanner on the flange (scanner.mounted_on: flange). A scanner beside the arm has one view: "
-            "remove the list, or let the arm carry the scanner."
+            "planning.scan_poses_deg is for a scanner on the flange (scanner.mounted_on: flange). A scanner beside the"
+            " arm has one view: remove the list, or let the arm carry the scanner."
         )
     if on_flange and job.weld and (job.calibrate or job.X_FC is None):
         raise InputError(
-            "A weld with the scanner on the flange needs its pose there: calibrate with the scenario eye_in_hand first, then write "
-            "job.calibrate: false and job.X_FC."
+            "A weld with the scanner on the flange needs its pose there: calibrate with the scenario eye_in_hand first,"
+            " then write job.calibrate: false and job.X_FC."
         )
     if len(poses) > 1 and (scenario.workpiece is None or scenario.workpiece.file is None):
         raise InputError(
@@ -195,7 +197,8 @@ def check_scan_poses(scenario: Scenario) -> None:
 
 
 def clear_scan_move(scenario: Scenario, station: Station, q_a: Array, q_b: Array) -> bool:
-    """Whether a straight move (6,) rad between home and scan poses is clear of all that is known, the part at its guess included."""
+    """Whether a straight move (6,) rad between home and scan poses is clear of all that is known, the part at its guess
+    included."""
     bodies, spec, cad = station_bodies(station), scenario.workpiece, station.cad
     if not clear_move(scenario, station, bodies, q_a, q_b) or spec is None or cad is None:
         return False
@@ -219,7 +222,8 @@ def check_scan_moves(scenario: Scenario, station: Station) -> None:
                 else "home from the last of planning.scan_poses_deg"
             )
             raise InputError(
-                f"On the way {where} the arm would touch the table, the part, the surroundings or itself: choose another pose."
+                f"On the way {where} the arm would touch the table, the part, the surroundings or itself: choose"
+                " another pose."
             )
 
 

@@ -1,7 +1,8 @@
 """Predicts how far errors of the arm put the torch off the seam that the tip has felt.
 
-At one place of a bent seam the torch is led by another posture of the arm than the tip was: it comes a chord later, and the tool has turned.
-What the arm's kinematics are off is not the same in both, and the tip cannot feel the difference. Derivation in docs/parts.md.
+At one place of a bent seam the torch is led by another posture of the arm than the tip was: it comes a chord later, and
+the tool has turned. What the arm's kinematics are off is not the same in both, and the tip cannot feel the difference.
+Derivation in docs/parts.md.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolG
 from weldcal.welding.servo.tool_axes import tool_path
 
 EVERY = 10  # places of the tool's path: 10 mm of tip and torch together
-_UNPRESSED_M = 1e-9
+_UNPRESSED_M = 1e-9  # stands for a tip that is not pressed: zero has no direction
 _DIFFERENCE = 1e-2  # of the prior's standard deviation: micrometres
 
 
 @dataclass(frozen=True)
 class TipToTorch:
-    """Between tip and torch at the same place of a seam: ``sigma_m``, rms over the seam of the torch's distance from the line that the tip
-    felt, m, for arms of one accuracy; ``turn_rad``, the largest turn of the tool."""
+    """Between tip and torch at the same place of a seam: ``sigma_m``, rms over the seam of the torch's distance from
+    the line that the tip felt, m, for arms of one accuracy; ``turn_rad``, the largest turn of the tool."""
 
     sigma_m: float
     turn_rad: float
@@ -52,7 +53,8 @@ def tip_to_torch(
     Args:
         seam: line of the seated tip in B.
         q_near: (6,) rad, of the posture in which the arm welds.
-        stated: what a refinement states of the errors that it has found (Refinement.arm_errors); without it the arm is as makers leave it.
+        stated: what a refinement states of the errors that it has found (Refinement.arm_errors); without it the arm is
+            as makers leave it.
         prior: how makers leave it.
     """
     at = _held(arm, tool, seam, q_near)
@@ -71,7 +73,8 @@ def tip_to_torch(
 
 
 def torch_sigma(arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array) -> float:
-    """The largest standard deviation m, across a seam, of where an arm as its maker leaves it puts the torch; NaN out of its reach."""
+    """The largest standard deviation m, across a seam, of where an arm as its maker leaves it puts the torch; NaN out
+    of its reach."""
     at = _held(arm, tool, seam, q_near)
     if at is None:
         return math.nan
@@ -83,7 +86,8 @@ def torch_sigma(arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array
 def _held(
     arm: ArmModel, tool: WeldingTool, seam: SeamCurve, q_near: Array
 ) -> tuple[Array, Array, list[RigidTransform], Array] | None:
-    """Arcs (n,) of torch and tip, poses of T and joint angles (n, 6), with the tool as the servo holds it, both ends on the line."""
+    """Arcs (n,) of torch and tip, poses of T and joint angles (n, 6), with the tool as the servo holds it, both ends on
+    the line."""
     geometry = ToolGeometry(torch_offset_m=tool.chord_m, torch_clearance_m=0.0)
     unpressed = DeflectionControl(delta_d_m=_UNPRESSED_M, axial_d_m=_UNPRESSED_M)
     path = tool_path(seam, ServoConfig(tool=geometry, deflection=unpressed))
@@ -115,7 +119,8 @@ def _sensitivities(arm: ArmModel, tool: WeldingTool, q: Array, prior: FactoryPri
 
 
 def _covariance(size: int, stated: Mapping[str, Any] | None) -> Array:
-    """Covariance (k, k) of the links' errors in units of the prior: one where nothing was found, else as it is stated."""
+    """Covariance (k, k) of the links' errors in units of the prior: one where nothing was found, else as it is
+    stated."""
     covariance = np.eye(size)
     if stated is not None:
         which = np.array(stated["which"], dtype=int)

@@ -1,4 +1,5 @@
-"""WeldingVelocityServo: computes the tip's spatial velocity and the torch request from planned seam and tip deformation."""
+"""WeldingVelocityServo: computes the tip's spatial velocity and the torch request from planned seam and tip
+deformation."""
 
 import dataclasses as dc
 from collections.abc import Sequence
@@ -71,11 +72,11 @@ class WeldingVelocityServo(LeafSystem):
         - telemetry
         - torch_on
 
-    `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B, zero unless the job's mode is `weld`; `telemetry` as named in TELEMETRY (SI), all of one tick; `torch_on`
-    (1) is the request for the process: job and servo must both enable it, and it passes the ProcessSwitch. While it is on and
-    `arc_established` (1; unconnected: always) is 0 the tool stands. While `hold` (1; unconnected: never) is 1 the torch is off and the
-    tool stands; it goes on from a little before that place. Where `calibration_status` (may stay open) has an arm with refined kinematics,
-    that one is used.
+    `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B, zero unless the job's mode is `weld`; `telemetry` as named in
+    TELEMETRY (SI), all of one tick; `torch_on` (1) is the request for the process: job and servo must both enable it,
+    and it passes the ProcessSwitch. While it is on and `arc_established` (1; unconnected: always) is 0 the tool stands.
+    While `hold` (1; unconnected: never) is 1 the torch is off and the tool stands; it goes on from a little before that
+    place. Where `calibration_status` (may stay open) has an arm with refined kinematics, that one is used.
     """
 
     def __init__(
@@ -133,7 +134,8 @@ class WeldingVelocityServo(LeafSystem):
         state.get_mutable_abstract_state(self._state).set_value(report)
 
     def _velocity(self, context: Context, output: BasicVector) -> None:
-        # The last report stays after a fault; its motion must not, when the job leaves the weld before the ramp has ended.
+        # The last report stays after a fault; its motion must not, when the job leaves the weld before the ramp has
+        # ended.
         job: JobCommand = self._job.Eval(context)
         command = context.get_abstract_state(self._state).get_value().command
         output.SetFromVector(np.zeros(6) if command is None or job.mode != "weld" else command.V_BT)

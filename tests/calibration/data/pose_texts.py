@@ -1,4 +1,5 @@
-"""Ten poses as robots, cameras and other programs write them: text, the form of the right reading, and the unit that the text states."""
+"""Ten poses as robots, cameras and other programs write them: text, the form of the right reading, and the unit that
+the text states."""
 
 from __future__ import annotations
 
@@ -43,7 +44,10 @@ def fanuc(k: int) -> str:
 
 def echo(k: int, words: str) -> str:
     p, q = join(P[k], mark=", "), join(Q[k], mark=", ")
-    return f"At time {k}.5\n- Translation: [{p}]\n- Rotation: in Quaternion {words}[{q}]\n            in RPY (radian) [0.1, 0.2, 0.3]"
+    return (
+        f"At time {k}.5\n- Translation: [{p}]\n- Rotation: in Quaternion {words}[{q}]\n            in RPY (radian)"
+        " [0.1, 0.2, 0.3]"
+    )
 
 
 def caption(k: int) -> str:

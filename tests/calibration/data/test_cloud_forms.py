@@ -210,7 +210,10 @@ def test_packed_files_are_read(tmp_path: Path, form: str) -> None:
         read_cloud(packed)
 
 
-PCD = "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH {}\nHEIGHT {}\nVIEWPOINT {}\nPOINTS {}\nDATA {}\n"
+PCD = (
+    "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH {}\nHEIGHT {}\nVIEWPOINT"
+    " {}\nPOINTS {}\nDATA {}\n"
+)
 
 
 def pcd(points: np.ndarray, viewpoint: str, data: str = "binary") -> bytes:
@@ -231,7 +234,8 @@ def test_a_compressed_pcd_of_equal_lengths_is_stored(tmp_path: Path) -> None:
 
 
 def test_viewpoint_is_never_ignored(tmp_path: Path) -> None:
-    """Identity says nothing; another pose is refused until its meaning is stated, and undone where the points were moved."""
+    """Identity says nothing; another pose is refused until its meaning is stated, and undone where the points were
+    moved."""
     R, t = Rotation.from_euler("xyz", [0.3, -0.7, 2.0]), np.array([120.0, -80.0, 500.0])
     pose = " ".join(f"{v:.12g}" for v in (*t, *R.as_quat(scalar_first=True)))
     for same in ("0 0 0 1 0 0 0", "0 0 0 -1 0 0 0", "0 0 0 0 0 0 0"):

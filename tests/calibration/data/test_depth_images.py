@@ -1,4 +1,5 @@
-"""Depth images become points by the intrinsics that dataset.yaml or a file of the camera states; else a sentence asks for them."""
+"""Depth images become points by the intrinsics that dataset.yaml or a file of the camera states; else a sentence asks
+for them."""
 
 from __future__ import annotations
 
@@ -77,16 +78,28 @@ def test_the_advice_on_intrinsics_leads_on(tmp_path: Path, name: str, pixels: np
 K = [FX, 0.0, CX, 0.0, FY, CY, 0.0, 0.0, 1.0]
 LISTED = ", ".join(map(str, K))
 FILES = {
-    "camera_info.yaml": f"image_width: {W}\nimage_height: {H}\ncamera_name: depth\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [{LISTED}]\n"
-    "distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0, 0, 0, 0, 0]\n",
-    "camera_info.yml": f"header: {{frame_id: depth}}\nheight: {H}\nwidth: {W}\ndistortion_model: plumb_bob\nd: [0.0, 0.0, 0.0, 0.0, 0.0]\n"
-    f"k: [{LISTED}]\nr: [1.0, 0, 0, 0, 1, 0, 0, 0, 1]\n",
-    "camera.yml": f"%YAML:1.0\n---\nimage_width: {W}\nimage_height: {H}\nCamera_Matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
-    f"   data: [ {LISTED} ]\n",
-    "camera.xml": '<?xml version="1.0"?>\n<opencv_storage>\n<camera_matrix type_id="opencv-matrix">\n  <rows>3</rows>\n  <cols>3</cols>\n'
-    f"  <dt>d</dt>\n  <data>\n    {LISTED.replace(',', '')}</data></camera_matrix>\n</opencv_storage>\n",
-    "camchain.yaml": f"cam0:\n  camera_model: pinhole\n  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n  intrinsics: [{FX}, {FY}, {CX}, {CY}]\n"
-    f"  resolution: [{W}, {H}]\n",
+    "camera_info.yaml": (
+        f"image_width: {W}\nimage_height: {H}\ncamera_name: depth\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data:"
+        f" [{LISTED}]\ndistortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0, 0, 0,"
+        " 0, 0]\n"
+    ),
+    "camera_info.yml": (
+        f"header: {{frame_id: depth}}\nheight: {H}\nwidth: {W}\ndistortion_model: plumb_bob\nd: [0.0, 0.0, 0.0, 0.0,"
+        f" 0.0]\nk: [{LISTED}]\nr: [1.0, 0, 0, 0, 1, 0, 0, 0, 1]\n"
+    ),
+    "camera.yml": (
+        f"%YAML:1.0\n---\nimage_width: {W}\nimage_height: {H}\nCamera_Matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
+        f"   dt: d\n   data: [ {LISTED} ]\n"
+    ),
+    "camera.xml": (
+        '<?xml version="1.0"?>\n<opencv_storage>\n<camera_matrix type_id="opencv-matrix">\n  <rows>3</rows>\n '
+        " <cols>3</cols>\n"
+        f"  <dt>d</dt>\n  <data>\n    {LISTED.replace(',', '')}</data></camera_matrix>\n</opencv_storage>\n"
+    ),
+    "camchain.yaml": (
+        f"cam0:\n  camera_model: pinhole\n  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n  intrinsics: [{FX}, {FY}, {CX},"
+        f" {CY}]\n  resolution: [{W}, {H}]\n"
+    ),
     "camera_intrinsic.json": json.dumps(
         {"width": W, "height": H, "intrinsic_matrix": np.reshape(K, (3, 3)).T.ravel().tolist()}
     ),

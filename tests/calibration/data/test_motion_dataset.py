@@ -1,4 +1,5 @@
-"""Recordings in motion: what is written is read back; wrong files get one sentence, single frames are refused by name."""
+"""Recordings in motion: what is written is read back; wrong files get one sentence, single frames are refused by
+name."""
 
 from __future__ import annotations
 
@@ -11,12 +12,7 @@ import pytest
 from weldcal.calibration.data.checks import is_motion
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.header import DatasetHeader, ScannerGuess
-from weldcal.calibration.data.motion_dataset import (
-    FrameTime,
-    RobotStream,
-    load_motion_dataset,
-    save_motion_dataset,
-)
+from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream, load_motion_dataset, save_motion_dataset
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arms.chain import chain_forward, chain_poses, load_chain
 

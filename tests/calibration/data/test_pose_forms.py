@@ -1,4 +1,5 @@
-"""Poses as people record them: each notation gives the same flange poses, and what cannot be told is asked for in one sentence."""
+"""Poses as people record them: each notation gives the same flange poses, and what cannot be told is asked for in one
+sentence."""
 
 from __future__ import annotations
 
@@ -89,7 +90,8 @@ def storage_of_vectors(folder: Path) -> None:
     (folder / "poses.json").write_text(
         '{"poses": ['
         + ",".join(
-            f'{{"position": {{"x": {p[0]!r}, "y": {p[1]!r}, "z": {p[2]!r}}}, "orientation": {{"x": {q[0]!r}, "y": {q[1]!r}, "z": {q[2]!r}, "w": {q[3]!r}}}}}'
+            f'{{"position": {{"x": {p[0]!r}, "y": {p[1]!r}, "z": {p[2]!r}}}, "orientation": {{"x": {q[0]!r}, "y":'
+            f' {q[1]!r}, "z": {q[2]!r}, "w": {q[3]!r}}}}}'
             for p, q in zip(P.tolist(), TURN.as_quat().tolist(), strict=True)
         )
         + "]}"

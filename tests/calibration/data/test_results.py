@@ -125,8 +125,7 @@ def test_every_export_says_what_of_a_refinement_it_cannot_hold(result: Calibrati
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [("schema: 1", "schema: 9", "schema 1"), ("X_BC:", "X_BD:", "not a calibration result")],
+    ("old", "new", "sentence"), [("schema: 1", "schema: 9", "schema 1"), ("X_BC:", "X_BD:", "not a calibration result")]
 )
 def test_a_file_that_is_no_calibration_is_named(
     result: CalibrationResult, tmp_path: Path, old: str, new: str, sentence: str

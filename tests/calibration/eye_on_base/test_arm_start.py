@@ -1,4 +1,5 @@
-"""The visible arm puts the scanner to some centimetres where the flange alone does not, and refuses what is no arm of its kind."""
+"""The visible arm puts the scanner to some centimetres where the flange alone does not, and refuses what is no arm of
+its kind."""
 
 from __future__ import annotations
 
@@ -161,7 +162,8 @@ def test_an_arm_that_is_seen_through_is_no_start() -> None:
 
 
 def test_surface_seen_through_is_allowed_only_where_nothing_else_comes_near() -> None:
-    """Links inside their capsules: 0.15 of a rendered UR10e's surface is seen through; a wrong place leads by less than 0.2."""
+    """Links inside their capsules: 0.15 of a rendered UR10e's surface is seen through; a wrong place leads by less than
+    0.2."""
     start = ArmStart(X_BC=RigidTransform(), explained=0.82, seen_through=0.15, score=0.67, next_best=0.1)
     assert start.accepted
     assert not replace(start, next_best=0.45).accepted

@@ -1,4 +1,5 @@
-"""Scans of the flange select how the robot's poses are to be read: written by SciPy in many notations, read without a setting."""
+"""Scans of the flange select how the robot's poses are to be read: written by SciPy in many notations, read without a
+setting."""
 
 from __future__ import annotations
 

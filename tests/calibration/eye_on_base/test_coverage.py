@@ -43,7 +43,8 @@ def error(estimate: CalibrationEstimate) -> np.ndarray:
 
 
 def squares(n: int, runs: int, sigma_n: float) -> list[float]:
-    """Normalised squared errors of calibrations from n scans; scans that contradict each other are refused now and then."""
+    """Normalised squared errors of calibrations from n scans; scans that contradict each other are refused now and
+    then."""
     found = []
     for seed in range(runs):
         try:
@@ -139,7 +140,8 @@ TURN = np.radians(0.9)  # of the drilled pattern about the axis, stated to 0.1 d
 
 @pytest.mark.parametrize("n", [1, 3])
 def test_whole_poses_of_usual_cells_err_as_stated(n: int) -> None:
-    """Scans with holes: 0.15 mm and 1.2 mrad per axis of robot and scanner, and one error of the stated turn for all scans."""
+    """Scans with holes: 0.15 mm and 1.2 mrad per axis of robot and scanner, and one error of the stated turn for all
+    scans."""
     found = []
     for seed in range(150):
         rng = np.random.default_rng([4, n, seed])

@@ -87,7 +87,8 @@ def test_a_rotation_that_the_holes_leave_open_is_not_used() -> None:
 
 @pytest.mark.parametrize(("n", "holes"), [(1, True), (3, True), (3, False)])
 def test_the_region_of_few_scans_holds_what_they_cannot_show_of_the_scanner(n: int, holes: bool) -> None:
-    """Scanners off by what is usual: scale 0.2 %, gradient 0.15 % per 100 mm, bends 0.1 % at the image's edge, 0.4 m away."""
+    """Scanners off by what is usual: scale 0.2 %, gradient 0.15 % per 100 mm, bends 0.1 % at the image's edge, 0.4 m
+    away."""
     squares, alone = [], []
     for seed in range(60):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,5 @@
-"""X_BC and the scanner's errors are estimated together: corrected where the scans show it, with a covariance that holds the rest."""
+"""X_BC and the scanner's errors are estimated together: corrected where the scans show it, with a covariance that holds
+the rest."""
 
 from __future__ import annotations
 
@@ -208,7 +209,8 @@ def test_many_poses_are_held_out_in_folds(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_bend_is_found() -> None:
     bent = _verdict(_cell(BENT))
     assert bent.accepted is not None
-    # 18 normals of 1 mrad: what 0.1 m from the middle turns a normal by (0.4 m x 0.1 / m^2 x 0.1 m = 4 mrad) is known to a fifth
+    # 18 normals of 1 mrad: what 0.1 m from the middle turns a normal by (0.4 m x 0.1 / m^2 x 0.1 m = 4 mrad) is known
+    # to a fifth
     assert np.all(np.abs(np.array(bent.accepted.bend[:3]) - BENT.bend) < 0.4 * np.abs(BENT.bend))
     plain = _verdict(_cell(WRONG))
     assert plain.accepted is not None
@@ -243,7 +245,10 @@ def test_the_covariance_holds_what_the_correction_leaves_open() -> None:
 
 
 def test_the_region_is_right_where_the_scanner_is_not_corrected_for_want_of_evidence() -> None:
-    """Scanners that are off by a third of what is usual, six poses each: a third of them are corrected. The rigid covariance is too small."""
+    """Scanners that are off by a third of what is usual, six poses each: a third of them are corrected.
+
+    The rigid covariance is too small.
+    """
     stated, rigid, corrected = [], [], 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -275,8 +280,8 @@ def test_held_out_errors_are_those_of_new_scans_where_no_correction_of_ours_is_e
         ratio.append(float(np.sqrt(np.mean(estimate.held_out.position_m**2) / np.mean(after**2))))
     assert max(better) < 1.1
     assert np.mean(better) < 0.8
-    # The decision is repeated without each pose, so nothing makes them too small but chance: ten
-    # poses know an rms to some 20 %, ten devices to 6 %. Errors of poses that were fitted would be 0.62 of the true ones.
+    # The decision is repeated without each pose, so nothing makes them too small but chance: ten poses know an rms to
+    # some 20 %, ten devices to 6 %. Errors of poses that were fitted would be 0.62 of the true ones.
     assert 0.8 <= np.mean(ratio) <= 1.25
 
 
@@ -289,7 +294,8 @@ def test_an_unwanted_correction_is_not_looked_for() -> None:
 
 
 def test_the_interval_holds_the_mean_of_as_many_new_errors() -> None:
-    """Errors in space are distributed as chi with three degrees of freedom; with other scatters they are not normal either."""
+    """Errors in space are distributed as chi with three degrees of freedom; with other scatters they are not normal
+    either."""
     rng = np.random.default_rng(0)
     inside = []
     for _ in range(2000):

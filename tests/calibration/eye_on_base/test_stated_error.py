@@ -1,4 +1,5 @@
-"""The limit of a verification: exceeded as rarely as it says by calibrations as good as they state, and by worse ones at once."""
+"""The limit of a verification: exceeded as rarely as it says by calibrations as good as they state, and by worse ones
+at once."""
 
 from __future__ import annotations
 
@@ -109,7 +110,8 @@ def test_a_wider_stated_percentile_counts_and_nothing_stated_gives_no_limit() ->
 
 
 def test_the_region_grows_where_the_flange_is_turned_beyond_the_calibration() -> None:
-    """An arm that errs by 0.15 mm per axis and orientation: the limit of one scan holds at the orientation of the calibration and at others."""
+    """An arm that errs by 0.15 mm per axis and orientation: the limit of one scan holds at the orientation of the
+    calibration and at others."""
     rng, over = np.random.default_rng(3), []
     for seed in range(60):
         scans = make_observations(14, seed, sigma=1e-4, turn=0.0)

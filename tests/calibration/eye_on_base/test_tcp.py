@@ -64,7 +64,8 @@ def test_without_a_tcp_none_is_named() -> None:
 
 
 def facing(n: int, seed: int) -> list[Observation]:
-    """Poses that face the scanner to within 9 degrees, as planned ones do: an error along its rays is one along their z."""
+    """Poses that face the scanner to within 9 degrees, as planned ones do: an error along its rays is one along their
+    z."""
     rng = np.random.default_rng(seed)
     out = []
     for o in make_observations(n, seed):
@@ -88,8 +89,8 @@ def test_a_scanners_own_error_is_not_called_a_tcp() -> None:
 
 
 def test_what_an_arm_is_off_is_not_called_a_tcp() -> None:
-    """Errors of 0.45 mm a coordinate that are spread over the poses as an offset along z would be, as far as no shift and no turn of
-    the camera takes them up: nothing that an arm may be off looks more like a TCP."""
+    """Errors of 0.45 mm a coordinate that are spread over the poses as an offset along z would be, as far as no shift
+    and no turn of the camera takes them up: nothing that an arm may be off looks more like a TCP."""
     for seed in range(10):
         poses = make_observations(12, seed, sigma=2e-5, turn=0.15)
         p = np.array([o.p_BR for o in poses])
@@ -136,7 +137,8 @@ def test_a_tcp_is_found_beside_outliers() -> None:
 def _pairs(folder: Path, observations: list[Observation]) -> Path:
     folder.mkdir()
     (folder / "dataset.yaml").write_text(
-        "schema: 1\nrobot: ur10e\nflange: iso9409-1-50-4-m6\nscanner: any\nconfiguration: eye_on_base\nunits: {clouds: m, poses: m}\n"
+        "schema: 1\nrobot: ur10e\nflange: iso9409-1-50-4-m6\nscanner: any\nconfiguration: eye_on_base\nunits: {clouds:"
+        " m, poses: m}\n"
     )
     rows = [
         [o.id, *o.p_BR, *o.p_CR, *o.X_BR.rotation().ToQuaternion().wxyz()] for o in observations

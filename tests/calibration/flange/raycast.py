@@ -1,4 +1,5 @@
-"""A ray caster of its own for flange scans: disc, bore, holes, chamfers, wrist, shoulder and floor, by rays and formulas."""
+"""A ray caster of its own for flange scans: disc, bore, holes, chamfers, wrist, shoulder and floor, by rays and
+formulas."""
 
 from __future__ import annotations
 
@@ -48,8 +49,8 @@ def scan(
 ) -> Array:
     """An organised scan (H, W, 3) m, NaN without return, of a flange at X_CR (4, 4): z outward, face at z = 0.
 
-    ``sigma`` m of noise along z, correlated over ``correlation_px`` pixels; ``floor`` m is its distance along the camera's
-    axis.
+    ``sigma`` m of noise along z, correlated over ``correlation_px`` pixels; ``floor`` m is its distance along the
+    camera's axis.
     """
     rays = camera.rays()
     R, p = X_CR[:3, :3], X_CR[:3, 3]
@@ -113,7 +114,8 @@ def _cones(wrist: bool):  # type: ignore[no-untyped-def]
 
 
 def facing(p: Array, tilt: float, azimuth: float, turn: float) -> Array:
-    """X_CR (4, 4) of a flange at p (3,) whose normal leans ``tilt`` rad away from the line of sight, about ``azimuth``."""
+    """X_CR (4, 4) of a flange at p (3,) whose normal leans ``tilt`` rad away from the line of sight, about
+    ``azimuth``."""
     z = -p / np.linalg.norm(p)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)

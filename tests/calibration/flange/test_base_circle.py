@@ -97,7 +97,8 @@ def test_half_a_ring_places_its_centre(elevation_deg: float, azimuth_deg: float)
 
 
 def test_the_upright_side_that_the_scanner_sees_does_not_pull_the_centre() -> None:
-    """The face seems to go on down the ring's near side by its own thickness: untreated, 0.2 mm and more towards the scanner."""
+    """The face seems to go on down the ring's near side by its own thickness: untreated, 0.2 mm and more towards the
+    scanner."""
     error, *_ = fit(35.0, 10.0, 1e-4)
     assert abs(error[0]) < 6e-5
 

@@ -1,4 +1,5 @@
-"""The covariance of half a face and of holes off their places is that of the errors: scans and faces by rays and formulas."""
+"""The covariance of half a face and of holes off their places is that of the errors: scans and faces by rays and
+formulas."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ HARMONICS = np.arange(2, 6)
 
 
 def _wave(rng: np.random.Generator) -> Array:
-    """Amplitudes (2, 4) m of cos and sin of an edge's harmonics that move the circle through half of it by OUT_OF_ROUND_M per axis."""
+    """Amplitudes (2, 4) m of cos and sin of an edge's harmonics that move the circle through half of it by
+    OUT_OF_ROUND_M per axis."""
     half = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 181)
     circle = np.column_stack([np.cos(half), np.sin(half), np.ones_like(half)])
     waves = np.column_stack([f(k * half) for k in HARMONICS for f in (np.cos, np.sin)])
@@ -29,7 +31,8 @@ def _wave(rng: np.random.Generator) -> Array:
 
 
 def _scan(X_CR: Array, rng: np.random.Generator, *, half: bool) -> Array:
-    """An organised scan (H, W, 3) m of a face whose edges are out of round, a floor behind; of the right half only, or of all."""
+    """An organised scan (H, W, 3) m of a face whose edges are out of round, a floor behind; of the right half only, or
+    of all."""
     focal, p = 1000.0, X_CR[:3, 3]
     u, v = np.meshgrid(
         np.arange(-100, 101) + round(focal * p[0] / p[2]), np.arange(-100, 101) + round(focal * p[1] / p[2])
@@ -90,7 +93,8 @@ def test_a_whole_face_is_as_high_and_as_level_as_stated() -> None:
 
 
 def _drilled(rng: np.random.Generator, off_m: float) -> tuple[Array, float]:
-    """Points (N, 3) m of a face 0.5 m away, its holes off their places by ``off_m`` per axis, and the turn of the pattern (rad)."""
+    """Points (N, 3) m of a face 0.5 m away, its holes off their places by ``off_m`` per axis, and the turn of the
+    pattern (rad)."""
     pitch, reach = 4e-4, 80
     j, i = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     xy = np.column_stack([(i + 0.5 * (j % 2)).ravel(), np.sqrt(0.75) * j.ravel()]) * pitch
@@ -106,7 +110,8 @@ def _drilled(rng: np.random.Generator, off_m: float) -> tuple[Array, float]:
 
 
 def test_holes_off_their_places_say_how_well_they_know_the_turn() -> None:
-    """Five holes, each 0.1 mm off per axis: the turn is off by 0.1 mm over the root of five at the circle, as six numbers to spare show."""
+    """Five holes, each 0.1 mm off per axis: the turn is off by 0.1 mm over the root of five at the circle, as six
+    numbers to spare show."""
     square = []
     for seed in range(70):
         points, turn = _drilled(np.random.default_rng([9, seed]), 1e-4)

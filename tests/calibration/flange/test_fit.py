@@ -148,7 +148,8 @@ def test_centre_is_within_a_twentieth_of_a_millimetre_up_to_thirty_degrees_of_ti
 
 
 def test_perfect_scan_gives_the_centre_to_a_fiftieth_of_a_pixel() -> None:
-    # only the pixel grid is left: about 600 edge pixels of 0.9 mm, 0.29 pixels rms each, would give 0.012 mm by averaging
+    # only the pixel grid is left: about 600 edge pixels of 0.9 mm, 0.29 pixels rms each, would give 0.012 mm by
+    # averaging
     centre, _, _, _ = errors(10, 3, scanner=DepthNoise(), standard=STANDARD)
     assert np.sqrt((centre**2).sum(axis=1).mean()) < 3e-5
 
@@ -219,7 +220,8 @@ def test_millimetres_for_metres_are_named() -> None:
 
 
 def test_a_half_hidden_face_is_fitted_and_says_how_much_less_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
-    # what real edges are out of round is stated too; these here are round, and their noise alone must account for the errors
+    # what real edges are out of round is stated too; these here are round, and their noise alone must account for the
+    # errors
     with monkeypatch.context() as plain:
         plain.setattr("weldcal.calibration.flange.fit._OUT_OF_ROUND_M", 0.0)
         centre, normalised, _, _ = errors(20, 6, hidden=0.5)

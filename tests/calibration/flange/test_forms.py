@@ -1,4 +1,5 @@
-"""The same scan as people have it: with its grid, flat, shuffled, cropped or thinned, of a caster that shares nothing with weldcal."""
+"""The same scan as people have it: with its grid, flat, shuffled, cropped or thinned, of a caster that shares nothing
+with weldcal."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ SCANS = 24
 
 @pytest.fixture(scope="module")
 def errors() -> dict[str, np.ndarray]:
-    """Of each form (scans, 2): distance of the centre from the truth (m), and its square over the stated covariance, per unknown."""
+    """Of each form (scans, 2): distance of the centre from the truth (m), and its square over the stated covariance,
+    per unknown."""
     found: dict[str, list[tuple[float, float]]] = {}
     for k in range(SCANS):
         rng = np.random.default_rng([3, k])

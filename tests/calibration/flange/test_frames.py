@@ -1,4 +1,5 @@
-"""The flange is found wherever it is seen, never where it is not, whole or in part, in every size; regions hold the truth."""
+"""The flange is found wherever it is seen, never where it is not, whole or in part, in every size; regions hold the
+truth."""
 
 from __future__ import annotations
 

@@ -62,7 +62,8 @@ def test_the_pitch_circle_measures_the_scale(scale: float) -> None:
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 33.0, -140.0])
 def test_slots_between_the_threads_are_no_holes(yaw_deg: float) -> None:
-    """Three slots as deep as the face is wide, on the pitch circle between threads: emptier than the holes themselves."""
+    """Three slots as deep as the face is wide, on the pitch circle between threads: emptier than the holes
+    themselves."""
     points, X_CR = _scan(STANDARD, yaw_deg)
     d = (X_CR.inverse() @ points.T).T
     rho, angle = np.hypot(d[:, 0], d[:, 1]), np.degrees(np.arctan2(d[:, 1], d[:, 0]))
@@ -100,8 +101,8 @@ def test_the_stated_spread_of_the_rotation_covers_its_error() -> None:
         normalised.append(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]) / pattern.turn_sigma)
         axis = pattern.X_CR.rotation().matrix()[:, 2]
         assert np.sqrt(axis @ pattern.covariance[:3, :3] @ axis) == pytest.approx(pattern.turn_sigma)
-    # chi-square with 16 degrees of freedom over its mean, 99.9 % above; below, innermost points err less than a circle's
-    # residuals say, at most by the 2.5 seen over 60 seeds
+    # chi-square with 16 degrees of freedom over its mean, 99.9 % above; below, innermost points err less than a
+    # circle's residuals say, at most by the 2.5 seen over 60 seeds
     assert 0.2 / 2.5 < np.mean(np.square(normalised)) < 2.5
 
 

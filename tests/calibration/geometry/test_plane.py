@@ -25,7 +25,8 @@ def test_the_normal_is_as_far_off_as_stated(radius: float) -> None:
 
 @pytest.mark.parametrize(("width", "readings"), [(0.0, 1.0), (0.7, 4.0 * np.pi * 0.7**2), (1.2, 4.0 * np.pi * 1.2**2)])
 def test_noise_that_neighbours_share_counts_once(width: float, readings: float) -> None:
-    """White noise smoothed by a Gaussian of s pixels: a sum over many has 4 pi s^2 times the variance of independent ones."""
+    """White noise smoothed by a Gaussian of s pixels: a sum over many has 4 pi s^2 times the variance of independent
+    ones."""
     noise = np.random.default_rng(1).normal(size=(200, 200))
     noise = gaussian_filter(noise, width) if width else noise
     good = np.ones(noise.size, dtype=bool)

@@ -26,7 +26,10 @@ from tests.calibration.hand_eye.pair_world import (
 
 
 def one_sheet(folder: Path) -> Path:
-    head = "No;Robot X [mm];Robot Y [mm];Robot Z [mm];Robot A [°];Robot B [°];Robot C [°];Cam X [mm];Cam Y [mm];Cam Z [mm];Cam Rx [rad];Cam Ry [rad];Cam Rz [rad]\n"
+    head = (
+        "No;Robot X [mm];Robot Y [mm];Robot Z [mm];Robot A [°];Robot B [°];Robot C [°];Cam X [mm];Cam Y [mm];Cam Z"
+        " [mm];Cam Rx [rad];Cam Ry [rad];Cam Rz [rad]\n"
+    )
     rows = every(
         lambda k: f"{k + 1};" + row(ROBOT.mm[k], ROBOT.ZYX[k], CAMERA.mm[k], CAMERA.v[k], mark=";").replace(".", ",")
     )
@@ -68,7 +71,8 @@ def rtde(folder: Path) -> Path:
     return beside(
         "robot.csv",
         every(lambda k: row(f"{k * 0.008:.3f}", ROBOT.p[k], ROBOT.v[k], "4", mark=" ")),
-        "timestamp actual_TCP_pose_0 actual_TCP_pose_1 actual_TCP_pose_2 actual_TCP_pose_3 actual_TCP_pose_4 actual_TCP_pose_5 output_int_register_0\n",
+        "timestamp actual_TCP_pose_0 actual_TCP_pose_1 actual_TCP_pose_2 actual_TCP_pose_3 actual_TCP_pose_4"
+        " actual_TCP_pose_5 output_int_register_0\n",
     )(folder)
 
 
@@ -92,8 +96,8 @@ def kuka(k: int) -> str:
 
 
 DTX = (
-    '<?xml version="1.0" encoding="utf-8" ?>\n<Database xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance">\n  <Datas>\n'
-    '    <Data name="p" access="public" xsi:type="array" type="pointRx" size="13">\n'
+    '<?xml version="1.0" encoding="utf-8" ?>\n<Database xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance">\n '
+    ' <Datas>\n    <Data name="p" access="public" xsi:type="array" type="pointRx" size="13">\n'
 )
 
 

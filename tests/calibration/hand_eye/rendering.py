@@ -64,7 +64,8 @@ def _marker(image: np.ndarray, dictionary: str, number: int, x: float, y: float,
 
 
 def draw_charuco(columns: int, rows: int, square: float, marker: float, dictionary: str, old: bool = False) -> Drawing:
-    """Squares with markers in the white ones, numbered row by row; ``old``: the upper left square is white where rows are even."""
+    """Squares with markers in the white ones, numbered row by row; ``old``: the upper left square is white where rows
+    are even."""
     image = _canvas(columns * square, rows * square, square)
     number, inset = 0, 0.5 * (square - marker)
     white_first = 1 if old and rows % 2 == 0 else 0

@@ -1,4 +1,5 @@
-"""The data choose how two lists of poses are read; SciPy writes the lists, so that the readers' own tables are not the truth."""
+"""The data choose how two lists of poses are read; SciPy writes the lists, so that the readers' own tables are not the
+truth."""
 
 from __future__ import annotations
 

@@ -134,11 +134,7 @@ def test_millimetres_follow_from_the_reach_and_the_motion(tmp_path: Path, poses:
 
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
-    [
-        ("camera", "poses are inverted"),
-        ("robot", "mounted eye_on_base"),
-        ("unit", "multiplied by"),
-    ],
+    [("camera", "poses are inverted"), ("robot", "mounted eye_on_base"), ("unit", "multiplied by")],
 )
 def test_one_mistake_is_recognised(wrong: str, sentence: str, tmp_path: Path, poses: tuple[Array, Array]) -> None:
     F, G = poses[0].copy(), poses[1].copy()

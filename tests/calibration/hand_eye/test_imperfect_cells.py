@@ -39,7 +39,8 @@ def test_a_wrong_camera_bends_the_rotations_of_least_squares_alone() -> None:
 
 
 def test_a_target_at_five_metres_is_placed_by_its_translations() -> None:
-    """A few tenths of a degree in each rotation are centimetres at the target, while its translations are known to millimetres."""
+    """A few tenths of a degree in each rotation are centimetres at the target, while its translations are known to
+    millimetres."""
     worse = []
     for seed in range(8):
         rng = np.random.default_rng(seed)

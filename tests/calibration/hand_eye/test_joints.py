@@ -25,7 +25,8 @@ OFFSET_RAD = np.radians(
 
 
 def cell(mode: str, offsets: Array, seed: int = 0, n: int = 40) -> tuple[PosePairs, Chain, Array]:
-    """Pairs as a controller with nominal numbers states them while the robot turns by the offsets, and the camera's pose."""
+    """Pairs as a controller with nominal numbers states them while the robot turns by the offsets, and the camera's
+    pose."""
     arm, rng = load_chain("ur10e"), np.random.default_rng(seed)
     q = np.array([0.3, -1.4, 1.7, -1.9, -1.5, 0.4]) + rng.uniform(-0.6, 0.6, (n, 6))
     errors = np.zeros((6, 6))

@@ -1,4 +1,5 @@
-"""Every mounting finds its camera from poses, from points, and from points with normals; directions are told in words."""
+"""Every mounting finds its camera from poses, from points, and from points with normals; directions are told in
+words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Pairs of poses in the forms of calibration tools, robots and loggers are read, and give the known X; the rest is refused with advice."""
+"""Pairs of poses in the forms of calibration tools, robots and loggers are read, and give the known X; the rest is
+refused with advice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Calibration from pictures of a board: every kind is found, bad pictures are named, and the stated region holds the truth."""
+"""Calibration from pictures of a board: every kind is found, bad pictures are named, and the stated region holds the
+truth."""
 
 from __future__ import annotations
 
@@ -125,7 +126,8 @@ def test_every_kind_of_board_is_found_where_it_was_drawn(text: str) -> None:
 
 @pytest.mark.parametrize("small", [False, True])
 def test_a_large_picture_is_searched_in_a_small_one(small: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three times as large, or a part of the whole: corners of a tenth of a pixel, and no search that samples the picture up."""
+    """Three times as large, or a part of the whole: corners of a tenth of a pixel, and no search that samples the
+    picture up."""
     drawing, calls = BOARDS["chessboard:9x6:20"], []
     C = draw.world(drawing, 0, 1).camera[0]
     picture = draw.render(drawing, C, np.random.default_rng(0), sub=3)
@@ -152,7 +154,8 @@ def test_a_large_picture_is_searched_in_a_small_one(small: bool, monkeypatch: py
 
 @pytest.mark.parametrize("text", ["circles:7x5:20", "circles:6x4:20", "acircles:4x11:12"])
 def test_centroids_of_circles_become_their_centres(text: str) -> None:
-    """The pictures of the drawn circles' centres, by the lens equation, are met five times better than by the centroids."""
+    """The pictures of the drawn circles' centres, by the lens equation, are met five times better than by the
+    centroids."""
     drawing, board = BOARDS[text], parse_board(text)
     C = draw.world(drawing, 1, 1).camera[0]
     found, radius = find_circles(draw.render(drawing, C, np.random.default_rng(0), sub=5), board)
@@ -182,7 +185,8 @@ def test_sides_that_the_lens_bends_meet_where_they_were_drawn() -> None:
 
 @pytest.mark.parametrize("text", ["circles:7x5:20", "tags:4x3:30:10:4X4_50"])
 def test_a_camera_is_estimated_from_points_with_offsets(text: str) -> None:
-    """Exact points with their offsets added: the camera and the pictures of the points are found as they are without offsets."""
+    """Exact points with their offsets added: the camera and the pictures of the points are found as they are without
+    offsets."""
     board = replace(parse_board(text), radius=0.009 if text[0] == "c" else 0.0)
     views = draw.world(BOARDS[text], 4, 12).camera
     points = [draw.project(board.points, C) for C in views]
@@ -228,8 +232,9 @@ def test_pictures_and_poses_give_camera_and_hand_eye_pose(chess: tuple[Path, dra
 def test_a_stated_camera_is_used_as_it_is(chess: tuple[Path, draw.World], tmp_path: Path) -> None:
     folder, truth = chess
     (tmp_path / "ost.yaml").write_text(
-        "image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [620, 0, 322, 0, 623, 236, 0, 0, 1]\n"
-        "distortion_model: plumb_bob\ndistortion_coefficients: {rows: 1, cols: 5, data: [-0.12, 0.06, 0.0008, -0.0006, 0]}\n"
+        "image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [620, 0, 322, 0, 623, 236,"
+        " 0, 0, 1]\ndistortion_model: plumb_bob\ndistortion_coefficients: {rows: 1, cols: 5, data: [-0.12, 0.06,"
+        " 0.0008, -0.0006, 0]}\n"
     )
     for option in ("--camera",):
         code, found = solve(folder, "chessboard:9x6:20", option, str(tmp_path / "ost.yaml"))
@@ -323,7 +328,8 @@ def layout_one_file_each(shots: Path, to: Path, robot: np.ndarray) -> int:
 
 
 def layout_folders_of_npz(shots: Path, to: Path, robot: np.ndarray) -> int:
-    """RGBImgs/color_image001.png, T_base2ee/T_Base2EE_001.npz (the base in the hand), and pictures of detected corners."""
+    """RGBImgs/color_image001.png, T_base2ee/T_Base2EE_001.npz (the base in the hand), and pictures of detected
+    corners."""
     copied(shots, to, lambda j: f"RGBImgs/color_image{j + 1:03d}.png")
     copied(shots, to, lambda j: f"DetectedCorners/DetectedCorners{j + 1}.png")
     (to / "T_base2ee").mkdir()
@@ -467,7 +473,8 @@ def test_a_folder_without_robot_poses_says_what_to_add(chess: tuple[Path, draw.W
 
 
 def test_the_stated_region_of_the_corners_holds_the_truth_as_often_as_it_says() -> None:
-    """On corners of 120 worlds with errors of the robot, and X no worse than the best method of OpenCV on the same corners."""
+    """On corners of 120 worlds with errors of the robot, and X no worse than the best method of OpenCV on the same
+    corners."""
     drawing = BOARDS["chessboard:9x6:20"]
     obj = np.c_[1e-3 * drawing.points, np.zeros(len(drawing.points))]
     inside, squares, ours, theirs = [], [], [], []

@@ -1,4 +1,5 @@
-"""The region of a hand-eye pose holds the truth as often as it says, neither more nor less: poses by NumPy and SciPy alone."""
+"""The region of a hand-eye pose holds the truth as often as it says, neither more nor less: poses by NumPy and SciPy
+alone."""
 
 from __future__ import annotations
 

@@ -21,7 +21,8 @@ TURN, SHIFT = float(np.radians(0.05)), 3e-4
 
 
 def repeated(seed: int, counts: list[int], shot: float = 1.0, jitter: float = 0.0) -> tuple[Array, Array, Array, Array]:
-    """Samples of poses that were each measured so often: an error of each pose, and one of each sample (``shot`` times as large)."""
+    """Samples of poses that were each measured so often: an error of each pose, and one of each sample (``shot`` times
+    as large)."""
     rng = np.random.default_rng(seed)
     F, G, X, Y = eye_in_hand(len(counts), rng, TURN, SHIFT)
     rows = np.repeat(np.arange(len(counts)), counts)
@@ -35,8 +36,11 @@ def solved(F: Array, G: Array, folds: int = 0) -> HandEyeResult:
 
 @pytest.mark.parametrize("counts", [[8] * 8, [1, 1, 1, 1, 1, 25, 4, 2, 2, 1], [1] * 40 + [30] * 4])
 def test_the_covariance_is_right_whatever_the_repeats(counts: list[int]) -> None:
-    """The squared error over the covariance is 1 for each unknown. Its spread over a run is 0.75 at most (six unknowns of 13 degrees of
-    freedom), so that the mean of 30 runs lies within 0.4 with 99.7 %; counted as independent, 8 x 8 samples give 4.7."""
+    """The squared error over the covariance is 1 for each unknown.
+
+    Its spread over a run is 0.75 at most (six unknowns of 13 degrees of freedom), so that the mean of 30 runs lies
+    within 0.4 with 99.7 %; counted as independent, 8 x 8 samples give 4.7.
+    """
     squares = []
     for seed in range(30):
         F, G, X, Y = repeated(seed, counts, jitter=1.0)
@@ -76,7 +80,8 @@ def test_a_wrong_repeat_is_excluded_alone() -> None:
 
 
 def test_repeats_that_vary_more_than_other_samples_are_used() -> None:
-    """Three samples at one of 40 poses with errors 2.5 times those of the others, as of a pause in a recorded motion."""
+    """Three samples at one of 40 poses with errors 2.5 times those of the others, as of a pause in a recorded
+    motion."""
     for seed in range(10):
         F, G, X, _ = repeated(seed, [1] * 39 + [3], shot=0.0)
         G[39:] = G[39:] @ noise(3, np.random.default_rng(100 + seed), 2.5 * TURN, 2.5 * SHIFT)

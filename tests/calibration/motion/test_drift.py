@@ -9,12 +9,12 @@ from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter, Field
 from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
 from weldcal.calibration.motion.drift.residuals import CLOCK, SIZE, Rows
 from weldcal.calibration.motion.drift.sequential import CREEP, MOVED, WARM_UP, DriftConfig, DriftTest
-from weldcal.tools.worlds.features import Change, World, WorldConfig, simulate
+from weldcal.tools.worlds.features import Change, FeatureWorld, WorldConfig, simulate
 
 KNOCK_S = 22.3
 
 
-def watched(world: World, rows: Rows | None = None, config: DriftConfig | None = None) -> DriftTest:
+def watched(world: FeatureWorld, rows: Rows | None = None, config: DriftConfig | None = None) -> DriftTest:
     """The test after all frames of a world, in parts of ten."""
     test = DriftTest(world.X_BC, world.covariance, world.pivot, config)
     rows = world.rows if rows is None else rows
@@ -135,7 +135,7 @@ def test_the_noise_rises_at_once_and_falls_slowly() -> None:
     """What is measured in some hundred frames varies; the test does not count in sigmas of the quietest."""
     usual, loud = (simulate(WorldConfig(centre_m=f * 3.5e-5, depth_m=f * 2e-5), 60.0, 8) for f in (1.0, 3.0))
 
-    def noises(first: World, then: World, seconds: float) -> tuple[FrameNoise, FrameNoise]:
+    def noises(first: FeatureWorld, then: FeatureWorld, seconds: float) -> tuple[FrameNoise, FrameNoise]:
         test = DriftTest(first.X_BC, first.covariance, first.pivot)
         seen = []
         for world in (first, then):

@@ -1,4 +1,5 @@
-"""The pose after a move and its covariance: as far off as stated, in worlds of NumPy with the errors that the filter expects."""
+"""The pose after a move and its covariance: as far off as stated, in worlds of NumPy with the errors that the filter
+expects."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ def _field(rng: np.random.Generator, centers: Array, normals: Array) -> Array:
 
 
 def _world(seed: int, turn: Array, shift: Array, noise: float = 1.0) -> tuple[DriftTest, Rows, Rotation, Array]:
-    """A calibration with an error of the size that it states, its frames, and the scanner's pose after it moved at half time."""
+    """A calibration with an error of the size that it states, its frames, and the scanner's pose after it moved at half
+    time."""
     rng = np.random.default_rng([5, seed])
     t = FRAME_S * np.arange(FRAMES)
     phase, size = rng.uniform(0.0, 2.0 * np.pi, 6), np.array([0.08, 0.08, 0.06, 0.25, 0.25, 0.25])
@@ -73,7 +75,8 @@ def _error(X: RigidTransform, R: Rotation, p: Array) -> Array:
 
 
 def _moved(cells: int, noise: float = 1.0) -> Moved:
-    """Cells whose scanner turns by a milliradian and shifts by half a millimetre; ``noise`` is the share of it that is stated."""
+    """Cells whose scanner turns by a milliradian and shifts by half a millimetre; ``noise`` is the share of it that is
+    stated."""
     found = []
     for seed in range(cells):
         rng = np.random.default_rng([6, seed])
@@ -135,7 +138,8 @@ def test_a_turn_about_the_scanner_shifts_it_nowhere() -> None:
 
 
 def test_a_quiet_hour_has_the_stated_chance_of_a_false_alarm() -> None:
-    """Of all tests in an hour, 20 frames a second times the hypotheses, each a chi-square with the unknowns of a move."""
+    """Of all tests in an hour, 20 frames a second times the hypotheses, each a chi-square with the unknowns of a
+    move."""
     config = DriftConfig()
     test = DriftTest(_pose(R_BC, P_BC), 1e-8 * np.eye(6), PIVOT, config, frame_rate_hz=20.0)
     tests = 3600.0 * 20.0 * len(test.filter.kind)

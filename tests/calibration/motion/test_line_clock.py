@@ -1,4 +1,5 @@
-"""A profiler's clock offset from one straight edge: found while the arm weaves over it, refused where the motion is one way."""
+"""A profiler's clock offset from one straight edge: found while the arm weaves over it, refused where the motion is one
+way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Two pose streams with an unknown clock offset: the offset is found with an honest sigma, in simulation and on recorded arms."""
+"""Two pose streams with an unknown clock offset: the offset is found with an honest sigma, in simulation and on
+recorded arms."""
 
 from __future__ import annotations
 

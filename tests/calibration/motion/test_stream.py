@@ -1,4 +1,5 @@
-"""The robot's stream in continuous time: exact motion is recovered between samples, jitter is averaged, gaps are known."""
+"""The robot's stream in continuous time: exact motion is recovered between samples, jitter is averaged, gaps are
+known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A link of the arm is tracked by its mesh and by a model fused from scans; a body that can slide along itself is refused."""
+"""A link of the arm is tracked by its mesh and by a model fused from scans; a body that can slide along itself is
+refused."""
 
 import numpy as np
 import open3d as o3d

@@ -1,4 +1,5 @@
-"""A calibration is watched over a recording: frames synchronised in spite of a knock, the pose after it, what is dropped."""
+"""A calibration is watched over a recording: frames synchronised in spite of a knock, the pose after it, what is
+dropped."""
 
 from dataclasses import replace
 
@@ -24,7 +25,8 @@ DELAY_S = 0.140
 def recording(
     seed: int, *, device: bool, knock: RigidTransform | None = None, at: float = 10.0, duration: float = 16.0
 ) -> tuple[CalibrationResult, ObservedFrames, ContinuousMotion]:
-    """A calibration, frames of a scanner that jumps by ``knock`` about its own origin in the base, and the robot's motion."""
+    """A calibration, frames of a scanner that jumps by ``knock`` about its own origin in the base, and the robot's
+    motion."""
     rng = np.random.default_rng(seed)
     moves, X_BC = cube_moves(rng)
     motion = ContinuousMotion(recorded_stream(moves, duration, rng))

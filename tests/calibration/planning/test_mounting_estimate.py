@@ -1,4 +1,5 @@
-"""Poses of a mounting and the scanner's correction are as far off as they state, with errors of scanner and arm in the world."""
+"""Poses of a mounting and the scanner's correction are as far off as they state, with errors of scanner and arm in the
+world."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ def test_a_scanner_on_the_wrist_finds_its_own_scale_and_gradient() -> None:
 
 
 def test_a_gap_in_the_views_is_named() -> None:
-    """A scanner under the forearm has the foot in the middle of its image, from left to right: it cannot show a bend along x."""
+    """A scanner under the forearm has the foot in the middle of its image, from left to right: it cannot show a bend
+    along x."""
     world = mounted_world("eye_on_arm_base", 0)
     assert solve_mounting(world.scene, world.seen).undetermined == ("bend in x",)
 

@@ -1,4 +1,5 @@
-"""A profiler on a flange, calibrated by one straight edge: the paper's method and the joint one, and what both refuse."""
+"""A profiler on a flange, calibrated by one straight edge: the paper's method and the joint one, and what both
+refuse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Profiles as makers' software and people's scripts write them: each form gives the calibration that the generator knows."""
+"""Profiles as makers' software and people's scripts write them: each form gives the calibration that the generator
+knows."""
 
 import json
 from collections.abc import Callable
@@ -40,7 +41,8 @@ class World:
 def world(
     seed: int = 3, turn: float = 28.0, scans: int = SCANS, noise_mm: float = 0.02, axis: tuple[float, ...] = ()
 ) -> World:
-    """A sphere seen from above in turned poses: z of a profile point is where the ray of its column first meets the sphere.
+    """A sphere seen from above in turned poses: z of a profile point is where the ray of its column first meets the
+    sphere.
 
     With an ``axis`` the flange turns about it only.
     """
@@ -171,7 +173,8 @@ def heights_in_lines(w: World) -> str:
 
 
 def raw_integers(w: World) -> str:
-    """Tabs, unmodified integers in 0.01 micrometres with the most negative one for nothing: a column for each profile."""
+    """Tabs, unmodified integers in 0.01 micrometres with the most negative one for nothing: a column for each
+    profile."""
     rows = [
         "\t".join([f"{round(1e5 * a)}", *(f"{-2147483648 if np.isnan(v) else round(1e5 * v)}" for v in w.z[:, j])])
         for j, a in enumerate(w.x)
@@ -209,7 +212,8 @@ def kuka_dat(w: World) -> str:
     return (
         "DEFDAT P\n"
         + "\n".join(
-            f"DECL E6POS XP{k + 1}={{X {r[0]:.3f},Y {r[1]:.3f},Z {r[2]:.3f},A {r[3]:.3f},B {r[4]:.3f},C {r[5]:.3f},S 2,T 35}}"
+            f"DECL E6POS XP{k + 1}={{X {r[0]:.3f},Y {r[1]:.3f},Z {r[2]:.3f},A {r[3]:.3f},B {r[4]:.3f},C {r[5]:.3f},S"
+            " 2,T 35}"
             for k, r in enumerate(rows)
         )
         + "\nENDDAT\n"

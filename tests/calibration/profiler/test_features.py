@@ -1,4 +1,5 @@
-"""What a calibrated profiler is used for: a V-groove's three features in a raw profile, and a frustum put together from many."""
+"""What a calibrated profiler is used for: a V-groove's three features in a raw profile, and a frustum put together from
+many."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ needs_data = needs(DATA)
 def groove(
     rng: np.random.Generator, *, noise_m: float = 0.05 * MM, lean: float = 0.05
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A profile (400, 2) over a groove of 30 mm with walls of 22.5 deg, with spikes and gaps, and its features (3, 2)."""
+    """A profile (400, 2) over a groove of 30 mm with walls of 22.5 deg, with spikes and gaps, and its features (3,
+    2)."""
     x = np.linspace(-0.03, 0.03, 400)
     middle, half = rng.uniform(-0.004, 0.004), 0.03 * np.tan(np.radians(22.5))
 
@@ -47,7 +49,8 @@ def test_a_grooves_features_lie_where_they_are_within_their_sigmas() -> None:
         p, truth = groove(rng)
         f = groove_features(p)
         z.append((f.points - truth) / f.sigmas)
-    # 40 draws: the mean of their squares is 1 with a sigma of sqrt(2/40) = 0.22; the samples' own x noise is no regressor's
+    # 40 draws: the mean of their squares is 1 with a sigma of sqrt(2/40) = 0.22; the samples' own x noise is no
+    # regressor's
     assert (np.mean(np.square(z), axis=0) < 1.0 + 4 * 0.22 + 0.3).all()
     assert (np.mean(np.square(z), axis=0) > 1.0 - 3 * 0.22).all()
 
@@ -65,8 +68,8 @@ def test_walls_that_bend_are_in_the_sigmas_and_followed_where_it_shows() -> None
             f = groove_features(p)
             z.append((f.points - truth) / f.sigmas)
             off.append(f.points - truth)
-    # a bend just too small to show shifts a feature by up to 2.5 sigmas of it, of which the sigma holds a part: 3 is what is
-    # left of 38 without either measure
+    # a bend just too small to show shifts a feature by up to 2.5 sigmas of it, of which the sigma holds a part: 3 is
+    # what is left of 38 without either measure
     assert (np.mean(np.square(z), axis=0) < 3.0 + 2 * np.sqrt(2 / 24)).all()
     assert np.sqrt(np.mean(np.square(off[12:]))) < 0.05 * MM
 

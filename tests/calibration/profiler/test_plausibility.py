@@ -1,4 +1,5 @@
-"""What a person may state or copy wrongly beside a sphere's scans: its radius, a file cut short; and why a model was taken."""
+"""What a person may state or copy wrongly beside a sphere's scans: its radius, a file cut short; and why a model was
+taken."""
 
 from __future__ import annotations
 
@@ -102,8 +103,7 @@ def test_clearly_less_is_more_than_one_standard_error_of_paired_differences() ->
 
 
 @pytest.mark.parametrize(
-    ("cut", "said"),
-    [(0, None), (12, "the file is cut off there"), (4, "may be cut off within its last number")],
+    ("cut", "said"), [(0, None), (12, "the file is cut off there"), (4, "may be cut off within its last number")]
 )
 def test_a_csv_cut_off_is_told(tmp_path: Path, cut: int, said: str | None) -> None:
     whole = edge_csv(tmp_path / "whole.csv").read_text()

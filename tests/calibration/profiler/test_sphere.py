@@ -1,4 +1,5 @@
-"""A profiler calibrated by a sphere and touches of it: the paper's method, the joint one, its sigma, and what is refused."""
+"""A profiler calibrated by a sphere and touches of it: the paper's method, the joint one, its sigma, and what is
+refused."""
 
 from __future__ import annotations
 
@@ -10,15 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.places import SHARED_DATA, needs
-from weldcal.calibration.errors import (
-    ArcNotFound,
-    DegenerateMotion,
-    InconsistentData,
-    RadiusError,
-    TooFewTranslations,
-)
+from weldcal.calibration.errors import ArcNotFound, DegenerateMotion, InconsistentData, RadiusError, TooFewTranslations
 from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
+from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate, choose_model, leave_one_out_m, sphere_joint
@@ -132,10 +127,10 @@ def test_the_arms_errors_move_the_flange_as_their_derivatives_say() -> None:
     loads, point, h = world.nominal.loads(q), np.array([0.1, -0.2, 0.3]), 1e-6
 
     def at(v: np.ndarray) -> np.ndarray:
-        X = world.nominal.with_errors(q, ArmErrors.of(v), loads)
+        X = world.nominal.with_errors(q, ProfilerArmErrors.of(v), loads)
         return X.rotation @ point + X.translation
 
-    w, v = world.nominal.twists(q, ArmErrors.of(values), loads)
+    w, v = world.nominal.twists(q, ProfilerArmErrors.of(values), loads)
     for k in range(ARM_ERRORS):
         step = h * np.eye(ARM_ERRORS)[k]
         found = (at(values + step) - at(values - step)) / (2.0 * h)

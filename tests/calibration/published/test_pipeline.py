@@ -92,8 +92,9 @@ def test_equation_10_read_literally_loses_the_camera() -> None:
     p_B = (X_BC @ p_C.T).T
     pairs = [Observation(str(k), RigidTransform(b), c) for k, (b, c) in enumerate(zip(p_B, p_C, strict=True))]
     assert np.abs(all_pairs(pairs).GetAsMatrix34() - X_BC.GetAsMatrix34()).max() < 1e-12
-    # printed: c = (1/n) sum |p_C - mu_C|^2, the variance of the camera points in square metres, and t = mu_B - c R mu_C: off by
-    # (1 - c) of the camera's mean distance; Umeyama's (1991) scale is tr(D S) over that variance, the authors' program takes 1
+    # printed: c = (1/n) sum |p_C - mu_C|^2, the variance of the camera points in square metres, and t = mu_B - c R
+    # mu_C: off by (1 - c) of the camera's mean distance; Umeyama's (1991) scale is tr(D S) over that variance, the
+    # authors' program takes 1
     mean_B, mean_C = p_B.mean(axis=0), p_C.mean(axis=0)
     c = ((p_C - mean_C) ** 2).sum(axis=1).mean()
     t = mean_B - c * all_pairs(pairs).rotation().matrix() @ mean_C

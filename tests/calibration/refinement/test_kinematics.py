@@ -19,12 +19,12 @@ from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.wrong_arm import Station, judged, station, study_station
+from weldcal.tools.worlds.wrong_arm import WrongArmStation, judged, station, study_station
 
 ARM = load_chain("ur10e")
 
 
-def _choice(world: Station, kind: str) -> KinematicsChoice:
+def _choice(world: WrongArmStation, kind: str) -> KinematicsChoice:
     estimate = estimate_eye_on_base(world.observations, SolveConfig(leave_one_out=False))
     return choose_kinematics(world.observations, world.q, ARM, kind, {}, estimate)
 
@@ -38,7 +38,8 @@ def test_planned_scans_find_factory_size_errors_and_state_what_remains() -> None
 
 
 def test_offsets_alone_state_what_unfitted_links_do_to_them() -> None:
-    """An arm whose axes are off besides its zeros: without the prior of the links the offsets would be stated far too well."""
+    """An arm whose axes are off besides its zeros: without the prior of the links the offsets would be stated far too
+    well."""
     world = station(46)
     X_BC, plain = _near(world)
     sought = arm_errors(ARM, "joints")
@@ -67,7 +68,7 @@ def test_the_written_kinematics_reach_where_the_arm_is(tmp_path: Path) -> None:
         load_chain("aubo_i5", tmp_path / "k.yaml")
 
 
-def _near(world: Station) -> tuple[RigidTransform, ScannerCorrection]:
+def _near(world: WrongArmStation) -> tuple[RigidTransform, ScannerCorrection]:
     return estimate_eye_on_base(world.observations, SolveConfig(leave_one_out=False)).X_BC, ScannerCorrection()
 
 

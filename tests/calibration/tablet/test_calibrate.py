@@ -1,4 +1,5 @@
-"""weldcal tablet calibrate: from an npz, or from the page's CSV with robot poses and a picture, to a result others can read."""
+"""weldcal tablet calibrate: from an npz, or from the page's CSV with robot poses and a picture, to a result others can
+read."""
 
 from __future__ import annotations
 
@@ -182,7 +183,10 @@ def _turned_page(folder: Path) -> None:
     write(folder / "touches.csv", rows)
 
 
-ROS = "camera_matrix: {rows: 3, cols: 3, data: [617.7, 0, 316.5, 0, 617.7, 242.3, 0, 0, 1]}\ndistortion_coefficients: {data: [0, 0, 0, 0]}\n"
+ROS = (
+    "camera_matrix: {rows: 3, cols: 3, data: [617.7, 0, 316.5, 0, 617.7, 242.3, 0, 0, 1]}\ndistortion_coefficients:"
+    " {data: [0, 0, 0, 0]}\n"
+)
 OPENCV = (
     "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
     "   data: [ 617.7, 0., 316.5, 0., 617.7, 242.3, 0., 0., 1. ]\n"

@@ -1,4 +1,5 @@
-"""Two small models of camera and pen: exact without noise, honest about what they did not see, sure of what they say."""
+"""Two small models of camera and pen: exact without noise, honest about what they did not see, sure of what they
+say."""
 
 from __future__ import annotations
 
@@ -109,7 +110,8 @@ def test_unseen_queries_of_the_shared_trials_are_met_within_the_target() -> None
 
 
 def test_the_covariance_tells_how_far_the_pen_is_off() -> None:
-    """Normal touches of 0.3 mm: the pen's normalised square error is chi-square with two degrees of freedom per trial."""
+    """Normal touches of 0.3 mm: the pen's normalised square error is chi-square with two degrees of freedom per
+    trial."""
     rng = np.random.default_rng(4)
     squares = []
     for k in range(60):
@@ -119,7 +121,8 @@ def test_the_covariance_tells_how_far_the_pen_is_off() -> None:
         fit = fit_planar(noisy, leave_one_out=False)
         e = fit.pen_m - true
         squares.append(e @ np.linalg.solve(fit.covariance[3:5, 3:5], e))
-    # mean 2 (13 / 11 more for the estimated sigma: an F distribution), its standard error 2 / sqrt(60) * 1.4: +- 3 of them
+    # mean 2 (13 / 11 more for the estimated sigma: an F distribution), its standard error 2 / sqrt(60) * 1.4: +- 3 of
+    # them
     assert 2.36 - 1.1 < np.mean(squares) < 2.36 + 1.1
 
 

@@ -1,4 +1,5 @@
-"""Files of planar touches as strangers write them: many visits, other counts, other signs and units, landmarks that are not there."""
+"""Files of planar touches as strangers write them: many visits, other counts, other signs and units, landmarks that are
+not there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Camera and pen on the wrist: exact without noise, sure of what they say with it, and open about what touches leave open."""
+"""Camera and pen on the wrist: exact without noise, sure of what they say with it, and open about what touches leave
+open."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ FOCAL = 617.7
 def visit(
     *, tilt: float, touch_m: float = 0.0, pixel: float = 0.0, seed: int = 0, views: int = 1, across: float = 1.0
 ) -> WristTouches:
-    """Nine touches beside the landmarks, the hand turned by 22.5 deg each time and tilted by up to ``tilt`` deg; ``across`` the
-    tablet the noise is so many times that along it."""
+    """Nine touches beside the landmarks, the hand turned by 22.5 deg each time and tilted by up to ``tilt`` deg;
+    ``across`` the tablet the noise is so many times that along it."""
     rng = np.random.default_rng(seed)
     touched = GRID + rng.normal(0.0, 0.5e-3, GRID.shape)
     poses = []
@@ -69,7 +70,8 @@ def test_the_covariance_is_that_of_the_errors() -> None:
         turn = rotation_vector(fit.X_FC.rotation() @ X_FC.rotation().inverse())
         e = np.r_[turn, fit.X_FC.translation() - X_FC.translation()]
         squares.append(e @ np.linalg.solve(fit.covariance, e))
-    # chi-square with 6 degrees of freedom, some more for estimated variances: mean 6.8, its standard error 0.8, three of them
+    # chi-square with 6 degrees of freedom, some more for estimated variances: mean 6.8, its standard error 0.8, three
+    # of them
     assert 6.8 - 2.4 < np.mean(squares) < 6.8 + 2.4
 
 
@@ -79,8 +81,8 @@ def test_the_pen_is_as_sure_as_it_says_where_the_glass_is_noisier_than_the_arm()
         data = visit(tilt=12.0, touch_m=0.06e-3, pixel=0.1, seed=seed, across=0.2)
         fit = fit_wrist(data, leave_one_out=False)
         squares.append((fit.p_FP - P_FP) @ np.linalg.solve(fit.pen_covariance, fit.p_FP - P_FP))
-    # chi-square with 3 degrees of freedom over a variance from 12: mean 3.6, its standard error 0.6, two of them (one scatter
-    # for all directions: 5.6)
+    # chi-square with 3 degrees of freedom over a variance from 12: mean 3.6, its standard error 0.6, two of them (one
+    # scatter for all directions: 5.6)
     assert 3.6 - 1.2 < np.mean(squares) < 3.6 + 1.2
 
 

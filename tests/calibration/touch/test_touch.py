@@ -28,11 +28,11 @@ from weldcal.calibration.touch.table import (
 from weldcal.calibration.touch.touches import POINT, Touch
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.touch import World, touch_world
+from weldcal.tools.worlds.touch import TouchWorld, touch_world
 
 
 @lru_cache(maxsize=8)
-def world(seed: int) -> World:
+def world(seed: int) -> TouchWorld:
     return touch_world(seed)
 
 

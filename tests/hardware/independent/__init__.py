@@ -1,1 +1,4 @@
-"""A minimal UR controller, written from Universal Robots' public documents only. It shares no code with the product or its emulator."""
+"""A minimal UR controller, written from Universal Robots' public documents only.
+
+It shares no code with the product or its emulator.
+"""

@@ -1,6 +1,7 @@
 """A minimal UR controller at a loopback address: `python -m tests.hardware.independent --host 127.40.0.1`.
 
-Ports 29999, 30001 to 30004 as on a robot; 30095 takes one JSON object a line, with which a test asks for faults (see `Hooks`).
+Ports 29999, 30001 to 30004 as on a robot; 30095 takes one JSON object a line, with which a test asks for faults (see
+`Hooks`).
 """
 
 from __future__ import annotations
@@ -185,7 +186,8 @@ class Controller:
             due += STEP_S
             late = time.monotonic() - due
             if late > CATCHES_UP_S:
-                # this computer was late: the next frame is one step later, so that the program does not see many frames at once
+                # this computer was late: the next frame is one step later, so that the program does not see many frames
+                # at once
                 self.hooks.late["slips"] += 1
                 self.hooks.late["slipped_ms"] += 1e3 * late
                 due += late
@@ -266,7 +268,10 @@ def main() -> None:
     parser.add_argument(
         "--own-computer",
         action="store_true",
-        help="take real-time priority where the system allows it, as a controller that shares no processor with its client",
+        help=(
+            "take real-time priority where the system allows it, as a controller that shares no processor with its"
+            " client"
+        ),
     )
     given = parser.parse_args()
     if not given.host.startswith("127."):

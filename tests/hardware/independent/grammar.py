@@ -1,8 +1,9 @@
-"""The grammar of URScript for the independent controller: words, framing on a script port, and a recursive-descent parser.
+"""The grammar of URScript for the independent controller: words, framing on a script port, and a recursive-descent
+parser.
 
-Source: Universal Robots, "The URScript Programming Language for e-Series", chapters on numbers and types, flow of control, functions,
-scoping rules. Of two readings the stricter one is taken: a variable keeps its type, an array its length, and a function finds no
-local variable of another function.
+Source: Universal Robots, "The URScript Programming Language for e-Series", chapters on numbers and types, flow of
+control, functions, scoping rules. Of two readings the stricter one is taken: a variable keeps its type, an array its
+length, and a function finds no local variable of another function.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ KEYWORDS = {
     "sec", "thread", "True", "while", "xor",
 }  # fmt: skip
 TOKEN = re.compile(
-    r"(?P<space>[ \t\r]+|\#[^\n]*)|(?P<line>\n)|(?P<number>(?:\d+\.\d*|\.\d+|\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
+    r"(?P<space>["
+    r" \t\r]+|\#[^\n]*)|(?P<line>\n)|(?P<number>(?:\d+\.\d*|\.\d+|\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
     r'|(?P<text>"[^"\n]*")|(?P<sign>==|!=|<=|>=|[-+*/%<>=(),:\[\]])'
 )
 COMPARISONS = ("==", "!=", "<", ">", "<=", ">=")
@@ -52,7 +54,10 @@ def tokens_of(text: str) -> list[Token]:
 
 
 def complete_programs(text: str) -> tuple[list[str], str]:
-    """The complete programs at the start of a script port's data, and the rest. A line outside of a program is one by itself."""
+    """The complete programs at the start of a script port's data, and the rest.
+
+    A line outside of a program is one by itself.
+    """
     programs: list[str] = []
     lines, depth = text.split("\n"), 0
     begun: list[str] = []

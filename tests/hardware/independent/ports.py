@@ -1,6 +1,7 @@
 """The text and state ports of the independent controller: script and client interface, real-time port, dashboard.
 
-Sources: Universal Robots, "Client Interfaces 5.x" (primary, secondary and real-time), "Dashboard Server e-Series, port 29999".
+Sources: Universal Robots, "Client Interfaces 5.x" (primary, secondary and real-time), "Dashboard Server e-Series, port
+29999".
 """
 
 from __future__ import annotations

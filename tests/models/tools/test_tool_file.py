@@ -1,4 +1,5 @@
-"""Tool files: the welding tool's own gives the same numbers, other tools are possible, and impossible ones are refused by name."""
+"""Tool files: the welding tool's own gives the same numbers, other tools are possible, and impossible ones are refused
+by name."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Random joints of separate solids with the seams that they have, and the share that is found; mm.
 
-python tests/models/workpieces/random_joints.py [COUNT] [FIRST SEED] [stl] prints the figure; with stl of the same solids as triangles.
+python tests/models/workpieces/random_joints.py [COUNT] [FIRST SEED] [stl] prints the figure; with stl of the same
+solids as triangles.
 """
 
 from __future__ import annotations
@@ -107,10 +108,7 @@ def lap(rng: np.random.Generator) -> Case:
     over = rng.uniform(15.0, 40.0)
     g = 0.0 if rng.random() < 0.33 else float(rng.uniform(-min(2.0, 0.6 * min(t, u)), 3.0))
     plates = [box((0, 0, -t), (L, w, t)), box((0, w - over, g), (L, v, u))]
-    return plates, [
-        line("lap", (0, w - over, 0), (L, w - over, 0)),
-        line("lap", (0, w, g), (L, w, g)),
-    ]
+    return plates, [line("lap", (0, w - over, 0), (L, w - over, 0)), line("lap", (0, w, g), (L, w, g))]
 
 
 @kind
@@ -303,7 +301,7 @@ def _same(seam: Seam, found: tuple[str, Floats, float, bool]) -> bool:
 
 if __name__ == "__main__":
     words = [word for word in sys.argv[1:] if word != "stl"]
-    count, first = (int(word) for word in (words + ["2000", "0"][len(words) :]))
+    count, first = (int(word) for word in words + ["2000", "0"][len(words) :])
     of = found_in_mesh if "stl" in sys.argv else found_in
     bad = 0
     for n in range(count):

@@ -27,7 +27,8 @@ def test_both_its_meshes_are_closed_and_as_heavy_as_they_were(pair: tuple[Workpi
         volume = float(np.einsum("ij,ij->i", v[:, 0], np.cross(v[:, 1], v[:, 2])).sum()) / 6.0
         u = before.vertices[before.triangles]
         flat_volume = float(np.einsum("ij,ij->i", u[:, 0], np.cross(u[:, 1], u[:, 2])).sum()) / 6.0
-        # Inside the top face lengths shrink by depth over radius: of a plate of 20 mm a fifteenth on average, of a band less.
+        # Inside the top face lengths shrink by depth over radius: of a plate of 20 mm a fifteenth on average, of a band
+        # less.
         assert 0.90 * flat_volume < volume < flat_volume
 
 

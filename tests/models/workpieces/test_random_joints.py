@@ -39,7 +39,10 @@ def test_a_mesh_of_two_boxes_is_a_t_in_every_form(gap: float, form: str, tmp_pat
     if form.endswith("obj"):
         (tmp_path / form).write_text(mesh.to_obj())
     elif form.endswith("ply"):
-        head = f"ply\nformat ascii 1.0\nelement vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        head = (
+            f"ply\nformat ascii 1.0\nelement vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty"
+            " float z\n"
+        )
         rows = [*(" ".join(map(str, p)) for p in mesh.vertices), *("3 {} {} {}".format(*t) for t in mesh.triangles)]
         faces = f"element face {len(mesh.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
         (tmp_path / form).write_text(head + faces + "\n".join(rows) + "\n")

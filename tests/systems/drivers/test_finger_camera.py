@@ -1,4 +1,5 @@
-"""The finger camera and its tag: a known push of the tip is read back, late but with its own time, and never invented."""
+"""The finger camera and its tag: a known push of the tip is read back, late but with its own time, and never
+invented."""
 
 from __future__ import annotations
 
@@ -105,7 +106,8 @@ def test_a_push_of_the_drawn_tag_is_read_back(push_mm: tuple[float, float, float
     assert answer.sequence == 4
     assert answer.sample.capture_time == 1.5
     assert answer.sample.X_BT_at_capture.IsNearlyEqualTo(forward_kinematics(the_arm(), Q_HOME) @ TOOL.X_FT, 1e-12)
-    # A side is found to a hundredth of a pixel, 0.001 mm at 40 mm; along the line of sight that is 0.02 px in 112 px of 40 mm.
+    # A side is found to a hundredth of a pixel, 0.001 mm at 40 mm; along the line of sight that is 0.02 px in 112 px of
+    # 40 mm.
     assert answer.sample.deflection_T[:2] == pytest.approx(push[:2], abs=0.003 * MM)
     assert answer.sample.deflection_T[2] == pytest.approx(push[2], abs=0.01 * MM)
 
@@ -281,7 +283,8 @@ def test_a_frame_from_before_the_arms_memory_is_not_used() -> None:
 
 
 def test_images_wait_for_an_arm_whose_poses_come_later() -> None:
-    """Poses 0.1 s late, an image every 0.033 s: the newest image is always ahead of them, and the older ones are read."""
+    """Poses 0.1 s late, an image every 0.033 s: the newest image is always ahead of them, and the older ones are
+    read."""
     estimator = Estimator()
     ages, read = [], []
     for k in range(1, 13):

@@ -1,4 +1,5 @@
-"""The simulated arm does what a controller's speedj does: it follows at once, holds still, and stops for good on a fault."""
+"""The simulated arm does what a controller's speedj does: it follows at once, holds still, and stops for good on a
+fault."""
 
 from __future__ import annotations
 

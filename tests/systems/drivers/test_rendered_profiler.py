@@ -1,4 +1,5 @@
-"""The simulated profiler: its rays meet the true geometry to a micron, it loses what a real one loses, and its time is right."""
+"""The simulated profiler: its rays meet the true geometry to a micron, it loses what a real one loses, and its time is
+right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The simulated scanner: pixel centres where OpenCV has them, one cloud per trigger, and the same noise for the same seed."""
+"""The simulated scanner: pixel centres where OpenCV has them, one cloud per trigger, and the same noise for the same
+seed."""
 
 from __future__ import annotations
 
@@ -120,8 +121,8 @@ def the_face(scan: Scan) -> np.ndarray:
 def height_and_middle(p_Plate: np.ndarray, face: np.ndarray) -> tuple[float, np.ndarray]:
     """Mean height of the face over its plane, and the middle of what is seen of it, from its four edges: (2,) m.
 
-    The outermost pixels lie up to a pixel inside an edge; the edges run askew, so over many rows and columns that averages
-    to half a pixel on either side, which the middle is free of.
+    The outermost pixels lie up to a pixel inside an edge; the edges run askew, so over many rows and columns that
+    averages to half a pixel on either side, which the middle is free of.
     """
     middle = []
     for axis, lines, seen in ((0, p_Plate, face), (1, p_Plate.transpose(1, 0, 2), face.T)):

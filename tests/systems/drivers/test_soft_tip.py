@@ -1,4 +1,5 @@
-"""The simulated soft tip seats itself in a groove, and sits there as deep and as far aside as the tool's numbers say."""
+"""The simulated soft tip seats itself in a groove, and sits there as deep and as far aside as the tool's numbers
+say."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ AXIAL_M, LATERAL_M = 0.003, 0.002  # how hard the job presses
 
 
 class Groove:
-    """The straight groove of the plain station: where a hard ball of the tip's size would rest in it, and its own axes."""
+    """The straight groove of the plain station: where a hard ball of the tip's size would rest in it, and its own
+    axes."""
 
     def __init__(self) -> None:
         truth = plain_station().truth
@@ -48,7 +50,8 @@ def groove() -> Groove:
 
 
 def pressed(groove: Groove, depth_m: float, left_m: float = 0.0) -> Drive:
-    """The tool's rest point `depth_m` below and `left_m` beside the seat, its tip let go just above the groove's walls."""
+    """The tool's rest point `depth_m` below and `left_m` beside the seat, its tip let go just above the groove's
+    walls."""
     drive = Drive(plain_station())
     p_BT = groove.p_BSeat - depth_m * groove.up + left_m * groove.left
     X_BF = RigidTransform(groove.X_BT_axes, p_BT) @ TOOL.X_FT.inverse()
@@ -104,7 +107,8 @@ def sliding(groove: Groove) -> tuple[np.ndarray, np.ndarray]:
 
 def test_friction_drags_it_behind_and_nothing_else_does(sliding: tuple[np.ndarray, np.ndarray]) -> None:
     _, deflection = sliding
-    # Coulomb friction of 0.2 on two walls at 22.5 degrees: of the axial force of 1 N some 0.2 / sin(22.5 deg) comes back.
+    # Coulomb friction of 0.2 on two walls at 22.5 degrees: of the axial force of 1 N some 0.2 / sin(22.5 deg) comes
+    # back.
     expected = 0.2 / np.sin(np.radians(22.5)) * TOOL.axial_stiffness_N_per_m * deflection[2]
     assert -deflection[0] * TOOL.lateral_stiffness_N_per_m == pytest.approx(expected, rel=0.4)
 

@@ -1,4 +1,5 @@
-"""The touch probe without a controller: the world's contact and wire, and what the driver makes of the input's samples."""
+"""The touch probe without a controller: the world's contact and wire, and what the driver makes of the input's
+samples."""
 
 from __future__ import annotations
 

@@ -86,7 +86,8 @@ def test_a_controller_that_stood_still_is_on_the_map_again_within_a_second() -> 
 
 def test_a_controller_that_falls_behind_its_own_pace_is_followed() -> None:
     """An emulated one on a busy computer: its clock loses a fiftieth, or half a second at once."""
-    # The earliest package of the newest whole bin is at most a second old: a fiftieth of that, where the line was 1.2 s off.
+    # The earliest package of the newest whole bin is at most a second old: a fiftieth of that, where the line was 1.2 s
+    # off.
     assert abs(error_s(fed(60.0, drift=0.02), 60.0, drift=0.02)) < 0.025
     clock = fed(60.0)
     for k in range(int(250 * 4.0)):

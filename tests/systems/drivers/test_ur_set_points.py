@@ -1,4 +1,5 @@
-"""Set points of the power source: which level an analog output gets, what is refused, and that the torch waits for them."""
+"""Set points of the power source: which level an analog output gets, what is refused, and that the torch waits for
+them."""
 
 from __future__ import annotations
 

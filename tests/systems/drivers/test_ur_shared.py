@@ -68,7 +68,8 @@ def block(descriptor: int) -> Block:
 
 
 def newest(block: Block) -> tuple[float, ...] | None:
-    """Read while another process writes as fast as it can: on a busy computer each of a read's attempts may meet two writes."""
+    """Read while another process writes as fast as it can: on a busy computer each of a read's attempts may meet two
+    writes."""
     while True:
         with suppress(TornRead):
             return block.read()

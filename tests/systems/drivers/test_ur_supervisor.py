@@ -24,11 +24,11 @@ from weldcal.systems.drivers.ur.supervisor import (
     SAFEGUARD,
     SYSTEM_EMERGENCY,
     Action,
-    Command,
     Decision,
     Limits,
     RobotSample,
     Supervisor,
+    VelocityCommand,
 )
 
 PERIOD_S = 0.004
@@ -44,7 +44,8 @@ VELOCITY = np.array([0.1, 0.0, -0.05, 0.0, 0.0, 0.1])
 
 
 class Rig:
-    """A supervisor at 250 Hz, an arm that follows its commands, a cell that gives one every 8 ms; `lag_s` is the arm's."""
+    """A supervisor at 250 Hz, an arm that follows its commands, a cell that gives one every 8 ms; `lag_s` is the
+    arm's."""
 
     def __init__(self, limits: Limits = LIMITS, velocity: np.ndarray = VELOCITY, *, process: bool = False) -> None:
         self.supervisor = Supervisor(limits)
@@ -63,7 +64,7 @@ class Rig:
             guard=OBEYING,
             connected=True,
         )
-        self.command = Command(number=1, given_at=self.now, qd=velocity, process=process)
+        self.command = VelocityCommand(number=1, given_at=self.now, qd=velocity, process=process)
 
     def passes(self, seconds: float, *, state: bool = True, commands: bool = True) -> Decision:
         """So long with or without new states and commands; the last decision."""
@@ -87,7 +88,7 @@ class Rig:
 
     def told(self, qd: np.ndarray) -> Decision:
         """One pass with a new command."""
-        self.command = Command(number=self.command.number + 1, given_at=self.now + PERIOD_S, qd=qd)
+        self.command = VelocityCommand(number=self.command.number + 1, given_at=self.now + PERIOD_S, qd=qd)
         return self.one(commands=False)
 
 
@@ -150,7 +151,7 @@ def test_in_lockstep_a_controller_that_waited_has_not_jumped(rig: Rig) -> None:
     """Its time stood still for 0.7 s of the host's; a time that goes back is a fault even so."""
     patient = Supervisor(LIMITS.in_lockstep())
     for supervisor, fault in ((rig.supervisor, Fault.CLOCK_JUMPED), (patient, Fault.NONE)):
-        resting = Command(number=rig.command.number, given_at=rig.now, qd=np.zeros(6))
+        resting = VelocityCommand(number=rig.command.number, given_at=rig.now, qd=np.zeros(6))
         supervisor.step(rig.now, rig.robot, resting)
         later = replace(rig.robot, robot_time=rig.robot.robot_time + 0.002, fresh_at=rig.now + 0.7)
         assert supervisor.step(rig.now + 0.7, later, replace(resting, given_at=rig.now + 0.7)).fault is fault

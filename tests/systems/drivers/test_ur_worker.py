@@ -12,7 +12,7 @@ import pytest
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.shared import Given, Memory
-from weldcal.systems.drivers.ur.supervisor import OBEYING, PLAYING, RUNNING, Command, Limits, RobotSample
+from weldcal.systems.drivers.ur.supervisor import OBEYING, PLAYING, RUNNING, Limits, RobotSample, VelocityCommand
 from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.worker import Worker, WorkerConfig
 
@@ -138,5 +138,5 @@ def test_a_late_velocity_slows_the_arm_but_not_under_a_burning_torch(process: bo
     """The torch goes out first: an arm that slowed under it would burn a hole."""
     memory = memory_of()
     sample = RecordingRobot(memory, right=True).sample(100.0)
-    late = Command(number=1, given_at=99.94, qd=np.full(6, 0.1), process=process)
+    late = VelocityCommand(number=1, given_at=99.94, qd=np.full(6, 0.1), process=process)
     assert Worker(CONFIG, memory)._scaled(late, 100.0, sample).scale == scale

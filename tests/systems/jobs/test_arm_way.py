@@ -1,4 +1,5 @@
-"""A seam that the arm cannot follow is refused before anything moves; what the refusal advises, followed literally, is accepted."""
+"""A seam that the arm cannot follow is refused before anything moves; what the refusal advises, followed literally, is
+accepted."""
 
 from __future__ import annotations
 
@@ -136,7 +137,8 @@ def test_an_offered_turn_of_a_refused_placement_is_followed() -> None:
 
 
 def test_a_ring_is_welded_round_within_the_wrists_limits() -> None:
-    """From this start wrist 3 would reach -360 deg: it begins a whole turn higher, and turns back where the weld ends."""
+    """From this start wrist 3 would reach -360 deg: it begins a whole turn higher, and turns back where the weld
+    ends."""
     tool = load_tool(tool_file(Path("pipe"))).tool
     a = np.linspace(np.pi, 3.0 * np.pi, 361)
     out = np.column_stack([np.cos(a), np.sin(a), np.zeros(361)])

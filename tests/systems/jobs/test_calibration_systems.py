@@ -1,4 +1,5 @@
-"""Scan by scan: the ring is found where the arm holds it, X_BC comes of it, and a scan that is no use is refused by name."""
+"""Scan by scan: the ring is found where the arm holds it, X_BC comes of it, and a scan that is no use is refused by
+name."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ from weldcal.systems.jobs.weld.iterative_calibrator import (
     CalibrationPosePlanner,
     CalibratorConfig,
     IterativeCalibrator,
-    NextPose,
+    PoseRequest,
     digest,
     expected_error,
     verify_at,
@@ -288,7 +289,7 @@ def test_the_pose_planner_shows_the_next_pose_after_each_scan_and_none_when_they
     system = CalibrationPosePlanner(PLAN)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
-    shown: list[NextPose] = []
+    shown: list[PoseRequest] = []
     for k in range(4):
         status = CalibrationStatus(sequence=k)
         system.GetInputPort("calibration_status").FixValue(context, AbstractValue.Make(status))
@@ -301,5 +302,5 @@ def test_the_pose_planner_shows_the_next_pose_after_each_scan_and_none_when_they
 
 def test_a_planner_without_a_plan_has_nothing_to_show() -> None:
     system = CalibrationPosePlanner(())
-    next_pose: NextPose = system.GetOutputPort("next_pose").Eval(system.CreateDefaultContext())
+    next_pose: PoseRequest = system.GetOutputPort("next_pose").Eval(system.CreateDefaultContext())
     assert next_pose.q is None

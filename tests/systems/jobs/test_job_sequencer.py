@@ -1,4 +1,5 @@
-"""The job goes through its phases in order, only when each is done; whatever goes wrong, it holds and says why, for good."""
+"""The job goes through its phases in order, only when each is done; whatever goes wrong, it holds and says why, for
+good."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from pydrake.systems.analysis import Simulator
 
 from tests.systems.cells import Q_HOME
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, HeldOut
-from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import PoseRequest
 from weldcal.systems.jobs.weld.job import SHARES
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobInputs, JobPlan, JobSequencer, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
@@ -69,7 +70,7 @@ class World:
             robot=UrStatus(),
             settled_goal=0,
             q=Q_HOME,
-            next_pose=NextPose(0, 0, "pose01", Q_HOME),
+            next_pose=PoseRequest(0, 0, "pose01", Q_HOME),
             calibration_status=CalibrationStatus(),
             planned_seam=PlannedSeam(),
             servo_report=ServoReport(),
@@ -101,7 +102,7 @@ class World:
         counts = self.now.calibration_status.calibration_scans + int(self.command.scan_purpose == "calibrate")
         status = dc.replace(self.now.calibration_status, sequence=n, calibration_scans=counts, **changes)
         return self.look(
-            0.3, calibration_status=status, next_pose=NextPose(n, n, f"pose{n + 1:02d}", np.full(6, 0.01 * n))
+            0.3, calibration_status=status, next_pose=PoseRequest(n, n, f"pose{n + 1:02d}", np.full(6, 0.01 * n))
         )
 
 
@@ -234,9 +235,9 @@ def test_it_waits_for_the_arm_to_have_been_still_for_its_dwell_time() -> None:
 
 def test_it_does_not_go_to_a_pose_that_was_chosen_before_the_newest_scan() -> None:
     world = in_phase("scan_pose", purpose="calibrate")
-    old = NextPose(3, 3, "pose04", Q_HOME)
+    old = PoseRequest(3, 3, "pose04", Q_HOME)
     assert world.look(0.1, calibration_status=CalibrationStatus(sequence=4), next_pose=old) == "scan_pose"
-    assert world.look(0.1, next_pose=NextPose(4, 4, "pose05", Q_HOME)) == "move_to_pose"
+    assert world.look(0.1, next_pose=PoseRequest(4, 4, "pose05", Q_HOME)) == "move_to_pose"
 
 
 def test_the_camera_streams_before_the_tip_touches() -> None:
@@ -250,7 +251,7 @@ def status(**changes: Any) -> CalibrationStatus:
     return CalibrationStatus(sequence=4, **changes)
 
 
-NO_POSE = NextPose(4, 14, "pose15", None)
+NO_POSE = PoseRequest(4, 14, "pose15", None)
 HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
     "protective stop": (
         "weld",
@@ -291,7 +292,10 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         "scan_pose",
         0.1,
         {"calibration_status": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.023e-3)},
-        r"^Only 0 of 8 scans could be used, and the calibration needs 6 .*0\.023 mm at the work point, within the required 0\.100 mm",
+        (
+            r"^Only 0 of 8 scans could be used, and the calibration needs 6 .*0\.023 mm at the work point, within the"
+            r" required 0\.100 mm"
+        ),
     ),
     "no calibration at all": (
         "scan_pose",
@@ -386,7 +390,7 @@ def test_the_system_passes_its_command_on_to_everyone() -> None:
     context = simulator.get_mutable_context()
     for name, value in {
         "robot_status": UrStatus(),
-        "next_pose": NextPose(),
+        "next_pose": PoseRequest(),
         "calibration_status": CalibrationStatus(),
         "planned_seam": PlannedSeam(),
         "servo_report": ServoReport(),
@@ -416,11 +420,9 @@ def test_the_system_passes_its_command_on_to_everyone() -> None:
 def test_the_progress_told_of_a_run_never_falls_from_phase_to_phase() -> None:
     told = [SHARES[phase] for phase in PHASES if phase in SHARES]
     assert told == sorted(told)
-    assert set(PHASES) - set(SHARES) == {
-        "move_to_verification_cloud",
-        "scan_verification_cloud",
-        "scan_pose",
-    }, "these and move_to_pose are told by the number of scans"
+    assert set(PHASES) - set(SHARES) == {"move_to_verification_cloud", "scan_verification_cloud", "scan_pose"}, (
+        "these and move_to_pose are told by the number of scans"
+    )
 
 
 def test_a_scanner_that_moved_holds_the_job_before_the_weld_and_warns_during_it() -> None:

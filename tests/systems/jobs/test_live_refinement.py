@@ -1,4 +1,5 @@
-"""A live calibration is refined once its scans are enough, and the corrected arm is the one that the cell believes from then on."""
+"""A live calibration is refined once its scans are enough, and the corrected arm is the one that the cell believes from
+then on."""
 
 from __future__ import annotations
 
@@ -27,10 +28,10 @@ from weldcal.systems.scenario.arm import corrected_arm
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.wrong_arm import Station, station
+from weldcal.tools.worlds.wrong_arm import WrongArmStation, station
 
 
-def status_of(world: Station) -> CalibrationStatus:
+def status_of(world: WrongArmStation) -> CalibrationStatus:
     """The live calibration of a light world, before it is refined."""
     seen = tuple(world.observations)
     return CalibrationStatus(observations=seen, joints=tuple(world.q), estimate=estimate_jointly(seen)[0], done=True)
@@ -40,7 +41,7 @@ def flange(arm: ArmModel, q: Array) -> Array:
     return np.array([forward_kinematics(arm, each).translation() for each in q])
 
 
-def new_errors(status: CalibrationStatus, world: Station) -> Array:
+def new_errors(status: CalibrationStatus, world: WrongArmStation) -> Array:
     """Errors at new scans, m, where the arm that the cell believes says that it is."""
     arm, X_BC = status.arm_or(load_arm("ur10e")), status.X_BC
     assert X_BC is not None
@@ -69,7 +70,8 @@ def test_the_arm_s_errors_are_found_and_its_new_poses_agree_with_new_scans() -> 
 
 
 def test_a_wrong_factory_file_is_found_out_and_what_cannot_be_refined_stays_plain(tmp_path: Path) -> None:
-    """The controller computes with another robot's file; the sentence says so, and the file written for it is the cell's afterwards."""
+    """The controller computes with another robot's file; the sentence says so, and the file written for it is the
+    cell's afterwards."""
     world = station(43, scans=14, links=False, size=20.0)
     arm = load_arm("ur10e")
     found = refined_status(status_of(world), "joints", arm, True).refinement
@@ -89,9 +91,9 @@ def test_a_wrong_factory_file_is_found_out_and_what_cannot_be_refined_stays_plai
     assert "need 12 usable poses, and there are 8" in kept.refinement.sentence
 
 
-def _turned_away(arm: ArmModel, world: Station) -> float:
-    """Mean distance (m) of the flange's travel between new poses from the true arm's: the first joint's zero, which no scan shows, drops out
-    of lengths."""
+def _turned_away(arm: ArmModel, world: WrongArmStation) -> float:
+    """Mean distance (m) of the flange's travel between new poses from the true arm's: the first joint's zero, which no
+    scan shows, drops out of lengths."""
     true = flange_poses(load_chain("ur10e"), world.new_q, world.errors)[:, :3, 3]
     p = flange(arm, world.new_q)
     lengths = [np.linalg.norm(x[:, None] - x[None], axis=2) for x in (p, true)]

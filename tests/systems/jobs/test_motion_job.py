@@ -111,7 +111,8 @@ def test_no_frame_is_dropped_in_simulation() -> None:
 
 
 def streamed() -> tuple[dict[int, float], dict[int, float], dict[int, StreamedScan]]:
-    """When each frame was on the port, when it was captured, and the frame, of a quarter of a second of a turning arm."""
+    """When each frame was on the port, when it was captured, and the frame, of a quarter of a second of a turning
+    arm."""
     found = scenario()
     found.scanner = StreamingScanner(width=480, height=360, exposure_samples=3, jitter_ms=0.0, delay_ms=100.0)
     station = make_station(found, 0)

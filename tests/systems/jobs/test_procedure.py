@@ -22,7 +22,7 @@ from weldcal.systems.jobs.profiler.plan import Goal, JointPath, PlanningContext
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
-from weldcal.systems.jobs.touch.planner import Place, PlannedTouches
+from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchPlace
 from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
@@ -90,7 +90,7 @@ def touch() -> Descent:
     motion = TouchMotion(
         q_home=Q_HOME, descent_m_s=0.02, press_m=1e-3, deepest_m=9.0, move_timeout_s=20.0, maximum_time_s=99.0
     )
-    place = Place(Q_HOME, np.zeros(3), -ASLANT, 1e-5, np.zeros(3), -ASLANT)
+    place = TouchPlace(Q_HOME, np.zeros(3), -ASLANT, 1e-5, np.zeros(3), -ASLANT)
     state = TouchState(phase="descend", places=(place,), zero=np.zeros(3))
     p_FT = np.array(TOOL.X_FT.translation())
     told = {"planned_touches": PlannedTouches(), "deformation": Deformation()}

@@ -1,4 +1,5 @@
-"""Errors of an arm between tip and torch at the same place: as large as arms drawn with such errors have them, and larger in a bend."""
+"""Errors of an arm between tip and torch at the same place: as large as arms drawn with such errors have them, and
+larger in a bend."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def fillet(radius_m: float) -> SeamCurve:
-    """A seam round a pipe that stands on a plate 0.65 m before the robot, its bisector 45 deg up and away from the pipe."""
+    """A seam round a pipe that stands on a plate 0.65 m before the robot, its bisector 45 deg up and away from the
+    pipe."""
     angle = (np.linspace(0.0, LENGTH_M, 80) - 0.5 * LENGTH_M) / radius_m
     out = np.column_stack([-np.cos(angle), np.sin(angle), np.zeros(len(angle))])
     middle = np.array([0.65 + radius_m, 0.0, 0.02])
@@ -39,7 +41,8 @@ STRAIGHT = SeamCurve.from_points(
 
 
 def drawn(radius_m: float, arms: int) -> Array:
-    """(arms,) m: rms distance of the torch from the line that the tip felt on the pipe, for arms with the prior's errors.
+    """(arms,) m: rms distance of the torch from the line that the tip felt on the pipe, for arms with the prior's
+    errors.
 
     By the forward kinematics of each arm, at postures on a circle about which the whole tool turns.
     """
@@ -98,7 +101,8 @@ def test_it_grows_with_the_curvature() -> None:
 
 
 def test_of_an_arm_whose_links_are_known_only_the_unseen_turn_of_the_flange_is_left() -> None:
-    """The first joint moves tip and torch alike; the last one's zero, which no flange shows, turns the torch about the tip."""
+    """The first joint moves tip and torch alike; the last one's zero, which no flange shows, turns the torch about the
+    tip."""
     which = arm_errors(chain_of(ARM), "links").which
     size = 6 + len(which)  # X_BC first
     known = {"which": which.tolist(), "covariance": np.zeros((size, size)).tolist()}

@@ -20,7 +20,7 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, link_frames
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.touch.job import AddedTouches
-from weldcal.systems.jobs.touch.planner import Place, PlannedTouches, TouchConfig, TouchPlanning, plan_touches
+from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchConfig, TouchPlace, TouchPlanning, plan_touches
 from weldcal.systems.jobs.touch.procedure import FRAMES, Felt, TouchInputs, TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.arm_way import CLEAR_OF_PART_M
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
@@ -66,7 +66,8 @@ def test_the_places_are_on_the_flat_face_on_both_sides_and_the_tip_stands_above_
 
 
 def test_a_face_that_seems_tilted_by_three_degrees_does_not_refuse_a_place(planned: PlannedTouches) -> None:
-    """The torch hangs as low as the tip, 60 mm from it: a few points of noise in the scanned face must not bring it to the part."""
+    """The torch hangs as low as the tip, 60 mm from it: a few points of noise in the scanned face must not bring it to
+    the part."""
     told = scenario(SMALL_IDEAL_SCANNER, EXACT_PLATE)
     station = plain_station()
     seam = seam_planning(told, station, servo_config(told, station))
@@ -179,7 +180,7 @@ def test_the_touches_of_a_true_calibration_agree_with_the_scan_and_go_through_th
         assert np.abs(judge_touches(result, each).error_m).max() < 2e-5
 
 
-def _joints_at(place: Place, height_m: float) -> np.ndarray:
+def _joints_at(place: TouchPlace, height_m: float) -> np.ndarray:
     """Joints that put the tip at rest this high over a place."""
     above = forward_kinematics(the_arm(), place.q_above) @ TOOL.X_FT
     wanted = RigidTransform(above.rotation(), np.add(place.p_B, height_m * place.n_B)) @ TOOL.X_FT.inverse()
@@ -188,7 +189,7 @@ def _joints_at(place: Place, height_m: float) -> np.ndarray:
     return np.asarray(q)
 
 
-def _felt(place: Place, q: np.ndarray, given_way: float) -> Felt:
+def _felt(place: TouchPlace, q: np.ndarray, given_way: float) -> Felt:
     return Felt(place, q, np.array([0.0, 0.0, given_way]))
 
 

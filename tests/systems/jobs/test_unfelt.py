@@ -1,4 +1,5 @@
-"""What is stated across a seam that the tip does not feel: as large as errors of arms and calibrations are, and refused where too large."""
+"""What is stated across a seam that the tip does not feel: as large as errors of arms and calibrations are, and refused
+where too large."""
 
 from __future__ import annotations
 
@@ -108,7 +109,8 @@ def root_at(point: Array, along: Array, part_m: float) -> RootPlan:
 
 
 def squared(widened: float, worlds: int = 16) -> float:
-    """Mean square of the error across a seam in units of its stated sigma (times `widened`), over calibrations of wrong arms and scanners.
+    """Mean square of the error across a seam in units of its stated sigma (times `widened`), over calibrations of wrong
+    arms and scanners.
 
     The truth is where the arm itself says that the flange is at new postures, and where the calibrated scanner puts it.
     """

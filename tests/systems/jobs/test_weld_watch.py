@@ -1,4 +1,5 @@
-"""The weld job with a scanner that streams: its stand is knocked in the simulated world; before the weld that holds, in it warns."""
+"""The weld job with a scanner that streams: its stand is knocked in the simulated world; before the weld that holds, in
+it warns."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ POSE = "X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"
 
 
 def knocked(knock_s: float, speed_factor: float, fps: float) -> DemoResult:
-    """A weld with a stated pose whose scanner is knocked; the run ends with the job, or as by Ctrl-C when the move is measured."""
+    """A weld with a stated pose whose scanner is knocked; the run ends with the job, or as by Ctrl-C when the move is
+    measured."""
     scanner = (
         "scanner: !StreamingScanner {width: 400, height: 300, exposure_samples: 1, mounting_translation_mm: 0.0,"
         f" mounting_rotation_deg: 0.0, fps: {fps}, knock_s: {knock_s}, knock_mm: {KNOCK_MM}}}"

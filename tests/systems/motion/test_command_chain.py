@@ -261,12 +261,7 @@ def test_a_job_that_takes_the_weld_back_leaves_no_motion_behind() -> None:
 
 
 @pytest.mark.parametrize(
-    ("job", "on"),
-    [
-        (WELD, 1.0),
-        (dc.replace(WELD, process_on=False), 0.0),
-        (dc.replace(WELD, held=True), 0.0),
-    ],
+    ("job", "on"), [(WELD, 1.0), (dc.replace(WELD, process_on=False), 0.0), (dc.replace(WELD, held=True), 0.0)]
 )
 def test_the_torch_needs_the_jobs_consent_in_the_same_tick(job: JobCommand, on: float) -> None:
     servo = Servo()

@@ -1,5 +1,5 @@
-"""DriftMonitor: a knock raises `moved`, is measured, and the recalibrated pose is the new one; all state is in the Context.
-The scanner's clock is learnt where the calibration's is of another run."""
+"""DriftMonitor: a knock raises `moved`, is measured, and the recalibrated pose is the new one; all state is in the
+Context. The scanner's clock is learnt where the calibration's is of another run."""
 
 import dataclasses as dc
 
@@ -118,7 +118,8 @@ def test_a_recalibration_takes_the_new_pose(run: tuple[list[DriftStatus], list[f
 
 
 def watched(clock: ScannerClock | None, at_0_s: float, late_s: Array) -> DriftStatus:
-    """The status at 14 s of a scanner whose clock reads `at_0_s` at 0, and whose frames came `late_s` (n,) later than usual."""
+    """The status at 14 s of a scanner whose clock reads `at_0_s` at 0, and whose frames came `late_s` (n,) later than
+    usual."""
     rng = np.random.default_rng(2)
     calibration = MonitoredCalibration(X_BC, np.diag([1e-9] * 6), clock=clock, delay_s=DELAY_S)
     monitor = DriftMonitor(ARM, RigidTransform(), calibration)
@@ -171,7 +172,10 @@ def test_one_knock_is_found_whatever_the_calibration_says_of_the_clock(
 
 @pytest.mark.parametrize(("set_by_s", "lost"), [(-70.0, 0), (1.2, 0), (-1.2, 62)], ids=["anew", "forward", "back"])
 def test_a_clock_that_is_set_is_learnt_again(set_by_s: float, lost: int) -> None:
-    """Nothing moves: what the second half shows is another device clock. One that was set back a little may be late for 3 s."""
+    """Nothing moves: what the second half shows is another device clock.
+
+    One that was set back a little may be late for 3 s.
+    """
     calibration = MonitoredCalibration(X_BC, np.diag([1e-9] * 6), delay_s=DELAY_S)
     monitor = DriftMonitor(ARM, RigidTransform(), calibration)
     context, rng = monitor.CreateDefaultContext(), np.random.default_rng(3)

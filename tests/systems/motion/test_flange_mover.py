@@ -29,7 +29,8 @@ def test_the_path_goes_from_rest_to_rest() -> None:
     assert q[0] == pytest.approx(Q_HOME)
     assert q[-1] == pytest.approx(GOAL)
     assert v[[0, -1]] == pytest.approx(0.0, abs=1e-12)
-    # It starts and ends without a jerk in acceleration, too: over the first and last thousandth it gains next to nothing.
+    # It starts and ends without a jerk in acceleration, too: over the first and last thousandth it gains next to
+    # nothing.
     assert np.abs(v[[10, -11]]).max() < 1e-5
     assert q[len(q) // 2] == pytest.approx(0.5 * (Q_HOME + GOAL))
 
@@ -147,8 +148,8 @@ def test_a_new_goal_starts_from_where_the_arm_is() -> None:
 
 
 def settled(turns_rad_s: float) -> float:
-    """The settled goal 3 s after a move to where the arm is, where each joint is measured to turn at 2 mrad/s, and swings about its goal at
-    this speed.
+    """The settled goal 3 s after a move to where the arm is, where each joint is measured to turn at 2 mrad/s, and
+    swings about its goal at this speed.
     """
     mover = FlangeMover()
     simulator = Simulator(mover)

@@ -1,4 +1,5 @@
-"""A planned motion is refused where the guard would slow or stop the arm, with the place and the joint; the drive shows who is right."""
+"""A planned motion is refused where the guard would slow or stop the arm, with the place and the joint; the drive shows
+who is right."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def drive(arm: ArmModel, q: Array, motion: GuardedMotion) -> tuple[str | None, float, Array]:
-    """How the guard's joint velocities end when they follow a straight motion: reason, least share, and the way (3,) m that was made."""
+    """How the guard's joint velocities end when they follow a straight motion: reason, least share, and the way (3,) m
+    that was made."""
     carrier = GuardedArm(arm=arm, X_FT=motion.X_FT, q=q)
     p = np.array([X.translation() for X in motion.X_BT])
     V = np.r_[np.zeros(3), (p[-1] - p[0]) / motion.time[-1]]

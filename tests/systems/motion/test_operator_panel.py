@@ -1,4 +1,5 @@
-"""The panel brings a person's wishes and the viewer's controls into the Diagram; the viewer can hold and set the pace, no more."""
+"""The panel brings a person's wishes and the viewer's controls into the Diagram; the viewer can hold and set the pace,
+no more."""
 
 from __future__ import annotations
 

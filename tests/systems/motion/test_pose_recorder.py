@@ -1,4 +1,5 @@
-"""A sensor's datum meets the pose of its own time, between samples too, and a time that is not remembered has no pose."""
+"""A sensor's datum meets the pose of its own time, between samples too, and a time that is not remembered has no
+pose."""
 
 from __future__ import annotations
 

@@ -127,10 +127,7 @@ class Alone:
         return on, stopped
 
 
-STOPS = {
-    "margin": ([0.02, 1.0], [0.5, 0.0]),
-    "robot_status": (UrStatus(safety_mode="PROTECTIVE_STOP"), UrStatus()),
-}
+STOPS = {"margin": ([0.02, 1.0], [0.5, 0.0]), "robot_status": (UrStatus(safety_mode="PROTECTIVE_STOP"), UrStatus())}
 
 
 @pytest.mark.parametrize("name", STOPS)

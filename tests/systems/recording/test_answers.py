@@ -1,4 +1,5 @@
-"""Answers of computations beside the control loop come as late in a replay as they came in the run, also when they are noted again."""
+"""Answers of computations beside the control loop come as late in a replay as they came in the run, also when they are
+noted again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What a person sees: Meshcat gets a board for every phase, each belief as it comes, and a recording that opens by itself."""
+"""What a person sees: Meshcat gets a board for every phase, each belief as it comes, and a recording that opens by
+itself."""
 
 from __future__ import annotations
 
@@ -158,7 +159,8 @@ X_BC = RigidTransform(RollPitchYaw(np.pi, 0.0, -np.pi / 2), [0.65, 0.0, 0.95])
 
 
 def calibrated(sigma_m: float, inliers: list[bool], above_m: float = 0.0) -> CalibrationStatus:
-    """A calibration by as many scans, whose flange face was seen `above_m` above the arm's; isotropic error of the position."""
+    """A calibration by as many scans, whose flange face was seen `above_m` above the arm's; isotropic error of the
+    position."""
     n = len(inliers)
     X_BR = X_BC @ RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 0.6 + above_m])
     seen = tuple(Observation(f"pose{k + 1:02d}", X_BR, FIT.center_C) for k in range(n))

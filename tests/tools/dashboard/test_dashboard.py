@@ -1,4 +1,5 @@
-"""The dashboard in a real browser: state, hold, go on, end, plots; what it refuses; what a phone and the network see."""
+"""The dashboard in a real browser: state, hold, go on, end, plots; what it refuses; what a phone and the network
+see."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
 from tests.browser import Browser, Pixels, colours
-from weldcal.systems.jobs.weld.iterative_calibrator import NextPose
+from weldcal.systems.jobs.weld.iterative_calibrator import PoseRequest
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
 from weldcal.systems.person import Person
@@ -30,7 +31,7 @@ from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.dashboard.facts import Facts
 from weldcal.tools.dashboard.server import Dashboard
 from weldcal.tools.dashboard.source import DashboardSource
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, ShownPose, Tolerance
 from weldcal.tools.report.run import RunOptions
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
@@ -53,7 +54,7 @@ FACTS = Facts(
 SEAM = SeamCurve.from_points(np.linspace([0.5, 0.0, 0.0], [0.6, 0.0, 0.0], 40))
 RESULT = FirstScreen(
     Findings(tolerance=Tolerance("the error", 0.2, 0.3, "--limit-mm"), unseen=8),
-    Expected("error at the work point, 95 %", "0.213 mm", "8 unseen poses"),
+    ExpectedError("error at the work point, 95 %", "0.213 mm", "8 unseen poses"),
     Next("See it again."),
     (ShownPose("X_BC", "pose of the scanner C in the robot's base B", RigidTransform([0.65, 0.0, 0.95])),),
     {"torch": "0.025 mm (95 % of the weld)"},
@@ -66,7 +67,7 @@ def calibrating(live: LiveView) -> None:
     status = CalibrationStatus(
         sequence=4, calibration_scans=3, predicted_error_m=0.21e-3, refused=(("pose02", "no flange in the scan"),)
     )
-    shown = {"calibration_status": status, "next_pose": NextPose(4, 4, "pose05", np.zeros(6))}
+    shown = {"calibration_status": status, "next_pose": PoseRequest(4, 4, "pose05", np.zeros(6))}
     live.moment = Moment(12.0, JobCommand(phase="move_to_pose", mode="move"), shown)
     live.scans[:] = [ScanRow(1, math.inf, math.nan), ScanRow(2, 0.6e-3, 0.5e-3), ScanRow(3, 0.21e-3, 0.2e-3)]
 
@@ -294,7 +295,10 @@ def test_the_page_keeps_result_report_and_replay_when_the_program_has_ended(
         assert words in text.lower(), words
     assert browser.run("return document.getElementById('state').textContent") == "DONE"
     assert not browser.run("return document.getElementById('live_view').offsetHeight"), "its server is gone"
-    bar = "const r = document.querySelector('.replay').getBoundingClientRect(); const f = loaded['recording.html'].getBoundingClientRect();"
+    bar = (
+        "const r = document.querySelector('.replay').getBoundingClientRect(); const f ="
+        " loaded['recording.html'].getBoundingClientRect();"
+    )
     assert browser.run(bar + "return r.bottom <= f.top + 1 && f.height > 200"), "nothing covers REPLAY"
     pixels = browser.screenshot(tmp_path / f"done_{size}.png", until=lambda picture: colours(picture) > 60)
     assert colours(pixels) > 60, "the replay is drawn"
@@ -366,7 +370,8 @@ def test_the_network_reads_with_a_token_and_cannot_act(
 def test_a_page_that_is_over_answers_nothing_on_connections_that_a_browser_keeps(
     source: DashboardSource, view: Meshcat
 ) -> None:
-    """The next run's page may have the same port: a request on such a connection would be answered by the page before it."""
+    """The next run's page may have the same port: a request on such a connection would be answered by the page before
+    it."""
     dashboard = Dashboard(source, view.web_url())
     address = dashboard.url.split("/")[2].split(":")
     with socket.create_connection((address[0], int(address[1])), timeout=5) as kept:

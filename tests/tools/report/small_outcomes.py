@@ -277,12 +277,7 @@ def _demo(estimate: Any, *, held: bool, begun: bool = True) -> Made:
     sequencer = SimpleNamespace(
         GetMyContextFromRoot=lambda root: root, state_in=lambda context: SimpleNamespace(warnings=("A remark.",))
     )
-    run = _run(
-        "calibrate_only",
-        sequencer=sequencer,
-        drift=lambda root: None,
-        planned_seam=lambda root: PlannedSeam(),
-    )
+    run = _run("calibrate_only", sequencer=sequencer, drift=lambda root: None, planned_seam=lambda root: PlannedSeam())
     if held:
         run.held, run.reason = True, "The tag was lost."
     if not begun:
@@ -405,9 +400,9 @@ def tablet() -> Made:
 def finger() -> Made:
     """`finger calibrate` with touches."""
     from weldcal.tools.commands.cell.finger import FingerReport, finger_page
-    from weldcal.welding.finger.calibration import Intrinsics, TipCalibration
+    from weldcal.welding.finger.calibration import FingerIntrinsics, TipCalibration
 
-    camera = Intrinsics(
+    camera = FingerIntrinsics(
         K=np.diag([900.0, 900.0, 1.0]),
         distortion=np.zeros(5),
         width=640,

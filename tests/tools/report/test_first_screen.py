@@ -1,4 +1,5 @@
-"""The first screen: which of three verdicts, at most three things that could be wrong, and the same lines on the terminal."""
+"""The first screen: which of three verdicts, at most three things that could be wrong, and the same lines on the
+terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from weldcal.tools.report.first_screen import (
     CARE,
     DO_NOT,
     USE,
-    Expected,
+    ExpectedError,
     Findings,
     FirstScreen,
     Next,
@@ -37,7 +38,7 @@ X = RigidTransform(RollPitchYaw(0.3, -0.7, 2.0), [0.65, -0.02, 0.94])
 
 def screen(found: Findings) -> FirstScreen:
     """A first screen of these findings."""
-    expected = Expected("error at the work point, 95 %", "0.213 mm", "8 unseen poses")
+    expected = ExpectedError("error at the work point, 95 %", "0.213 mm", "8 unseen poses")
     after = Next("Verify it.", "weldcal verify out NEW_SCANS")
     return FirstScreen(found, expected, after, (ShownPose("X_BC", "pose of the scanner C in the robot's base B", X),))
 

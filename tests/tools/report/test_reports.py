@@ -1,4 +1,5 @@
-"""Every report of a command that computes a pose: one well-formed file without a network, with the same first screen."""
+"""Every report of a command that computes a pose: one well-formed file without a network, with the same first
+screen."""
 
 from __future__ import annotations
 

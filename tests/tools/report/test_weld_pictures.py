@@ -1,4 +1,5 @@
-"""The pictures of a weld: zero is marked where the measure passes it, and a weld that lacks something is still drawn."""
+"""The pictures of a weld: zero is marked where the measure passes it, and a weld that lacks something is still
+drawn."""
 
 from __future__ import annotations
 

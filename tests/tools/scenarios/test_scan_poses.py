@@ -1,4 +1,5 @@
-"""A part larger than one scan: its scan poses are proposed, and it is welded from all scans; a scan that is off is refused."""
+"""A part larger than one scan: its scan poses are proposed, and it is welded from all scans; a scan that is off is
+refused."""
 
 import json
 from pathlib import Path

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.motion.drift import Trial, _watched, expected_late, found_by_angle, knock_trial
+from weldcal.tools.studies.motion.drift import DriftTrial, _watched, expected_late, found_by_angle, knock_trial
 from weldcal.tools.worlds.features import Change, WorldConfig
 
 
@@ -34,7 +34,7 @@ def test_a_trial_says_what_the_change_was() -> None:
 
 def test_a_turn_about_the_line_of_sight_shows_least() -> None:
     trials = [
-        Trial(
+        DriftTrial(
             kind="turn",
             seed=k,
             along_view=view,
@@ -65,7 +65,8 @@ def test_a_turn_about_the_line_of_sight_shows_least() -> None:
 
 
 def test_what_is_known_of_other_errors_bounds_what_a_test_that_is_told_all_else_finds() -> None:
-    """What the monitor does not know of arm and scanner can only hide a change; one that shows at four thresholds is never late."""
+    """What the monitor does not know of arm and scanner can only hide a change; one that shows at four thresholds is
+    never late."""
     sure = knock_trial(WorldConfig(), 2, turn=False)
     assert 1.0 < sure.told < sure.shown
     assert expected_late([sure]) < 1e-3

@@ -110,7 +110,7 @@ def test_a_gigabyte_and_ten_times_the_file_are_allowed() -> None:
 
 
 def test_findings_are_kept_and_end_in_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Child, "ask", lambda self, reader, seed, case: (cases.Verdict(WRONG, "x"), 0.1))
+    monkeypatch.setattr(Child, "ask", lambda self, reader, seed, case: (cases.ReaderVerdict(WRONG, "x"), 0.1))
     result = fuzz.fuzz_files(READERS[:1], 2, 0, tmp_path)
     assert result.summary()["state"] == "failed"
     assert "silently wrong" in str(result.summary()["reason"])

@@ -12,7 +12,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.tools.studies.flange.live import live_scenario
 from weldcal.tools.studies.flange.recorded import median_sigma, study_few_scans
-from weldcal.tools.worlds.redrawn import Station, bound_covariance, joints_of, redraw
+from weldcal.tools.worlds.redrawn import RedrawnStation, bound_covariance, joints_of, redraw
 
 DATA = SHARED_DATA / "flange"
 Q_HOME = np.deg2rad([180.0, -70.0, 120.0, -50.0, 90.0, 0.0])
@@ -30,9 +30,9 @@ def _observations(n: int, center_sigma_m: float = 1e-5) -> tuple[Observation, ..
     return tuple(out)
 
 
-def _station(observations: tuple[Observation, ...], repeatability_m: float) -> Station:
+def _station(observations: tuple[Observation, ...], repeatability_m: float) -> RedrawnStation:
     arm = load_arm("ur10e")
-    return Station(arm, joints_of(observations, arm, Q_HOME), repeatability_m, X_CB.inverse(), WORK)
+    return RedrawnStation(arm, joints_of(observations, arm, Q_HOME), repeatability_m, X_CB.inverse(), WORK)
 
 
 def _bound(observations: tuple[Observation, ...], repeatability_m: float) -> tuple[float, float]:

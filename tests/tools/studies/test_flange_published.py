@@ -1,4 +1,5 @@
-"""The flange study: its batch is the published algorithm, its traced pools are the true ones, its claims hold on the data."""
+"""The flange study: its batch is the published algorithm, its traced pools are the true ones, its claims hold on the
+data."""
 
 from __future__ import annotations
 

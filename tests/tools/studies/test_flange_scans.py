@@ -1,4 +1,5 @@
-"""Studies of simulated flanges: found wherever one shows, no hole pattern turned wrongly, stated regions hold the truth."""
+"""Studies of simulated flanges: found wherever one shows, no hole pattern turned wrongly, stated regions hold the
+truth."""
 
 from __future__ import annotations
 

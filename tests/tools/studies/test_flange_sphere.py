@@ -1,4 +1,5 @@
-"""The sphere of Table 2 beside the flange: both are measured in one scan, and the sphere's calibration needs its place on the flange."""
+"""The sphere of Table 2 beside the flange: both are measured in one scan, and the sphere's calibration needs its place
+on the flange."""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ BARS = {
     "visp_franka_eye_in_hand": (0.6432, 5.623),
 }
 MARGIN = 1.02
-# Two small sets (15 and 8 poses) miss the margin by what docs/hand_eye.md states; a third one, or more on these, is a fault.
+# Two small sets (15 and 8 poses) miss the margin by what docs/hand_eye.md states; a third one, or more on these, is a
+# fault.
 BEHIND = {"ros_industrial_circle_grid_camera_on_wrist": 1.029, "visp_franka_eye_in_hand": 1.033}
 
 

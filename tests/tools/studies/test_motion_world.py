@@ -1,4 +1,5 @@
-"""The simulated world of calibration in motion: exact motion, pixels of their own times, skewed delays, a truth kept apart."""
+"""The simulated world of calibration in motion: exact motion, pixels of their own times, skewed delays, a truth kept
+apart."""
 
 from __future__ import annotations
 

@@ -17,12 +17,12 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.studies.parts.welds import run_part_welds
-from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
 
 
 def test_a_refined_cell_calibrates_scanner_and_arm_before_it_welds(tmp_path: Path) -> None:
-    trial = Trial.of("scan", refine="links", arm_mm=0.7)
+    trial = PartTrial.of("scan", refine="links", arm_mm=0.7)
     scenario = trial.scenario(write_cell(PARTS["straight_web"](), tmp_path, trial))
     assert scenario.job.calibrate
     assert scenario.job.weld
@@ -33,7 +33,7 @@ def test_a_refined_cell_calibrates_scanner_and_arm_before_it_welds(tmp_path: Pat
 
 
 def test_without_it_the_scanners_pose_is_given(tmp_path: Path) -> None:
-    trial = Trial()
+    trial = PartTrial()
     scenario = trial.scenario(write_cell(PARTS["straight_web"](), tmp_path, trial))
     assert not scenario.job.calibrate
     assert scenario.job.X_BC is not None
@@ -43,7 +43,7 @@ def test_without_it_the_scanners_pose_is_given(tmp_path: Path) -> None:
 
 def test_another_refinement_is_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"calibration.refine must be .*, not 'wrists'"):
-        run_part_welds(tmp_path, ["straight_web"], range(1), Trial(refine="wrists"))
+        run_part_welds(tmp_path, ["straight_web"], range(1), PartTrial(refine="wrists"))
 
 
 def of_plan(sigma_m: float, refinement: Refinement | None = None) -> DemoResult:

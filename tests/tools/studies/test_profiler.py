@@ -1,4 +1,5 @@
-"""The study's own worlds, of other seeds than the fixed files: the joint methods are at their bound, the papers' are not."""
+"""The study's own worlds, of other seeds than the fixed files: the joint methods are at their bound, the papers' are
+not."""
 
 from __future__ import annotations
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from weldcal.tools.studies.robot.faults import FaultReport
 from weldcal.tools.worlds.robot.cases import STOP
-from weldcal.tools.worlds.robot.fault_run import Outcome
+from weldcal.tools.worlds.robot.fault_run import FaultOutcome
 
 
 def test_a_wrong_result_fails_the_study_and_is_named() -> None:
-    wrong = Outcome(
+    wrong = FaultOutcome(
         name="nothing", must=STOP, did="stopped", fault="", sentence="", problems=("not at rest within 0.3 s",)
     )
     summary = FaultReport([wrong], []).summary()

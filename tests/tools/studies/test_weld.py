@@ -14,14 +14,14 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.weld.rows import ROWS, CaseResult, Target, UnknownRow, get_rows, hold_against, run_turn
+from weldcal.tools.studies.weld.rows import ROWS, CaseResult, MetricTarget, UnknownRow, get_rows, hold_against, run_turn
 from weldcal.tools.worlds.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, planned_seam, roughness
-from weldcal.tools.worlds.weld.case import Case, run_case, study_config
-from weldcal.tools.worlds.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, Tip
+from weldcal.tools.worlds.weld.case import WeldCase, run_case, study_config
+from weldcal.tools.worlds.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, TipPlace
 from weldcal.tools.worlds.weld.metrics import RunMetrics
 from weldcal.tools.worlds.weld.plant import Stamps, StudyRun, simulate
 from weldcal.tools.worlds.weld.seams import NAMES, UnknownSeam, get_seam
-from weldcal.tools.worlds.weld.unknowns import World, draw_world
+from weldcal.tools.worlds.weld.unknowns import WeldUnknowns, draw_world
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import DeflectionSample
@@ -30,7 +30,7 @@ MM = 1e-3
 TARGETS = {row.key: row for row in ROWS}
 
 
-def holds(key: str, case: Case, seed: int = 0) -> RunMetrics:
+def holds(key: str, case: WeldCase, seed: int = 0) -> RunMetrics:
     """One weld against the targets of its row."""
     _, figures = run_case(case, seed)
     assert figures.completed, figures.reason
@@ -41,17 +41,17 @@ def holds(key: str, case: Case, seed: int = 0) -> RunMetrics:
 
 @pytest.mark.parametrize("seam", ["s_r60", "l_r20_concave"])
 def test_a_gentle_seam_holds_the_nominal_targets(seam: str) -> None:
-    holds("nominal", Case(seam), 1)
+    holds("nominal", WeldCase(seam), 1)
 
 
 def test_the_imperfect_world_holds_its_targets() -> None:
-    holds("imperfect", Case("s_r60", "imperfect"), 1)
+    holds("imperfect", WeldCase("s_r60", "imperfect"), 1)
 
 
 @pytest.fixture(scope="module")
 def known() -> StudyRun:
     """The weld of a straight seam in a groove that is as the servo knows it."""
-    return simulate(get_seam("straight"), NOMINAL, study_config(Case("straight")), 0, time_limit_s=25.0)
+    return simulate(get_seam("straight"), NOMINAL, study_config(WeldCase("straight")), 0, time_limit_s=25.0)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,9 @@ def test_what_the_servo_does_not_know_of_its_groove_shows_in_full(
     budget: str, side_mm: float, height_mm: float, known: StudyRun
 ) -> None:
     """A servo that were told of it would correct it."""
-    run = simulate(get_seam("straight"), BUDGETS[budget], study_config(Case("straight", budget)), 0, time_limit_s=25.0)
+    run = simulate(
+        get_seam("straight"), BUDGETS[budget], study_config(WeldCase("straight", budget)), 0, time_limit_s=25.0
+    )
     off = []
     for weld in (run, known):
         error = path_error(weld.points("torch")[weld.column("torch_on") > 0.5], weld.torch_line)
@@ -79,7 +81,7 @@ def test_what_the_servo_does_not_know_of_its_groove_shows_in_full(
 
 
 def test_a_picture_gets_the_pose_of_its_stamp() -> None:
-    stamps = Stamps(World(image_bias_s=-0.010, pose_bias_s=0.008), 0)
+    stamps = Stamps(WeldUnknowns(image_bias_s=-0.010, pose_bias_s=0.008), 0)
     told = []
     for k in range(40):
         c, s = math.cos(0.5 * 0.008 * k), math.sin(0.5 * 0.008 * k)
@@ -93,7 +95,7 @@ def test_a_picture_gets_the_pose_of_its_stamp() -> None:
     assert seen.X_BT_at_capture.translation()[0] == pytest.approx(0.008 * 0.182, abs=1e-9)
     turn = RollPitchYaw(seen.X_BT_at_capture.rotation()).yaw_angle()
     assert turn == pytest.approx(0.5 * 0.182, abs=1e-6)
-    exact = Stamps(World(), 0)
+    exact = Stamps(WeldUnknowns(), 0)
     assert exact.pose(0.3, np.eye(3), np.zeros(3)) == 0.3
     assert exact.picture(taken) is taken
 
@@ -101,7 +103,7 @@ def test_a_picture_gets_the_pose_of_its_stamp() -> None:
 def test_a_world_is_drawn_within_its_ranges_and_is_that_of_its_seed() -> None:
     ranges = BUDGETS["imperfect"].unknown
     worlds = [draw_world(ranges, seed) for seed in range(200)]
-    for field in fields(World):
+    for field in fields(WeldUnknowns):
         low, high = getattr(ranges, field.name)
         drawn = np.array([getattr(w, field.name) for w in worlds])
         assert drawn.min() >= low
@@ -115,7 +117,7 @@ def test_a_world_is_drawn_within_its_ranges_and_is_that_of_its_seed() -> None:
 
 
 def test_the_stamps_jitter_has_its_sigma_and_the_clock_never_runs_back() -> None:
-    stamps = Stamps(World(pose_jitter_s=0.002, image_jitter_s=0.002), 3)
+    stamps = Stamps(WeldUnknowns(pose_jitter_s=0.002, image_jitter_s=0.002), 3)
     told = np.array([stamps.pose(0.008 * k, np.eye(3), np.zeros(3)) for k in range(2000)])
     assert np.all(np.diff(told) > 0.0)
     # 2000 stamps know their sigma to 2 %; the few that would run back are held.
@@ -123,28 +125,28 @@ def test_the_stamps_jitter_has_its_sigma_and_the_clock_never_runs_back() -> None
 
 
 def test_the_hard_budget_holds_its_targets() -> None:
-    holds("hard", Case("s_r60", "hard"))
+    holds("hard", WeldCase("s_r60", "hard"))
 
 
 def test_round_a_sharp_concave_corner_the_torch_goes_by_what_was_felt() -> None:
     # With this seed it was 0.34 mm off when the plan, which is 2 mm late, stood in for points close together.
-    assert holds("r1_concave", Case("l_r1_concave"), 100).max_mm <= 0.2
+    assert holds("r1_concave", WeldCase("l_r1_concave"), 100).max_mm <= 0.2
 
 
 def test_a_sharp_concave_corner_is_welded_in_the_hard_budget() -> None:
-    holds("hard_corners", Case("l_r1_concave", "hard"), 2)
+    holds("hard_corners", WeldCase("l_r1_concave", "hard"), 2)
 
 
 def test_a_gap_of_ten_millimetres_hardly_shows() -> None:
-    holds("gap_10", Case("s_r60", gaps=((0.145, 0.155),)))
+    holds("gap_10", WeldCase("s_r60", gaps=((0.145, 0.155),)))
 
 
 def test_a_fast_weld_holds_its_target() -> None:
-    holds("speed_24", Case("l_r20_convex", speed_m_s=0.024))
+    holds("speed_24", WeldCase("l_r20_convex", speed_m_s=0.024))
 
 
 def test_on_a_cylinder_work_and_travel_angle_are_as_foretold() -> None:
-    figures = holds_space(Case("s_r60_on_r150", "kinematic"))
+    figures = holds_space(WeldCase("s_r60_on_r150", "kinematic"))
     # asin(d/2R) of the line that rest point and torch run on, R 150 mm raised by the seat, less 3 mm, on the part of it
     # that is crossed square to the axis.
     assert figures.travel_deg == pytest.approx(
@@ -152,7 +154,7 @@ def test_on_a_cylinder_work_and_travel_angle_are_as_foretold() -> None:
     )
 
 
-def holds_space(case: Case) -> RunMetrics:
+def holds_space(case: WeldCase) -> RunMetrics:
     _, figures = run_case(case, 0)
     assert figures.completed
     assert figures.mean_mm <= 0.03
@@ -171,17 +173,17 @@ def test_a_turn_no_torch_can_follow_is_refused_and_welded_in_pieces() -> None:
 
 
 def test_figures_that_a_run_lacks_count_as_missed() -> None:
-    case = Case("straight")
+    case = WeldCase("straight")
     good, broken = (
         RunMetrics(completed=True, phase="DONE", reason="", reached_mm=300.0, max_mm=0.1),
         RunMetrics(completed=False, phase="FAULT", reason="why", reached_mm=20.0),
     )
-    target = Target("max_mm", 0.15)
+    target = MetricTarget("max_mm", 0.15)
     assert hold_against(target, [CaseResult(case, (0,), (good,))]).met
     both = hold_against(target, [CaseResult(case, (0, 1), (good, broken))])
     assert not both.met
     assert both.worst_run.endswith("seed 1")
-    mean = hold_against(Target("max_mm", 0.15, "mean"), [CaseResult(case, (0, 1), (good, good))])
+    mean = hold_against(MetricTarget("max_mm", 0.15, "mean"), [CaseResult(case, (0, 1), (good, good))])
     assert mean.value == pytest.approx(0.1)
 
 
@@ -222,14 +224,14 @@ def test_the_walls_roughness_has_its_sigma_and_its_length() -> None:
 def test_the_tip_sits_in_the_groove_lags_by_friction_and_relaxes_beyond_the_end() -> None:
     line = SeamCurve.from_points(get_seam("straight").points).raised(SEAT_M)
     pressed = np.array([0.1, 1.0 * MM, SEAT_M - 3.0 * MM])
-    tip = Tip(pressed, Groove(line, friction=0.2))
+    tip = TipPlace(pressed, Groove(line, friction=0.2))
     for k in range(300):
         centre = tip.step(pressed + np.array([1e-4 * k, 0.0, 0.0]), 0.008)
     np.testing.assert_allclose(centre[1:], [0.0, SEAT_M], atol=1e-9)
     # It drags behind by mu F / (k sin b): F = 0.9 N of the axial spring, k = 600 N/m.
     assert 0.1 + 1e-4 * 299 - centre[0] == pytest.approx(0.2 * 0.9 / math.sin(math.radians(22.5)) / 600.0, rel=1e-3)
     beyond = np.array([0.32, 1.0 * MM, SEAT_M - 3.0 * MM])
-    free = Tip(beyond, Groove(line))
+    free = TipPlace(beyond, Groove(line))
     for _ in range(100):
         centre = free.step(beyond, 0.008)
     np.testing.assert_allclose(centre, beyond, atol=1e-6)

@@ -1,4 +1,5 @@
-"""The whole-body study in a short form: a wrist link is tracked by its mesh and by a fused model, no worse than twice the flange."""
+"""The whole-body study in a short form: a wrist link is tracked by its mesh and by a fused model, no worse than twice
+the flange."""
 
 import json
 from pathlib import Path

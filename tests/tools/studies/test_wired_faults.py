@@ -115,12 +115,7 @@ def readings(how: str, wrong_at: float) -> list[tuple[float, bool]]:
 
 @pytest.mark.parametrize(
     ("how", "on"),
-    [
-        ("", (1.0, 6.0)),
-        ("killed", (1.0, 3.0)),
-        ("frozen", (1.0, 10.0)),
-        ("delayed", (1.0, 6.0 + DELAY_S)),
-    ],
+    [("", (1.0, 6.0)), ("killed", (1.0, 3.0)), ("frozen", (1.0, 10.0)), ("delayed", (1.0, 6.0 + DELAY_S))],
 )
 def test_an_input_reads_as_its_wire_lets_it(how: str, on: tuple[float, float]) -> None:
     lit = [now for now, value in readings(how, 3.0) if value]

@@ -1,4 +1,5 @@
-"""A square's corners by its whole sides: unbiased under blur, deaf to specks, and silent where a side cannot be seen."""
+"""A square's corners by its whole sides: unbiased under blur, deaf to specks, and silent where a side cannot be
+seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A bent plate is found in its scan, by its drawing and from the cloud alone; a part bent otherwise is refused by name."""
+"""A bent plate is found in its scan, by its drawing and from the cloud alone; a part bent otherwise is refused by
+name."""
 
 from __future__ import annotations
 

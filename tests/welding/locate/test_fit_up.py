@@ -1,4 +1,5 @@
-"""The fit-up along a seam: two solids displaced by a known gap, offset and angle, scanned by a ray caster of its own."""
+"""The fit-up along a seam: two solids displaced by a known gap, offset and angle, scanned by a ray caster of its
+own."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ UNIT = {"gap": 1e-3, "misalignment": 1e-3, "angle": math.radians(1.0)}
 
 
 def parts(joint: str, gap: float, aside: float, angle: float) -> list[Solid]:
-    """Two solids with the seam along x at y = z = 0, the second one displaced: gap and offset m, turned by an angle rad about the seam."""
+    """Two solids with the seam along x at y = z = 0, the second one displaced: gap and offset m, turned by an angle rad
+    about the seam."""
     first = box((-0.11, 0.11), (-0.07, 0.05 if joint != "butt" else 0.0), (-0.008, 0.0))
     turn = (angle, 0.0, 0.0)
     if joint == "butt":  # it stands to the left, and lower by `aside`, open by the angle
@@ -75,7 +77,8 @@ def scanned(joint: str, seed: int) -> tuple[FitUp, dict[str, float]]:
 
 @cache
 def judged(joint: str, name: str) -> tuple[float, float, float]:
-    """Root mean square of a quantity's error in mm or deg over six scenes, largest error, and mean square in units of the stated sigma."""
+    """Root mean square of a quantity's error in mm or deg over six scenes, largest error, and mean square in units of
+    the stated sigma."""
     off, z = [], []
     for seed in range(100, 106):
         found, true = scanned(joint, seed)

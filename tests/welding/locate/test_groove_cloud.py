@@ -19,12 +19,7 @@ from weldcal.models.scanners import cast, get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.tools.worlds.parts.plates import Scene, box, looking_at, scan_part, sideways, table
 from weldcal.welding.locate.groove.extract import extract_groove
-from weldcal.welding.locate.groove.seam import (
-    GrooveNotFound,
-    GrooveSeam,
-    GrooveTooNarrow,
-    SeveralGrooves,
-)
+from weldcal.welding.locate.groove.seam import GrooveNotFound, GrooveSeam, GrooveTooNarrow, SeveralGrooves
 
 SCANNER = get_scanner("phoxi_m", 618, 462)
 COARSE = get_scanner("phoxi_m", 412, 308)

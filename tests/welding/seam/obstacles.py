@@ -1,6 +1,8 @@
-"""Nuts, tacks and clamps near a seam, scanned by a ray caster of its own: whether the tool would touch them, by their geometry.
+"""Nuts, tacks and clamps near a seam, scanned by a ray caster of its own: whether the tool would touch them, by their
+geometry.
 
-``python -m tests.welding.seam.obstacles COUNT`` prints how many are touched and accepted, and how many are refused without need.
+``python -m tests.welding.seam.obstacles COUNT`` prints how many are touched and accepted, and how many are refused
+without need.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ HIGH_M = np.sqrt(2.0) * TOOL.tip_radius_m  # of the ball's centre above the root
 
 
 class Found(NamedTuple):
-    """One scene: the kind of the thing, its least distance m from the tool (infinite: there is none), and what the check says."""
+    """One scene: the kind of the thing, its least distance m from the tool (infinite: there is none), and what the
+    check says."""
 
     kind: str
     away_m: float
@@ -57,7 +60,8 @@ def thing(kind: str, rng: np.random.Generator, half_m: float, top_m: float, side
 
 
 def away(solid: Solid, tool: WeldingTool, root: Array, half_m: float) -> float:
-    """Least distance m between a thing's surface and the tool, as its tip runs over a straight seam along x and rises at its ends."""
+    """Least distance m between a thing's surface and the tool, as its tip runs over a straight seam along x and rises
+    at its ends."""
     p = TriMesh(*triangles([solid])).sample(3000, np.random.default_rng(1))[0]
     y = np.cross(UP, [1.0, 0.0, 0.0])
     held = np.column_stack([[1.0, 0.0, 0.0], y, UP])

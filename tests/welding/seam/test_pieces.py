@@ -13,7 +13,8 @@ CHORD_M, RUN_UP_M, STEP_M = 0.06, 0.016, 0.005
 
 
 def met(pieces: list[tuple[float, float, float]], low: float, high: float) -> bool:
-    """Whether a tip that comes down and runs to the end of each piece, or its torch, is in a thing between two places."""
+    """Whether a tip that comes down and runs to the end of each piece, or its torch, is in a thing between two
+    places."""
     for start, end, down in pieces:
         tips = np.arange(down, end + CHORD_M if end < SEAM.length else SEAM.length, 1e-4)
         torch = tips - CHORD_M

@@ -117,8 +117,9 @@ def test_a_tip_that_is_held_up_does_not_advance_the_path() -> None:
         * 1e-3
     )
     arc = 0.25e-3 * np.arange(len(x))
-    # The way is the mean over six frames, and it counts where it is under half of the progress of 0.25 mm: from the fourth
-    # of the twelve slow frames on (0.117 and 0.083 mm, then seven of 0.05 mm) to the second quick one (0.083 and 0.117 mm).
+    # The way is the mean over six frames, and it counts where it is under half of the progress of 0.25 mm: from the
+    # fourth of the twelve slow frames on (0.117 and 0.083 mm, then seven of 0.05 mm) to the second quick one (0.083 and
+    # 0.117 mm).
     expected = -(2.0 * (0.25 - 0.7 / 6.0) + 2.0 * (0.25 - 0.5 / 6.0) + 7.0 * 0.20) * 1e-3
     assert felt(np.column_stack([x, 0 * x, 0 * x]), arc).jumped == pytest.approx(expected, abs=1e-9)
     noise = np.random.default_rng(3).normal(0.0, 0.05e-3, (len(x), 2))

@@ -1,4 +1,5 @@
-"""A tool on a ring: its chord, pitch and travel angle in closed form, the ends of a measured ring, and the least pipe of a tool."""
+"""A tool on a ring: its chord, pitch and travel angle in closed form, the ends of a measured ring, and the least pipe
+of a tool."""
 
 from __future__ import annotations
 

@@ -70,7 +70,8 @@ def along_ring(radius: float, lean: float, turn: tuple[float, float], length: fl
 
 @pytest.mark.parametrize(("height", "fits"), [(0.05, False), (0.006, True)])
 def test_a_wall_met_at_a_slant_leads_the_tip_on_only_where_it_can_climb_it(height: float, fits: bool) -> None:
-    """The seam on the hollow side of a bent web, cut off 90 mm before the web's end: straight on, the tip meets the web."""
+    """The seam on the hollow side of a bent web, cut off 90 mm before the web's end: straight on, the tip meets the
+    web."""
     web = ring(0.2, 0.21, 0.0, height, (-0.6, 0.6))
     path = along_ring(0.2, -1.0, (-0.5, 0.15))
     if fits:

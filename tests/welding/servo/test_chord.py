@@ -1,4 +1,5 @@
-"""The rigid chord under the laws as they are shipped: Eq. 17's wrong sign, and a singularity of the law, not of the tool."""
+"""The rigid chord under the laws as they are shipped: Eq. 17's wrong sign, and a singularity of the law, not of the
+tool."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from weldcal.welding.servo.guards import seam_conditioning
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import MotionLimits, ServoConfig
 from weldcal.welding.servo.state import WeldingState
-from weldcal.welding.servo.track import Motion, TorchTarget
+from weldcal.welding.servo.track import TickMotion, TorchTarget
 
 # No rate limit hides what the law itself answers.
 QUICK = MotionLimits(
@@ -41,7 +42,7 @@ def tool(p_tip: Array, alpha: float) -> RigidTransform:
     return RigidTransform(RotationMatrix(RollPitchYaw(0.0, 0.0, alpha)), p_tip)
 
 
-def moved(name: str, p_tip: Array, alpha: float, psi_tip: float, psi_torch: float, offset: float = 0.0) -> Motion:
+def moved(name: str, p_tip: Array, alpha: float, psi_tip: float, psi_torch: float, offset: float = 0.0) -> TickMotion:
     """One tick of a law: seam tangents at psi_tip and psi_torch, the torch `offset` m to the left of its path."""
     torch = p_tip - D * direction(alpha)
     t = direction(psi_torch)
@@ -53,7 +54,7 @@ def moved(name: str, p_tip: Array, alpha: float, psi_tip: float, psi_torch: floa
     )
 
 
-def torch_velocity(motion: Motion, alpha: float) -> Array:
+def torch_velocity(motion: TickMotion, alpha: float) -> Array:
     """Velocity (3,) m/s of the torch point under the commanded twist of the tool."""
     arm = -D * direction(alpha)
     return np.asarray(motion.V_BT[3:] + np.cross(motion.V_BT[:3], arm))

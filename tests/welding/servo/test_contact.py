@@ -23,7 +23,8 @@ def driven(speeds: list[float]) -> WeldingState:
 
 
 def test_progress_between_two_ticks_is_interpolated() -> None:
-    """A frame is taken at any time: a tick at 10 mm/s is 80 um, and a tip that turns back in between counts with its sign."""
+    """A frame is taken at any time: a tick at 10 mm/s is 80 um, and a tip that turns back in between counts with its
+    sign."""
     speeds = [0.01, 0.012, 0.008, -0.004, 0.01]
     state = driven(speeds)
     ends, at = np.arange(1, 6) * DT, np.cumsum(speeds) * DT
@@ -54,7 +55,8 @@ def test_both_springs_unload_at_a_loss_of_contact() -> None:
 
 
 def test_a_tip_pushed_back_and_up_is_deflected_to_the_left_and_axially() -> None:
-    """The tool presses to the left and down; the wall holds the tip 0.4 mm to the right of its rest and 0.3 mm above it."""
+    """The tool presses to the left and down; the wall holds the tip 0.4 mm to the right of its rest and 0.3 mm above
+    it."""
     x, y, z = np.eye(3)
     seam = SeamFrame(np.zeros(3), x, y, z, 0.0)
     X_BT = RigidTransform(RollPitchYaw(0.0, 0.0, 0.5), [0.4, 0.1, 0.2])

@@ -13,12 +13,12 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.case import Case, study_config
+from weldcal.tools.worlds.weld.case import WeldCase, study_config
 from weldcal.tools.worlds.weld.metrics import judge
 from weldcal.tools.worlds.weld.plant import simulate
 from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.seam.curve import SeamCurve, SeamError
-from weldcal.welding.servo.settings import ServoConfig, TorchControl, TouchConfig
+from weldcal.welding.servo.settings import ServoConfig, TorchControl, TouchOnConfig
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
@@ -182,7 +182,7 @@ def test_a_plan_two_centimetres_off_never_lights_the_arc() -> None:
 
 @pytest.mark.parametrize("length", [0.030, 0.050])
 def test_a_seam_shorter_than_the_chord_is_welded(length: float) -> None:
-    case = Case("short")
+    case = WeldCase("short")
     run = simulate(straight(length), NOMINAL, study_config(case), 2, time_limit_s=60.0)
     figures = judge(run, case.speed_m_s, case.chord_m)
     assert figures.completed, run.reason
@@ -271,7 +271,7 @@ def test_the_tags_own_bias_goes_with_its_zero() -> None:
     biased = replace(NOMINAL, tag_bias_m=-0.23e-3, tag_gain=1.0)
     seam = straight(0.12)
     plain = simulate(seam, biased, CONFIG, 6, time_limit_s=12.0)
-    zeroed = simulate(seam, biased, ServoConfig(touch=TouchConfig(zero_frames=10)), 6, time_limit_s=12.0)
+    zeroed = simulate(seam, biased, ServoConfig(touch=TouchOnConfig(zero_frames=10)), 6, time_limit_s=12.0)
     felt = [float(np.mean(run.column("tip_z")[-400:] - (run.points("robot")[-400:, 2])) - np.mean(run.column("delta_axial_m")[-400:]))
             for run in (plain, zeroed)]  # fmt: skip
     # Ten frames of 0.05 mm leave 0.016 mm of the bias.
@@ -280,7 +280,7 @@ def test_the_tags_own_bias_goes_with_its_zero() -> None:
 
 
 def test_a_tip_that_is_not_free_is_not_taken_for_its_rest() -> None:
-    config = ServoConfig(touch=TouchConfig(zero_frames=5))
+    config = ServoConfig(touch=TouchOnConfig(zero_frames=5))
     plan = SeamCurve.from_points(straight(0.2).points)
     state, X = WeldingState(), touch_start_pose(plan, config)
     for k in range(30):

@@ -15,12 +15,12 @@ from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit
 from weldcal.welding.servo.feel_start import feel_start_step, with_touch_place
-from weldcal.welding.servo.settings import ServoConfig, TouchConfig
-from weldcal.welding.servo.state import Measurement, Phase, ServoSample, TouchState, WeldingState
+from weldcal.welding.servo.settings import ServoConfig, TouchOnConfig
+from weldcal.welding.servo.state import Measurement, Phase, ServoSample, TouchOnState, WeldingState
 
 MM = 1e-3
 UP = np.array([0.0, 0.0, 1.0])
-CONFIG = ServoConfig(touch=TouchConfig(calibrate_gain=True, zero_frames=30, feel_start=True))
+CONFIG = ServoConfig(touch=TouchOnConfig(calibrate_gain=True, zero_frames=30, feel_start=True))
 
 
 def straight(length: float) -> TrueSeam:
@@ -36,14 +36,15 @@ def lit_at(run: StudyRun) -> float:
 def test_the_arc_starts_where_the_groove_does_and_the_torch_is_on_it_there() -> None:
     run = simulate(straight(0.080), NOMINAL, CONFIG, 103)
     assert run.phase == Phase.DONE
-    # The plan is 2 mm off as a whole, along the seam too; a frame at 4 mm/s is 0.13 mm, what friction lets the tip lead 0.
+    # The plan is 2 mm off as a whole, along the seam too; a frame at 4 mm/s is 0.13 mm, what friction lets the tip lead
+    # 0.
     assert abs(float(run.planned.position(0.0)[0])) > 1.0 * MM
     assert lit_at(run) == pytest.approx(0.0, abs=0.4 * MM)
     on = run.column("torch_on") > 0.5
     error = path_error(run.points("torch")[on], run.torch_line)
     first = (error.s >= 0.0) & (error.s < 8.0 * MM)
-    # Without feeling it the plan's own noise leads here, 0.26 mm off with this seed; the tip's points leave three sigma of
-    # 0.015 mm and a zero and gain of 0.01 mm each.
+    # Without feeling it the plan's own noise leads here, 0.26 mm off with this seed; the tip's points leave three sigma
+    # of 0.015 mm and a zero and gain of 0.01 mm each.
     assert np.abs(error.lateral[first]).max() <= 0.1 * MM
 
 
@@ -61,7 +62,7 @@ def test_a_groove_that_is_not_found_again_is_said_not_to_be() -> None:
     p = np.array([0.012, 0.0, -0.5 * MM])
     state = WeldingState(
         plan_fit=PlanFit.start(plan),
-        touch=TouchState(step="enter"),
+        touch=TouchOnState(step="enter"),
         measurement=Measurement(0.0, p, np.zeros(3), p),
         s_tip=0.012,
         lost_at=-1.0 * MM,

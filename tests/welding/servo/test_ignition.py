@@ -1,4 +1,5 @@
-"""The weld moves while the arc is established, stands pressed on while it is not, and ends by name where it does not come."""
+"""The weld moves while the arc is established, stands pressed on while it is not, and ends by name where it does not
+come."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A weld that a person holds: the arc is off at once, the tool rests, goes back over its own path and welds the rest as well."""
+"""A weld that a person holds: the arc is off at once, the tool rests, goes back over its own path and welds the rest as
+well."""
 
 from __future__ import annotations
 
@@ -15,16 +16,17 @@ from weldcal.tools.worlds.weld.groove import SEAT_M
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.interruption import RAMP_S, Interruption, interruptible_step
-from weldcal.welding.servo.settings import ServoConfig, TouchConfig
+from weldcal.welding.servo.settings import ServoConfig, TouchOnConfig
 from weldcal.welding.servo.state import Phase, ServoSample, WeldingCommand, WeldingState
 
-CONFIG = ServoConfig(touch=TouchConfig(calibrate_gain=True))
+CONFIG = ServoConfig(touch=TouchOnConfig(calibrate_gain=True))
 SEAMS = {"straight": straight(0.1), "l": l_curve()}
 MM = 1e-3
 
 
 class Held:
-    """The servo with a person beside it, who holds it for a second once the torch has come to each of these places (m)."""
+    """The servo with a person beside it, who holds it for a second once the torch has come to each of these places
+    (m)."""
 
     def __init__(self, *places: float, held_s: float = 1.0, moved: float = 0.0, phase: Phase | None = None) -> None:
         self.places, self.held_s, self.moved, self.phase = list(places), held_s, moved, phase

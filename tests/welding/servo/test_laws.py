@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from weldcal.tools.worlds.weld.budgets import KINEMATIC, NOMINAL, Budget
-from weldcal.tools.worlds.weld.case import Case, study_config
+from weldcal.tools.worlds.weld.case import WeldCase, study_config
 from weldcal.tools.worlds.weld.metrics import RunMetrics, judge
 from weldcal.tools.worlds.weld.plant import simulate
 from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner
@@ -21,7 +21,7 @@ BEND = arcs((0.03, 0.0), (0.06, 1.0 / 0.06), spacing=2e-3)
 
 def welded(points: Array, law: str, budget: Budget = NOMINAL) -> RunMetrics:
     """One short weld under a law, as in the study."""
-    case = Case("short", law=law)
+    case = WeldCase("short", law=law)
     run = simulate(TrueSeam("short", points, np.array([0.0, 0.0, 1.0])), budget, study_config(case), 0)
     return judge(run, case.speed_m_s, case.chord_m)
 

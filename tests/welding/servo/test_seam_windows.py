@@ -1,4 +1,5 @@
-"""What stands against a seam is named before the arc is lit: cusps, angles, speed; and a split seam is feasible piece by piece."""
+"""What stands against a seam is named before the arc is lit: cusps, angles, speed; and a split seam is feasible piece
+by piece."""
 
 from __future__ import annotations
 

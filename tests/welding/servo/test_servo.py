@@ -31,13 +31,13 @@ from weldcal.welding.servo.settings import (
     SteeringConfig,
     ToolGeometry,
     TorchControl,
-    TouchConfig,
+    TouchOnConfig,
 )
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
 
-CALIBRATED = ServoConfig(touch=TouchConfig(calibrate_gain=True))
+CALIBRATED = ServoConfig(touch=TouchOnConfig(calibrate_gain=True))
 SPEED = CALIBRATED.weld_speed_m_s
 MM = 1e-3
 
@@ -159,8 +159,8 @@ def test_a_corner_of_one_millimetre_neither_jams_the_tip_nor_throws_the_torch() 
     points = l_curve(0.001, side=1.0)
     run, error, _ = judged(weld(points, NOMINAL, CALIBRATED, 22), points)
     assert run.last.phase == Phase.DONE
-    # Target D4 asks for 1.3; the corner put back from its two sides does better. The repaired paper law turns at 891 rad/s
-    # here and throws the torch at 10 m/s.
+    # Target D4 asks for 1.3; the corner put back from its two sides does better. The repaired paper law turns at 891
+    # rad/s here and throws the torch at 10 m/s.
     assert error.max_m <= 0.5 * MM
     assert error.mean_m <= 0.05 * MM
     assert max(abs(c.diagnostics.omega) for c in run.commands) <= 0.8
@@ -295,7 +295,7 @@ def test_every_command_is_finite_wherever_the_tool_stands() -> None:
 
 
 GROUPS = (
-    *(ToolGeometry, TouchConfig, ContactConfig, GapConfig, FaultLimits, DeflectionControl, TorchControl),
+    *(ToolGeometry, TouchOnConfig, ContactConfig, GapConfig, FaultLimits, DeflectionControl, TorchControl),
     *(MotionLimits, LawWeights, SteeringConfig, FeltPathConfig, ServoConfig),
 )
 SIGNED = {"torch_height_m", "side_offset_m", "offset_m", "work_angle_rad"}  # a side, or a direction
@@ -335,4 +335,4 @@ def test_a_chord_too_short_to_trail_and_a_press_that_does_not_press_are_refused(
     with pytest.raises(ServoConfigError, match="trail"):
         ServoConfig(tool=ToolGeometry(torch_offset_m=0.0))
     with pytest.raises(ServoConfigError, match="press_ratio"):
-        TouchConfig(press_ratio=1.0)
+        TouchOnConfig(press_ratio=1.0)

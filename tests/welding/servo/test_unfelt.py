@@ -1,4 +1,5 @@
-"""A seam that the tip does not feel: the torch follows the plan, the tip hangs above it, and no frame of the finger counts."""
+"""A seam that the tip does not feel: the torch follows the plan, the tip hangs above it, and no frame of the finger
+counts."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchOnConfig
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
@@ -20,7 +21,7 @@ RAISED = np.array([0.0, 0.0, ABOVE_M])
 CONFIG = ServoConfig(
     felt=False,
     tool=ToolGeometry(torch_clearance_m=TORCH_M - ABOVE_M, torch_height_m=-0.0015, tip_drop_m=0.002),
-    touch=TouchConfig(offset_m=0.0, zero_frames=10),
+    touch=TouchOnConfig(offset_m=0.0, zero_frames=10),
     deflection=DeflectionControl(delta_d_m=1e-9, axial_d_m=1e-9),
 )
 

@@ -54,7 +54,7 @@ def print_board(
         sheet = described_sheet(parse_board(kind), paper)
         kind = kind.partition(":")[0]
     elif kind == "charuco":
-        board = Board(columns, rows, square_mm, marker_mm, dictionary)
+        board = CharucoBoard(columns, rows, square_mm, marker_mm, dictionary)
         sheet = board_sheet(board, paper)
     elif kind == "tags":
         words = ids.split(",")
@@ -64,7 +64,8 @@ def print_board(
         sheet = tag_sheet(tags, paper)
     else:
         raise InputError(
-            f"There is no board of the kind '{kind}': use charuco, tags, or a description such as {EXAMPLES['chessboard'].split()[0]}."
+            f"There is no board of the kind '{kind}': use charuco, tags, or a description such as"
+            f" {EXAMPLES['chessboard'].split()[0]}."
         )
     written = write_board(call.folder("print-board", kind), sheet, board)
     return Outcome({"state": "done", "kind": kind, **written, "note": NOTE})
@@ -72,7 +73,8 @@ def print_board(
 
 @dataclass(kw_only=True)
 class Sheet:
-    """A page: black rectangles, then white ones over them, thin lines (x0, y0, x1, y1) and texts (x, y, size, words), in mm."""
+    """A page: black rectangles, then white ones over them, thin lines (x0, y0, x1, y1) and texts (x, y, size, words),
+    in mm."""
 
     width: float
     height: float
@@ -138,7 +140,8 @@ class Sheet:
             # a viewer is asked not to scale the page either
             b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
             b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-            f"<< /Type /Page /Parent 2 0 R /MediaBox [{box}] /Contents 4 0 R /Resources << /Font << /F 5 0 R >> >> >>".encode(),
+            f"<< /Type /Page /Parent 2 0 R /MediaBox [{box}] /Contents 4 0 R "
+            "/Resources << /Font << /F 5 0 R >> >> >>".encode(),
             b"<< /Length %d >>\nstream\n%s\nendstream" % (len(stream), stream),
             b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
         ]
@@ -154,7 +157,7 @@ class Sheet:
 
 
 @dataclass(frozen=True)
-class Board:
+class CharucoBoard:
     """A ChArUco board: squares, their side and that of the markers in mm, and the markers' dictionary."""
 
     columns: int = 8
@@ -178,14 +181,15 @@ class Board:
         return cv2.aruco.CharucoBoard((self.columns, self.rows), *sides, dictionary_named(self.dictionary))
 
 
-def board_sheet(board: Board, paper: str) -> Sheet:
+def board_sheet(board: CharucoBoard, paper: str) -> Sheet:
     """The board in the middle of a page. Raises InputError where it does not fit."""
     sizes = f"{board.square_mm:.12g}:{board.marker_mm:.12g}:{board.dictionary}"
     return described_sheet(parse_board(f"charuco:{board.columns}x{board.rows}:{sizes}"), paper)
 
 
 def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
-    """What a description of a board says, in the middle of a page, with the description. Raises InputError where it does not fit."""
+    """What a description of a board says, in the middle of a page, with the description. Raises InputError where it
+    does not fit."""
     sheet = _page(paper)
     size, gap = 1e3 * board.size, 1e3 * board.inner
     points = 1e3 * board.points[:, :2]
@@ -260,7 +264,7 @@ def tag_sheet(tags: Iterable[TagModel], paper: str) -> Sheet:
     return sheet
 
 
-def write_board(folder: Path, sheet: Sheet, board: Board | None) -> dict[str, str]:
+def write_board(folder: Path, sheet: Sheet, board: CharucoBoard | None) -> dict[str, str]:
     """Write board.pdf, and board.yaml where it is a board, into a folder; returns their paths by kind."""
     folder.mkdir(parents=True, exist_ok=True)
     written = {"pdf": str(folder / "board.pdf")}
@@ -283,8 +287,8 @@ def _require_room(sheet: Sheet, width: float, height: float, paper: str) -> None
     room = (sheet.width - 2.0 * MARGIN_MM, sheet.height - 2.0 * MARGIN_MM - FOOT_MM)
     if width > room[0] or height > room[1]:
         raise InputError(
-            f"{width:.0f} x {height:.0f} mm do not fit on {paper}, which has room for {room[0]:.0f} x {room[1]:.0f} mm: take a "
-            "larger --paper, or less."
+            f"{width:.0f} x {height:.0f} mm do not fit on {paper}, which has room for {room[0]:.0f} x {room[1]:.0f} mm:"
+            " take a larger --paper, or less."
         )
 
 

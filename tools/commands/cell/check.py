@@ -1,4 +1,5 @@
-"""weldcal check-cell: looks at every device of a scenario and says what to do; weldcal tool check: draws a tool. Nothing moves."""
+"""weldcal check-cell: looks at every device of a scenario and says what to do; weldcal tool check: draws a tool.
+Nothing moves."""
 
 import dataclasses as dc
 import inspect
@@ -105,7 +106,8 @@ def look_at_cell(
 ) -> CellReport:
     """Look at the robot, then at each sensor, at the torch's output and at this computer.
 
-    A simulated device is looked at in a simulation that moves nothing. A sensor that cannot be used is a row, not an exception.
+    A simulated device is looked at in a simulation that moves nothing. A sensor that cannot be used is a row, not an
+    exception.
     """
     tell = progress or (lambda stage, fraction: None)
     tell("robot", 0.0)
@@ -154,8 +156,12 @@ def _robot(scenario: Scenario, q: Array) -> tuple[list[tuple[str, Check]], Rigid
     arm = nominal_arm(scenario)
     if isinstance(config, UrRtde):
         report = preflight(
-            config.host, upper_registers=config.upper_registers, nominal=arm, load=config.load(), set_points=config.set_points
-        )  # fmt: skip
+            config.host,
+            upper_registers=config.upper_registers,
+            nominal=arm,
+            load=config.load(),
+            set_points=config.set_points,
+        )
         X_BF = None if report.arm is None or report.arm_q is None else forward_kinematics(report.arm, report.arm_q)
         return [("robot", check) for check in report.checks], X_BF
     if config.SIMULATED:
@@ -210,7 +216,8 @@ def _simulated(scenario: Scenario, device: str, seed: int, q: Array, config: Dri
 
 
 def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) -> Check:
-    """Whether the feature of the calibration is in a scan, near where the arm's pose and the scanner's nominal pose put it."""
+    """Whether the feature of the calibration is in a scan, near where the arm's pose and the scanner's nominal pose put
+    it."""
     standard, on_tool = feature_standard(scenario), scenario.calibration.feature == "tool_ring"
     loaded = scenario.loaded_tool()
     guess = None
@@ -223,7 +230,10 @@ def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) ->
     try:
         fit = fit_flange(np.asarray(points_C, dtype=float), standard, guess=guess)
     except FlangeNotFound as error:
-        action = f"{error} Jog the arm until {feature} faces the scanner in its range, or correct calibration.mounting_guess."
+        action = (
+            f"{error} Jog the arm until {feature} faces the scanner in its range, or correct"
+            " calibration.mounting_guess."
+        )
         return Check("flange", False, f"{feature} is not in the scan", action)
     middle = fit.center_C
     found = f"{feature} is {np.linalg.norm(middle):.3f} m away"
@@ -241,8 +251,8 @@ def _tag(scenario: Scenario, config: FingerCameraConfig, picture: Array) -> Chec
     seen = detect_tag(pixels, config.camera().camera_matrix, tag)
     if not seen.valid or seen.corners is None or seen.X_KM is None:
         action = (
-            f"The finger camera does not see tag {tag.id} of {tag.dictionary}: {seen.reason.rstrip('.')}. Clean lens and tag, look "
-            "at exposure and focus, and print the tag with weldcal print-board."
+            f"The finger camera does not see tag {tag.id} of {tag.dictionary}: {seen.reason.rstrip('.')}. Clean lens"
+            " and tag, look at exposure and focus, and print the tag with weldcal print-board."
         )
         return Check("tag", False, "not seen", action)
     blur = edge_width_px(pixels, seen.corners)
@@ -297,8 +307,7 @@ def _computer() -> list[tuple[str, Check]]:
 
 @command("tool check", short_help="Check a tool file and draw the tool.")
 def tool_check(
-    call: Call,
-    file: Annotated[Path, typer.Argument(help="A tool file; models/tools/welding.yaml is one.")],
+    call: Call, file: Annotated[Path, typer.Argument(help="A tool file; models/tools/welding.yaml is one.")]
 ) -> Outcome:
     """Read a tool file, say what was understood of it, and draw it: tool.png and tool.html."""
     folder = call.folder("tool", file.stem)

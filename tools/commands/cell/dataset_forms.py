@@ -23,7 +23,8 @@ _REST_S = 2.0
 
 
 def rewrite(folder: Path, form: str) -> Path:
-    """Write the poses and clouds of a plain dataset folder in another form, in their place; the rest of dataset.yaml stays.
+    """Write the poses and clouds of a plain dataset folder in another form, in their place; the rest of dataset.yaml
+    stays.
 
     Raises:
         InputError: no such form, or a package that it needs is not installed.
@@ -88,9 +89,13 @@ def write_pcd(path: Path, points: Array) -> None:
 
 def _ros(folder: Path, poses: Array, clouds: list[Array], data: Dataset) -> None:
     names = [
-        "%time", "field.header.seq", "field.header.stamp", "field.header.frame_id",
-        *(f"field.pose.position.{a}" for a in "xyz"), *(f"field.pose.orientation.{a}" for a in "xyzw"),
-    ]  # fmt: skip
+        "%time",
+        "field.header.seq",
+        "field.header.stamp",
+        "field.header.frame_id",
+        *(f"field.pose.position.{a}" for a in "xyz"),
+        *(f"field.pose.orientation.{a}" for a in "xyzw"),
+    ]
     rows = [",".join(names)]
     for k, id in enumerate(data.clouds):
         stamp = 1_700_000_000 * SECOND + int(k * _APART_S * SECOND)
@@ -146,6 +151,11 @@ def write_bag(path: Path, poses: Array, clouds: list[Array], *, kind: str = "mca
 
 
 FORMS: dict[str, Callable[[Path, Array, list[Array], Dataset], None]] = {
-    "ur": _ur, "matrices": _matrices, "opencv": _opencv, "zivid": _zivid, "ros": _ros, "mcap": _mcap,
-}  # fmt: skip
+    "ur": _ur,
+    "matrices": _matrices,
+    "opencv": _opencv,
+    "zivid": _zivid,
+    "ros": _ros,
+    "mcap": _mcap,
+}
 """What writes each form."""

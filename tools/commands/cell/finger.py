@@ -18,11 +18,11 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
-from weldcal.tools.commands.cell.board import Board
-from weldcal.tools.report.first_screen import Expected, Findings, FirstScreen, Next, Tolerance, check_limit
+from weldcal.tools.commands.cell.board import CharucoBoard
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, Tolerance, check_limit
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.welding.finger.calibration import (
-    Intrinsics,
+    FingerIntrinsics,
     TipCalibration,
     calibrate_intrinsics,
     calibrate_tip,
@@ -50,7 +50,8 @@ def finger_calibrate(
     ] = None,
     limit_mm: LimitOption = None,
 ) -> Outcome:
-    """Calibrate the finger: intrinsics from pictures of the board; tag, seat and stiffness from touches on a known plate."""
+    """Calibrate the finger: intrinsics from pictures of the board; tag, seat and stiffness from touches on a known
+    plate."""
     report = calibrate_finger(folder, board, touches, call.folder("finger-calibrate", folder.name), tool, limit_mm)
     found = report.document()
     camera = found["camera"]
@@ -58,7 +59,10 @@ def finger_calibrate(
         "focal length": f"{camera['fx']:.2f}, {camera['fy']:.2f} px, +- {camera['focal_sigma_px']:.2f}",
         "principal point": f"{camera['cx']:.2f}, {camera['cy']:.2f} px",
         "reprojection": f"{camera['rms_px']:.3f} px, on held-out pictures {camera['held_out_px']:.3f} px",
-        "pictures": f"{camera['pictures']} used, {camera['held_out_pictures']} held out, {len(report.without_board)} without the board",
+        "pictures": (
+            f"{camera['pictures']} used, {camera['held_out_pictures']} held out, {len(report.without_board)} without"
+            " the board"
+        ),
     }
     if report.tip is not None:
         tag, tip = found["tag"], found["tip"]
@@ -74,9 +78,10 @@ def finger_calibrate(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FingerReport:
-    """The camera, the tip (None without touches), pictures in which the board was not found, and the tag's pose at rest."""
+    """The camera, the tip (None without touches), pictures in which the board was not found, and the tag's pose at
+    rest."""
 
-    camera: Intrinsics
+    camera: FingerIntrinsics
     tip: TipCalibration | None
     without_board: tuple[str, ...]
     tag_size_mm: float | None = None
@@ -86,8 +91,8 @@ class FingerReport:
 
     @property
     def first(self) -> FirstScreen:
-        """The first screen. There is no work point: the error of a touch that the fit did not use stands in its place; without touches
-        the reprojection of pictures that were left out."""
+        """The first screen. There is no work point: the error of a touch that the fit did not use stands in its place;
+        without touches the reprojection of pictures that were left out."""
         c, tip = self.camera, self.tip
         concerns = [] if tip is None else [f"Open: {text}" for text in tip.unknown]
         lost = f"The board was not found in {len(self.without_board)} pictures ({', '.join(self.without_board[:4])})."
@@ -96,7 +101,10 @@ class FingerReport:
             f"{c.held_out} of {c.held_out + c.used} pictures were left out of the fit: {c.held_out_px:.3f} px rms"
         )
         more = {
-            "camera": f"focal length {c.K[0, 0]:.2f}, {c.K[1, 1]:.2f} px, +- {c.focal_sigma_px:.2f}; centre {c.K[0, 2]:.2f}, {c.K[1, 2]:.2f} px",
+            "camera": (
+                f"focal length {c.K[0, 0]:.2f}, {c.K[1, 1]:.2f} px, +- {c.focal_sigma_px:.2f}; centre {c.K[0, 2]:.2f},"
+                f" {c.K[1, 2]:.2f} px"
+            ),
             "pose": "none is computed; the tool file states that of the camera",
         }
         if self.tag_at_rest_mm is not None:
@@ -108,7 +116,7 @@ class FingerReport:
             )
             return FirstScreen(
                 found,
-                Expected("reprojection of pictures left out", f"{c.held_out_px:.3f} px", pictures),
+                ExpectedError("reprojection of pictures left out", f"{c.held_out_px:.3f} px", pictures),
                 after,
                 (),
                 more,
@@ -116,7 +124,7 @@ class FingerReport:
         error, what = 1e3 * tip.held_out_m, "error of a touch, median"
         tolerance = None if self.limit_mm is None else Tolerance(f"the {what},", error, self.limit_mm, "--limit-mm")
         found = Findings(tolerance=tolerance, unseen=self.touches, concerns=concerns, notes=notes)
-        expected = Expected(
+        expected = ExpectedError(
             what,
             f"{error:.3f} mm",
             f"of {self.touches} touches, each left out of the fit; too few for a 95 % figure. {pictures}",
@@ -163,16 +171,11 @@ class FingerReport:
 
 
 def calibrate_finger(
-    folder: Path,
-    board: Path,
-    touches: Path | None,
-    out: Path,
-    tool: Path | None = None,
-    limit_mm: float | None = None,
+    folder: Path, board: Path, touches: Path | None, out: Path, tool: Path | None = None, limit_mm: float | None = None
 ) -> FingerReport:
-    """Calibrate from a folder of pictures of the board, and a table of touches with a picture each; writes finger.yaml and report.html
-    to `out`. `limit_mm` is the error of a touch that the job allows.
-    `tool` is the file of the tool that carries the tag; None: the welding tool.
+    """Calibrate from a folder of pictures of the board, and a table of touches with a picture each; writes finger.yaml
+    and report.html to `out`. `limit_mm` is the error of a touch that the job allows. `tool` is the file of the tool
+    that carries the tag; None: the welding tool.
 
     Raises:
         InputError: what was given cannot be used; nothing is written.
@@ -224,16 +227,20 @@ def finger_page(report: FingerReport, folder: Path) -> str:
             *((f"stiffness along {axis}", f"{1e-3 * v:.2f} N/mm") for axis, v in t.stiffness_N_per_m.items()),
         ]
     return render(
-        "finger.html.j2", first=report.first, folder=folder.name, rows=rows, unknown=[] if t is None else t.unknown,
+        "finger.html.j2",
+        first=report.first,
+        folder=folder.name,
+        rows=rows,
+        unknown=[] if t is None else t.unknown,
         without_board=report.without_board,
-    )  # fmt: skip
+    )
 
 
-def read_board(path: Path) -> Board:
+def read_board(path: Path) -> CharucoBoard:
     """The board that `weldcal print-board` described. Raises InputError where the file is no such description."""
     try:
         keys = dict(read_document(path)["board"])
-        board = Board(**keys)
+        board = CharucoBoard(**keys)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"'{path}' describes no board: give the board.yaml that weldcal print-board wrote.") from error
     return board

@@ -39,8 +39,8 @@ from weldcal.systems.station import Station, make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
 from weldcal.tools.commands.cell.scan_poses import add_scan_poses
-from weldcal.tools.commands.cell.schema import Key, json_schema, keys_of, yaml_of
-from weldcal.tools.commands.cell.screen import joint_of, least_pipe, ranked, unit_hint, ways
+from weldcal.tools.commands.cell.schema import SchemaKey, json_schema, keys_of, yaml_of
+from weldcal.tools.commands.cell.screen import MOST_TRIED, joint_of, least_pipe, to_try, unit_hint, ways
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
 from weldcal.tools.report.run import RunOptions
@@ -55,7 +55,8 @@ Scans of a robot's bare flange, taken in simulation. Calibrate with: weldcal cal
     poses.csv      id, x, y, z (m), qw, qx, qy, qz, time (s): the flange in the robot's base, TCP zero, at each scan
     clouds/ID.npz  the scan of that pose in the camera's frame; ply and pcd are read too
 
-Put your own scans and poses in their place. Eight to twelve poses, tilted and turned, spread over the working volume, are a good number.
+Put your own scans and poses in their place. Eight to twelve poses, tilted and turned, spread over the working volume,
+are a good number.
 """
 OTHER = """# An example of a calibration dataset: {form}
 
@@ -67,10 +68,17 @@ Scans of a robot's bare flange, taken in simulation. Calibrate with: weldcal cal
 docs/datasets.md lists the forms that are read. Put your own scans and poses in the place of these.
 """
 FILES = {
-    "ur": "poses.txt      p[x, y, z, rx, ry, rz] (m, rad) of the flange, TCP zero, one line a scan, in the order of clouds/",
+    "ur": (
+        "poses.txt      p[x, y, z, rx, ry, rz] (m, rad) of the flange, TCP zero, one line a scan, in the order of"
+        " clouds/"
+    ),
     "matrices": "poses/ID.txt   X_BF, the flange in the robot's base, 4 x 4, row by row (m); clouds/ID.npz is its scan",
-    "opencv": "robot_poses.yml OpenCV FileStorage with a node for each scan: X_BF, 4 x 4 (m); clouds/ID.npz is its scan",
-    "zivid": "pos01.yaml     X_BF as PoseState, 4 x 4 (mm); img01.pcd is its scan (mm), in place of Zivid's closed .zdf",
+    "opencv": (
+        "robot_poses.yml OpenCV FileStorage with a node for each scan: X_BF, 4 x 4 (m); clouds/ID.npz is its scan"
+    ),
+    "zivid": (
+        "pos01.yaml     X_BF as PoseState, 4 x 4 (mm); img01.pcd is its scan (mm), in place of Zivid's closed .zdf"
+    ),
     "ros": "tool_pose.csv  X_BF of each scan as 'rostopic echo -p' prints it, in the order of clouds/",
     "mcap": "recording/     a ROS 2 recording: PointCloud2 and PoseStamped",
 }
@@ -79,14 +87,12 @@ WIDTH = 120
 LEFT_OUT = ("extends", "visualization")
 HEAD = """# yaml-language-server: $schema={schema}
 {state}
-# A key behind a `#` has its default: remove the `#` to change it. Positions are in the robot's base, in metres; `rpy_deg` are roll,
-# pitch and yaw about fixed axes. All keys: docs/scenario.md. With real devices: docs/your_cell.md, and
+# A key behind a `#` has its default: remove the `#` to change it. Positions are in the robot's base, in metres;
+# `rpy_deg` are roll, pitch and yaw about fixed axes. All keys: docs/scenario.md. With real devices:
+# docs/your_cell.md, and
 #   weldcal check-cell {path}
 """
 TOOL = "tool.yaml"
-FLUSH_RAD = np.deg2rad(179.0)  # a joint as open as this needs a gap for the tip to feel
-MOST_TRIED = 4  # seams for which a place is looked for, and after these so many of their pieces
-OPEN_ABOVE = 0.3  # z of the joint's bisector
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 SAME_PLACE_M = 0.005  # between the middles of part and seam: they are tried as one
 TABLE_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
@@ -129,7 +135,8 @@ def new(
         option("--format", "NAME", "With --dataset: ur, matrices, opencv, zivid, ros or mcap; default: weldcal's own."),
     ] = "",
 ) -> Outcome:
-    """Write a commented scenario that runs, cell.yaml, with a schema for editors; or an example of a calibration dataset."""
+    """Write a commented scenario that runs, cell.yaml, with a schema for editors; or an example of a calibration
+    dataset."""
     if form and not dataset:
         raise typer.BadParameter("--format is for --dataset")
     if dataset:
@@ -164,7 +171,8 @@ def edge_numbers(text: str) -> list[int]:
 
 
 def write_example(folder: Path, seed: int, progress: Progress = no_progress, form: str = "") -> Path:
-    """Scan a flange in simulation and write the scans as a dataset, in weldcal's own form or another (ur, matrices, opencv ...).
+    """Scan a flange in simulation and write the scans as a dataset, in weldcal's own form or another (ur, matrices,
+    opencv ...).
 
     Raises:
         InputError: there is something in the folder already, or no such form.
@@ -189,7 +197,8 @@ def write_example(folder: Path, seed: int, progress: Progress = no_progress, for
 
 @dataclass(frozen=True)
 class OwnPart:
-    """A part's file, the numbers of the seam's edges (none: the best that can be welded), the joint (None: by its angle), its unit."""
+    """A part's file, the numbers of the seam's edges (none: the best that can be welded), the joint (None: by its
+    angle), its unit."""
 
     file: Path
     edges: tuple[int, ...] = ()
@@ -201,8 +210,9 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     """Write cell.yaml and its JSON schema into a folder, with a part and a tool of one's own.
 
     Returns:
-        The path of cell.yaml, and ""; where the arm can weld a seam only in pieces, which, and why. Where the arm can weld
-        the part's seam in no pose that was tried: the path of unfinished.yaml, and the reason in the pose that came nearest.
+        The path of cell.yaml, and ""; where the arm can weld a seam only in pieces, which, and why. Where the arm can
+        weld the part's seam in no pose that was tried: the path of unfinished.yaml, and the reason in the pose that
+        came nearest.
 
     Raises:
         InputError: there is one already, `base` is no scenario, or the part cannot be used.
@@ -262,7 +272,7 @@ def _refused(
 
 
 def planned(part: OwnPart, seams: list[list[PartEdge]], tool: Path, progress: Progress) -> list[tuple[str, str]]:
-    """Why a new cell's arm cannot weld each seam of a part, given by its edges, in any pose that is tried; "" where it can.
+    """Why a new cell's arm cannot weld each seam of a part, given by its edges, in any pose that is tried, else "".
 
     And in which pieces it can; "" where it can as a whole.
     """
@@ -316,7 +326,7 @@ def _below(config: Any, indent: str) -> Iterator[str]:
         yield _line(key, getattr(config, key.name), indent, written=k == 0 and not changed)
 
 
-def _line(key: Key, value: Any, indent: str, written: bool = False) -> str:
+def _line(key: SchemaKey, value: Any, indent: str, written: bool = False) -> str:
     """The key with its value, behind a comment sign where that is the default, and what it means."""
     meaning = key.meaning
     mark = "# " if value == key.default and not written and key.name != "description" else ""
@@ -341,7 +351,7 @@ def add_part(
         InputError: the part cannot be read, has no such edge, or no joint.
     """
     shape = read_shape(part.file, part.units)
-    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else _candidates(shape, part.file, tool)
+    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else to_try(shape, part.file, tool)
     found = [
         (seams, part.joint or joint_of(edges[0]), note)
         for edges in chosen
@@ -375,9 +385,8 @@ def _with_advice(shape: PartShape, seam: SeamConfig, tool: WeldingTool, reason: 
 def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig, str]:
     """The first of some poses on the table in which the arm can weld the seams of a scenario's part, and "".
 
-    There it must also be found in a scan: else the reason is why not.
-    Where there is none: the scenario's own pose, and the reason of the try in which the most seams could be welded; `advises`:
-    with what would help.
+    There it must also be found in a scan: else the reason is why not. Where there is none: the scenario's own pose, and
+    the reason of the try in which the most seams could be welded; `advises`: with what would help.
     """
     assert scenario.workpiece is not None
     own = scenario.workpiece.pose_guess
@@ -413,7 +422,8 @@ def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig
 def _first_refusal(
     scenario: Scenario, station: Station, seams: list[WeldPart], guess: PoseConfig, advises: bool = False
 ) -> tuple[int, str]:
-    """The number of seams before the first that the arm cannot weld with the part in a pose, and why; all, and "" for none."""
+    """The number of seams before the first that the arm cannot weld with the part in a pose, and why; all, and "" for
+    none."""
     for number, part in enumerate(seams):
         config = servo_config(scenario, station, number)
         planning = dc.replace(
@@ -462,28 +472,9 @@ def _standing(mesh: TriMesh, turn_deg: float, middle_P: NDArray[np.float64], sce
 
 
 def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
-    """Make a file the scenario's tool: one of weldcal's is copied into the cell's folder as tool.yaml, another stays where it is."""
+    """Make a file the scenario's tool: one of weldcal's is copied into the cell's folder as tool.yaml, another stays
+    where it is."""
     ours = tool.parent == WELDING.parent
     if ours:
         shutil.copyfile(tool, folder / TOOL)
     scenario.tool = ToolFile(TOOL if ours else str(tool.resolve()))
-
-
-def _candidates(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdge]]:
-    """The seams to try, at most MOST_TRIED, each by its edges.
-
-    Those that the tool fits come first, then those that it nearly fits; of these first what opens upwards.
-    """
-    found = []
-    for seam in ranked(shape, tool):
-        if not seam.felt or seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
-            above = seam.joint.up_P is not None and seam.joint.up_P[2] > OPEN_ABOVE
-            order = (bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above)
-            found.append((order, [shape.edge(id) for id in seam.joint.edges]))
-    chains = [chain for _, chain in sorted(found, key=lambda pair: pair[0])]
-    if not shape.joints:  # of a mesh of other surfaces
-        concave = [edge for edge in shape.edges if edge.kind == "concave"]
-        chains = [[edge] for edge in sorted(concave, key=lambda edge: -edge.length_m)]
-    if not chains:
-        raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
-    return chains[:MOST_TRIED]

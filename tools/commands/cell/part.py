@@ -167,12 +167,7 @@ def write_part(shape: PartShape, seams: list[Seam], folder: Path) -> None:
         "convex": str(len(chosen) - len(concave)),
         "picture": picture,
         "seams": [
-            (
-                row["type"],
-                ", ".join(map(str, seam.joint.edges)),
-                *(fixed(row[key], 1) for key in SHOWN),
-                seam.verdict,
-            )
+            (row["type"], ", ".join(map(str, seam.joint.edges)), *(fixed(row[key], 1) for key in SHOWN), seam.verdict)
             for seam, row in ((seam, seam.as_row()) for seam in seams)
         ],
         "rows": [(str(e.id), e.kind, *_figures(e)) for e in chosen],
@@ -229,7 +224,8 @@ def _towards(elevation: float, azimuth: float) -> Array:
 
 
 def _number(axes: Axes3D, shape: PartShape) -> None:
-    """Write the edges' numbers, those of joints and long edges first, each where it covers no other; else not at all."""
+    """Write the edges' numbers, those of joints and long edges first, each where it covers no other; else not at
+    all."""
     order = {"concave": 0, "flush": 0, "boundary": 1, "convex": 1}
     edges = sorted((e for e in shape.edges if e.kind in order), key=lambda e: (order[e.kind], -e.length_m))
     placed: list[Array] = []
@@ -244,9 +240,16 @@ def _number(axes: Axes3D, shape: PartShape) -> None:
             if all((np.abs(box[:2] - other[:2]) > box[2:] + other[2:]).any() for other in placed):
                 style = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 0.8}
                 axes.text(
-                    *p, str(edge.id), color=COLOURS[edge.kind], fontsize=size, fontweight="bold", zorder=20, bbox=style,
-                    ha="center", va="center",
-                )  # fmt: skip
+                    *p,
+                    str(edge.id),
+                    color=COLOURS[edge.kind],
+                    fontsize=size,
+                    fontweight="bold",
+                    zorder=20,
+                    bbox=style,
+                    ha="center",
+                    va="center",
+                )
                 placed.append(box)
                 break
 

@@ -1,4 +1,5 @@
-"""Proposes from where a scanner on the flange scans a part: views along it that overlap, each reached and tried by a scan."""
+"""Proposes from where a scanner on the flange scans a part: views along it that overlap, each reached and tried by a
+scan."""
 
 import dataclasses as dc
 import math
@@ -35,7 +36,8 @@ CARRIED = "carried_scanner"
 
 
 def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
-    """Write into a scenario from where a scanner on the flange scans its part, or say why a scan does not show the part.
+    """Write into a scenario from where a scanner on the flange scans its part, or say why a scan does not show the
+    part.
 
     Args:
         scenario: the scenario; its part lies where the arm can weld it.
@@ -69,7 +71,8 @@ def add_scan_poses(scenario: Scenario, path: Path, reason: str) -> str:
 
 
 def _too_long(scenario: Scenario, station: Station) -> str:
-    """Why one scan of a scanner beside the arm does not show a part that the arm could weld; "" where size is not the cause."""
+    """Why one scan of a scanner beside the arm does not show a part that the arm could weld; "" where size is not the
+    cause."""
     cad, X_BP = _part(scenario, station)
     scanner, planning = scenario.scanner, seam_planning(scenario, station, servo_config(scenario, station))
     refused = plan_drawn_seam(dc.replace(planning, advises=False), 0).reason is not None
@@ -96,7 +99,8 @@ def _scanner(scenario: Scenario) -> tuple[ScannerPreset, RigidTransform]:
 
 
 def _lying(mesh_B: TriMesh, up: Array) -> tuple[Array, Array, Array]:
-    """The part's box that stands upright: axes (3,3) in columns, the longest level one first and up last; size (3,); middle (3,)."""
+    """The part's box that stands upright: axes (3,3) in columns, the longest level one first and up last; size (3,);
+    middle (3,)."""
     R = RotationMatrix.MakeFromOneVector(up, 2).matrix()
     q = mesh_B.vertices @ R
     _, sides, turn = cv2.minAreaRect(q[:, :2].astype(np.float32))
@@ -129,7 +133,8 @@ def scan_poses(scenario: Scenario, station: Station) -> list[Array]:
 
 
 def _spread(scanner: ScannerPreset, size: Array) -> tuple[Array, float]:
-    """Middles of the scans along the part, m from its own, and the scanner's distance; equal overlaps, also beyond the ends.
+    """Middles of the scans along the part, m from its own, and the scanner's distance; equal overlaps, also beyond the
+    ends.
 
     Raises:
         InputError: the part is wider than a scan at any distance.
@@ -142,7 +147,8 @@ def _spread(scanner: ScannerPreset, size: Array) -> tuple[Array, float]:
             overlap = (count * along - size[0]) / (count + 1)
             return (np.arange(count) - 0.5 * (count - 1)) * (along - overlap), float(distance)
     raise InputError(
-        f"The part is {wide - 2.0 * MARGIN_M:.2g} m wide, and the scanner shows at most {across:.2g} m: take a scanner with a larger field."
+        f"The part is {wide - 2.0 * MARGIN_M:.2g} m wide, and the scanner shows at most {across:.2g} m: take a scanner"
+        " with a larger field."
     )
 
 

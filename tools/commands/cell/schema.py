@@ -25,8 +25,9 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _PLAIN = {float: "number", int: "integer", bool: "boolean", str: "string"}
 HEAD = """# Keys of a scenario
 
-Written by `weldcal schema --markdown`; do not edit. How to write a scenario: [scenarios.md](scenarios.md). Installed packages may add
-drivers. A key that is left out has its default. Units are in the names: m, mm, deg, s. Poses are in the robot's base.
+Written by `weldcal schema --markdown`; do not edit. How to write a scenario: [scenarios.md](scenarios.md).
+Installed packages may add drivers. A key that is left out has its default. Units are in the names: m, mm, deg, s. Poses
+are in the robot's base.
 """
 
 
@@ -41,7 +42,7 @@ def schema(
 
 
 @dataclass(frozen=True)
-class Key:
+class SchemaKey:
     """One key: its name, its type, its default value, and what it means."""
 
     name: str
@@ -67,7 +68,7 @@ class Key:
         return isinstance(self.kind, UnionType) and NoneType in get_args(self.kind)
 
 
-def keys_of(config: type) -> tuple[Key, ...]:
+def keys_of(config: type) -> tuple[SchemaKey, ...]:
     """The keys of a dataclass, those of its base classes included, in their order."""
     comments: dict[str, str] = {}
     for base in reversed(config.__mro__):
@@ -75,7 +76,7 @@ def keys_of(config: type) -> tuple[Key, ...]:
             comments |= _comments(base)
     default = config() if not inspect.isabstract(config) else None
     return tuple(
-        Key(field.name, field.type, getattr(default, field.name), comments.get(field.name, ""))
+        SchemaKey(field.name, field.type, getattr(default, field.name), comments.get(field.name, ""))
         for field in dc.fields(config)
     )
 
@@ -121,7 +122,7 @@ def yaml_of(value: Any) -> str:
     return json.dumps(value)
 
 
-def changed_keys(config: Any) -> list[tuple[Key, Any]]:
+def changed_keys(config: Any) -> list[tuple[SchemaKey, Any]]:
     """The keys of a configuration that do not have their default, each with its value."""
     pairs = ((key, getattr(config, key.name)) for key in keys_of(type(config)))
     return [(key, value) for key, value in pairs if value != key.default]
@@ -150,7 +151,7 @@ def _object(config: type, meanings: dict[str, str] | None = None) -> dict[str, A
     return {"type": "object", "additionalProperties": False, "properties": properties}
 
 
-def _property(key: Key, meaning: str) -> dict[str, Any]:
+def _property(key: SchemaKey, meaning: str) -> dict[str, Any]:
     schema = _value(key.kind)
     if key.name in DEVICES:
         schema = {"anyOf": [{"title": f"!{part.__name__}", **_object(part)} for part in key.parts]}
@@ -196,7 +197,7 @@ def _part(name: str, config: type, mark: str, listed: bool = False) -> Iterator[
             yield from _part(f"{name}.{key.name}", key.parts[0], "###", key.listed)
 
 
-def _device(key: Key) -> str:
+def _device(key: SchemaKey) -> str:
     drivers = [part for part in key.parts if part is not NoDevice]
     used = type(key.default).__name__
     text = (
@@ -226,7 +227,7 @@ def _sentence(config: type) -> str:
     return " ".join(first.split())
 
 
-def _table(keys: tuple[Key, ...] | list[Key], meanings: dict[str, str]) -> str:
+def _table(keys: tuple[SchemaKey, ...] | list[SchemaKey], meanings: dict[str, str]) -> str:
     if not keys:
         return "No keys.\n"
     rows = [
@@ -236,13 +237,13 @@ def _table(keys: tuple[Key, ...] | list[Key], meanings: dict[str, str]) -> str:
     return "\n".join(["| key | value | default | meaning |", "|---|---|---|---|", *rows]) + "\n"
 
 
-def _kind(key: Key) -> str:
+def _kind(key: SchemaKey) -> str:
     if len(key.parts) == 1 and key.parts[0].__name__ == "PoseConfig":
         return "pose: `xyz_m`, `rpy_deg`"
     return kind_in_words(key.kind)
 
 
-def _default(key: Key) -> str:
+def _default(key: SchemaKey) -> str:
     return "" if key.parts and key.default is not None else f"`{yaml_of(key.default)}`"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
-from weldcal.models.errors import WeldcalError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import load_tool, tool_file
 from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
@@ -25,6 +25,9 @@ from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
 
 PIPE_TOOL = "pipe"
 SMALL_M = 0.012  # a part this small may be drawn in inches
+FLUSH_RAD = math.radians(179.0)  # a joint as open as this needs a gap for the tip to feel
+MOST_TRIED = 4  # seams for which a place is looked for, and after these so many of their pieces
+OPEN_ABOVE = 0.3  # z of the joint's bisector
 LAP_MM = 5.0  # by which the pieces of a ring overlap
 CORNER_COS = math.cos(math.radians(35.0))  # between two steps of a seam's line: a sharper turn is a corner
 SHORT_M = 0.02  # the end of a sheet is such an edge: too short for the tip to come down and for the torch to follow
@@ -33,10 +36,12 @@ NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 @dataclass(frozen=True)
 class Seam:
-    """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it can).
+    """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it
+    can).
 
     short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
-    felt: by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was asked, too.
+    felt: by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was
+    asked, too.
     pieces: in which pieces that arm welds it; "" for one.
     """
 
@@ -78,7 +83,8 @@ class Seam:
 
 
 def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
-    """The joints of a part: those that the tool can weld first, the longest first, then the others, the nearest miss first.
+    """The joints of a part: those that the tool can weld first, the longest first, then the others, the nearest miss
+    first.
 
     The arm is not asked.
     """
@@ -90,7 +96,8 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
 
 
 def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[str, float, bool]:
-    """Why a tool does not fit a joint, its ball at the walls or its body at the middle of one of the edges, by how much, m, and if it is felt."""
+    """Why a tool does not fit a joint, its ball at the walls or its body at the middle of one of the edges, by how
+    much, m, and if it is felt."""
     flush = joint.angle_rad > math.pi - 0.01
     half, gap = (0.5 * math.pi, joint.gap_m) if flush else (0.5 * joint.angle_rad, 0.0)
     section, felt = JointSection(half, *joint.walls_m, gap), True
@@ -132,7 +139,8 @@ def _ring(shape: PartShape, joint: PartJoint) -> tuple[Array, Array] | None:
 
 
 def least_pipe(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> str:
-    """What the least pipe is whose outside the tool can weld onto a plate, both as far as the joint's longer wall; "" for a joint that is none of these."""
+    """What the least pipe is whose outside the tool can weld onto a plate, both as far as the joint's longer wall; ""
+    for a joint that is none of these."""
     ring = _ring(shape, joint)
     if ring is None or float(ring[1][0] @ (ring[0][0] - ring[0][:-1].mean(axis=0))) <= 0.0:
         return ""
@@ -193,3 +201,23 @@ def joint_of(edge: PartEdge) -> str:
     if edge.kind == "flush":
         return "butt"
     return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"
+
+
+def to_try(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdge]]:
+    """The seams to try, at most MOST_TRIED, each by its edges.
+
+    Those that the tool fits come first, then those that it nearly fits; of these first what opens upwards.
+    """
+    found = []
+    for seam in ranked(shape, tool):
+        if not seam.felt or seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
+            above = seam.joint.up_P[2] > OPEN_ABOVE
+            order = (bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above)
+            found.append((order, [shape.edge(id) for id in seam.joint.edges]))
+    chains = [chain for _, chain in sorted(found, key=lambda pair: pair[0])]
+    if not shape.joints:  # of a mesh of other surfaces
+        concave = [edge for edge in shape.edges if edge.kind == "concave"]
+        chains = [[edge] for edge in sorted(concave, key=lambda edge: -edge.length_m)]
+    if not chains:
+        raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
+    return chains[:MOST_TRIED]

@@ -1,4 +1,5 @@
-"""weldcal profiler clock: the offset of a profiler's clock from profiles of one straight edge, taken while the arm moves."""
+"""weldcal profiler clock: the offset of a profiler's clock from profiles of one straight edge, taken while the arm
+moves."""
 
 from pathlib import Path
 from typing import Annotated, Literal, cast
@@ -25,7 +26,8 @@ from weldcal.tools.report.files import write_json
 _KINDS, _SIDES = ("bar", "step", "apex"), ("left", "right")
 _STREAM, _TIMES = "stream.csv", "times.csv"
 _NEAR_S = 0.5  # offset of the clocks that is searched
-_SHARE = 0.01  # of the stream that the profiles last at least: seconds that are read as milliseconds last 0.002 of it at most
+# Of the stream that the profiles last at least: seconds that are read as milliseconds last 0.002 of it at most
+_SHARE = 0.01
 
 
 @command("profiler clock", short_help="Find a profiler's clock from a straight edge.")
@@ -51,15 +53,23 @@ def clock(
 
 
 def find_clock(
-    folder: Path, calibration: Path, out: Path, *, robot: str = "", unit: str = "m", feature: str = "bar", side: str = "left",
+    folder: Path,
+    calibration: Path,
+    out: Path,
+    *,
+    robot: str = "",
+    unit: str = "m",
+    feature: str = "bar",
+    side: str = "left",
     pitch_mm: float | None = None,
-) -> dict[str, object]:  # fmt: skip
+) -> dict[str, object]:
     """Find the offset of a profiler's clock and write clock.json to ``out``.
 
-    ``folder`` holds stream.csv (as a recording in motion) and the profiles: profiles.csv with time,x,z, the export of an instrument, or a
-    folder with one file per profile. Of a profile of many points the ``feature`` at the ``side`` is found; one point is the crossing.
-    times.csv gives the time of each profile where the export holds none. ``pitch_mm``: of an export with heights only.
-    Raises InputError: the files cannot be used; TooFewPoses, UndeterminedPoses: the motion does not show the offset.
+    ``folder`` holds stream.csv (as a recording in motion) and the profiles: profiles.csv with time,x,z, the export of
+    an instrument, or a folder with one file per profile. Of a profile of many points the ``feature`` at the ``side`` is
+    found; one point is the crossing. times.csv gives the time of each profile where the export holds none.
+    ``pitch_mm``: of an export with heights only. Raises InputError: the files cannot be used; TooFewPoses,
+    UndeterminedPoses: the motion does not show the offset.
     """
     if unit not in ("m", "mm"):
         raise InputError(f"The unit '{unit}' is not known; write m or mm.")
@@ -97,34 +107,45 @@ def _source(folder: Path, skip: set[Path]) -> Path:
     found = [plain] if plain.exists() else []
     if not found and folder.is_dir():
         found = [
-            p for p in sorted(folder.iterdir())
-            if p.name not in (_STREAM, _TIMES) and p.resolve() not in skip and not p.name.startswith((".", "_"))
-            and (p.suffix.lower() in (*TABLES, *TREES) if p.is_file() else any(q.suffix.lower() in (*TABLES, *TREES) for q in p.iterdir()))
-        ]  # fmt: skip
+            p
+            for p in sorted(folder.iterdir())
+            if p.name not in (_STREAM, _TIMES)
+            and p.resolve() not in skip
+            and not p.name.startswith((".", "_"))
+            and (
+                p.suffix.lower() in (*TABLES, *TREES)
+                if p.is_file()
+                else any(q.suffix.lower() in (*TABLES, *TREES) for q in p.iterdir())
+            )
+        ]
     if len(found) == 1:
         return found[0]
     if found:
         names = ", ".join(p.name for p in found[:4])
         raise InputError(f"'{folder}' holds {names}. Keep one of them beside stream.csv, or name it profiles.csv.")
     raise InputError(
-        f"There is no '{plain}'. Give a table with the columns time,x,z, or put an export of the profiler or a folder of profiles there."
+        f"There is no '{plain}'. Give a table with the columns time,x,z, or put an export of the profiler or a folder"
+        " of profiles there."
     )
 
 
 def _stamps(folder: Path, profiles: Profiles, motion: ContinuousMotion) -> tuple[Array, str]:
-    """The times (n,) s of the profiles, and their unit: the stated one, or the one in which half of them lie in the robot's stream."""
+    """The times (n,) s of the profiles, and their unit: the stated one, or the one in which half of them lie in the
+    robot's stream."""
     times, stated = profiles.times, profiles.time_unit
     if (folder / _TIMES).is_file():
         blocks = blocks_of(read_text(folder / _TIMES), _TIMES)
         times, stated = np.concatenate([b.table[:, 0] for b in blocks]) if blocks else np.zeros(0), ""
         if len(times) != len(profiles):
             raise InputError(
-                f"'{_TIMES}' holds {len(times)} times and '{profiles.source}' {len(profiles)} profiles. Give one for each."
+                f"'{_TIMES}' holds {len(times)} times and '{profiles.source}' {len(profiles)} profiles. Give one for"
+                " each."
             )
     if times is None:
         raise InputError(
-            f"'{profiles.source}' ({profiles.form}) holds {len(profiles)} profiles and no time of each. Write their times into {_TIMES} in the "
-            "same folder, a row each in the order of the profiles, or give profiles.csv with the columns time,x,z."
+            f"'{profiles.source}' ({profiles.form}) holds {len(profiles)} profiles and no time of each. Write their"
+            f" times into {_TIMES} in the same folder, a row each in the order of the profiles, or give profiles.csv"
+            " with the columns time,x,z."
         )
     if stated:
         return SECONDS[stated] * times, stated
@@ -134,14 +155,15 @@ def _stamps(folder: Path, profiles: Profiles, motion: ContinuousMotion) -> tuple
         if inside and scale * float(np.nanmax(times) - np.nanmin(times)) >= _SHARE * (end - begin):
             return scale * times, unit
     raise InputError(
-        f"The profiles' times run from {np.nanmin(times):.10g} to {np.nanmax(times):.10g}, and the robot's stream from {motion.span[0]:.10g} to "
-        f"{motion.span[1]:.10g} s. Bring both to one clock within {_NEAR_S:g} s: add a constant to the times, and write them into {_TIMES}, a row for each "
-        "profile."
+        f"The profiles' times run from {np.nanmin(times):.10g} to {np.nanmax(times):.10g}, and the robot's stream from"
+        f" {motion.span[0]:.10g} to {motion.span[1]:.10g} s. Bring both to one clock within {_NEAR_S:g} s: add a"
+        f" constant to the times, and write them into {_TIMES}, a row for each profile."
     )
 
 
 def _crossings(profiles: Profiles, stamps: Array, scale: float, feature: str, side: str) -> tuple[Array, Array, int]:
-    """Times (n,) s, points (n, 2) m at which the profiles cross the edge, and the number of profiles that do not show it."""
+    """Times (n,) s, points (n, 2) m at which the profiles cross the edge, and the number of profiles that do not show
+    it."""
     kept, points, lost = [], [], 0
     for t, found in zip(stamps, profiles.points, strict=True):
         at = scale * found

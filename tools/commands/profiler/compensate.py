@@ -51,7 +51,8 @@ def compensate(
     ] = False,
     limit_mm: LimitOption = None,
 ) -> Outcome:
-    """Calibrate by the sphere paper's two linear steps and its compensation. 'sphere' is more accurate on the same file."""
+    """Calibrate by the sphere paper's two linear steps and its compensation. 'sphere' is more accurate on the same
+    file."""
     check_limit(limit_mm)
     stated = PosesStated(poses, robot_form, pitch)
     data, measured = read_sphere(call, file, unit, dataset, trial, radius, touches, tip, stated=stated)

@@ -12,11 +12,7 @@ from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
-from weldcal.calibration.profiler.plan import (
-    Field,
-    plan_edge_poses,
-    sample_edge_poses,
-)
+from weldcal.calibration.profiler.plan import Field, plan_edge_poses, sample_edge_poses
 from weldcal.calibration.profiler.reading_choice import edge_fit
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.models.errors import InputError, WeldcalError
@@ -85,7 +81,8 @@ def edge(
     plan: PlanOption = 0,
     limit_mm: LimitOption = None,
 ) -> Outcome:
-    """Calibrate the profiler's pose on the flange by points of one straight edge, seen in any poses. Needs no initial guess."""
+    """Calibrate the profiler's pose on the flange by points of one straight edge, seen in any poses. Needs no initial
+    guess."""
     check_limit(limit_mm)
     given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
     robot, x, z = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
@@ -146,7 +143,8 @@ def calibrate_edge(
         found |= {"mean_distance_mm": 1e3 * float(linear.distances_m.mean())}
         if found["mean_distance_mm"] > FAR_FROM_EDGE_MM:
             found["warnings"] = [
-                f"The points lie {found['mean_distance_mm']:.1f} mm from one edge on average. Scan one edge only, and check unit and poses."
+                f"The points lie {found['mean_distance_mm']:.1f} mm from one edge on average. Scan one edge only, and"
+                " check unit and poses."
             ]
         record = ProfilerRecord(
             method="edge, linear",
@@ -180,9 +178,13 @@ def calibrate_edge(
 def edge_points(file: Measurements, feature: str, side: str) -> tuple[Floats, list[int]]:
     """Points (n, 2) m, not finite where a profile shows no edge, and the numbers of those."""
     if not feature:
-        return file.needed(
-            "points", "the edge's point [x, z] in each profile (with raw profiles, name --feature bar, step or apex)"
-        ), []
+        return (
+            file.needed(
+                "points",
+                "the edge's point [x, z] in each profile (with raw profiles, name --feature bar, step or apex)",
+            ),
+            [],
+        )
     if feature not in FEATURES:
         raise InputError(f"The feature is bar, step or apex, not '{feature}'.")
     if file.profiles is None:
@@ -199,9 +201,9 @@ def edge_points(file: Measurements, feature: str, side: str) -> tuple[Floats, li
 def edge_by_noise(poses: FlangePoses, points: Floats, sigmas: Sigmas) -> tuple[EdgeEstimate, Sigmas]:
     """The joint estimate, and the sigmas that it uses.
 
-    Where none are stated, the usual ones are scaled up together until they agree with the residuals: otherwise good points
-    of a noisier sensor would be rejected as outliers, which biases the estimate and makes its sigma too small. A larger scale
-    is kept only if no inlier is lost.
+    Where none are stated, the usual ones are scaled up together until they agree with the residuals: otherwise good
+    points of a noisier sensor would be rejected as outliers, which biases the estimate and makes its sigma too small. A
+    larger scale is kept only if no inlier is lost.
 
     Raises:
         InconsistentData: the points lie on no edge, with the enlarged sigmas either; others as edge_joint.
@@ -240,9 +242,15 @@ def edge_by_noise(poses: FlangePoses, points: Floats, sigmas: Sigmas) -> tuple[E
 
 
 def finish_edge(
-    file: Measurements, feature: str, side: str, record: ProfilerRecord, found: dict[str, Any], source: str,
-    out: Path, limit_mm: float | None,
-) -> tuple[ProfilerFile, dict[str, Any]]:  # fmt: skip
+    file: Measurements,
+    feature: str,
+    side: str,
+    record: ProfilerRecord,
+    found: dict[str, Any],
+    source: str,
+    out: Path,
+    limit_mm: float | None,
+) -> tuple[ProfilerFile, dict[str, Any]]:
     """Write an edge's calibration and its report; the result, and its JSON object without the folder."""
     points, _ = edge_points(file, feature, side)
     keep = np.asarray(np.isfinite(points).all(axis=1), bool)
@@ -253,15 +261,19 @@ def finish_edge(
 
 
 def edge_held_out(poses: FlangePoses, points: Floats, sigmas_mm: Mapping[str, float]) -> Floats:
-    """Distance (n,) mm of each point (n, 2) m from the edge of a calibration without its fifth of the scans; NaN where there is none."""
+    """Distance (n,) mm of each point (n, 2) m from the edge of a calibration without its fifth of the scans; NaN where
+    there is none."""
     found, n = np.full(len(points), np.nan), len(points)
     for fold in range(FOLDS):
         out = np.arange(n) % FOLDS == fold
         try:
             e = edge_joint(
-                poses.rotation[~out], poses.translation[~out], points[~out], sigma_robot_m=1e-3 * sigmas_mm["robot"],
+                poses.rotation[~out],
+                poses.translation[~out],
+                points[~out],
+                sigma_robot_m=1e-3 * sigmas_mm["robot"],
                 sigma_xz_m=1e-3 * np.array([sigmas_mm["x"], sigmas_mm["z"]]),
-            )  # fmt: skip
+            )
         except WeldcalError:  # the others do not determine the pose
             continue
         p_S = np.column_stack([points[out, 0], np.zeros(out.sum()), points[out, 1]])

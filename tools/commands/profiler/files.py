@@ -1,4 +1,5 @@
-"""Read measurements of a profiler from NPZ, tables, exports and folders into SI units and one set of names (layouts: docs/profiler.md)."""
+"""Read measurements of a profiler from NPZ, tables, exports and folders into SI units and one set of names (layouts:
+docs/profiler.md)."""
 
 import hashlib
 import re
@@ -27,9 +28,17 @@ FAR_M = 20.0  # no robot's flange is this far from its base
 
 # other names of the same arrays, in files with one more axis for trials or worlds
 ALIASES = {
-    "scan_T": "T", "T_base_flange": "T", "Rb": "rotation", "Tb": "translation", "ps": "points", "prof": "profiles",
-    "scan_prof": "profiles", "scan_sign": "sign", "scan_q": "q", "tip_nominal": "tip",
-}  # fmt: skip
+    "scan_T": "T",
+    "T_base_flange": "T",
+    "Rb": "rotation",
+    "Tb": "translation",
+    "ps": "points",
+    "prof": "profiles",
+    "scan_prof": "profiles",
+    "scan_sign": "sign",
+    "scan_q": "q",
+    "tip_nominal": "tip",
+}
 DIMENSIONS = {
     "T": 3, "rotation": 3, "translation": 2, "points": 2, "profiles": 3, "sign": 1, "translated": 1, "group": 1, "q": 2,
     "touch_T": 3, "touch_q": 2, "tip": 1, "dh": 2, "scan_kind": 1, "dh_nominal": 2,
@@ -39,7 +48,8 @@ LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 
 @dataclass(frozen=True)
 class PosesStated:
-    """What the user states of an export's poses: their file, their form, and the distance of points (mm) where it holds heights only."""
+    """What the user states of an export's poses: their file, their form, and the distance of points (mm) where it holds
+    heights only."""
 
     poses: Path | None = None
     form: str = ""
@@ -55,7 +65,8 @@ class Measurements:
         profiles: raw profiles [x, z] (m, 2), or None.
         digest: SHA-256 of the file or of the files of the folder.
         warnings: sentences about the file.
-        readings: the readings that the numbers of the poses allow, the used one first; empty where the file's form fixes one.
+        readings: the readings that the numbers of the poses allow, the used one first; empty where the file's form
+            fixes one.
         reading: how the profiles and the poses were understood; empty for this package's own forms.
         notes: sentences about the reading that was chosen.
     """
@@ -69,7 +80,8 @@ class Measurements:
     notes: tuple[str, ...] = ()
 
     def decided(self, fit: Fit, what: str) -> "Measurements":
-        """The same with the reading of the poses that the profiles select. Raises InconsistentData where they select none."""
+        """The same with the reading of the poses that the profiles select. Raises InconsistentData where they select
+        none."""
         if len(self.readings) < 2:
             return self
         k, sentence = choose_reading(self.readings, fit, what)
@@ -165,11 +177,13 @@ def read_profiler_file(
         raise InputError("The file has no flange poses. Give 'T', or 'rotation' and 'translation'.")
     if len(X) and float(np.abs(X.translation).max()) > FAR_M:
         raise InputError(
-            f"The flange would be {np.abs(X.translation).max():.0f} m from the base. Give --unit mm if the lengths are in mm."
+            f"The flange would be {np.abs(X.translation).max():.0f} m from the base. Give --unit mm if the lengths are"
+            " in mm."
         )
     if len(X) and float(np.abs(X.translation).max()) < NEAR_M:
         raise InputError(
-            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base. Give --unit m if the lengths are in m."
+            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base. Give --unit m if the"
+            " lengths are in m."
         )
     return file
 
@@ -297,7 +311,8 @@ def _of_trial(value: Floats, trial: int | None) -> Floats:
 
 
 def _from_csv(path: Path) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]:
-    """One row for each profile point: the flange's x, y, z and rotation vector, then the point; scans by a column `scan`."""
+    """One row for each profile point: the flange's x, y, z and rotation vector, then the point; scans by a column
+    `scan`."""
     header, rows = read_rows(path)
     if not rows:
         raise InputError(f"'{path.name}' needs a header and a row of numbers for each profile point.")
@@ -323,8 +338,8 @@ def _from_csv(path: Path) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]
     turn = float(np.nanmax(np.linalg.norm(pose[:, 3:], axis=1), initial=0.0))
     if turn > LONGEST_TURN:
         raise InputError(
-            f"The rotation vectors rx_rad, ry_rad, rz_rad of '{path.name}' are up to {turn:.0f} long, more than a whole turn. They seem "
-            "to be degrees; write radians."
+            f"The rotation vectors rx_rad, ry_rad, rz_rad of '{path.name}' are up to {turn:.0f} long, more than a whole"
+            " turn. They seem to be degrees; write radians."
         )
     seen = [f"px_{unit}", f"pz_{unit}"]
     points: NDArray[np.float64] | None = None

@@ -1,4 +1,5 @@
-"""weldcal profiler live: the profiler job, its measurement files, calibrations and report; for several seeds, a table."""
+"""weldcal profiler live: the profiler job, its measurement files, calibrations and report; for several seeds, a
+table."""
 
 import hashlib
 import io
@@ -11,19 +12,11 @@ import numpy as np
 from weldcal.calibration.profiler.record import ProfilerRecord, save_record
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.profiler.estimates import Taken
+from weldcal.systems.jobs.profiler.estimates import TakenProfile
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import (
-    LIVE,
-    Call,
-    Outcome,
-    RecordOption,
-    ScenarioArgument,
-    command,
-    option,
-)
+from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, ScenarioArgument, command, option
 from weldcal.tools.commands.run import JobRun, named_once, run_job, run_options
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.profiler_live import (
@@ -79,7 +72,8 @@ def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progres
 
 
 def write_live(live: ProfilerLive, finished: JobRun) -> None:
-    """Write edge.npz, sphere.npz, seam.npz (as weldcal profiler reads them), edge/ and sphere/ with profiler.yaml, seam.csv, report.html."""
+    """Write edge.npz, sphere.npz, seam.npz (as weldcal profiler reads them), edge/ and sphere/ with profiler.yaml,
+    seam.csv, report.html."""
     s, arm, folder = live.state, finished.cell.station.arm, live.folder
     folder.mkdir(parents=True, exist_ok=True)
     job = live.run.cell.job.job
@@ -92,14 +86,19 @@ def write_live(live: ProfilerLive, finished: JobRun) -> None:
             continue
         data = _npz(arm, taken, more)
         write_atomic(folder / f"{name}.npz", data)
-        estimate = {"edge": None if s.edge is None else s.edge.estimate, "sphere": None if s.sphere is None else s.sphere.estimate}.get(name)  # fmt: skip
+        estimate = {
+            "edge": None if s.edge is None else s.edge.estimate,
+            "sphere": None if s.sphere is None else s.sphere.estimate,
+        }.get(name)
         if estimate is not None:
             (folder / name).mkdir(exist_ok=True)
             save_record(
                 ProfilerRecord.of(f"{name}, live", estimate, {}, hashlib.sha256(data).hexdigest()), folder / name
             )
     if s.seam is not None:
-        rows = [dict(zip(("x_mm", "y_mm", "z_mm"), (f"{1e3 * v:.4f}" for v in p), strict=True)) for p in s.seam.points_B]  # fmt: skip
+        rows = [
+            dict(zip(("x_mm", "y_mm", "z_mm"), (f"{1e3 * v:.4f}" for v in p), strict=True)) for p in s.seam.points_B
+        ]
         write_atomic(folder / "seam.csv", mappings_csv(rows))
     finished.write_recording(folder)
     write_atomic(
@@ -110,7 +109,7 @@ def write_live(live: ProfilerLive, finished: JobRun) -> None:
     )
 
 
-def _npz(arm: ArmModel, taken: Sequence[Taken], more: Mapping[str, Any]) -> bytes:
+def _npz(arm: ArmModel, taken: Sequence[TakenProfile], more: Mapping[str, Any]) -> bytes:
     """The bytes of an npz file with flange poses, joints and raw profiles."""
     T = np.array([forward_kinematics(arm, t.q).GetAsMatrix4() for t in taken])
     out = io.BytesIO()
@@ -141,7 +140,11 @@ def run_profiler_seeds(scenario: Scenario, options: RunOptions, runs: int, progr
     for k in range(runs):
         seed = options.seed + k
         one = replace(options, seed=seed, out=options.out / f"seed{seed:02d}", recording=False)
-        live = run_profiler_live(scenario, one, lambda what, share, k=k: progress(what, (k + share) / runs))  # type: ignore[misc]
+
+        def part(what: str, share: float, k: int = k) -> None:
+            progress(what, (k + share) / runs)
+
+        live = run_profiler_live(scenario, one, part)
         live.run.raise_if_interrupted()
         rows.append(_flat(live.summary()))
         outcomes.append(live.outcome)

@@ -1,4 +1,5 @@
-"""What `edge`, `sphere` and `compensate` share: their options, the sigmas, and the files and report of a calibration."""
+"""What `edge`, `sphere` and `compensate` share: their options, the sigmas, and the files and report of a
+calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -96,7 +97,8 @@ def outcome_of(call: Call, found: Mapping[str, object], made: ProfilerFile | Pro
 
 @dataclass(frozen=True)
 class Sigmas:
-    """Standard deviations of sensor and robot, m; `stated`: given by the user or the file, so points beyond them are outliers."""
+    """Standard deviations of sensor and robot, m; `stated`: given by the user or the file, so points beyond them are
+    outliers."""
 
     robot_m: float = 0.03e-3
     x_m: float = 0.05e-3
@@ -157,9 +159,14 @@ def write_calibration(record: ProfilerRecord, folder: Path) -> dict[str, Any]:
 
 
 def finish(
-    record: ProfilerRecord, found: dict[str, Any], points: Floats, held_mm: Floats, source: str, out: Path,
+    record: ProfilerRecord,
+    found: dict[str, Any],
+    points: Floats,
+    held_mm: Floats,
+    source: str,
+    out: Path,
     limit_mm: float | None,
-) -> tuple[ProfilerFile, dict[str, Any]]:  # fmt: skip
+) -> tuple[ProfilerFile, dict[str, Any]]:
     """Write a calibration and its report; the result, and its JSON object without the folder."""
     points = points[np.isfinite(points).all(axis=1)]
     if "reading" in found:

@@ -51,14 +51,15 @@ def seam(
 
 
 def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
-    """The measurements with their poses read as those of the calibration were. Raises InputError where several readings are left."""
+    """The measurements with their poses read as those of the calibration were. Raises InputError where several readings
+    are left."""
     if len(data.readings) > 1:
         data = data.with_form(str(load_record(calibration).figures.get("robot_form", "")))
     if len(data.readings) > 1:
         one, other = data.readings[:2]
         raise InputError(
-            f"A seam does not show how its poses are written: as {one.words}, or as {other.words} ({len(data.readings)} readings). State it, for "
-            f"example with --robot-form {one.form} or --robot-form {other.form}."
+            f"A seam does not show how its poses are written: as {one.words}, or as {other.words} ({len(data.readings)}"
+            f" readings). State it, for example with --robot-form {one.form} or --robot-form {other.form}."
         )
     return data
 

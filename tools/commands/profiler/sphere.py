@@ -9,11 +9,7 @@ import numpy as np
 from weldcal.calibration.errors import ArcNotFound
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.calibration.profiler.plan import (
-    Field,
-    plan_sphere_poses,
-    sample_sphere_poses,
-)
+from weldcal.calibration.profiler.plan import Field, plan_sphere_poses, sample_sphere_poses
 from weldcal.calibration.profiler.reading_choice import sphere_fit
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
@@ -78,8 +74,8 @@ def sphere(
     plan: PlanOption = 0,
     limit_mm: LimitOption = None,
 ) -> Outcome:
-    """Calibrate the profiler's pose on the flange by raw profiles of a sphere. Needs no initial guess, no scan sides and no
-    pure translations."""
+    """Calibrate the profiler's pose on the flange by raw profiles of a sphere. Needs no initial guess, no scan sides
+    and no pure translations."""
     check_limit(limit_mm)
     sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
     lost: list[int] = []
@@ -88,9 +84,14 @@ def sphere(
     )
     record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=call.seed)
     made, summary = finish_sphere(
-        measured, SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m), record,
-        with_warnings(data, found) | {"without_sphere": lost}, file.name, call.folder("profiler", file.stem), limit_mm,
-    )  # fmt: skip
+        measured,
+        SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m),
+        record,
+        with_warnings(data, found) | {"without_sphere": lost},
+        file.name,
+        call.folder("profiler", file.stem),
+        limit_mm,
+    )
     return outcome_of(call, summary, made)
 
 
@@ -174,9 +175,15 @@ def sphere_data(
     if q is not None:
         check_number(poses, (len(q),), "joint vectors q")
     return SphereData(
-        poses=poses[np.array(kept)], profiles=profiles, radius_m=radius, touches=felt, tip=tip if felt is not None else None, arm=table,
-        q=None if q is None else q[kept], touch_q=file.arrays.get("touch_q"),
-    )  # fmt: skip
+        poses=poses[np.array(kept)],
+        profiles=profiles,
+        radius_m=radius,
+        touches=felt,
+        tip=tip if felt is not None else None,
+        arm=table,
+        q=None if q is None else q[kept],
+        touch_q=file.arrays.get("touch_q"),
+    )
 
 
 def parse_tip(text: str) -> Floats | None:
@@ -236,7 +243,8 @@ def calibrate_sphere(
     if plan:
         if np.median([fit_circle(p)[0][1] - np.median(p[:, 1]) for p in data.profiles]) < 0.0:
             raise InputError(
-                "Planning needs z pointing away from the sensor. Change the sign of z, and of x to keep the frame right-handed, in the file."
+                "Planning needs z pointing away from the sensor. Change the sign of z, and of x to keep the frame"
+                " right-handed, in the file."
             )
         seen = np.vstack(data.profiles)
         near, far = (float(v) for v in np.percentile(seen[:, 1], [1.0, 99.0]))
@@ -286,7 +294,8 @@ def _warnings(e: SphereEstimate, data: SphereData, s: SphereSigmas) -> list[str]
         )
     if e.tip is not None and data.tip is not None and np.linalg.norm(e.tip - data.tip) > 3.0 * s.tip_m:
         said.append(
-            f"The touches put the tip {1e3 * float(np.linalg.norm(e.tip - data.tip)):.0f} mm from its given position. Check --tip."
+            f"The touches put the tip {1e3 * float(np.linalg.norm(e.tip - data.tip)):.0f} mm from its given position."
+            " Check --tip."
         )
     return said
 
@@ -298,9 +307,14 @@ def _without_arm(data: SphereData) -> SphereData:
 
 
 def finish_sphere(
-    data: SphereData, sigmas: SphereSigmas, record: ProfilerRecord, found: dict[str, Any], source: str, out: Path,
+    data: SphereData,
+    sigmas: SphereSigmas,
+    record: ProfilerRecord,
+    found: dict[str, Any],
+    source: str,
+    out: Path,
     limit_mm: float | None,
-) -> tuple[ProfilerFile, dict[str, Any]]:  # fmt: skip
+) -> tuple[ProfilerFile, dict[str, Any]]:
     """Write a sphere's calibration and its report; the result, and its JSON object without the folder."""
     held = np.zeros(0)
     if "model" in found:  # the published method cannot leave a scan out

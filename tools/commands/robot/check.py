@@ -36,7 +36,8 @@ def check_robot(
     ] = None,
     arm: Annotated[str, option("--arm", "NAME", "The arm, where no scenario is given: ur3e, ur5e, ur20 ...")] = "ur10e",
 ) -> Outcome:
-    """Check whether a robot and this computer are ready: what is right and what to change. Nothing moves or is written."""
+    """Check whether a robot and this computer are ready: what is right and what to change. Nothing moves or is
+    written."""
     nominal = nominal_arm(load_scenario(scenario)) if scenario is not None else load_arm(arm)
     config = configured(host, scenario)
     report = preflight(

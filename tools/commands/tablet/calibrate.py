@@ -58,7 +58,7 @@ def calibrate(
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Calibrate camera and pen on the wrist from one image of the tablet and a touch of each landmark."""
-    inputs = TabletInputs(
+    inputs = VisitFiles(
         file=file,
         poses=poses,
         camera=camera,
@@ -77,7 +77,7 @@ def calibrate(
 
 
 @dataclass(frozen=True, kw_only=True)
-class TabletInputs:
+class VisitFiles:
     """The files of one visit, and the known quantities."""
 
     file: Path
@@ -96,8 +96,8 @@ class TabletInputs:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TabletCalibration:
-    """The result, the data of its report, the fit with full poses where it is one; else the rounding step of the hand and the
-    errors at the file's queries; and the duration."""
+    """The result, the data of its report, the fit with full poses where it is one; else the rounding step of the hand
+    and the errors at the file's queries; and the duration."""
 
     result: TabletResult
     shown: Shown
@@ -143,7 +143,7 @@ class TabletCalibration:
         write_atomic(folder / "report.html", page)
 
 
-def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration | ManyVisits:
+def calibrate_tablet(inputs: VisitFiles, folder: Path) -> TabletCalibration | ManyVisits:
     """Calibrate from the files and write the result folder; a file of many visits gives each of them, and all together.
 
     Raises:
@@ -163,7 +163,7 @@ def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration | 
     return made
 
 
-def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
+def _planar(inputs: VisitFiles) -> TabletCalibration | ManyVisits:
     if any(path is not None for path in (inputs.poses, inputs.camera, inputs.image, inputs.seen)):
         raise InputError("An npz file is complete. Omit --poses, --camera, --image and --seen, or give the CSV.")
     read = load_planar(inputs.file)
@@ -173,7 +173,8 @@ def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
     if len(visits) + len(read.refused) > 1:
         if inputs.two_stages:
             raise InputError(
-                f"'{inputs.file.name}' holds {len(visits) + len(read.refused)} visits. --two-stages needs a file with one."
+                f"'{inputs.file.name}' holds {len(visits) + len(read.refused)} visits. --two-stages needs a file with"
+                " one."
             )
         return fit_many(inputs.file, read, sign, step_m)
     found = fit_visit(visits[0], sign, step_m)
@@ -206,7 +207,7 @@ def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
     }
 
 
-def _wrist(inputs: TabletInputs) -> TabletCalibration:
+def _wrist(inputs: VisitFiles) -> TabletCalibration:
     if inputs.poses is None or inputs.camera is None:
         raise InputError(
             "Touches in a CSV need the robot's poses (--poses FILE) and the camera's intrinsics (--camera FILE)."

@@ -17,16 +17,9 @@ from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import (
-    LIVE,
-    Call,
-    Outcome,
-    RecordOption,
-    ScenarioOption,
-    command,
-)
+from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, ScenarioOption, command
 from weldcal.tools.commands.run import run_job, run_options
-from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
+from weldcal.tools.commands.tablet.calibrate import TabletCalibration, VisitFiles, calibrate_tablet
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.first_screen import FirstScreen
 from weldcal.tools.report.render import write_atomic
@@ -106,11 +99,12 @@ def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress)
 
 
 def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCalibration, dict[str, object]]:
-    """Write the run's files, calibrate from them as `weldcal tablet calibrate` does, and compare with the ground truth."""
+    """Write the run's files, calibrate from them as `weldcal tablet calibrate` does, and compare with the ground
+    truth."""
     folder, tablet = options.out, run.cell.job.tablet
     write_visit(run, folder)
     done = calibrate_tablet(
-        TabletInputs(
+        VisitFiles(
             file=folder / "touches.csv",
             poses=folder / "poses.csv",
             camera=folder / "camera.yaml",
@@ -130,9 +124,9 @@ def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCa
 def compare(run: Run[AddedVisit], fit: WristFit, seed: int) -> dict[str, object]:
     """Errors of the fit against the ground truth: camera, pen, and touches of points not used in the fit.
 
-    An unseen touch: the camera observes a point of the tablet from the pose of the picture, and the flange moves to where the
-    fit predicts that the pen touches it, with any rotation and no more tilt than the run's touches. The error is the true
-    pen's distance from the point, in the tablet's plane.
+    An unseen touch: the camera observes a point of the tablet from the pose of the picture, and the flange moves to
+    where the fit predicts that the pen touches it, with any rotation and no more tilt than the run's touches. The error
+    is the true pen's distance from the point, in the tablet's plane.
     """
     job = run.cell.job
     lean = min(MOST_LEAN_RAD, float(np.deg2rad(job.tablet.tilt_deg)))
@@ -159,7 +153,8 @@ def compare(run: Run[AddedVisit], fit: WristFit, seed: int) -> dict[str, object]
 
 
 def depth_error(run: Run[AddedVisit], uv: Array) -> dict[str, object]:
-    """Depth errors (rms) of the landmarks, apart from the scale: from the tablet's plane, and from each landmark's pixel."""
+    """Depth errors (rms) of the landmarks, apart from the scale: from the tablet's plane, and from each landmark's
+    pixel."""
     job = run.cell.job
     K, truth, depth_m = job.camera.camera_matrix(), job.truth, job.picture(run.root).depth_m
     X_CT = (forward_kinematics(run.cell.station.arm, job.state(run.root).q_look) @ truth.X_FC).inverse() @ truth.X_BT

@@ -85,8 +85,8 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
     if abs(scale - 1.0) > max(_SCALE_SIGMAS * deviation, _SCALE_LEAST):
         fits[FREE] = _fit_planar(touches, dc.replace(config, free_scale=True), thorough)
         warnings.append(
-            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (sigma {100 * deviation:.1f} %). Check the "
-            "page's size with a card, or the tablet's pixels per inch."
+            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (sigma {100 * deviation:.1f} %). Check"
+            " the page's size with a card, or the tablet's pixels per inch."
         )
     if visit.excluded:
         rows = ", ".join(map(str, visit.excluded))
@@ -101,10 +101,11 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
 
 
 def best_model(visits: Sequence[VisitFits]) -> tuple[str, dict[str, float]]:
-    """The model with the smallest held-out error over all visits, and every model's mean held-out error (mm; NaN: none).
+    """The model with the smallest held-out error over all visits, and every model's mean held-out error (mm; NaN:
+    none).
 
-    A free scale is a candidate only if every visit needs it. Only landmarks that every model could hold out are compared;
-    with four landmarks there are none, and PnP is chosen.
+    A free scale is a candidate only if every visit needs it. Only landmarks that every model could hold out are
+    compared; with four landmarks there are none, and PnP is chosen.
     """
     models = [m for m in (PNP, LINEAR, FREE) if all(m in v.fits for v in visits)]
     left = {m: np.concatenate([v.left_out_mm(m) for v in visits]) for m in models}
@@ -125,8 +126,8 @@ def _same_units(planar: PlanarFit) -> None:
     if not 1.0 / _OTHER_UNIT < scale < _OTHER_UNIT:
         unit = min(abs(np.log(scale * k)) for k in (1e3, 1e-3, 10.0, 0.1, 25.4, 1 / 25.4)) < _LIKE_A_UNIT
         raise InputError(
-            f"The hand moved {scale:.3g} times as far as the distance of the tablet's landmarks. Write hand and hand_capture in "
-            "millimetres, and mm_per_px in millimetres per pixel of tablet_px."
+            f"The hand moved {scale:.3g} times as far as the distance of the tablet's landmarks. Write hand and"
+            " hand_capture in millimetres, and mm_per_px in millimetres per pixel of tablet_px."
             if unit
             else f"Hands and landmarks do not fit (the hand moved {scale:.3g} times as far); {_ONE_ORDER}."
         )
@@ -143,8 +144,8 @@ def _refuse_contradictions(
     left, spread = min(fit.sigma_m for fit in fits.values()), _spread_m(touches)
     if left > _CONTRADICTION * spread:
         raise InputError(
-            f"The touches contradict each other: they fit to {1e3 * left:.0f} mm only, with landmarks {1e3 * spread:.0f} mm from their "
-            f"centre. {causes[0] if causes else f'Please {_ONE_ORDER}, x before y.'}"
+            f"The touches contradict each other: they fit to {1e3 * left:.0f} mm only, with landmarks"
+            f" {1e3 * spread:.0f} mm from their centre. {causes[0] if causes else f'Please {_ONE_ORDER}, x before y.'}"
         )
 
 
@@ -205,8 +206,8 @@ def _odd_landmarks(visit: PlanarVisit, planar: PlanarFit, config: PlanarConfig) 
         return []
     row = visit.rows[int(np.nonzero(number == worst)[0][0])]
     return [
-        f"Without landmark {row} the others fit to {1e3 * left[worst]:.2f} mm instead of {1e3 * planar.sigma_m:.2f}: touch it again, "
-        "or remove it."
+        f"Without landmark {row} the others fit to {1e3 * left[worst]:.2f} mm instead of {1e3 * planar.sigma_m:.2f}:"
+        " touch it again, or remove it."
     ]
 
 
@@ -288,9 +289,15 @@ class ManyVisits:
             cards.insert(0, ("The file's queries, mean", fixed(held["mean"], 3), "mm", "good", worst))
         cards.append(("Visits", str(len(self.visits)), "", "plain", f"{len(self.refused)} refused"))
         rows = [
-            (v["id"], fixed(v["held_out_mm"], 3), fixed(v["leave_one_out_mm"], 3), fixed(v["residual_mm"], 3), str(v["n_landmarks"]))
+            (
+                v["id"],
+                fixed(v["held_out_mm"], 3),
+                fixed(v["leave_one_out_mm"], 3),
+                fixed(v["residual_mm"], 3),
+                str(v["n_landmarks"]),
+            )
             for v in map(self._visit, self.visits)
-        ]  # fmt: skip
+        ]
         warnings = [f"Visit {v.visit.name}: {text}" for v in self.visits for text in v.warnings]
         models = ", ".join(f"{m} {fixed(e, 3)} mm" for m, e in self.errors_mm.items())
         return render(
@@ -315,7 +322,7 @@ class ManyVisits:
                     ("seconds", fixed(self.seconds, 2)),
                 ],
             ),
-        )  # fmt: skip
+        )
 
 
 def error_figures(errors_mm: Array) -> dict[str, float] | None:

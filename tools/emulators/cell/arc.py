@@ -1,4 +1,5 @@
-"""The power source: an arc some time after its enable, where it is given its set points; a digital input tells the controller."""
+"""The power source: an arc some time after its enable, where it is given its set points; a digital input tells the
+controller."""
 
 from dataclasses import dataclass
 
@@ -7,7 +8,10 @@ IGNITION_S = 0.12
 
 @dataclass
 class Arc:
-    """The arc behind an enable; without its set points (`fed`) it does not burn. `fails`: it does not ignite, and the fault input is on while it is asked for."""
+    """The arc behind an enable; without its set points (`fed`) it does not burn.
+
+    `fails`: it does not ignite, and the fault input is on while it is asked for.
+    """
 
     ignition_s: float = IGNITION_S
     fails: bool = False

@@ -34,7 +34,7 @@ class FingerSetup:
     port: int
 
 
-class Stream:
+class PictureStream:
     """The newest part of the stream, for any number of clients."""
 
     def __init__(self) -> None:
@@ -49,7 +49,8 @@ class Stream:
 
     @contextlib.contextmanager
     def client(self) -> Iterator[int]:
-        """A client is connected for the duration of the block; gives the number of the newest part, which may be old."""
+        """A client is connected for the duration of the block; gives the number of the newest part, which may be
+        old."""
         with self._news:
             self._clients += 1
             number = self._number
@@ -61,7 +62,10 @@ class Stream:
 
     def put(self, jpeg: bytes, taken: float) -> None:
         """Show another picture, taken at this Unix time (s)."""
-        head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\nX-Timestamp: {taken:.6f}\r\n\r\n"
+        head = (
+            f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\nX-Timestamp:"
+            f" {taken:.6f}\r\n\r\n"
+        )
         with self._news:
             self._number, self._part = self._number + 1, head.encode("ascii") + jpeg + b"\r\n"
             self._news.notify_all()
@@ -77,7 +81,7 @@ class _Server(Limited, socketserver.ThreadingTCPServer):
     allow_reuse_address = True
 
 
-def _handler(stream: Stream) -> type[BaseHTTPRequestHandler]:
+def _handler(stream: PictureStream) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_response(200)
@@ -105,13 +109,13 @@ def draw(view: TagView, X_FM: Array, noise_grey: float, rng: np.random.Generator
 
 
 def run_finger_camera(setup: FingerSetup, world: Connection) -> None:
-    """Serve until the world closes its end of the pipe; it sends (Unix time s, X_FM (4, 4)) for each exposure, and is told when
-    the picture is shown.
+    """Serve until the world closes its end of the pipe; it sends (Unix time s, X_FM (4, 4)) for each exposure, and is
+    told when the picture is shown.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     cv2.setNumThreads(1)
-    view, stream, rng = TagView(setup.tool, setup.camera), Stream(), np.random.default_rng([setup.seed, 3])
+    view, stream, rng = TagView(setup.tool, setup.camera), PictureStream(), np.random.default_rng([setup.seed, 3])
     with _Server((setup.host, setup.port), _handler(stream)) as server, contextlib.suppress(EOFError, OSError):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         world.send("ready")

@@ -12,7 +12,10 @@ SEED = 11
 
 @dataclass
 class InputWire:
-    """What the two inputs (arc established, arc fault) read. `how`: killed (off), frozen (as they are), delayed, garbage, or "" (right)."""
+    """What the two inputs (arc established, arc fault) read.
+
+    `how`: killed (off), frozen (as they are), delayed, garbage, or "" (right).
+    """
 
     how: str = ""
     _shown: tuple[bool, bool] = (False, False)

@@ -30,7 +30,8 @@ STILL_FRAMES = 50  # for so many frames; then its state stays as it is until the
 
 
 def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
-    """The simulated station of a scenario whose arm stands where its controller has moved it; all else follows from `seed`.
+    """The simulated station of a scenario whose arm stands where its controller has moved it; all else follows from
+    `seed`.
 
     Raises:
         InputError: the scenario has no simulated scanner or profiler, or a tool and no workpiece or no finger camera.
@@ -41,8 +42,8 @@ def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
         feels and (not scenario.finger_camera.SIMULATED or scenario.workpiece is None)
     ):
         raise InputError(
-            "The world needs a scenario with a simulated scanner or profiler, and a simulated finger camera and a workpiece or tool: none, "
-            "such as s_groove, motion or profiler_edge."
+            "The world needs a scenario with a simulated scanner or profiler, and a simulated finger camera and a"
+            " workpiece or tool: none, such as s_groove, motion or profiler_edge."
         )
     if not isinstance(scenario.robot_2, NoDevice):
         raise InputError("The world has one arm: remove robot_2 from its scenario.")
@@ -61,7 +62,8 @@ def still(station: Station, q: Array) -> tuple[Simulator, Context]:
 
 
 class Physics:
-    """The plant of the world, advanced by the controller's frames; without a tool nothing touches, and the arm is where it should be."""
+    """The plant of the world, advanced by the controller's frames; without a tool nothing touches, and the arm is where
+    it should be."""
 
     def __init__(self, scenario: Scenario, arm: ArmModel, seed: int, repeatability_mm: float) -> None:
         self.station = true_station(scenario, arm, seed)

@@ -51,7 +51,8 @@ class NoWorld(WeldcalError):
 
 @dataclass(frozen=True, kw_only=True)
 class WiredWorld:
-    """A running world: its process, those of scanner and finger camera, the cell's scenario file, and the file of its truth."""
+    """A running world: its process, those of scanner and finger camera, the cell's scenario file, and the file of its
+    truth."""
 
     process: subprocess.Popen[str]
     host: str
@@ -149,7 +150,9 @@ def wired_world(folder: Path, host: str, seed: int, seam_mm: float, *, bridged: 
         if bridged:
             trigger, stream = (host, TRIGGER_PORT), (host, STREAM_PORT)
             clocks = [stack.enter_context(_controller(process, host)) for _ in range(2)]  # one for each thread
-            trigger_clock, stream_clock = (lambda clock=clock: float(clock.ask(ask="time")["timestamp"]) for clock in clocks)  # fmt: skip
+            trigger_clock, stream_clock = (
+                lambda clock=clock: float(clock.ask(ask="time")["timestamp"]) for clock in clocks
+            )
             bridges["scanner"] = ScannerBridge((host, TRIGGER_PORT + BRIDGED), trigger, scans, passed, trigger_clock)
             bridges["finger camera"] = PictureBridge((host, STREAM_PORT + BRIDGED), stream, stream_clock)
             for bridge in bridges.values():

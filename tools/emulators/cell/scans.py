@@ -1,4 +1,5 @@
-"""The world's end of a triggered scanner's pipe: tells how the world stands when a scan is asked for, and lets no scan come late."""
+"""The world's end of a triggered scanner's pipe: tells how the world stands when a scan is asked for, and lets no scan
+come late."""
 
 import contextlib
 import time

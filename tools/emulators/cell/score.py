@@ -1,4 +1,5 @@
-"""The contents of the truth file: where the scanner stands, how far the torch was from the true seam, and how the job ended."""
+"""The contents of the truth file: where the scanner stands, how far the torch was from the true seam, and how the job
+ended."""
 
 import numpy as np
 
@@ -13,8 +14,8 @@ WELDED = 0.95  # share of the wanted length
 def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest: bool) -> dict[str, object]:
     """The contents of the truth file. `wanted_m` is the arc length to weld; None: the whole seam.
 
-    `state` is what the world can see: waiting (no arc yet), welding, done (the arc has gone off, the arm is at rest, the
-    seam's length is welded and nothing collided), or stopped.
+    `state` is what the world can see: waiting (no arc yet), welding, done (the arc has gone off, the arm is at rest,
+    the seam's length is welded and nothing collided), or stopped.
     """
     truth = physics.station.truth
     found: dict[str, object] = {}

@@ -1,4 +1,5 @@
-"""Process of the world's streaming scanner: renders each exposure and drops a cloud with the time of the scanner's own clock."""
+"""Process of the world's streaming scanner: renders each exposure and drops a cloud with the time of the scanner's own
+clock."""
 
 import contextlib
 import signal
@@ -33,7 +34,8 @@ class StreamSetup:
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """Frame `number`: the plant's positions at the instants of its exposure, its times (s), and whether the stand was knocked before."""
+    """Frame `number`: the plant's positions at the instants of its exposure, its times (s), and whether the stand was
+    knocked before."""
 
     number: int
     instants: tuple[Array, ...]
@@ -77,7 +79,8 @@ class FrameRenderer:
 
 
 def run_stream(setup: StreamSetup, world: Connection) -> None:
-    """Serve until the world closes its end of the pipe; it sends an Exposure when its frame is to arrive, and is told when it is there."""
+    """Serve until the world closes its end of the pipe; it sends an Exposure when its frame is to arrive, and is told
+    when it is there."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     renderer = FrameRenderer(setup)

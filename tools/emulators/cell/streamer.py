@@ -32,7 +32,10 @@ class Streamer:
         self.knocked_at_s: float | None = None
 
     def knock(self, now: float) -> None:
-        """Knock the scanner's stand at `now`, s of the world. Raises InputError where the world's scenario has no such stand."""
+        """Knock the scanner's stand at `now`, s of the world.
+
+        Raises InputError where the world's scenario has no such stand.
+        """
         if self._knock_s is None:
             raise InputError(
                 "Write scanner.knock_s and knock_mm in the world's scenario: then its stand can be knocked."
@@ -51,7 +54,8 @@ class Streamer:
             self._waiter.send(self._underway.popleft()[1])  # no frame is late by more than this computer
 
     def truth(self) -> dict[str, object]:
-        """The scanner's clock, what it read (s) at time 0 of the world and how much faster it is, and when its stand was knocked."""
+        """The scanner's clock, what it read (s) at time 0 of the world and how much faster it is, and when its stand
+        was knocked."""
         t = self._timing
         clock = {"at_0_s": t.device_epoch_s, "rate": 1.0 + 1e-6 * t.device_drift_ppm}
         return {"scanner_clock": clock, "knocked_at_s": self.knocked_at_s}

@@ -1,4 +1,5 @@
-"""The touch probe of the world: contact of the true tip with the true sphere, and the wire from it to the controller's input."""
+"""The touch probe of the world: contact of the true tip with the true sphere, and the wire from it to the controller's
+input."""
 
 from dataclasses import dataclass
 
@@ -16,8 +17,10 @@ HOWS = ("", "cut", "stuck", "chatters")
 
 @dataclass(kw_only=True)
 class TouchProbe:
-    """What the input reads. `how`: cut (the cable is broken), stuck (the contact stays closed), chatters (the contact opens and closes
-    every few frames, touched or not), or "" (right).
+    """What the input reads.
+
+    `how`: cut (the cable is broken), stuck (the contact stays closed), chatters (the contact opens and closes every few
+    frames, touched or not), or "" (right).
 
     `touches` counts the contacts, and `deepest_m` is how far the tip was inside the sphere at most.
     """

@@ -1,4 +1,5 @@
-"""Hands data to a device's process of the world, one at a time: the world waits for it, and not for one that has stopped."""
+"""Hands data to a device's process of the world, one at a time: the world waits for it, and not for one that has
+stopped."""
 
 import contextlib
 from multiprocessing.connection import Connection
@@ -14,7 +15,8 @@ class Waiter:
         self._unshown = self._gone = False
 
     def send(self, datum: object) -> None:
-        """Send once the last datum is shown; a device that does not answer misses this one, and is not waited for until it does."""
+        """Send once the last datum is shown; a device that does not answer misses this one, and is not waited for until
+        it does."""
         with contextlib.suppress(OSError, EOFError):
             if self._unshown and self._pipe.poll(0.0 if self._gone else LIMIT_S):
                 self._pipe.recv()

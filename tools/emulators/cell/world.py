@@ -85,8 +85,9 @@ def wires_of(cell: Scenario) -> Wires:
         camera, VideoFingerCamera | NoDevice
     ):
         raise InputError(
-            "The cell's scenario must have a robot !UrRtde, a scanner !FolderScanner or a profiler !FolderProfiler, and a finger_camera "
-            "!VideoFingerCamera or !NoDevice, such as wired_s_groove, wired_motion or wired_profiler_edge."
+            "The cell's scenario must have a robot !UrRtde, a scanner !FolderScanner or a profiler !FolderProfiler, and"
+            " a finger_camera !VideoFingerCamera or !NoDevice, such as wired_s_groove, wired_motion or"
+            " wired_profiler_edge."
         )
     streams = isinstance(scanner, FolderScanner) and scanner.streams
     trigger, stream = urlsplit(scanner.trigger), urlsplit("" if isinstance(camera, NoDevice) else camera.source)
@@ -96,8 +97,8 @@ def wires_of(cell: Scenario) -> Wires:
         or not scanner.folder
     ):
         raise InputError(
-            "The world needs folder and trigger: tcp://HOST:PORT of scanner or profiler (or streams: true without a trigger) and "
-            "finger_camera.source: http://HOST:PORT/PATH in the cell's scenario."
+            "The world needs folder and trigger: tcp://HOST:PORT of scanner or profiler (or streams: true without a"
+            " trigger) and finger_camera.source: http://HOST:PORT/PATH in the cell's scenario."
         )
     probe = cell.touch_probe if isinstance(cell.touch_probe, UrTouchProbe) else None
     if probe is not None:
@@ -258,10 +259,12 @@ def run_world(
     control_port: int = CONTROL_PORT,
     parent: int | None = None,
 ) -> None:
-    """Play the world behind a cell's wires until the process is asked to end (SIGTERM or SIGINT), or process ``parent`` is gone.
+    """Play the world behind a cell's wires until the process is asked to end (SIGTERM or SIGINT), or process ``parent``
+    is gone.
 
     Args:
-        world_name: what is true: a scenario, by name or path, with simulated devices; its deviations follow from `seed`.
+        world_name: what is true: a scenario, by name or path, with simulated devices; its deviations follow from
+            `seed`.
         cell_name: the scenario with what the cell knows, and on which addresses it looks for its devices.
         seed: of everything random.
         write: called with the contents of the truth file whenever they have changed.

@@ -16,7 +16,10 @@ SETTLES = 0.05  # share by which the joints move to the offset of a new stop in 
 
 @dc.dataclass
 class WorldArm(DriverConfig):
-    """A driver without a controller: the joint servos' reference is a port of the station. Made by code, not by a scenario."""
+    """A driver without a controller: the joint servos' reference is a port of the station.
+
+    Made by code, not by a scenario.
+    """
 
     FOR: ClassVar[tuple[str, ...]] = ("robot",)
     SIMULATED: ClassVar[bool] = True

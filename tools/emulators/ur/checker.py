@@ -9,8 +9,9 @@ from weldcal.tools.emulators.ur.controller.motions import STEP_S
 
 RECORD_FRAMES = 300_000  # ten minutes
 REST_RAD_S = 1e-3
-# A streamed motion whose client has been silent for longer than this moves unattended. Silence is counted in frames, as the
-# watchdogs count it and as the arm moves: a controller whose frames come late lives slowly, and its arm moves as slowly.
+# A streamed motion whose client has been silent for longer than this moves unattended. Silence is counted in frames, as
+# the watchdogs count it and as the arm moves: a controller whose frames come late lives slowly, and its arm moves as
+# slowly.
 SILENT_S = 0.25
 TIME, SPEED, TOOL, SILENCE, STREAMED, OUTPUTS = range(6)
 
@@ -110,8 +111,8 @@ class Checker:
     def output_after(self, fault_time: float, output: int) -> dict[str, Any]:
         """When after a point in time a digital output went off and when the arm began to slow down (s; None: not yet).
 
-        `frames_before_braking`: how many frames the output was off before the first in which the joints went slower than
-        at that time by a hundredth; `on_again_s`: when it went on again.
+        `frames_before_braking`: how many frames the output was off before the first in which the joints went slower
+        than at that time by a hundredth; `on_again_s`: when it went on again.
         """
         rows = self._rows()
         # from the last frame before that time: what happens between frames is seen in the first one after it
@@ -136,7 +137,8 @@ class Checker:
         }
 
     def output_on_after(self, fault_time: float, output: int) -> dict[str, Any]:
-        """For how long a digital output was on after a point in time (s), and when it was on for the last time (None: never)."""
+        """For how long a digital output was on after a point in time (s), and when it was on for the last time (None:
+        never)."""
         rows = self._rows()
         rows = rows[rows[:, TIME] >= fault_time]
         on = (rows[:, OUTPUTS].astype(np.int64) >> output & 1).astype(bool)

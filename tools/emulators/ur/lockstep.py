@@ -15,10 +15,10 @@ STREAM_PACKAGES = 5  # of one recipe: from then on it is a stream
 class Lockstep:
     """Says before every frame whether it has to wait.
 
-    A stream is a run of input packages of one recipe. It ends with a package of another recipe, with its connection, with
-    the program, and where the client stays silent for `bound_s`. A client that has let a watchdog be set has promised to
-    write, too: half of the watchdog's period passes without it. A connection that a fault keeps from being heard is not
-    waited for. `ahead`: frames that the controller may go past a stream's newest package.
+    A stream is a run of input packages of one recipe. It ends with a package of another recipe, with its connection,
+    with the program, and where the client stays silent for `bound_s`. A client that has let a watchdog be set has
+    promised to write, too: half of the watchdog's period passes without it. A connection that a fault keeps from being
+    heard is not waited for. `ahead`: frames that the controller may go past a stream's newest package.
     """
 
     def __init__(self, controller: Controller, bound_s: float, ahead: int = AHEAD_FRAMES) -> None:

@@ -34,7 +34,7 @@ from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, Lockstep
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
-from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, Request, World
+from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, LoopWorld, Request
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer
 from weldcal.tools.emulators.ur.wire.net import Connection, Network
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
@@ -127,9 +127,11 @@ def narrowed(model: ArmModel, ranges: str) -> ArmModel:
 
 
 class Emulation:
-    """A controller's ports and its loop. `after_step` is called with the host's time (s) after every step of the controller,
-    before its frame is sent: what it does belongs to the same time, and the controller waits for it. `while_waiting` is called
-    while the controller's time waits for its client. `more_faults` are those of what stands around the controller.
+    """A controller's ports and its loop.
+
+    `after_step` is called with the host's time (s) after every step of the controller, before its frame is sent: what
+    it does belongs to the same time, and the controller waits for it. `while_waiting` is called while the controller's
+    time waits for its client. `more_faults` are those of what stands around the controller.
     """
 
     def __init__(
@@ -149,7 +151,7 @@ class Emulation:
         self._pace = pace
         self._checker = Checker(controller)
         self._lockstep = Lockstep(controller, lockstep, AHEAD_FRAMES if after_step is None else WORLD_AHEAD_FRAMES)
-        self._world = World()
+        self._world = LoopWorld()
         self._sent_at = 0.0
         self._network = Network(host, seed)
         self._rng = np.random.default_rng([seed, 1])

@@ -35,8 +35,8 @@ SEAM_MM = 30.0
 SHORT = f"welding: {{seam_length_mm: {SEAM_MM}}}"
 FEW = "calibration: {minimum_scans: 4, maximum_scans: 6, required_error_mm: 1.0}"
 KNOWN = (
-    "scanner: !RenderedScanner {preset: phoxi_m, width: 824, height: 616, mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0}\n"
-    f"job: {{calibrate: false, X_BC: {X_BC}}}"
+    "scanner: !RenderedScanner {preset: phoxi_m, width: 824, height: 616, mounting_translation_mm: 0.0,"
+    f" mounting_rotation_deg: 0.0}}\njob: {{calibrate: false, X_BC: {X_BC}}}"
 )
 HIDDEN = "finger_camera: !RenderedFingerCamera {hidden_from_s: 8.0}"
 HOLE_MM = 25.0
@@ -45,7 +45,8 @@ Happens = Callable[[], object]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of run: scenario, overrides, the robot (simulated, emulated or wired), and a fault at the begin of a phase."""
+    """A kind of run: scenario, overrides, the robot (simulated, emulated or wired), and a fault at the begin of a
+    phase."""
 
     scenario: str
     overrides: str
@@ -151,9 +152,14 @@ def _wired(kind: Kind, seed: int, out: Path) -> DemoResult:
     with wired_world(out / "world", host, seed, SEAM_MM) as world:
         stopped = {"finger": world.finger, "scanner": world.scanner}.get(kind.fault)
         quick = {
-            "finger": f"finger_camera: !VideoFingerCamera {{source: 'http://{host}:8081/stream', stamps: host, silent_s: 2.0}}",
-            "scanner": f"scanner: !FolderScanner {{folder: {out / 'world' / 'scans'}, trigger: 'tcp://{host}:5020', "
-            "preset: phoxi_m, width: 824, height: 616, scan_timeout_s: 2.0}",
+            "finger": (
+                f"finger_camera: !VideoFingerCamera {{source: 'http://{host}:8081/stream', stamps: host, silent_s:"
+                " 2.0}"
+            ),
+            "scanner": (
+                f"scanner: !FolderScanner {{folder: {out / 'world' / 'scans'}, trigger: 'tcp://{host}:5020', "
+                "preset: phoxi_m, width: 824, height: 616, scan_timeout_s: 2.0}"
+            ),
         }.get(kind.fault, "")
         options = RunOptions(scenario=str(world.cell), out=out, seed=seed, recording=False, record=True)
         return _run(
@@ -188,12 +194,13 @@ _TURNS: list[Semaphore] = []  # of a measuring process: one for each side
 
 
 def run_overhead(folder: Path, pairs: int, seed: int, progress: Progress) -> tuple[dict[str, object], str]:
-    """Pairs of one run (the S groove, 30 mm of seam), one of each pair recorded: the JSON object, and a table in Markdown.
+    """Pairs of one run (the S groove, 30 mm of seam), one of each pair recorded: the JSON object, and a table in
+    Markdown.
 
-    Computing time (all threads of a process, s) of whole runs, reports included, is compared. The two runs of a pair take turns of
-    one simulated second: a host that works for others too changes its speed by a third within minutes, and so changes it for both.
-    A first pair, which compiles and loads, does not count. Each recording is removed. `percent_of_a_core`: what recording takes,
-    spread over the run's own seconds.
+    Computing time (all threads of a process, s) of whole runs, reports included, is compared. The two runs of a pair
+    take turns of one simulated second: a host that works for others too changes its speed by a third within minutes,
+    and so changes it for both. A first pair, which compiles and loads, does not count. Each recording is removed.
+    `percent_of_a_core`: what recording takes, spread over the run's own seconds.
     """
     rows: list[dict[str, float]] = []
     with _two_processes() as (pool, turns):
@@ -202,8 +209,14 @@ def run_overhead(folder: Path, pairs: int, seed: int, progress: Progress) -> tup
             plain, recorded = _pair(pool, turns, folder / f"pair_{k}", seed)
             if k:
                 rows.append(
-                    {"pair": float(k), "plain_cpu_s": plain[0], "recorded_cpu_s": recorded[0], "size_mb": recorded[1], "run_s": plain[2]}
-                )  # fmt: skip
+                    {
+                        "pair": float(k),
+                        "plain_cpu_s": plain[0],
+                        "recorded_cpu_s": recorded[0],
+                        "size_mb": recorded[1],
+                        "run_s": plain[2],
+                    }
+                )
     found = overhead(np.array([[row["plain_cpu_s"], row["recorded_cpu_s"]] for row in rows]))
     lines = [
         (f"{row['pair']:.0f}", f"{row['plain_cpu_s']:.2f}", f"{row['recorded_cpu_s']:.2f}", f"{row['size_mb']:.0f}")
@@ -219,7 +232,8 @@ def run_overhead(folder: Path, pairs: int, seed: int, progress: Progress) -> tup
 
 
 def overhead(seconds: np.ndarray) -> dict[str, float]:
-    """By how many percent the second column (n,2) is longer than the first: the median of the pairs, and its interval of at least 95 %.
+    """By how many percent the second column (n,2) is longer than the first: the median of the pairs, and its interval
+    of at least 95 %.
 
     A disturbance of the host makes single runs longer: the median and its interval (order statistics) bear that.
     """
@@ -253,7 +267,8 @@ def _pair(
 
 
 def _in_turns(side: int, folder: Path, seed: int) -> tuple[float, float, float]:
-    """One run that works only in its turns; side 1 is recorded: computing time s, size of the recording MB, the run's own length s."""
+    """One run that works only in its turns; side 1 is recorded: computing time s, size of the recording MB, the run's
+    own length s."""
     mine, others = _TURNS[side], _TURNS[1 - side]
 
     def hand_over(*_: object) -> None:
@@ -285,20 +300,17 @@ def seconds(folder: Path, seed: int, *, record: bool, progress: Progress) -> tup
     "benchmark replay", short_help="Record runs of every kind and replay each bit for bit.", hidden=True, options=FARM
 )
 def replays(
-    call: Call,
-    runs: Annotated[int, option("--runs", "N", "Number of runs, over all kinds in turn.", min=1)] = 20,
+    call: Call, runs: Annotated[int, option("--runs", "N", "Number of runs, over all kinds in turn.", min=1)] = 20
 ) -> Outcome:
-    """Record runs of every kind (simulated, on an emulated controller, by wire, with faults), and replay each bit for bit."""
+    """Record runs of every kind (simulated, on an emulated controller, by wire, with faults), and replay each bit for
+    bit."""
     folder = call.folder("benchmark", "replay")
     found = REPLAYS.run(Farm.of(folder, call.given, call.progress), replay_cases(folder, runs, call.seed))
     return Outcome(found.figures, text=found.markdown())
 
 
 @command("benchmark recording", short_help="Measure the computing time that a recording costs.", hidden=True)
-def recording(
-    call: Call,
-    pairs: Annotated[int, option("--pairs", "N", "Pairs of runs.", min=6)] = 11,
-) -> Outcome:
+def recording(call: Call, pairs: Annotated[int, option("--pairs", "N", "Pairs of runs.", min=6)] = 11) -> Outcome:
     """Run a short demo with and without --record in turn, and compare the computing time."""
     summary, table = run_overhead(call.folder("benchmark", "recording"), pairs, call.seed, call.progress)
     return Outcome(summary, text=table)

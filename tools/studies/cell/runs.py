@@ -52,9 +52,20 @@ def _mean_wall(phases: list[tuple[str, float, float]], name: str) -> float:
 
 
 WORST = (
-    "n_scans", "X_BC_error_mm", "X_BC_error_deg", "X_BC_error_at_work_mm", "expected_error_mm", "plan_mean_mm",
-    "plan_max_mm", "torch_mean_mm", "torch_max_mm", "torch_lateral_max_mm", "torch_speed_cv", "peak_omega", "wall_seconds",
-)  # fmt: skip
+    "n_scans",
+    "X_BC_error_mm",
+    "X_BC_error_deg",
+    "X_BC_error_at_work_mm",
+    "expected_error_mm",
+    "plan_mean_mm",
+    "plan_max_mm",
+    "torch_mean_mm",
+    "torch_max_mm",
+    "torch_lateral_max_mm",
+    "torch_speed_cv",
+    "peak_omega",
+    "wall_seconds",
+)
 
 
 def run_seed(scenario: str, folder: str, seed: int) -> Mapping[str, object]:
@@ -97,9 +108,18 @@ def seed_cases(scenario: str, folder: Path, seeds: Iterable[int]) -> Cases:
 
 
 COLUMNS = (
-    "arm", "state", "n_scans", "X_BC_error_mm", "X_BC_error_deg", "X_BC_error_at_work_mm", "plan_mean_mm", "plan_max_mm",
-    "torch_mean_mm", "torch_max_mm", "reason",
-)  # fmt: skip
+    "arm",
+    "state",
+    "n_scans",
+    "X_BC_error_mm",
+    "X_BC_error_deg",
+    "X_BC_error_at_work_mm",
+    "plan_mean_mm",
+    "plan_max_mm",
+    "torch_mean_mm",
+    "torch_max_mm",
+    "reason",
+)
 
 
 def run_arm(arm: str, folder: str, seed: int, seam_mm: float, robot: str | None) -> Mapping[str, object]:

@@ -22,7 +22,8 @@ from weldcal.tools.studies.targets import Target
 from weldcal.tools.worlds.weld.cell_run import figures
 from weldcal.welding.servo.laws import get_law
 
-# (figure, name, worst or mean over the runs, limit, unit); a real-time factor is a lower bound and depends on the machine
+# (figure, name, worst or mean over the runs, limit, unit); a real-time factor is a lower bound and depends on the
+# machine
 TARGETS = (
     ("point_sd_mm", "seam points, sd", "worst", 0.02, "mm"),
     ("torch_mean_mm", "torch, mean", "worst", 0.1, "mm"),
@@ -31,12 +32,17 @@ TARGETS = (
 )
 WALL_CLOCK = ("real_time_factor",)
 FIGURES = (
-    ("seam points, sd mm", "point_sd_mm", 4), ("seam points, offset mm", "point_offset_mm", 4),
-    ("their height, sd mm", "height_sd_mm", 3), ("their height, offset mm", "height_offset_mm", 3),
-    ("torch, mean mm", "torch_mean_mm", 3), ("torch, largest mm", "torch_max_mm", 3),
-    ("in space, largest mm", "space_max_mm", 3), ("torch speed CV %", "cv_percent", 2),
-    ("real-time factor of the weld", "real_time_factor", 2), ("CPU s per simulated s", "cpu_per_second", 2),
-)  # fmt: skip
+    ("seam points, sd mm", "point_sd_mm", 4),
+    ("seam points, offset mm", "point_offset_mm", 4),
+    ("their height, sd mm", "height_sd_mm", 3),
+    ("their height, offset mm", "height_offset_mm", 3),
+    ("torch, mean mm", "torch_mean_mm", 3),
+    ("torch, largest mm", "torch_max_mm", 3),
+    ("in space, largest mm", "space_max_mm", 3),
+    ("torch speed CV %", "cv_percent", 2),
+    ("real-time factor of the weld", "real_time_factor", 2),
+    ("CPU s per simulated s", "cpu_per_second", 2),
+)
 
 
 class PhaseCpu:

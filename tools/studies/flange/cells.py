@@ -1,4 +1,5 @@
-"""Calibrations of simulated cells without rendering: arms with errors of their own, and an imperfect scanner and arm."""
+"""Calibrations of simulated cells without rendering: arms with errors of their own, and an imperfect scanner and
+arm."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -52,7 +53,8 @@ def arm(
         str, option("--kind", "KIND", "links: all errors of the arm; joints: zeros of the joints only.")
     ] = "links",
 ) -> Outcome:
-    """Calibrate UR10e cells with factory-size errors of the arm from 20 planned scans, plain and refined, and judge both on new scans."""
+    """Calibrate UR10e cells with factory-size errors of the arm from 20 planned scans, plain and refined, and judge
+    both on new scans."""
     seeds = range(call.seed, call.seed + worlds)
     return ARM.outcome(call, {f"world {s}": {"seed": s, "kind": kind} for s in seeds})
 
@@ -75,8 +77,10 @@ def _imperfect_rows(f: Figures) -> Iterable[Row]:
     e, (low, high) = f["at_work_mm"], f["inside_95_chance"]
     yield (
         "error at the work point",
-        f"{e['mean']:.3f} mm mean, {e['p95']:.3f} 95 %, {e['worst']:.3f} at most ({f['rms_at_work_mm']:.3f} rms; "
-        f"{f['expected_mm']:.3f} expected), from {f['scans_mean']:.1f} scans",
+        (
+            f"{e['mean']:.3f} mm mean, {e['p95']:.3f} 95 %, {e['worst']:.3f} at most ({f['rms_at_work_mm']:.3f} rms; "
+            f"{f['expected_mm']:.3f} expected), from {f['scans_mean']:.1f} scans"
+        ),
     )
     yield (
         "in the stated 95 % region",
@@ -87,7 +91,10 @@ def _imperfect_rows(f: Figures) -> Iterable[Row]:
 
 IMPERFECT = Study(
     name="flange-imperfect",
-    what="Live calibrations with an imperfect scanner and arm, without rendering: errors, and how often they lie in the region.",
+    what=(
+        "Live calibrations with an imperfect scanner and arm, without rendering: errors, and how often they lie in the"
+        " region."
+    ),
     figures=lambda results: results["all"],
     header=("", "found"),
     rows=_imperfect_rows,
@@ -102,8 +109,8 @@ def imperfect(
     ] = "s_groove",
     runs: Annotated[int, option("--runs", "N", "Number of calibrations, each in its own world.", min=10)] = 200,
 ) -> Outcome:
-    """Calibrate with an imperfect scanner and arm, without rendering: errors at the work point, and how often they lie in the
-    stated 95 % region."""
+    """Calibrate with an imperfect scanner and arm, without rendering: errors at the work point, and how often they lie
+    in the stated 95 % region."""
     folder = IMPERFECT.folder(call)
     found = study_light_runs(load_scenario(scenario), runs, seed=call.seed, progress=call.progress)
     return IMPERFECT.measured({"all": _imperfect(found)}, folder).outcome()
@@ -122,7 +129,10 @@ def _start_rows(f: Figures) -> Iterable[Row]:
 
 START = Study(
     name="flange-start",
-    what="Ray-cast cells of seven arms with a small, far or hidden flange, calibrated without a guess; the start is from three scans.",
+    what=(
+        "Ray-cast cells of seven arms with a small, far or hidden flange, calibrated without a guess; the start is from"
+        " three scans."
+    ),
     case=calibrate_cell,
     figures=_start_figures,
     header=("", "found"),
@@ -132,5 +142,6 @@ START = Study(
 
 @command("benchmark flange-start", short_help="Calibrate cells whose flange is small, far or hidden.", hidden=True)
 def start(call: Call, cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 200) -> Outcome:
-    """Calibrate ray-cast cells with a small, far or hidden flange without a guess, and start from the visible arm in three scans."""
+    """Calibrate ray-cast cells with a small, far or hidden flange without a guess, and start from the visible arm in
+    three scans."""
     return START.outcome(call, {f"cell {call.seed + k}": {"seed": call.seed + k} for k in range(cells)})

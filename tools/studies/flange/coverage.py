@@ -35,10 +35,11 @@ Calibrated = tuple[CalibrationEstimate, RigidTransform, Array]
 
 @dataclass(frozen=True, kw_only=True)
 class Coverage:
-    """Of ``runs`` calibrations from ``poses`` observations each: how often the truth lies within the stated 95 % region of
-    X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both means
-    over the runs, with the noise of the held-out scan in both (NaN where that was not looked at). ``corrected``: with a
-    scanner that is off in scale and gradient, and its correction; ``warped``: with one that errs by another model."""
+    """Of ``runs`` calibrations from ``poses`` observations each: how often the truth lies within the stated 95 % region
+    of X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both
+    means over the runs, with the noise of the held-out scan in both (NaN where that was not looked at). ``corrected``:
+    with a scanner that is off in scale and gradient, and its correction; ``warped``: with one that errs by another
+    model."""
 
     poses: int
     runs: int
@@ -80,7 +81,10 @@ def study_coverage(poses: int, runs: int, seed: int = 0, progress: Progress = no
 
 
 def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
-    """As study_coverage, with a scanner that is off and a correction from the same observations. Deterministic for ``seed``."""
+    """As study_coverage, with a scanner that is off and a correction from the same observations.
+
+    Deterministic for ``seed``.
+    """
 
     def calibrate(k: int) -> Calibrated:
         rng = np.random.default_rng([seed, poses, k, 3])
@@ -194,8 +198,10 @@ def honesty(
 
 @dataclass(frozen=True, kw_only=True)
 class Stated:
-    """Of ``runs`` worlds of one class (scans, largest error of the scanner m, rms error of the arm m, with a local field or plain): mean
-    error (m) of 60 new scans each, and how many times that is stated (nested held-out errors, both means over the worlds)."""
+    """Of ``runs`` worlds of one class (scans, largest error of the scanner m, rms error of the arm m, with a local
+    field or plain): mean error (m) of 60 new scans each, and how many times that is stated (nested held-out errors,
+    both means over the worlds).
+    """
 
     poses: int
     warp_m: float
@@ -207,7 +213,8 @@ class Stated:
 
 
 def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: bool) -> Stated:
-    """Calibrate ``runs`` devices with an arm each as `weldcal calibrate` does, and measure on scans that it has not seen."""
+    """Calibrate ``runs`` devices with an arm each as `weldcal calibrate` does, and measure on scans that it has not
+    seen."""
     stated, true = [], []
     for device in range(runs):
         observations, patterns = warped_scanner.warped_observations(device, poses, 0, warp_m, arm_m)
@@ -234,9 +241,14 @@ def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: b
 def _stated_rows(f: Figures) -> Iterable[Row]:
     for s in f["classes"]:
         yield (
-            str(s["poses"]), "local" if s["local"] else "plain", fixed(1e3 * s["warp_m"], 1), fixed(1e3 * s["arm_m"], 2),
-            str(s["runs"]), fixed(1e3 * s["true_m"]), fixed(s["stated_over_true"], 2),
-        )  # fmt: skip
+            str(s["poses"]),
+            "local" if s["local"] else "plain",
+            fixed(1e3 * s["warp_m"], 1),
+            fixed(1e3 * s["arm_m"], 2),
+            str(s["runs"]),
+            fixed(1e3 * s["true_m"]),
+            fixed(s["stated_over_true"], 2),
+        )
     yield "all", "", "", "", str(sum(s["runs"] for s in f["classes"])), "", fixed(f["mean"], 2)
 
 
@@ -254,7 +266,8 @@ STATED = Study(
 def stated(
     call: Call, runs: Annotated[int, option("--runs", "N", "Number of worlds of each class.", min=2)] = 34
 ) -> Outcome:
-    """Measure how many times the true mean error of new scans is stated, in generated worlds with errors of scanner and arm."""
+    """Measure how many times the true mean error of new scans is stated, in generated worlds with errors of scanner and
+    arm."""
     folder, classes = STATED.folder(call), []
     sizes = [(n, False) for n in (8, 12, 20, 30)] + [(20, True)]
     for k, (poses, local) in enumerate(sizes):

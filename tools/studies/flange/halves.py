@@ -64,8 +64,8 @@ def study_parts(
 ) -> list[dict[str, float]]:
     """Divide each cloud (N, 3) m into 2, 4 and 8 random parts and compare the first two. Deterministic for ``seed``.
 
-    Returns a row for each: parts, points in each, rms distance (mm) of two parts' centres, the least that any unbiased estimate could reach
-    (mm), and what the stated covariances expect (mm).
+    Returns a row for each: parts, points in each, rms distance (mm) of two parts' centres, the least that any unbiased
+    estimate could reach (mm), and what the stated covariances expect (mm).
     """
     whole: list[tuple[Array, FlangeFit]] = []
     for points in clouds:

@@ -23,7 +23,7 @@ from weldcal.tools.report.weld import calibration_error
 from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.studies.targets import Target
 from weldcal.tools.worlds.perfect_world import perfect
-from weldcal.tools.worlds.redrawn import Redrawn, Station, bound_covariance, joined, joints_of, redraw
+from weldcal.tools.worlds.redrawn import Redrawn, RedrawnStation, bound_covariance, joined, joints_of, redraw
 
 SCENARIO = "calibrate_only"
 TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
@@ -31,8 +31,10 @@ TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
 
 @dataclass(frozen=True, kw_only=True)
 class LiveRow:
-    """One seed: scans used, error of a point at the work point (m) and of the rotation (rad), what the estimate expected of the
-    former (rms), the least that these poses, arm and scanner allow (rms), and the same calibration with noise redrawn."""
+    """One seed: scans used, error of a point at the work point (m) and of the rotation (rad), what the estimate
+    expected of the former (rms), the least that these poses, arm and scanner allow (rms), and the same calibration with
+    noise redrawn.
+    """
 
     seed: int
     scans: int
@@ -45,7 +47,8 @@ class LiveRow:
 
 
 def live_scenario(repeatability_mm: float, scans: int) -> Scenario:
-    """The calibration scenario with an arm that repeats no better, a scanner without distortion, and exactly so many scans."""
+    """The calibration scenario with an arm that repeats no better, a scanner without distortion, and exactly so many
+    scans."""
     scenario = perfect(load_scenario(SCENARIO))
     assert isinstance(scenario.robot, SimulatedUr)
     scenario.robot.repeatability_mm = repeatability_mm
@@ -63,7 +66,8 @@ def study_live(
     redraws: int = 0,
     progress: Progress = no_progress,
 ) -> list[LiveRow]:
-    """Calibrate live, through the whole Diagram, once for each seed, and ``redraws`` times more from the same poses without it.
+    """Calibrate live, through the whole Diagram, once for each seed, and ``redraws`` times more from the same poses
+    without it.
 
     Raises InputError for numbers that no cell takes, and RuntimeError where a job was held.
     """
@@ -82,7 +86,7 @@ def study_live(
         error = calibration_error(status.estimate.X_BC, truth, work)
         found = status.observations
         joints = joints_of(found, cell.station.arm, np.deg2rad(scenario.home_deg))
-        station = Station(cell.station.arm, joints, 1e-3 * repeatability_mm, truth, np.asarray(work))
+        station = RedrawnStation(cell.station.arm, joints, 1e-3 * repeatability_mm, truth, np.asarray(work))
         least = np.diag(bound_covariance(found, station))
         rows.append(
             LiveRow(
@@ -100,7 +104,8 @@ def study_live(
 
 
 def live_picture(rows: list[LiveRow]) -> bytes:
-    """Share of the calibrations whose error is no larger than that: live ones (steps), their noise redrawn, and at the bound."""
+    """Share of the calibrations whose error is no larger than that: live ones (steps), their noise redrawn, and at the
+    bound."""
     again = joined([r.redrawn for r in rows])
     mm, deg = 1e3, float(np.degrees(1.0))
     figure = Figure(figsize=(8.2, 3.6), layout="constrained")

@@ -60,8 +60,9 @@ def usable_scans(
 
 @dataclass(frozen=True)
 class Draws:
-    """Calibrations from ``scans`` random scans each: median error (m) and tilt (rad; NaN where no normals are known) of every draw on
-    the scans that it did not use, how many were refused, and the share of the others that corrected the scanner."""
+    """Calibrations from ``scans`` random scans each: median error (m) and tilt (rad; NaN where no normals are known) of
+    every draw on the scans that it did not use, how many were refused, and the share of the others that corrected the
+    scanner."""
 
     scans: int
     position_m: Array
@@ -73,8 +74,11 @@ class Draws:
 def study_few_scans(
     folder: Path, draws: int = 60, seed: int = 0, sizes: Sequence[int] = SIZES, progress: Progress = no_progress
 ) -> list[Draws]:
-    """One row a size, as far as KEPT scans remain. From one scan the pose rests on the turn of the drilled holes about the flange's axis,
-    which is known from a calibration with all scans. Raises InputError for a folder that is none, TooFewPoses where nothing remains."""
+    """One row a size, as far as KEPT scans remain.
+
+    From one scan the pose rests on the turn of the drilled holes about the flange's axis, which is known from a
+    calibration with all scans. Raises InputError for a folder that is none, TooFewPoses where nothing remains.
+    """
     refusal = f"Draws need {ENOUGH + KEPT} usable scans and more"
     good, patterns, X_rough = usable_scans(folder, ENOUGH + KEPT, refusal, seed, progress, 0.3, allow_coplanar=True)
     known = any(o.id in patterns and patterns[o.id].turn_known for o in good)
@@ -113,17 +117,20 @@ def _calibrated(
 
 
 LEAST_HALVES = 16
-"""Scans of a recording from which on its halves are calibrated; eight are the least with a choice of the scanner's correction."""
+"""Scans of a recording from which on its halves are calibrated; eight are the least with a choice of the scanner's
+correction."""
 
 
 def study_halves(
     folder: Path, draws: int = 20, seed: int = 0, progress: Progress = no_progress, *, local: bool = False
 ) -> dict[str, Any]:
-    """Calibrate from ``draws`` random halves of a dataset, choices included, and measure on the others. Deterministic for ``seed``.
+    """Calibrate from ``draws`` random halves of a dataset, choices included, and measure on the others.
 
-    ``local``: from two thirds, with the choice of a local field (--refine local). Returns means of the stated held-out error and of the error
-    on the other half (mm), how many of the latter lie in the interval (95 %) that the first half states, and how many halves fixed no
-    calibration (``skipped``).
+    Deterministic for ``seed``.
+
+    ``local``: from two thirds, with the choice of a local field (--refine local). Returns means of the stated held-out
+    error and of the error on the other half (mm), how many of the latter lie in the interval (95 %) that the first half
+    states, and how many halves fixed no calibration (``skipped``).
 
     Raises InputError for a folder that is none, TooFewPoses for fewer than sixteen usable scans.
     """
@@ -224,7 +231,8 @@ def halves(
         bool, switch("--local", "Calibrate from two thirds with --refine local, and judge it on the others.")
     ] = False,
 ) -> Outcome:
-    """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the other half."""
+    """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the
+    other half."""
     folder, found = HALVES.folder(call), study_halves(dataset, draws, call.seed, call.progress, local=local)
     return HALVES.measured({"all": found}, folder).outcome()
 

@@ -1,4 +1,5 @@
-"""Studies on ray-cast frames: flanges found and imagined, half-hidden flanges, and the rotation of filled hole patterns."""
+"""Studies on ray-cast frames: flanges found and imagined, half-hidden flanges, and the rotation of filled hole
+patterns."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -149,14 +150,15 @@ def hidden(
     width: WidthOption = 824,
     flange: FlangeName = FLANGE,
 ) -> Outcome:
-    """Detect a flange partly hidden by a plate, the image border or missing readings: detections, and errors in units of the
-    stated uncertainty."""
+    """Detect a flange partly hidden by a plate, the image border or missing readings: detections, and errors in units
+    of the stated uncertainty."""
     get_flange(flange)
     return HIDDEN.outcome(call, hidden_cases(count, share, call.seed, width, flange))
 
 
 def turn_of(width: int, flange: str, filled: Sequence[int], rng: Sequence[int], name: str) -> Mapping[str, object]:
-    """The rotation of the hole pattern in one scan with these openings filled: "none", "open", "right" or "wrong" (over 10 degrees)."""
+    """The rotation of the hole pattern in one scan with these openings filled: "none", "open", "right" or "wrong" (over
+    10 degrees)."""
     scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
     frame = flange_frame(scanner, _with_filled(standard, filled), np.random.default_rng(list(rng)))
     assert frame.X_CR is not None

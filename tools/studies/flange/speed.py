@@ -21,7 +21,7 @@ from weldcal.tools.studies.flange.live import live
 from weldcal.tools.studies.flange.recorded import few, halves, parts
 from weldcal.tools.studies.flange.scans import frames, hidden, holes
 from weldcal.tools.studies.harness import Figures, Row, Study
-from weldcal.tools.worlds.flange_frames import Frame, facing, flange_frame
+from weldcal.tools.worlds.flange_frames import FlangeScan, facing, flange_frame
 
 FLANGE = "iso9409-1-50-4-m6"
 _E_D, _E_R, _K_MAX = 0.0003, 0.001, 10_000  # paper, section 3.2.2
@@ -30,7 +30,8 @@ _SEGMENTED = 13_000  # points, as the recorded clouds have
 
 
 Timing = dict[str, Any]
-"""One row: what ran on what, median and least milliseconds of processor time, and the centre's error, mm (None: it found nothing)."""
+"""One row: what ran on what, median and least milliseconds of processor time, and the centre's error, mm (None: it
+found nothing)."""
 
 
 def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress = no_progress) -> list[Timing]:
@@ -39,7 +40,7 @@ def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress
     ``loop`` includes the paper's search as a Python loop (its 10 000 draws take seconds).
     """
     standard = get_flange(FLANGE)
-    frames: dict[str, Frame] = {}
+    frames: dict[str, FlangeScan] = {}
     for name, width in (("0.5", 824), ("3.2", 2064)):
         progress("ray-casting the scans", 0.05 * len(frames))
         X_CR = facing(np.array([0.04, -0.03, 0.62]), np.radians(12.0), 0.7, 0.3)
@@ -94,7 +95,7 @@ def _time(
     }
 
 
-def _segmented(frame: Frame, outer_m: float) -> tuple[Array, Array]:
+def _segmented(frame: FlangeScan, outer_m: float) -> tuple[Array, Array]:
     """The flange's own points of a frame, thinned to a recorded cloud's number, and the true centre."""
     assert frame.X_CR is not None
     p = frame.points_C.reshape(-1, 3)
@@ -152,7 +153,8 @@ def _ransac(points: Array, seed: int) -> Array | None:
 
 
 def _open3d_chain(frame: Array, depth_m: float) -> Array | None:
-    """Gate about the known depth, statistical outlier removal, planes one after another, clusters, circle search: library calls all through."""
+    """Gate about the known depth, statistical outlier removal, planes one after another, clusters, circle search:
+    library calls all through."""
     p = frame.reshape(-1, 3)
     p = p[np.isfinite(p).all(axis=1)]
     p = p[np.abs(p[:, 2] - depth_m) < 0.04]
@@ -184,7 +186,9 @@ def _speed_rows(f: Figures) -> Iterable[Row]:
 
 SPEED = Study(
     name="flange",
-    what="Processor time to find the flange in a scan, beside the paper's loop, an Open3D chain and a PCL-style search.",
+    what=(
+        "Processor time to find the flange in a scan, beside the paper's loop, an Open3D chain and a PCL-style search."
+    ),
     figures=lambda results: results["all"],
     header=("method and scan", "median ms", "least ms", "", "centre off, mm"),
     rows=_speed_rows,
@@ -199,7 +203,8 @@ def speed(
         bool, switch("--loop/--no-loop", "Also run the paper's search as a Python loop; takes seconds.")
     ] = True,
 ) -> Outcome:
-    """Time the detection of the flange in a scan and compare with the paper's loop, an Open3D chain and a PCL-style search."""
+    """Time the detection of the flange in a scan and compare with the paper's loop, an Open3D chain and a PCL-style
+    search."""
     folder, rows = SPEED.folder(call), run_flange_benchmark(call.seed, loop=loop, progress=call.progress)
     return SPEED.measured({"all": {"rows": rows}}, folder).outcome()
 
@@ -221,5 +226,5 @@ def speed(
     arm=arm,
 )
 def flange(call: Call) -> None:
-    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden, holes), uncertainty (parts, honesty, stated,
-    imperfect, halves) and accuracy (live, few, arm)."""
+    """Measure the flange fit and the calibration from it: time (speed), detection (frames, hidden, holes), uncertainty
+    (parts, honesty, stated, imperfect, halves) and accuracy (live, few, arm)."""

@@ -1,4 +1,5 @@
-"""Hand-eye calibrations of simulated cells: beside OpenCV's in imperfect cells, and every mounting over several seeds."""
+"""Hand-eye calibrations of simulated cells: beside OpenCV's in imperfect cells, and every mounting over several
+seeds."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -24,7 +25,8 @@ MARGIN = 0.02  # by which a method must be better to count as ahead
 
 
 def _ahead(results: Results) -> Figures:
-    """In how many of a hundred cells some OpenCV method is ahead in a column by more than MARGIN, and the 95th percentile of the ratio."""
+    """In how many of a hundred cells some OpenCV method is ahead in a column by more than MARGIN, and the 95th
+    percentile of the ratio."""
     found: dict[str, list[Mapping[str, Any]]] = {}
     for name, cell in results.items():
         found.setdefault(name.rpartition(", cell ")[0], []).append(cell)
@@ -49,7 +51,9 @@ def _ahead_rows(figures: Figures) -> Iterable[Row]:
 
 CELLS = Study(
     name="hand-eye-cells",
-    what="Cells in which some OpenCV method has the smaller held-out error, and the 95 % ratio of the errors (deg, mm).",
+    what=(
+        "Cells in which some OpenCV method has the smaller held-out error, and the 95 % ratio of the errors (deg, mm)."
+    ),
     case=ratios,
     figures=_ahead,
     header=("cells", *WEIGHTINGS),
@@ -66,7 +70,8 @@ CELLS = Study(
 def hand_eye_cells(
     call: Call, runs: Annotated[int, option("--runs", "N", "Number of cells of each kind.", min=1)] = 40
 ) -> Outcome:
-    """Compare held-out errors with OpenCV's best on simulated cells with a wrong camera matrix, a wrong robot, or both."""
+    """Compare held-out errors with OpenCV's best on simulated cells with a wrong camera matrix, a wrong robot, or
+    both."""
     seeds = range(call.seed, call.seed + runs)
     return CELLS.outcome(call, {f"{kind}, cell {s}": {"kind": kind, "seed": s} for kind in KINDS for s in seeds})
 
@@ -77,8 +82,8 @@ LIVE, RECORDED, RENDERED = "live", "recorded", "rendered"
 def run_mounting(name: str, seed: int, kind: str, folder: str = "") -> Mapping[str, object]:
     """One calibration: what the table needs of it, mm.
 
-    ``kind``: rendered (the live job with its renderer), live (light world, scans until the expected error is small enough) or recorded (light
-    world, all scans).
+    ``kind``: rendered (the live job with its renderer), live (light world, scans until the expected error is small
+    enough) or recorded (light world, all scans).
     """
     if kind == RENDERED:
         options = RunOptions(scenario=name, out=Path(folder), seed=seed, recording=False)
@@ -169,7 +174,10 @@ def _mounting_rows(figures: Figures) -> Iterable[Row]:
 
 MOUNTINGS = Study(
     name="mountings",
-    what="Every mounting calibrated in simulation with errors of scanner and arm: errors against the truth, and in units of the covariance.",
+    what=(
+        "Every mounting calibrated in simulation with errors of scanner and arm: errors against the truth, and in units"
+        " of the covariance."
+    ),
     case=run_mounting,
     figures=_mountings,
     header=(

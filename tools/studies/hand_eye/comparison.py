@@ -1,4 +1,5 @@
-"""Hand-eye solvers on public data beside OpenCV, and in simulation: outliers, invariance, uncertainty, AXB = YCZ, speed."""
+"""Hand-eye solvers on public data beside OpenCV, and in simulation: outliers, invariance, uncertainty, AXB = YCZ,
+speed."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -67,13 +68,11 @@ class DatasetRow:
 
     @property
     def holds(self) -> bool:
-        """Whether no OpenCV method is ahead in a column by more than 2 % beyond chance; never where OpenCV was left out."""
+        """Whether no OpenCV method is ahead in a column by more than 2 % beyond chance; never where OpenCV was left
+        out."""
         return all(
             ours <= theirs * (1.0 + _SHARE) or low <= 1.0 + _SHARE
-            for ours, theirs, low in (
-                (self.deg, self.best_deg, self.low_deg),
-                (self.mm, self.best_mm, self.low_mm),
-            )
+            for ours, theirs, low in ((self.deg, self.best_deg, self.low_deg), (self.mm, self.best_mm, self.low_mm))
         )
 
 
@@ -117,10 +116,18 @@ def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: b
     mm = {m: 1e3 * h.rms_translation for m, h in theirs.items() if np.isfinite(h.translation).all()} or none
     by_deg, by_mm = min(deg, key=lambda m: deg[m]), min(mm, key=lambda m: mm[m])
     row = DatasetRow(
-        name=name, n=len(F), deg=ours.held_out.rms_deg, mm=1e3 * ours.held_out.rms_translation, best_deg=deg[by_deg],
-        best_deg_by=by_deg, best_mm=mm[by_mm], best_mm_by=by_mm,
-        flagged=tuple(int(i) for i in np.nonzero(~ours.inliers)[0]), unobservable=ours.unobservable, method=ours.method,
-    )  # fmt: skip
+        name=name,
+        n=len(F),
+        deg=ours.held_out.rms_deg,
+        mm=1e3 * ours.held_out.rms_translation,
+        best_deg=deg[by_deg],
+        best_deg_by=by_deg,
+        best_mm=mm[by_mm],
+        best_mm_by=by_mm,
+        flagged=tuple(int(i) for i in np.nonzero(~ours.inliers)[0]),
+        unobservable=ours.unobservable,
+        method=ours.method,
+    )
     if opencv:
         row = replace(
             row,
@@ -140,7 +147,8 @@ def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: b
 
 
 def lowest_ratio(ours: Array, theirs: Array, seed: int = 0) -> float:
-    """Lower end of the 95 % interval of the ratio of two rms errors, by 4,000 paired resamples of the poses (bootstrap)."""
+    """Lower end of the 95 % interval of the ratio of two rms errors, by 4,000 paired resamples of the poses
+    (bootstrap)."""
     drawn = np.random.default_rng(seed).integers(len(ours), size=(4000, len(ours)))
     ratio = np.sqrt((ours[drawn] ** 2).mean(axis=1) / (theirs[drawn] ** 2).mean(axis=1))
     return float(np.quantile(ratio, 0.025))
@@ -242,8 +250,8 @@ def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]
 
 
 def degenerate(seed: int = 0) -> dict[str, str]:
-    """What is said of motions that cannot determine the answer: an error by its name, or the direction left open; "answer"
-    where a number came without a warning."""
+    """What is said of motions that cannot determine the answer: an error by its name, or the direction left open;
+    "answer" where a number came without a warning."""
     rng = np.random.default_rng(seed)
     problem, truth = simulated("eye_in_hand", 20, rng, float(np.radians(0.05)), 2e-4)
     X, Y = truth["X"], truth["Y"]
@@ -278,8 +286,8 @@ def degenerate(seed: int = 0) -> dict[str, str]:
 
 
 def speed(n: int = 200, repeats: int = 7, peers: int = 3) -> dict[str, float]:
-    """Milliseconds of processor time that each method takes for ``n`` poses in this process, best of ``repeats``, and of ``peers`` for
-    OpenCV: what else runs on the machine does not count."""
+    """Milliseconds of processor time that each method takes for ``n`` poses in this process, best of ``repeats``, and
+    of ``peers`` for OpenCV: what else runs on the machine does not count."""
     problem, _ = simulated("eye_in_hand", n, np.random.default_rng(0), float(np.radians(0.05)), 2e-4)
     tasks: dict[str, Callable[[], object]] = {"weldcal": lambda: solve_problem(problem, config=_PLAIN)}
     tasks |= {m: partial(opencv_solve, m, problem.F, problem.G) for m in METHODS}
@@ -360,11 +368,16 @@ def _set_rows(figures: Figures) -> Iterable[Row]:
     for name, r in figures["datasets"].items():
         known = r["best_opencv_deg"] is not None and np.isfinite(r["best_opencv_deg"])
         yield (
-            name, f"{r['held_out_deg']:.4f}", fixed(r["best_opencv_deg"], 4), f"{r['held_out_mm']:.3f}",
-            fixed(r["best_opencv_mm"], 3), ", ".join(map(str, r["flagged"])) or "-",
-            "; ".join(r["unobservable"]) or "-", ("yes" if r["holds"] else "NO") if known else "-",
+            name,
+            f"{r['held_out_deg']:.4f}",
+            fixed(r["best_opencv_deg"], 4),
+            f"{r['held_out_mm']:.3f}",
+            fixed(r["best_opencv_mm"], 3),
+            ", ".join(map(str, r["flagged"])) or "-",
+            "; ".join(r["unobservable"]) or "-",
+            ("yes" if r["holds"] else "NO") if known else "-",
             f"{fixed(r['truth_nees'], 1)}, {fixed(r['truth_nees_corners'], 1)}",
-        )  # fmt: skip
+        )
 
 
 def _checks(figures: Figures) -> Iterable[Table]:
@@ -373,13 +386,23 @@ def _checks(figures: Figures) -> Iterable[Table]:
 
 
 SETS = Study(
-    name="hand-eye", what="The hand-eye solvers beside OpenCV's seven methods on public sets, and checks in simulation.",
-    figures=lambda results: results["all"], rows=_set_rows, others=_checks,
+    name="hand-eye",
+    what="The hand-eye solvers beside OpenCV's seven methods on public sets, and checks in simulation.",
+    figures=lambda results: results["all"],
+    rows=_set_rows,
+    others=_checks,
     header=(
-        "set", "held-out deg", "best OpenCV", "held-out mm", "best OpenCV", "flagged", "open", "holds",
+        "set",
+        "held-out deg",
+        "best OpenCV",
+        "held-out mm",
+        "best OpenCV",
+        "flagged",
+        "open",
+        "holds",
         "squared error against the truth, with corners",
     ),
-)  # fmt: skip
+)
 
 
 @command("benchmark hand-eye-sets", short_help="Compare the hand-eye solvers with OpenCV's on sets.", hidden=True)
@@ -399,5 +422,7 @@ def hand_eye_sets(
     "sets", sets=hand_eye_sets, cells=hand_eye_cells, mountings=mountings, conventions=conventions, pictures=pictures
 )
 def hand_eye(call: Call) -> None:
-    """Compare the hand-eye solvers with OpenCV's on public data (sets) and on imperfect cells (cells), test them in simulation,
-    calibrate every mounting live (mountings), read pose lists in random conventions (conventions), and calibrate from rendered pictures (pictures)."""
+    """Compare the hand-eye solvers with OpenCV's on public data (sets) and on imperfect cells (cells), test them in
+    simulation, calibrate every mounting live (mountings), read pose lists in random conventions (conventions), and
+    calibrate from rendered pictures (pictures).
+    """

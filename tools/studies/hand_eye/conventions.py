@@ -1,4 +1,5 @@
-"""How often the data choose the right reading of two lists of poses, and how often a right reading is rejected by chance."""
+"""How often the data choose the right reading of two lists of poses, and how often a right reading is rejected by
+chance."""
 
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
@@ -9,13 +10,14 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.poses.readings import PoseReading, readings
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import inverse, pose
-from weldcal.calibration.hand_eye.pairs.conventions import Decision, agreements, decide
+from weldcal.calibration.hand_eye.pairs.conventions import ReadingDecision, agreements, decide
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, Table
 from weldcal.tools.worlds.written_poses import WrittenSet, written_set
 
 SIGMAS = 6.0
-"""Without noise, the residual of the next reading in units of the noise, from which on the data determine the reading."""
+"""Without noise, the residual of the next reading in units of the noise, from which on the data determine the
+reading."""
 TAILS = (1e-2, 1e-3, 1e-4)
 _BLOCK = 200
 _NEAR_SIGMAS = 8.0  # of X: a reading that is written otherwise and gives the same result
@@ -23,7 +25,8 @@ _FEW = (6, 10, 20)
 
 
 def conventions(kind: str, seed: int, n: int = 0, runs: int = 0) -> Mapping[str, object]:
-    """One set of two lists in random conventions, or ``runs`` tests of readings that are equally right, of ``n`` poses."""
+    """One set of two lists in random conventions, or ``runs`` tests of readings that are equally right, of ``n``
+    poses."""
     rng = np.random.default_rng(seed)
     return _chosen(written_set(rng)) if kind == "set" else _tail(rng, n, runs)
 
@@ -36,19 +39,23 @@ def _chosen(case: WrittenSet) -> Mapping[str, object]:
     forms = best.robot.form, best.camera.form
     right = forms == case.forms or _near(found, case)
     return {
-        "written": list(case.forms), "read": list(forms), "n": len(case.robot.p), "determined": _determined(clean, case),
-        "used": found.determined and best.agrees, "right": right,
+        "written": list(case.forms),
+        "read": list(forms),
+        "n": len(case.robot.p),
+        "determined": _determined(clean, case),
+        "used": found.determined and best.agrees,
+        "right": right,
         "unit": best.unit_scale is not None and abs(np.log(best.unit_scale / case.unit_ratio)) < 0.01,
-    }  # fmt: skip
+    }
 
 
-def _determined(clean: Decision, case: WrittenSet) -> bool:
+def _determined(clean: ReadingDecision, case: WrittenSet) -> bool:
     """Whether the next reading that leads to another result leaves residuals over SIGMAS of the noise."""
     others = [one for one in (*clean.rivals, clean.next) if one is not None]
     return all(max(one.rotation / case.rotation, one.position / case.position) > SIGMAS for one in others)
 
 
-def _near(found: Decision, case: WrittenSet) -> bool:
+def _near(found: ReadingDecision, case: WrittenSet) -> bool:
     """Whether X is within the errors that the noise causes."""
     n, best = len(case.robot.p), found.best
     turn = Rotation.from_matrix(best.X[:3, :3].T @ case.X[:3, :3]).magnitude()
@@ -60,7 +67,8 @@ def _near(found: Decision, case: WrittenSet) -> bool:
 
 
 def _tail(rng: np.random.Generator, n: int, runs: int) -> Mapping[str, object]:
-    """How often the residuals of one of two right readings exceed the other's by the limit of each chance, rotations and positions."""
+    """How often the residuals of one of two right readings exceed the other's by the limit of each chance, rotations
+    and positions."""
     counts, compared = np.zeros(len(TAILS), dtype=int), 0
     for _ in range(max(runs // _BLOCK, 1)):
         turned = Rotation.from_rotvec(rng.normal(size=(n, 3)) * 0.5)
@@ -99,22 +107,32 @@ def _counts(results: Results) -> Figures:
             }
         )
     return {
-        "sets": len(sets), "determined": len(determined), "right_of_determined": sum(one["used"] and one["right"] for one in determined),
-        "used": len(used), "wrong": len(wrong), "wrong_units": sum(not one["unit"] for one in used),
+        "sets": len(sets),
+        "determined": len(determined),
+        "right_of_determined": sum(one["used"] and one["right"] for one in determined),
+        "used": len(used),
+        "wrong": len(wrong),
+        "wrong_units": sum(not one["unit"] for one in used),
         "wrong_sets": {name: [one["written"], one["read"]] for name, one in list(wrong.items())[:10]},
         "missed_sets": {
-            name: [one["written"], one["read"]] for name, one in sets.items() if one["determined"] and not (one["used"] and one["right"])
+            name: [one["written"], one["read"]]
+            for name, one in sets.items()
+            if one["determined"] and not (one["used"] and one["right"])
         },
         "tails": tails,
-    }  # fmt: skip
+    }
 
 
 def _rows(figures: Figures) -> Iterable[Row]:
     share = 100.0 * figures["right_of_determined"] / max(figures["determined"], 1)
     yield (
-        f"{figures['sets']}", f"{figures['determined']}", f"{share:.2f} %", f"{figures['used']}", f"{figures['wrong']}",
+        f"{figures['sets']}",
+        f"{figures['determined']}",
+        f"{share:.2f} %",
+        f"{figures['used']}",
+        f"{figures['wrong']}",
         f"{figures['wrong_units']}",
-    )  # fmt: skip
+    )
 
 
 def _tail_rows(figures: Figures) -> Iterable[Table]:
@@ -128,7 +146,9 @@ def _tail_rows(figures: Figures) -> Iterable[Table]:
 
 STUDY = Study(
     name="hand-eye-conventions",
-    what="Two lists of poses in random conventions: how often the data determine the reading, and the right one is used.",
+    what=(
+        "Two lists of poses in random conventions: how often the data determine the reading, and the right one is used."
+    ),
     case=conventions,
     figures=_counts,
     header=("sets", "determined", "right of these", "used", "wrong", "wrong units"),
@@ -145,7 +165,8 @@ def hand_eye_conventions(
         int, option("--tails", "N", "Number of comparisons of right readings, for each number of poses.", min=0)
     ] = 20_000,
 ) -> Outcome:
-    """Write two lists of poses in random conventions and count how often the right reading, and how often a wrong one, is used."""
+    """Write two lists of poses in random conventions and count how often the right reading, and how often a wrong one,
+    is used."""
     cases: dict[str, dict[str, Any]] = {
         f"set {s}": {"kind": "set", "seed": s} for s in range(call.seed, call.seed + runs)
     }

@@ -1,4 +1,5 @@
-"""How often the stated region of a calibration from pictures holds the truth, and its error beside OpenCV's on the same corners."""
+"""How often the stated region of a calibration from pictures holds the truth, and its error beside OpenCV's on the same
+corners."""
 
 from collections.abc import Iterable
 from typing import Annotated
@@ -23,11 +24,15 @@ def _figures(results: Results) -> Figures:
             ours = np.sqrt(np.mean(np.square([r["error"] for r in good]), axis=0))
             theirs = [[r["opencv"][m] or (np.inf, np.inf) for r in good] for m in METHODS]
             cells[f"{kind}, {board}"] = {
-                "runs": len(runs), "solved": len(good), "inside_percent": 100.0 * float(np.mean([r["inside"] for r in good])),
-                "nees": float(np.mean([r["square"] for r in good])) / 6.0, "nees_each": np.mean([r["each"] for r in good], axis=0).tolist(),
-                "rms_deg_mm": ours.tolist(), "opencv_deg_mm": np.sqrt(np.mean(np.square(theirs), axis=1)).min(axis=0).tolist(),
+                "runs": len(runs),
+                "solved": len(good),
+                "inside_percent": 100.0 * float(np.mean([r["inside"] for r in good])),
+                "nees": float(np.mean([r["square"] for r in good])) / 6.0,
+                "nees_each": np.mean([r["each"] for r in good], axis=0).tolist(),
+                "rms_deg_mm": ours.tolist(),
+                "opencv_deg_mm": np.sqrt(np.mean(np.square(theirs), axis=1)).min(axis=0).tolist(),
                 "right_percent": 100.0 * sum(r.get("right", False) for r in runs) / len(runs),
-            }  # fmt: skip
+            }
     return {"cells": cells}
 
 
@@ -36,9 +41,13 @@ def _rows(figures: Figures) -> Iterable[Row]:
         each = " ".join(f"{v:.2f}" for v in c["nees_each"])
         pairs = (f"{a:.4f} ({b:.4f})" for a, b in zip(c["rms_deg_mm"], c["opencv_deg_mm"], strict=True))
         yield (
-            name, f"{c['solved']} of {c['runs']}", f"{c['inside_percent']:.1f} %", f"{c['nees']:.2f}: {each}", *pairs,
+            name,
+            f"{c['solved']} of {c['runs']}",
+            f"{c['inside_percent']:.1f} %",
+            f"{c['nees']:.2f}: {each}",
+            *pairs,
             f"{c['right_percent']:.1f} %",
-        )  # fmt: skip
+        )
 
 
 def _targets(figures: Figures) -> list[Target]:
@@ -50,10 +59,16 @@ def _targets(figures: Figures) -> list[Target]:
 
 STUDY = Study(
     name="hand-eye-pictures",
-    what="Calibrations from pictures of six boards: truth in the 95 % region, NEES per unknown, rms errors (best of OpenCV's), right pictures used.",
-    case=calibrated, figures=_figures, rows=_rows, targets=_targets,
+    what=(
+        "Calibrations from pictures of six boards: truth in the 95 % region, NEES per unknown, rms errors (best of"
+        " OpenCV's), right pictures used."
+    ),
+    case=calibrated,
+    figures=_figures,
+    rows=_rows,
+    targets=_targets,
     header=("input", "solved", "inside 95 %", "NEES: each", "deg (OpenCV)", "mm (OpenCV)", "right pictures"),
-)  # fmt: skip
+)
 
 
 @command("benchmark hand-eye-pictures", short_help="Test calibrations from pictures.", hidden=True, options=FARM)
@@ -64,7 +79,8 @@ def hand_eye_pictures(
         int, option("--pictures", "N", "Runs on rendered pictures; half as many with three bad.", min=0)
     ] = 200,
 ) -> Outcome:
-    """Calibrate from rendered corners and pictures of six boards, and count how often the stated region holds the truth."""
+    """Calibrate from rendered corners and pictures of six boards, and count how often the stated region holds the
+    truth."""
     counts = {"corners": corners, "pictures": pictures, "bad": pictures // 2}
     runs = [(kind, BOARDS[s % len(BOARDS)], call.seed + s) for kind, n in counts.items() for s in range(n)]
     return STUDY.outcome(call, {f"{k}, {b}, {s}": {"kind": k, "board": b, "seed": s} for k, b, s in runs})

@@ -28,9 +28,12 @@ def one_run(
     """Calibrate one recording of a moveJ (even ``index``) or moveL, with device times or arrivals of 140 +- 15 ms.
 
     Returns:
-        errors (7,) of X_BC's six and the clock's offset (rad, m, s), the same in sigmas, the NEES of X_BC over its six, the
-        error of the offset against the mean delay of the recording's own frames (ms), the error of a point in the middle of
-        the work (mm), the turn (deg). With device times also the errors in sigmas (7,) of a least-squares fit that knows the
+        errors (7,) of X_BC's six and the clock's offset (rad, m, s), the same in sigmas, the NEES of X_BC over its six,
+            the
+        error of the offset against the mean delay of the recording's own frames (ms), the error of a point in the
+            middle of
+        the work (mm), the turn (deg). With device times also the errors in sigmas (7,) of a least-squares fit that
+            knows the
         motion exactly: what the draws themselves are.
     """
     device, linear = clock == "device", index % 2 == 1
@@ -120,7 +123,9 @@ def _cell(value: Any) -> str:
 
 STUDY = Study(
     name="motion-clock",
-    what="Calibrations in motion with known truth: coverage of the clock's offset, error and NEES of the scanner's pose.",
+    what=(
+        "Calibrations in motion with known truth: coverage of the clock's offset, error and NEES of the scanner's pose."
+    ),
     case=one_run,
     figures=_figures,
     header=("figure", *CLOCKS),
@@ -139,5 +144,6 @@ def benchmark_clock(
     runs: Annotated[int, option("--runs", "N", "Number of calibrations with each clock.", min=2)] = 300,
     seconds: Annotated[float, option("--seconds", "S", "Length of each recording.", min=5.0)] = 20.0,
 ) -> Outcome:
-    """Repeat calibrations in motion with known truth: coverage of the clock's offset, error and NEES of the scanner's pose."""
+    """Repeat calibrations in motion with known truth: coverage of the clock's offset, error and NEES of the scanner's
+    pose."""
     return STUDY.outcome(call, cases(runs, seconds, call.seed))

@@ -44,8 +44,7 @@ def motion_data(
         str, option("--base", "T,X,Y,Z[,R,P,Y]", "The robot's base jumps: s, mm, degrees.", show_default="none")
     ] = "",
     warm_up: Annotated[
-        str,
-        option("--warm-up", "TAU,PPM[,PPM/M]", "The scanner's scale error dies away: s, ppm.", show_default="none"),
+        str, option("--warm-up", "TAU,PPM[,PPM/M]", "The scanner's scale error dies away: s, ppm.", show_default="none")
     ] = "",
 ) -> Mapping[str, object]:
     """Write a simulated recording in motion: a UR arm moves through a cube's corners, seen by a streaming scanner.
@@ -55,14 +54,27 @@ def motion_data(
     folder = call.folder("reproduce", "motion-data")
     preset = get_scanner(scanner, width)
     options = MotionOptions(
-        robot=robot, scanner=scanner, size=(preset.width, preset.height) if width else None, frames=frames, move=move,
-        speed=speed, noise_mm=noise_mm, stream=replace(get_stream(scanner), readout_s=1e-3 * readout_ms),
-        stream_hz=stream_hz, stream_columns="pose" if poses else "joints", device_clock=device_clock,
-        surroundings=surroundings, disturbance=disturbance_of(knock, creep, base, warm_up), seed=call.seed,
-    )  # fmt: skip
+        robot=robot,
+        scanner=scanner,
+        size=(preset.width, preset.height) if width else None,
+        frames=frames,
+        move=move,
+        speed=speed,
+        noise_mm=noise_mm,
+        stream=replace(get_stream(scanner), readout_s=1e-3 * readout_ms),
+        stream_hz=stream_hz,
+        stream_columns="pose" if poses else "joints",
+        device_clock=device_clock,
+        surroundings=surroundings,
+        disturbance=disturbance_of(knock, creep, base, warm_up),
+        seed=call.seed,
+    )
     world = MotionWorld(options)
     write_motion_dataset(world, folder / "dataset", folder / "truth.json", call.progress)
     return {
-        "dataset": str(folder / "dataset"), "truth": str(folder / "truth.json"), "frames": len(world.captures),
-        "seconds": round(float(world.captures[-1] - world.captures[0]), 3), "pixels": world.scanner.width * world.scanner.height,
-    }  # fmt: skip
+        "dataset": str(folder / "dataset"),
+        "truth": str(folder / "truth.json"),
+        "frames": len(world.captures),
+        "seconds": round(float(world.captures[-1] - world.captures[0]), 3),
+        "pixels": world.scanner.width * world.scanner.height,
+    }

@@ -18,7 +18,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
 from weldcal.tools.studies.targets import Target, all_met
-from weldcal.tools.worlds.features import Change, World, WorldConfig, simulate
+from weldcal.tools.worlds.features import Change, FeatureWorld, WorldConfig, simulate
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
 WITHIN_S = 2.0
@@ -28,11 +28,12 @@ _CREEP_START_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
-    """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was measured.
-    ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of the first WITHIN_S
-    say of it to a test that knows the noise and all other errors exactly, in units of the test's threshold; ``told`` what they say to one
-    that knows of these errors what the monitor knows, and is told when the change was, in the same units."""
+class DriftTrial:
+    """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was
+    measured. ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames
+    of the first WITHIN_S say of it to a test that knows the noise and all other errors exactly, in units of the test's
+    threshold; ``told`` what they say to one that knows of these errors what the monitor knows, and is told when the
+    change was, in the same units."""
 
     kind: str
     seed: int
@@ -54,15 +55,24 @@ def one_recording(kind: str, seed: int, stamps: str, hours: float = 0.0) -> Mapp
         return asdict(creep_trial(world, seed) if kind == "creep" else knock_trial(world, seed, turn=kind == "turn"))
     alarmed, largest, threshold = quiet_hours(world, hours, seed)
     return {
-        "kind": kind, "stamps": stamps, "hours": hours, "largest_statistic": largest, "threshold": threshold,
+        "kind": kind,
+        "stamps": stamps,
+        "hours": hours,
+        "largest_statistic": largest,
+        "threshold": threshold,
         "alarmed": [
             {
-                "kind": e.kind, "time_s": e.time_s, "found_s": e.found_s, "statistic": e.statistic, "model": e.model,
-                "translation_mm": (1e3 * e.translation_m).tolist(), "rotation_deg": np.degrees(e.rotation_rad).tolist(),
+                "kind": e.kind,
+                "time_s": e.time_s,
+                "found_s": e.found_s,
+                "statistic": e.statistic,
+                "model": e.model,
+                "translation_mm": (1e3 * e.translation_m).tolist(),
+                "rotation_deg": np.degrees(e.rotation_rad).tolist(),
             }
             for e in alarmed
         ],
-    }  # fmt: skip
+    }
 
 
 def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cases:
@@ -75,7 +85,7 @@ def cases(knocks: int, creeps: int, hours: float, stamps: str, seed: int) -> Cas
 
 def _figures(results: Results) -> Figures:
     quiet = whole(results)["quiet"]
-    trials = [Trial(**_numbers(r)) for r in results.values() if r["kind"] != "quiet"]
+    trials = [DriftTrial(**_numbers(r)) for r in results.values() if r["kind"] != "quiet"]
     knocks = [t for t in trials if t.kind != "creep"]
     found = np.array([t.found_after_s for t in knocks])
     creeps = np.array([t.found_after_s for t in trials if t.kind == "creep"])
@@ -128,7 +138,10 @@ def _rows(figures: Figures) -> Iterable[Row]:
 
 STUDY = Study(
     name="drift",
-    what="How soon knocks of 0.2 mm or 0.03 degrees and creeps of the scanner are found, and false alarms in quiet hours.",
+    what=(
+        "How soon knocks of 0.2 mm or 0.03 degrees and creeps of the scanner are found, and false alarms in quiet"
+        " hours."
+    ),
     case=one_recording,
     figures=_figures,
     header=("turns about an axis so far from the view, deg", "turns", "found within 2 s, %", "shown, thresholds"),
@@ -154,7 +167,7 @@ def benchmark_drift(
     return STUDY.outcome(call, cases(*size, stamps, call.seed))
 
 
-def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> Trial:
+def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> DriftTrial:
     """A recording of some 40 s with a knock of 0.2 mm, or 0.03 degrees, along or about a random axis."""
     rng = np.random.default_rng([seed, 3])
     axis = rng.standard_normal(3)
@@ -166,7 +179,7 @@ def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> Trial:
     return _trial("turn" if turn else "shift", seed, events, at, shift, rotation, float(abs(axis @ view)), *said)
 
 
-def creep_trial(world: WorldConfig, seed: int) -> Trial:
+def creep_trial(world: WorldConfig, seed: int) -> DriftTrial:
     """A recording with a creep of 0.02 mm/min in a random direction."""
     rng = np.random.default_rng([seed, 4])
     axis = rng.standard_normal(3)
@@ -195,8 +208,8 @@ def quiet_hours(world: WorldConfig, hours: float, seed: int) -> tuple[list[Drift
 def _watched(
     config: WorldConfig, duration_s: float, seed: int, change: tuple[float, Array, Array]
 ) -> tuple[list[DriftEvent], Array, float, float]:
-    """Events of a recording, the line of sight in the base, and what its frames show of a change (time s, shift m, rotation rad): to a
-    test that knows everything else, and to one that knows what the monitor does."""
+    """Events of a recording, the line of sight in the base, and what its frames show of a change (time s, shift m,
+    rotation rad): to a test that knows everything else, and to one that knows what the monitor does."""
     w = simulate(config, duration_s, seed)
     test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / config.frame_s)
     before: DriftFilter | None = None
@@ -209,19 +222,20 @@ def _watched(
     return test.events, np.asarray(w.X_BC.rotation().matrix()[:, 2]), _shown(w, test, change), told
 
 
-def expected_late(knocks: Sequence[Trial]) -> float:
-    """How many of the changes a test with three unknowns that is told their times does not find within WITHIN_S, by the noise alone."""
+def expected_late(knocks: Sequence[DriftTrial]) -> float:
+    """How many of the changes a test with three unknowns that is told their times does not find within WITHIN_S, by the
+    noise alone."""
     threshold = DriftTest(RigidTransform(), np.eye(6), np.ones(3)).threshold_alone
     return float(sum(ncx2.cdf(threshold, 3, t.told * threshold) for t in knocks if np.isfinite(t.told)))
 
 
-def _moved(w: World, change: tuple[float, Array, Array]) -> Array:
+def _moved(w: FeatureWorld, change: tuple[float, Array, Array]) -> Array:
     """A change [rotation; translation] (6,) about the pivot."""
     _, shift, rotation = change
     return np.concatenate([rotation, shift + np.cross(rotation, w.pivot - np.asarray(w.X_BC.translation()))])
 
 
-def _within(w: World, at: float) -> NDArray[np.intp]:
+def _within(w: FeatureWorld, at: float) -> NDArray[np.intp]:
     """The frames of WITHIN_S after a time."""
     return np.flatnonzero((w.rows.times >= at) & (w.rows.times <= at + WITHIN_S))
 
@@ -232,9 +246,9 @@ def _without_clock(information: Array) -> Array:
     return np.asarray(N[:c, :c] - np.outer(N[:c, c], N[c, :c]) / N[c, c])
 
 
-def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> float:
-    """The expected statistic of a pure shift or turn by the frames of WITHIN_S after it, over its threshold, where noise and all other
-    errors are known exactly and the clock alone is not."""
+def _shown(w: FeatureWorld, test: DriftTest, change: tuple[float, Array, Array]) -> float:
+    """The expected statistic of a pure shift or turn by the frames of WITHIN_S after it, over its threshold, where
+    noise and all other errors are known exactly and the clock alone is not."""
     chosen = _within(w, change[0])
     if not len(chosen) or test.noise is None:
         return float("nan")
@@ -247,8 +261,9 @@ def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> flo
     return float(move @ _without_clock(N) @ move) / test.threshold_alone
 
 
-def _told(w: World, test: DriftTest, before: DriftFilter, change: tuple[float, Array, Array]) -> float:
-    """The same, where all other errors are known as by the monitor's filter ``before`` the change, and its time exactly."""
+def _told(w: FeatureWorld, test: DriftTest, before: DriftFilter, change: tuple[float, Array, Array]) -> float:
+    """The same, where all other errors are known as by the monitor's filter ``before`` the change, and its time
+    exactly."""
     chosen = _within(w, change[0])
     if not len(chosen) or test.noise is None:
         return float("nan")
@@ -264,9 +279,9 @@ def _told(w: World, test: DriftTest, before: DriftFilter, change: tuple[float, A
     return 1.0 / (1.0 / known + 1.0 / float(move @ (move / floor))) / test.threshold_alone
 
 
-def found_by_angle(trials: Sequence[Trial]) -> list[dict[str, float]]:
-    """Of turns, by the angle between their axis and the line of sight: how many there were, the share found within WITHIN_S, and
-    the median of what the frames show."""
+def found_by_angle(trials: Sequence[DriftTrial]) -> list[dict[str, float]]:
+    """Of turns, by the angle between their axis and the line of sight: how many there were, the share found within
+    WITHIN_S, and the median of what the frames show."""
     turns = [t for t in trials if t.kind == "turn"]
     angles = np.degrees(np.arccos(np.clip([t.along_view for t in turns], 0.0, 1.0)))
     rows = []
@@ -274,18 +289,32 @@ def found_by_angle(trials: Sequence[Trial]) -> list[dict[str, float]]:
         part = [t for t, a in zip(turns, angles, strict=True) if low <= a < high or a == high == 90.0]
         if part:
             found = np.array([t.found_after_s for t in part])
-            rows.append({
-                "from_deg": low, "to_deg": high, "turns": len(part), "found_within_2_s_percent": _percent(found <= WITHIN_S),
-                "shown_median": float(np.median([t.shown for t in part])), "shown_least": float(min(t.shown for t in part)),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "from_deg": low,
+                    "to_deg": high,
+                    "turns": len(part),
+                    "found_within_2_s_percent": _percent(found <= WITHIN_S),
+                    "shown_median": float(np.median([t.shown for t in part])),
+                    "shown_least": float(min(t.shown for t in part)),
+                }
+            )
     return rows
 
 
 def _trial(
-    kind: str, seed: int, events: list[DriftEvent], at: float, shift: Array, rotation: Array, view: float, shown: float, told: float
-) -> Trial:  # fmt: skip
+    kind: str,
+    seed: int,
+    events: list[DriftEvent],
+    at: float,
+    shift: Array,
+    rotation: Array,
+    view: float,
+    shown: float,
+    told: float,
+) -> DriftTrial:
     early = sum(e.found_s < at for e in events)
-    missed = Trial(kind=kind, seed=seed, along_view=view, false_alarms=early, shown=shown, told=told)
+    missed = DriftTrial(kind=kind, seed=seed, along_view=view, false_alarms=early, shown=shown, told=told)
     for e in (e for e in events if e.found_s >= at):
         return replace(
             missed,

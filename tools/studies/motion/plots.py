@@ -15,8 +15,8 @@ _SECONDS = 14.0  # of the history that a reader can still follow
 
 
 def track_picture(scanner: Array, robot: Array, robot_at_arrival: Array) -> bytes:
-    """Fig. 5: the flange's centre (N, 3) m by the scanner, and by the robot at the capture and, for comparison, at the arrival, in x-y
-    and x-z."""
+    """Fig. 5: the flange's centre (N, 3) m by the scanner, and by the robot at the capture and, for comparison, at the
+    arrival, in x-y and x-z."""
     figure = Figure(figsize=(9.0, 4.4), layout="constrained")
     for axes, (a, b) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
         for p, marker, colour, size, label in (
@@ -42,7 +42,8 @@ def _components(axes: Axes, t: Array, errors: Array, first: int) -> None:
 
 
 def history_picture(t: Array, before: Array, after: Array) -> bytes:
-    """Fig. 6: components (N, 6) of the calibration's error by ICP over time (N,) s, before and after synchronisation."""
+    """Fig. 6: components (N, 6) of the calibration's error by ICP over time (N,) s, before and after
+    synchronisation."""
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
     every = figure.subplots(2, 2, sharex=True, sharey="row")
     both = (("poses at arrival", before), ("joint estimate of X_BC and clock", after))

@@ -1,4 +1,5 @@
-"""Repeats the experiments of the second flange paper on a simulated cell: static and motion mode, tracking, compensation, quality."""
+"""Repeats the experiments of the second flange paper on a simulated cell: static and motion mode, tracking,
+compensation, quality."""
 
 import json
 import time
@@ -42,7 +43,8 @@ def motion(
     quick: Annotated[bool, switch("--quick", "A seventh of the pixels and 90 frames; decides nothing.")] = False,
     frames: Annotated[int | None, option("--frames", "N", "Frames in motion.", min=40, show_default="600")] = None,
 ) -> Outcome:
-    """Repeat the flange paper on motion: Table 1, Eq. 21, Fig. 5, 6 and 9; the recording and its truth are kept. 15 min."""
+    """Repeat the flange paper on motion: Table 1, Eq. 21, Fig. 5, 6 and 9; the recording and its truth are kept. 15
+    min."""
     folder = call.folder("reproduce", "motion")
     return STUDY.measured(compute(folder, call.seed, quick, frames, call.progress), folder).outcome()
 
@@ -50,8 +52,8 @@ def motion(
 def compute(folder: Path, seed: int, quick: bool, frames: int | None, progress: Progress) -> dict[str, dict[str, Any]]:
     """Run the study and write `dataset` with truth.json: its figures, and what the pictures are drawn from.
 
-    Errors of X_BC are in mm at the cube's centre and at the camera's origin, and in degrees. `icp_share` is the share of a shift along x, y
-    and z that point-to-point ICP reports.
+    Errors of X_BC are in mm at the cube's centre and at the camera's origin, and in degrees. `icp_share` is the share
+    of a shift along x, y and z that point-to-point ICP reports.
     """
     start = time.monotonic()
     world = MotionWorld(
@@ -214,7 +216,10 @@ def _others(figures: Figures) -> Iterable[Table]:
 
 STUDY = Study(
     name="motion",
-    what="The flange paper on motion repeated on a simulated cell: errors by ICP (degrees, mm) in both modes, mean and deviation.",
+    what=(
+        "The flange paper on motion repeated on a simulated cell: errors by ICP (degrees, mm) in both modes, mean and"
+        " deviation."
+    ),
     figures=_figures,
     header=("mode", "poses", *(c for c in plots.COMPONENTS if c != "yaw"), "rms, mm"),
     rows=_table_1,
@@ -247,7 +252,8 @@ class _Verifier:
 
     def one(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[Array, RigidTransform | None]:
         """Error (6,) deg and mm, and the correction of Eq. 21, None where the registration failed."""
-        # the unsynchronised error, some 30 mm, must be within reach; a search farther than needed takes most of the time
+        # the unsynchronised error, some 30 mm, must be within reach; a search farther than needed takes most of the
+        # time
         off = float(np.linalg.norm(X_BC @ self._fits[id].center_C - X_BF[:3, 3]))
         verification = replace(self.model(id), X_BR=_rigid(X_BF), max_distance_m=max(_REACH_M, 2.0 * off))
         found = icp_error(X_BC, verification)
@@ -281,11 +287,16 @@ def _static_errors(looks: list[Look], X_BC: RigidTransform, standard: FlangeStan
 
 
 def _compensation(
-    verify: _Verifier, ids: tuple[str, ...], chosen: NDArray[np.intp], at_arrival: Array, at_capture: Array,
-    X_raw: RigidTransform, X_found: RigidTransform,
-) -> dict[str, dict[str, float]]:  # fmt: skip
-    """Rms ICP displacement (mm) before and after X_BC is right-multiplied by the mean error matrix (Eq. 21); the matrix comes
-    from every other frame, the errors from the frames between."""
+    verify: _Verifier,
+    ids: tuple[str, ...],
+    chosen: NDArray[np.intp],
+    at_arrival: Array,
+    at_capture: Array,
+    X_raw: RigidTransform,
+    X_found: RigidTransform,
+) -> dict[str, dict[str, float]]:
+    """Rms ICP displacement (mm) before and after X_BC is right-multiplied by the mean error matrix (Eq. 21); the matrix
+    comes from every other frame, the errors from the frames between."""
     out = {}
     for name, X, poses in (
         ("SVD, poses at arrival", X_raw, at_arrival),
@@ -304,10 +315,15 @@ def _compensation(
 
 
 def _quality(
-    world: MotionWorld, static: StaticMode, data: MotionDataset, ids: tuple[str, ...], fits: dict[str, FlangeFit],
+    world: MotionWorld,
+    static: StaticMode,
+    data: MotionDataset,
+    ids: tuple[str, ...],
+    fits: dict[str, FlangeFit],
     found: MotionEstimate,
-) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:  # fmt: skip
-    """Fig. 9: the fastest frame that the estimate used, and a static scan at the same place; faces (N, 3) mm in the flange's axes."""
+) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
+    """Fig. 9: the fastest frame that the estimate used, and a static scan at the same place; faces (N, 3) mm in the
+    flange's axes."""
     k = int(np.argmax(np.where(found.inliers, found.speed, -np.inf)))
     q = world.joints(float(found.capture[k]) - world.options.robot_start_s)
     still = static.look(q, np.random.default_rng(9))

@@ -1,7 +1,8 @@
-"""Measures frames per second sustained and the time from arrival to estimate: half a megapixel, beside an arm's control in real time.
+"""Measures frames per second sustained and the time from arrival to estimate: half a megapixel, beside an arm's control
+in real time.
 
-Frames are rendered beforehand and replayed at the scanner's rate on the wall clock. The queue, the estimator and its process are
-the cell's own; the arm's control is a simulated arm at 500 Hz in the same Diagram.
+Frames are rendered beforehand and replayed at the scanner's rate on the wall clock. The queue, the estimator and its
+process are the cell's own; the arm's control is a simulated arm at 500 Hz in the same Diagram.
 """
 
 import os
@@ -43,8 +44,8 @@ _PAPER = "10 million points per second arrive; real-time processing is left to p
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Throughput:
-    """Frames offered, estimated, without a fit and dropped in ``seconds``; times from arrival to estimate (ms); how late the arm's
-    500 Hz loop ran (ms)."""
+    """Frames offered, estimated, without a fit and dropped in ``seconds``; times from arrival to estimate (ms); how
+    late the arm's 500 Hz loop ran (ms)."""
 
     pixels: int
     seconds: float
@@ -74,20 +75,30 @@ class Throughput:
         """The JSON object."""
         p = np.percentile(self.wait_ms, [50, 95, 100])
         return {
-            "state": "done", "pixels": self.pixels, "seconds": self.seconds, "frames_per_second": self.fps,
-            "offered": self.offered, "estimated": self.estimated, "refused": self.refused, "dropped": self.dropped,
+            "state": "done",
+            "pixels": self.pixels,
+            "seconds": self.seconds,
+            "frames_per_second": self.fps,
+            "offered": self.offered,
+            "estimated": self.estimated,
+            "refused": self.refused,
+            "dropped": self.dropped,
             "arrival_to_estimate_ms": {"median": float(p[0]), "p95": float(p[1]), "worst": float(p[2])},
             "loop_behind_ms": {"median": float(np.median(self.behind_ms)), "worst": float(max(self.behind_ms))},
-            "load_average": self.load_average, "cores": os.cpu_count(), "points_per_second": self.pixels * self.fps, "paper": _PAPER,
+            "load_average": self.load_average,
+            "cores": os.cpu_count(),
+            "points_per_second": self.pixels * self.fps,
+            "paper": _PAPER,
             "targets": [{"what": t.what, "reached": t.value, "wanted": t.wanted, "met": t.met} for t in self.targets],
-        }  # fmt: skip
+        }
 
 
 @command("benchmark motion-speed", short_help="Measure frames per second beside an arm's control.", hidden=True)
 def benchmark_speed(
     call: Call, seconds: Annotated[float, option("--seconds", "S", "Length of the stream.", min=2.0)] = 30.0
 ) -> Outcome:
-    """Fit half-megapixel frames at 20 per second beside an arm's control: frames per second, and arrival to estimate."""
+    """Fit half-megapixel frames at 20 per second beside an arm's control: frames per second, and arrival to
+    estimate."""
     found = run_throughput(call.folder("benchmark", "motion"), seconds, call.seed, call.progress)
     return Outcome(found.summary(), text=partial(print_targets, "streamed scans", found.targets))
 

@@ -1,4 +1,5 @@
-"""`weldcal benchmark whole-body`: the tracking error of the flange beside that of a wrist link, by its mesh and by a fused model."""
+"""`weldcal benchmark whole-body`: the tracking error of the flange beside that of a wrist link, by its mesh and by a
+fused model."""
 
 import tempfile
 from dataclasses import replace
@@ -9,7 +10,7 @@ import numpy as np
 
 from weldcal.calibration.data.motion_dataset import load_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult
-from weldcal.calibration.motion.drift.watch import Watched, watch
+from weldcal.calibration.motion.drift.watch import DriftHistory, watch
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.kinematics import load_arm
@@ -64,7 +65,7 @@ def run_whole_body(
         robot=options.robot,
         flange=world.flange.designation,
     )
-    found: dict[str, Watched] = {}
+    found: dict[str, DriftHistory] = {}
     with tempfile.TemporaryDirectory() as folder:
         data_folder = Path(folder) / "recording"
         write_motion_dataset(world, data_folder, Path(folder) / "truth.json", lambda s, f: tell(s, 0.5 * f))
@@ -76,9 +77,16 @@ def run_whole_body(
         known = replace(result, clock=None)
         for name, fused in (("mesh", False), ("fused", True)):
             frames, body_motion, X_LR, refused = see_link(
-                data, known, standard, link, fused=fused, seed=options.seed,
-                tell=lambda f, name=name: tell(f"{link}, {name}", 0.65 + 0.17 * f + 0.17 * (name == "fused")),  # type: ignore[misc]
-            )  # fmt: skip
+                data,
+                known,
+                standard,
+                link,
+                fused=fused,
+                seed=options.seed,
+                tell=lambda f, name=name, at=0.82 if fused else 0.65: tell(  # type: ignore[misc]
+                    f"{link}, {name}", at + 0.17 * f
+                ),
+            )
             found[name] = watch(known, frames, body_motion, X_FR=X_LR, dropped=refused)
     rows = {name: _row(w) for name, w in found.items()}
     limit = WITHIN * rows["flange"]["rms_mm"]
@@ -94,7 +102,7 @@ def run_whole_body(
     return summary, targets
 
 
-def _row(w: Watched) -> dict[str, float]:
+def _row(w: DriftHistory) -> dict[str, float]:
     used = ~w.gross
     e = w.residuals[used]
     return {

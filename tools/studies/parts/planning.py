@@ -1,4 +1,5 @@
-"""Plans seams from one scan, by drawing and from the cloud alone: every scanner preset in random poses, and hard cases."""
+"""Plans seams from one scan, by drawing and from the cloud alone: every scanner preset in random poses, and hard
+cases."""
 
 import math
 import time
@@ -34,8 +35,18 @@ from weldcal.welding.locate.planes import Floats
 SHAPES = ("straight", "s", "l", "corner", "bent")  # l: corner radius 20 mm; corner: 4 mm; bent: s over 200 mm
 FIRST_HELD_OUT = 1000  # seeds from here on were not used while the figures of the algorithms were set
 COLUMNS = (
-    "preset", "method", "shape", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "chi", "within_2_sigma", "seconds",
-)  # fmt: skip
+    "preset",
+    "method",
+    "shape",
+    "seed",
+    "refused",
+    "rms_mm",
+    "worst_mm",
+    "sigma_mm",
+    "chi",
+    "within_2_sigma",
+    "seconds",
+)
 JUDGED = ("rms_mm", "worst_mm", "sigma_mm", "chi", "within_2_sigma")
 Plan = dict[str, Any]
 """The plan of one scan by one method: lengths in mm, NaN where it was refused; processor seconds."""
@@ -91,8 +102,8 @@ def _rms(values: Any) -> float:
 
 
 def plan_rows(plans: list[Plan], key: str) -> dict[str, str]:
-    """A line per preset or kind of trouble (``key``) and method: planned of all, errors sideways (rms and worst), sigma stated; of the presets
-    CPU seconds, of the troubles how many are as they have to be."""
+    """A line per preset or kind of trouble (``key``) and method: planned of all, errors sideways (rms and worst), sigma
+    stated; of the presets CPU seconds, of the troubles how many are as they have to be."""
     rows: dict[str, str] = {}
     for name, method in dict.fromkeys((t[key], t["method"]) for t in plans):
         mine = [t for t in plans if (t[key], t["method"]) == (name, method)]
@@ -112,15 +123,24 @@ def error_text(planned: Sequence[Plan]) -> str:
         return ""
     within = 100.0 * float(np.mean([t["within_2_sigma"] for t in planned]))
     return (
-        f"; error rms {_rms([t['rms_mm'] for t in planned]):.3f}, worst {max(t['worst_mm'] for t in planned):.2f} mm; sigma stated "
-        f"{_rms([t['sigma_mm'] for t in planned]):.3f} mm ({within:.0f} % of the line within 2 sigma)"
+        f"; error rms {_rms([t['rms_mm'] for t in planned]):.3f}, worst {max(t['worst_mm'] for t in planned):.2f} mm;"
+        f" sigma stated {_rms([t['sigma_mm'] for t in planned]):.3f} mm ({within:.0f} % of the line within 2 sigma)"
     )
 
 
 PRESET = "phoxi_m"
 TROUBLE_COLUMNS = (
-    "name", "method", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "within_2_sigma", "ok", "seconds",
-)  # fmt: skip
+    "name",
+    "method",
+    "seed",
+    "refused",
+    "rms_mm",
+    "worst_mm",
+    "sigma_mm",
+    "within_2_sigma",
+    "ok",
+    "seconds",
+)
 
 
 def trouble_trial(trouble: Trouble, seed: int) -> Plan:
@@ -146,7 +166,8 @@ def run_seam_planning_benchmark(
 ) -> tuple[dict[str, object], dict[str, str]]:
     """Every preset, shape and method over `runs` held-out poses: trials.csv in `out`, and the rows of the table.
 
-    full: images as wide as the scanner has them. troubles: occlusion, clutter and wrong workpieces as well (troubles.csv).
+    full: images as wide as the scanner has them. troubles: occlusion, clutter and wrong workpieces as well
+    (troubles.csv).
     """
     presets = list(SCANNERS) if presets is None else presets
     trials: list[Plan] = []

@@ -36,9 +36,19 @@ MEAN_TARGET_MM, MAX_TARGET_MM = 0.3, 0.8
 SAME_SURFACE_M = 1e-4
 HINT_M, HINT_RAD = 0.04, math.radians(15.0)
 COLUMNS = (
-    "kind", "part", "seed", "verdict", "nees", "drawn_mean_mm", "drawn_max_mm", "seam_mean_mm", "seam_max_mm", "measured",
-    "cpu_s", "sentence",
-)  # fmt: skip
+    "kind",
+    "part",
+    "seed",
+    "verdict",
+    "nees",
+    "drawn_mean_mm",
+    "drawn_max_mm",
+    "seam_mean_mm",
+    "seam_max_mm",
+    "measured",
+    "cpu_s",
+    "sentence",
+)
 SCENES: dict[str, Mapping[str, object]] = {
     "clutter": {"objects": 8, "fingers": 2},
     "missing faces": {"objects": 6, "fingers": 1, "spots": 4},
@@ -94,20 +104,26 @@ def run(kind: str, name: str, seed: int, hinted: bool) -> dict[str, object]:
     figures = {"drawn_mean_mm": drawn.mean(), "drawn_max_mm": drawn.max(), "seam_mean_mm": seam.mean()}
     row.update({key: float(value) for key, value in figures.items()})
     return {
-        **row, "verdict": "right" if right else "wrong", "nees": nees, "seam_max_mm": float(seam.max()),
-        "measured": joint.share, "sentence": found.summary,
-    }  # fmt: skip
+        **row,
+        "verdict": "right" if right else "wrong",
+        "nees": nees,
+        "seam_max_mm": float(seam.max()),
+        "measured": joint.share,
+        "sentence": found.summary,
+    }
 
 
 def _off(line_P: Floats, found: PartRegistration, scene: PartScene, part: Subject) -> Floats:
-    """How far each point of a planned line is from the true seam, mm; a seam that a turn maps to itself is compared as a set."""
+    """How far each point of a planned line is from the true seam, mm; a seam that a turn maps to itself is compared as
+    a set."""
     true = part.seam.transformed(scene.X_BP).points_P
     R = found.X_BP.rotation().matrix()
     return 1e3 * np.asarray(cKDTree(true).query(line_P @ R.T + found.X_BP.translation())[0])
 
 
 def _nees(found: PartRegistration, X_BP: RigidTransform, part: Subject) -> float:
-    """The pose's error squared in units of its covariance, the least over the turns that change neither part nor seam."""
+    """The pose's error squared in units of its covariance, the least over the turns that change neither part nor
+    seam."""
     model = PartModel(part.mesh)
     p = model.points[::20]
     same = [RigidTransform()]
@@ -149,7 +165,8 @@ def run_registration_study(
     names: Sequence[str] | None = None,
     progress: Progress = no_progress,
 ) -> Mapping[str, object]:
-    """Run scenes with clutter (a seed each), plans (every part once a seed) and subjects to refuse; registrations.csv grows.
+    """Run scenes with clutter (a seed each), plans (every part once a seed) and subjects to refuse; registrations.csv
+    grows.
 
     Returns counts, worst figures and the verdict: done when nothing was wrong and the plans are within their targets.
     """
@@ -188,9 +205,11 @@ def _summed(rows: list[dict[str, object]]) -> dict[str, object]:
             nees = of(some, "nees")
             summary[kind] = {
                 **dict(summary[kind]),  # type: ignore[call-overload]
-                "nees_mean": float(nees.mean()), "nees_max": float(nees.max()),
-                "seam_mean_mm": float(of(some, "seam_mean_mm").max()), "seam_max_mm": float(of(some, "seam_max_mm").max()),
-            }  # fmt: skip
+                "nees_mean": float(nees.mean()),
+                "nees_max": float(nees.max()),
+                "seam_mean_mm": float(of(some, "seam_mean_mm").max()),
+                "seam_max_mm": float(of(some, "seam_max_mm").max()),
+            }
     plans = kinds["plan"]
     within = sum(
         isinstance(row.get("seam_mean_mm"), float)

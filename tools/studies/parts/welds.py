@@ -17,13 +17,24 @@ from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.parts.planning import planning
 from weldcal.tools.studies.parts.registration import registration
-from weldcal.tools.worlds.parts.cells import Trial, write_cell
+from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS
 
 COLUMNS = (
-    "part", "joint", "seed", "state", "torch_mean_mm", "torch_max_mm", "plan_mean_mm", "plan_max_mm", "welded_mm", "refined",
-    "plan_arm_sigma_mm", "plan_arm_turn_deg", "reason",
-)  # fmt: skip
+    "part",
+    "joint",
+    "seed",
+    "state",
+    "torch_mean_mm",
+    "torch_max_mm",
+    "plan_mean_mm",
+    "plan_max_mm",
+    "welded_mm",
+    "refined",
+    "plan_arm_sigma_mm",
+    "plan_arm_turn_deg",
+    "reason",
+)
 MEAN_TARGET_MM, MAX_TARGET_MM = 0.10, 0.40
 
 
@@ -31,7 +42,7 @@ def run_part_welds(
     out: Path,
     names: Sequence[str] | None,
     seeds: range,
-    trial: Trial | None = None,
+    trial: PartTrial | None = None,
     progress: Progress = no_progress,
 ) -> Mapping[str, object]:
     """Weld each part once per seed; parts.csv grows row by row.
@@ -46,7 +57,7 @@ def run_part_welds(
     if unknown:
         listed = f"choose from {', '.join(PARTS)}."
         raise InputError(f"There is no part '{unknown[0]}': {did_you_mean(unknown[0], PARTS, listed)}")
-    trial = trial or Trial()
+    trial = trial or PartTrial()
     rows: list[dict[str, object]] = []
     runs = [(name, seed) for name in chosen for seed in seeds]
     for k, (name, seed) in enumerate(runs):
@@ -109,8 +120,9 @@ def welds(
         float, option("--arm-mm", "MM", "How far the true flange is from the reported one (rms).", min=0.0, max=5.0)
     ] = 0.4,
 ) -> Outcome:
-    """Weld twelve parts in four joints in the simulated cell, each from its STEP file, and measure the torch's error."""
-    trial = Trial.of(located_by, seam_mm, refine, arm_mm)
+    """Weld twelve parts in four joints in the simulated cell, each from its STEP file, and measure the torch's
+    error."""
+    trial = PartTrial.of(located_by, seam_mm, refine, arm_mm)
     folder = call.folder("benchmark", "part-welds")
     return Outcome(run_part_welds(folder, part, range(call.seed, call.seed + runs), trial, call.progress))
 
@@ -118,4 +130,5 @@ def welds(
 @command("benchmark parts", short_help="Measure how parts are found, planned and welded.")
 @one_of("welds", welds=welds, registration=registration, seam_planning=planning)
 def parts(call: Call) -> None:
-    """Measure how parts are found in a scan, how their seams are planned, and how they are welded, against the truth."""
+    """Measure how parts are found in a scan, how their seams are planned, and how they are welded, against the
+    truth."""

@@ -22,11 +22,14 @@ TARGETS = {
     "outlier_nominal": (0.071, 0.095),
 }
 TITLES = {
-    "xy_paper": "level arcs, noise as in the paper", "tilt_paper": "tilted arcs, noise as in the paper",
-    "xy_nominal": "level arcs, nominal noise", "tilt_nominal": "tilted arcs, nominal noise",
-    "free_paper": "40 free poses, noise as in the paper", "free_nominal": "40 free poses, nominal noise",
+    "xy_paper": "level arcs, noise as in the paper",
+    "tilt_paper": "tilted arcs, noise as in the paper",
+    "xy_nominal": "level arcs, nominal noise",
+    "tilt_nominal": "tilted arcs, nominal noise",
+    "free_paper": "40 free poses, noise as in the paper",
+    "free_nominal": "40 free poses, nominal noise",
     "outlier_nominal": "a tenth of outliers",
-}  # fmt: skip
+}
 # Tables 1, 2 and 3 as printed: bar, scale, blade for 10, 15, 20, 25 rotations
 PRINTED_ALPHA = {10: (2.19, 3.10, 1.85), 15: (1.16, 0.74, 0.81), 20: (-1.03, 0.86, 0.84), 25: (-1.12, 0.73, 0.94)}
 PRINTED_ALPHA_STD = {10: (2.55, 4.46, 2.38), 15: (2.56, 2.32, 2.08), 20: (2.67, 1.95, 1.74), 25: (2.39, 1.86, 1.66)}
@@ -42,7 +45,8 @@ PRINTED_RADIUS = {
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeRow:
-    """One set, number of rotations and method: rms errors over the trials, and the paper's own three criteria (mm, deg)."""
+    """One set, number of rotations and method: rms errors over the trials, and the paper's own three criteria (mm,
+    deg)."""
 
     name: str
     rotations: int
@@ -109,7 +113,8 @@ def edge_rows(
 
 
 def _criteria(poses: FlangePoses, points: Floats, R: Floats, t: Floats) -> tuple[float, float, float, float]:
-    """Mean and std of d alpha (deg; vectors from the first point of a group, unsigned) and of d (mm), the paper's section 4.1."""
+    """Mean and std of d alpha (deg; vectors from the first point of a group, unsigned) and of d (mm), the paper's
+    section 4.1."""
     p_F = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]]) @ R.T + t
     at = np.einsum("nij,nj->ni", poses.rotation, p_F) + poses.translation
     group = at.reshape(-1, TRANSLATIONS, 3)

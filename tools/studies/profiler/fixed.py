@@ -32,8 +32,14 @@ DEGENERATE = {
     "two_edges": "points of two edges",
 }
 FILES = (
-    "edge_features.npz", "edge_sphere.npz", "edge_profiles.npz", "sphere.npz", "groove.npz", "boss.npz", "real_sphere15_a.npz",
-)  # fmt: skip
+    "edge_features.npz",
+    "edge_sphere.npz",
+    "edge_profiles.npz",
+    "sphere.npz",
+    "groove.npz",
+    "boss.npz",
+    "real_sphere15_a.npz",
+)
 RAW: tuple[tuple[str, Literal["bar", "step", "apex"], tuple[float, float]], ...] = (
     ("bar", "bar", (0.050, 0.031)),
     ("blade", "apex", (0.006, 0.012)),
@@ -60,8 +66,8 @@ def require_files(folder: Path) -> None:
     for name in FILES:
         if not (folder / name).is_file():
             raise InputError(
-                f"There is no {name} in '{folder}': give the folder of all fixed files, use --quick, or omit --data to make "
-                "trials from seeds."
+                f"There is no {name} in '{folder}': give the folder of all fixed files, use --quick, or omit --data to"
+                " make trials from seeds."
             )
 
 
@@ -131,7 +137,8 @@ def _outliers(folder: Path) -> Iterator[Target]:
 
 
 def _degenerate(folder: Path) -> Iterator[Target]:
-    """Sets that leave something open: how many answers were wrong and did not say so, by their covariance where they have one."""
+    """Sets that leave something open: how many answers were wrong and did not say so, by their covariance where they
+    have one."""
     with np.load(folder / "edge_features.npz") as d:
         truth = EdgeState(d["truth_Rs"], d["truth_Ts"] * MM, d["truth_p0"] * MM, d["truth_e"])
         sets = {name: [d[f"degen_{name}_{part}"] for part in ("Rb", "Tb", "ps")] for name in DEGENERATE}
@@ -169,7 +176,8 @@ def _raw(folder: Path) -> Iterator[Target]:
 
 
 def published_lines(sphere: list[WorldResult]) -> Iterator[Target]:
-    """Of the study's worlds: the sphere paper's own method must be that method: its figures on these files are known."""
+    """Of the study's worlds: the sphere paper's own method must be that method: its figures on these files are
+    known."""
     for method, known in PUBLISHED.items():
         mean = float(np.mean([r.points_mm.mean() for r in sphere if r.method == method]))
         yield Target(f"sphere, the paper's method, {method}: off its known {known} mm", "mm", abs(mean - known), 0.01)

@@ -102,8 +102,8 @@ def _missed(figures: Figures) -> list[Target]:
 
 
 def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[Table]:
-    """Tables 1 to 3 of the edge paper, over 10 to 25 rotations, as printed for its three objects and of every set and method; and
-    the calibration's own error, which those criteria hardly show."""
+    """Tables 1 to 3 of the edge paper, over 10 to 25 rotations, as printed for its three objects and of every set and
+    method; and the calibration's own error, which those criteria hardly show."""
     n = edge.COUNTS
     by = {(r.name, r.method, r.rotations): r for r in rows}
     names = list(dict.fromkeys(name for name, _, _ in by))

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
+from weldcal.calibration.profiler.arm_errors import DhArm, ProfilerArmErrors
 from weldcal.calibration.profiler.features.frustum import fit_frustum
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
@@ -43,7 +43,8 @@ def one_seed(seed: int | None = None, data: str | None = None) -> Mapping[str, o
     """Every figure of a seed, or of the fixed files in the folder ``data``, with its Cramer-Rao bound.
 
     Returns:
-        values and bounds (mm or deg) by the names of their targets, and the squared errors of the edge's trials in units of
+        values and bounds (mm or deg) by the names of their targets, and the squared errors of the edge's trials in
+            units of
         the bound.
     """
     if data is not None:
@@ -66,9 +67,7 @@ def one_seed(seed: int | None = None, data: str | None = None) -> Mapping[str, o
         values |= edge_figures(name, rms(errors))
         bounds |= edge_figures(name, rms(least))
     results, predicted = _sphere(worlds, number)
-    return {
-        "seed": seed, "nees": nees, "values": values | sphere_figures(results), "bounds": bounds | predicted
-    }  # fmt: skip
+    return {"seed": seed, "nees": nees, "values": values | sphere_figures(results), "bounds": bounds | predicted}
 
 
 def cases(first: int, count: int, data: Path | None) -> Cases:
@@ -83,18 +82,30 @@ def _figures(results: Results) -> Figures:
     lines = []
     for what, unit, target in [*edge_targets(TARGETS), *sphere_targets()]:
         values, bounds = (np.array([r[key][what] for r in seeds], dtype=float) for key in ("values", "bounds"))
-        lines.append({
-            "what": what, "unit": unit, "target": target, "median": float(np.median(values)),
-            "least": float(values.min()), "largest": float(values.max()), "met": int((values <= target).sum()),
-            "bound": float(np.median(bounds)), "over_bound": float(np.sqrt(np.mean(values**2) / np.mean(bounds**2))),
-            "fixed_files": fixed["values"].get(what), "fixed_files_bound": fixed["bounds"].get(what),
-            "values": values, "bounds": bounds,
-        })  # fmt: skip
+        lines.append(
+            {
+                "what": what,
+                "unit": unit,
+                "target": target,
+                "median": float(np.median(values)),
+                "least": float(values.min()),
+                "largest": float(values.max()),
+                "met": int((values <= target).sum()),
+                "bound": float(np.median(bounds)),
+                "over_bound": float(np.sqrt(np.mean(values**2) / np.mean(bounds**2))),
+                "fixed_files": fixed["values"].get(what),
+                "fixed_files_bound": fixed["bounds"].get(what),
+                "values": values,
+                "bounds": bounds,
+            }
+        )
     nees = [v for r in seeds for v in r["nees"]]
     return {
-        "seeds": [seeds[0]["seed"], seeds[-1]["seed"]], "edge_nees": float(np.mean(nees)), "edge_trials": len(nees),
+        "seeds": [seeds[0]["seed"], seeds[-1]["seed"]],
+        "edge_nees": float(np.mean(nees)),
+        "edge_trials": len(nees),
         "lines": lines,
-    }  # fmt: skip
+    }
 
 
 def _rows(figures: Figures) -> Iterable[Row]:
@@ -125,14 +136,37 @@ def over_seeds(results: Results) -> bytes:
     picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
     axes = picture.add_subplot()
     for k, n in enumerate(lines):
-        axes.plot(n["values"] / n["target"], np.full(len(n["values"]), k), "o", ms=4, mew=0, alpha=0.5, color=OURS,
-                  label="one seed" if k == 0 else None)  # fmt: skip
+        axes.plot(
+            n["values"] / n["target"],
+            np.full(len(n["values"]), k),
+            "o",
+            ms=4,
+            mew=0,
+            alpha=0.5,
+            color=OURS,
+            label="one seed" if k == 0 else None,
+        )
         low, high = np.nanmin(n["bounds"]) / n["target"], np.nanmax(n["bounds"]) / n["target"]
-        axes.plot([low, high], [k + 0.28] * 2, "-", lw=3, color="0.45", solid_capstyle="round",
-                  label="its bound, over the seeds" if k == 0 else None)  # fmt: skip
+        axes.plot(
+            [low, high],
+            [k + 0.28] * 2,
+            "-",
+            lw=3,
+            color="0.45",
+            solid_capstyle="round",
+            label="its bound, over the seeds" if k == 0 else None,
+        )
         if n["fixed_files"] is not None:
-            axes.plot(n["fixed_files"] / n["target"], k, "D", ms=5, mfc="none", mec="black", mew=1.4,
-                      label="the fixed files" if k == 0 else None)  # fmt: skip
+            axes.plot(
+                n["fixed_files"] / n["target"],
+                k,
+                "D",
+                ms=5,
+                mfc="none",
+                mec="black",
+                mew=1.4,
+                label="the fixed files" if k == 0 else None,
+            )
     axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
     axes.set_yticks(range(len(lines)), [f"{n['what']}, {n['target']:g} {n['unit']}" for n in lines], fontsize=8)
     axes.invert_yaxis()
@@ -191,23 +225,29 @@ def _sphere(worlds: Iterable[WorldData], seed: int) -> tuple[list[WorldResult], 
 
 # of the fixed files' worlds: what each error's sigma really is
 REAL = SphereSigmas(
-    sensor_m=0.05e-3, robot_m=0.04e-3, touch_m=0.04e-3, affine=0.01, joint_rad=np.radians(0.015), length_m=0.125e-3,
-    twist_rad=np.radians(0.01), tip_m=3.54e-3,
-)  # fmt: skip
+    sensor_m=0.05e-3,
+    robot_m=0.04e-3,
+    touch_m=0.04e-3,
+    affine=0.01,
+    joint_rad=np.radians(0.015),
+    length_m=0.125e-3,
+    twist_rad=np.radians(0.01),
+    tip_m=3.54e-3,
+)
 DRAWS, BOSS_DRAWS = 300, 6
 
 
 def changed(e: SphereEstimate, x: Floats) -> SphereEstimate:
     """The estimate with all its unknowns (39,) moved."""
     assert e.tip is not None
-    errors = ArmErrors.of(x[15:])
+    errors = ProfilerArmErrors.of(x[15:])
     return replace(
         e,
         rotation=Rotation.from_rotvec(x[:3]).as_matrix() @ e.rotation,
         translation=e.translation + x[3:6],
         tip=e.tip + x[9:12],
         affine=e.affine + x[12:15],
-        arm_errors=ArmErrors(
+        arm_errors=ProfilerArmErrors(
             e.arm_errors.offsets + errors.offsets, e.arm_errors.sag + errors.sag, e.arm_errors.table + errors.table
         ),
     )
@@ -228,9 +268,12 @@ def predicted_mm(
     at, X = _apart(e, arm, q, seen, q_touch)
     steps = 1e-3 * np.sqrt(np.diag(e.whole))
     J = np.stack(
-        [(_apart(changed(e, h * u), arm, q, seen, q_touch)[0] - at) / h for h, u in zip(steps, np.eye(len(steps)), strict=True)],
+        [
+            (_apart(changed(e, h * u), arm, q, seen, q_touch)[0] - at) / h
+            for h, u in zip(steps, np.eye(len(steps)), strict=True)
+        ],
         axis=2,
-    )  # fmt: skip
+    )
     R_BS = X.rotation @ e.rotation
     plane = R_BS[:, :, [0, 2]]
     C = J @ e.whole @ np.swapaxes(J, 1, 2)
@@ -240,7 +283,8 @@ def predicted_mm(
 
 
 def world_bounds(world: WorldData, features: Floats | None, seed: int) -> dict[str, Floats]:
-    """`points` (), `seam` (3,) mm and `boss` (2,) mm and deg that the bound predicts; the last two where the world has them."""
+    """`points` (), `seam` (3,) mm and `boss` (2,) mm and deg that the bound predicts; the last two where the world has
+    them."""
     data, tests = world.trial.data, world.trial.tests
     assert data.arm is not None
     assert tests is not None

@@ -113,7 +113,8 @@ def _row(
     solve: Callable[[EdgeTrial], Answer | None],
     best: list[Answer] | None,
 ) -> dict[str, Any]:
-    """A method on sets of one kind: wall and processor seconds (median and largest), how often the optimum was found, rms error."""
+    """A method on sets of one kind: wall and processor seconds (median and largest), how often the optimum was found,
+    rms error."""
     seconds, worked, errors, found = [], [], [], 0
     for k, trial in enumerate(trials):
         start, begun = time.perf_counter(), time.process_time()
@@ -180,7 +181,8 @@ def _paper_pairs(t: EdgeTrial) -> Answer:
 
 
 def _searched(t: EdgeTrial) -> Answer:
-    """Distance to the best line on a grid of rotations and translations, SciPy from the twenty best, the best one polished."""
+    """Distance to the best line on a grid of rotations and translations, SciPy from the twenty best, the best one
+    polished."""
     p_S = np.column_stack([t.points[:, 0], np.zeros(len(t.points)), t.points[:, 1]])
     axis = np.linspace(-GRID_REACH_M, GRID_REACH_M, GRID_STEPS)
     shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -30,8 +30,8 @@ HIP_MM, SLOPE_DEG = 50.0, float(np.degrees(np.arctan2(4.0, 3.0)))
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WorldResult:
-    """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and of the frustum the mean
-    error (2,) of the slanted edges (mm) and of the slopes (deg)."""
+    """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and of the
+    frustum the mean error (2,) of the slanted edges (mm) and of the slopes (deg)."""
 
     world: int
     method: str
@@ -55,9 +55,7 @@ def sphere_figures(results: Sequence[WorldResult]) -> dict[str, float]:
     points = {m: float(np.mean([r.points_mm.mean() for r in results if r.method == m])) for m in TARGET_POINTS}
     best = [r for r in results if r.method == METHODS[3]]
     return named_figures(
-        points,
-        [r.seam_mm for r in best if r.seam_mm is not None],
-        [r.boss for r in best if r.boss is not None],
+        points, [r.seam_mm for r in best if r.seam_mm is not None], [r.boss for r in best if r.boss is not None]
     )
 
 

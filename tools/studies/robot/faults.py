@@ -21,27 +21,47 @@ from weldcal.tools.studies.robot.stream import TRANSPORT, one_transport, stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING
-from weldcal.tools.worlds.robot.fault_run import Outcome, run_case
+from weldcal.tools.worlds.robot.fault_run import FaultOutcome, run_case
 from weldcal.tools.worlds.robot.sequences import Sequence, run_sequence
 
 OUTCOME_COLUMNS = (
-    "name", "must", "did", "fault", "rest_after_ms", "travel_mm", "seen_after_ms", "sentence", "played", "problems", "retries",
-)  # fmt: skip
+    "name",
+    "must",
+    "did",
+    "fault",
+    "rest_after_ms",
+    "travel_mm",
+    "seen_after_ms",
+    "sentence",
+    "played",
+    "problems",
+    "retries",
+)
 SEQUENCE_COLUMNS = (
-    "seed", "seconds", "starts", "starts_refused", "moves_without_a_command", "moves_after_a_fault", "unattended_s", "unseen",
-    "unasked_stops", "thrown", "reported",
-)  # fmt: skip
+    "seed",
+    "seconds",
+    "starts",
+    "starts_refused",
+    "moves_without_a_command",
+    "moves_after_a_fault",
+    "unattended_s",
+    "unseen",
+    "unasked_stops",
+    "thrown",
+    "reported",
+)
 
 
 @dataclass(frozen=True)
 class FaultReport:
     """All outcomes and all sequences."""
 
-    outcomes: list[Outcome]
+    outcomes: list[FaultOutcome]
     sequences: list[Sequence]
 
     def summary(self) -> dict[str, object]:
-        """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names the results that are not as required."""
+        """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names the results that are
+        not as required."""
         stopped = [outcome for outcome in self.outcomes if outcome.did == "stopped"]
         wrong = [{"id": o.name, "reason": "; ".join(o.problems)} for o in self.outcomes if not o.ok]
         wrong += [{"id": f"sequence {s.seed}", "reason": s.verdict} for s in self.sequences if not s.ok]
@@ -76,7 +96,8 @@ def run_fault_benchmark(
     transport: str = NATIVE,
     progress: Progress = no_progress,
 ) -> FaultReport:
-    """The matrix, then the random sequences, each on a controller of its own; faults.csv and sequences.csv grow row by row."""
+    """The matrix, then the random sequences, each on a controller of its own; faults.csv and sequences.csv grow row by
+    row."""
     report = FaultReport([], [])
     share = 150.0 / (150.0 + sequences * seconds)
 
@@ -127,7 +148,8 @@ def faults(
     seconds: Annotated[float, option("--seconds", "S", "Length of each.", min=1.0)] = 60.0,
     transport: Annotated[str, TRANSPORT] = NATIVE,
 ) -> Printed:
-    """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say why."""
+    """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say
+    why."""
     result = run_fault_benchmark(
         call.folder("benchmark", "robot-faults"),
         address=call.given["address"],
@@ -143,4 +165,5 @@ def faults(
 @command("benchmark robot", short_help="Measure the robot link and the cell by wire.", options=("address", *FARM))
 @one_of("stream", stream=stream, faults=faults, jobs=jobs, wired_faults=wired_faults, soak=soak)
 def robot(call: Call) -> None:
-    """Measure the robot link and the cell by wire: periods of commands, faults, lateness in whole jobs, and long runs."""
+    """Measure the robot link and the cell by wire: periods of commands, faults, lateness in whole jobs, and long
+    runs."""

@@ -58,8 +58,9 @@ class JobTiming:
         late = self.lateness
         torch = self.torch_mean_mm
         return (
-            f"{self.state}{': ' + self.reason if self.reason else ''}; {late.on_time_percent:.2f} % of {sum(late.counts)} under "
-            f"{ON_TIME_MS:.0f} ms, latest {late.worst_ms:.1f} ms; slowest {self.slowest_percent:.0f} %, {self.slowed_s:.2f} s longer"
+            f"{self.state}{': ' + self.reason if self.reason else ''}; {late.on_time_percent:.2f} % of"
+            f" {sum(late.counts)} under {ON_TIME_MS:.0f} ms, latest {late.worst_ms:.1f} ms; slowest"
+            f" {self.slowest_percent:.0f} %, {self.slowed_s:.2f} s longer"
             + ("" if torch is None else f"; torch {torch:.3f} mm mean")
         )
 
@@ -79,7 +80,8 @@ class JobsReport:
         return Lateness([int(count) for count in counts], max(job.lateness.worst_ms for job in self.jobs))
 
     def summary(self) -> dict[str, object]:
-        """The JSON object; `over_8_ms` counts velocities, `limits_ms` are those of the bins of `velocities` and of the host's wake-ups."""
+        """The JSON object; `over_8_ms` counts velocities, `limits_ms` are those of the bins of `velocities` and of the
+        host's wake-ups."""
         late = self.lateness
         return {
             "state": "done",
@@ -170,7 +172,8 @@ def jobs(
     ] = None,
     transport: Annotated[str, TRANSPORT] = NATIVE,
 ) -> Outcome:
-    """Run whole jobs on an emulated controller in real time: how late the velocities are, alone or beside busy programs."""
+    """Run whole jobs on an emulated controller in real time: how late the velocities are, alone or beside busy
+    programs."""
     folder = call.folder("benchmark", f"robot-jobs-{scenario}")
     result = run_jobs(
         scenario,

@@ -53,8 +53,11 @@ class Missed(NamedTuple):
 
 @dataclass(frozen=True)
 class StreamReport:
-    """One stream. `fault` is empty where it went through to its end; `stops`: when in the run (s) the link stopped the arm by itself, and its
-    reason, lived through with a new start."""
+    """One stream.
+
+    `fault` is empty where it went through to its end; `stops`: when in the run (s) the link stopped the arm by itself,
+    and its reason, lived through with a new start.
+    """
 
     seconds: float
     tap: Tap
@@ -73,10 +76,10 @@ class StreamReport:
     def summary(self) -> dict[str, object]:
         """The JSON object: milliseconds unless the key says otherwise.
 
-        command_period_ms: from one command to the next where the cell hands them over. echo_ms: from the worker's sending to
-        its reading that the script on the controller has the number. command_to_motion_ms: from the hand-over of a
-        velocity step to the first sample at the Diagram in which the joint has half of it. state_age_ms: of the sample,
-        by the robot's own timestamp, each time the Diagram reads it.
+        command_period_ms: from one command to the next where the cell hands them over. echo_ms: from the worker's
+        sending to its reading that the script on the controller has the number. command_to_motion_ms: from the
+        hand-over of a velocity step to the first sample at the Diagram in which the joint has half of it. state_age_ms:
+        of the sample, by the robot's own timestamp, each time the Diagram reads it.
         """
         tap, missed = self.tap, self.missed
         return {
@@ -146,8 +149,8 @@ def run_robot_benchmark(
 ) -> StreamReport:
     """On an emulated controller of its own; robot.json and missed.csv are written into `out`.
 
-    Where this computer stood still for so long that the link stopped the arm, that is a stop in the report, and the stream
-    goes on over a new link.
+    Where this computer stood still for so long that the link stopped the arm, that is a stop in the report, and the
+    stream goes on over a new link.
     """
     left, stops, tap = 60.0 * minutes, list[tuple[float, str]](), None
     with emulator_process(host=address, seed=seed, lockstep=lockstep) as emulator:
@@ -206,7 +209,8 @@ def stream(
     minutes: Annotated[float, option("--minutes", "M", "Length of the stream.", min=0.05)] = 10.0,
     transport: Annotated[str, TRANSPORT] = NATIVE,
 ) -> Mapping[str, object]:
-    """Stream commands at 125 Hz to an emulated controller: periods, latencies, and deadlines missed by 20 ms or more."""
+    """Stream commands at 125 Hz to an emulated controller: periods, latencies, and deadlines missed by 20 ms or
+    more."""
     found = run_robot_benchmark(
         call.folder("benchmark", "robot"),
         address=call.given["address"],

@@ -1,4 +1,5 @@
-"""Faults of the devices by wire, in each phase of the job, and long runs with random ones: memory, names, motion and arc."""
+"""Faults of the devices by wire, in each phase of the job, and long runs with random ones: memory, names, motion and
+arc."""
 
 import ctypes
 import dataclasses as dc
@@ -32,18 +33,24 @@ WARM_UP_SHARE = 1 / 3
 FLAT_MB_H = 10.0  # memory is flat where growth above this is not shown at 95 %
 FEWEST, SHORTEST_H = 5, 0.25  # cycles and hours for a slope: within minutes what is loaded late looks like growth
 COLUMNS = (
-    "cycle", "at_s", "job", "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s", "named_after_s", "wall_s", "moved",
-    "arc_s", "problems", "velocities", "over_8_ms", "latest_ms", "stuck", "cell_mb", "in_use_mb", "world_mb", "scanner_mb", "finger_mb",
+    "cycle", "at_s", "job", "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s",
+    "named_after_s", "wall_s", "moved",
+    "arc_s", "problems", "velocities", "over_8_ms", "latest_ms", "stuck", "cell_mb", "in_use_mb", "world_mb",
+    "scanner_mb", "finger_mb",
 )  # fmt: skip
 PROCESSES = ("cell", "world", "scanner", "finger")
-IN_USE = "in_use"  # of the cell's memory: what C library and Python have given out, and not what they keep for the next allocation
+# Of the cell's memory: what C library and Python have given out, and not what they keep for the next allocation
+IN_USE = "in_use"
 BLOCK_BYTES = 512  # at most, of what Python gives out itself: larger things come from the C library
 
 
 def run_soak(
     folder: Path, minutes: float, seed: int, progress: Progress = no_progress
 ) -> tuple[dict[str, object], str]:
-    """Cycles until the time is over: the JSON object, and the printed table. Writes cycles.csv after each cycle, and soak.json."""
+    """Cycles until the time is over: the JSON object, and the printed table.
+
+    Writes cycles.csv after each cycle, and soak.json.
+    """
     rng = np.random.default_rng([seed, 20])
     rows: list[dict[str, object]] = []
     host = f"127.36.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
@@ -96,7 +103,8 @@ def _processes(world: WiredWorld) -> dict[str, object]:
 
 
 def _return_free_memory() -> None:
-    """Let the C library give what is free back to the system: else resident memory is the largest that any cycle needed."""
+    """Let the C library give what is free back to the system: else resident memory is the largest that any cycle
+    needed."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # only the GNU library has it
     if trim is not None:
         trim(0)
@@ -104,11 +112,13 @@ def _return_free_memory() -> None:
 
 class _Mallinfo2(ctypes.Structure):
     _fields_ = [(name, ctypes.c_size_t) for name in (
-        "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")]  # fmt: skip
+        "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks",
+        "keepcost")]  # fmt: skip
 
 
 def _in_use_mb() -> float:
-    """What this process has allocated from the GNU C library and from Python and not freed, MB, at most; NaN for another library."""
+    """What this process has allocated from the GNU C library and from Python and not freed, MB, at most; NaN for
+    another library."""
     ask = getattr(ctypes.CDLL(None), "mallinfo2", None)
     if ask is None:
         return float("nan")
@@ -148,7 +158,8 @@ def _alive(pid: int) -> bool:
 
 
 def growth(hours: np.ndarray, megabytes: np.ndarray) -> dict[str, float | bool | None]:
-    """The slope of a memory (MB/h) with its 95 % interval by least squares; `flat`: growth above FLAT_MB_H is not shown.
+    """The slope of a memory (MB/h) with its 95 % interval by least squares; `flat`: growth above FLAT_MB_H is not
+    shown.
 
     None where the cycles after the warm-up are fewer than FEWEST, or within SHORTEST_H.
 
@@ -169,7 +180,10 @@ def growth(hours: np.ndarray, megabytes: np.ndarray) -> dict[str, float | bool |
 
 
 def grows(memory: Mapping[str, Mapping[str, object]]) -> list[str]:
-    """Whose memory grows. The cell is judged by what it uses, where that is known: resident memory has gaps that later jobs fill."""
+    """Whose memory grows.
+
+    The cell is judged by what it uses, where that is known: resident memory has gaps that later jobs fill.
+    """
     judged = [name for name in memory if name != "cell" or memory[IN_USE]["flat"] is None]
     return [name for name in judged if memory[name]["flat"] is False]
 
@@ -181,16 +195,22 @@ def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool
         mb = np.array([float(str(row[f"{name}_mb"])) for row in rows])
         memory[name] = {"first_mb": mb[0], "last_mb": mb[-1], **growth(hours, mb)}
     faults = [row for row in rows if row.get("fault")]
-    wrong = [f"cycle {row['cycle']} ({row['device']} {row.get('fault', '')}, {row.get('phase', '')}): {'; '.join(map(str, row['problems']))}"  # type: ignore[call-overload]
-             for row in rows if row["problems"]]  # fmt: skip
+    wrong = [
+        f"cycle {row['cycle']} ({row['device']} {row.get('fault', '')}, {row.get('phase', '')}): "
+        f"{'; '.join(map(str, row['problems']))}"  # type: ignore[call-overload]
+        for row in rows
+        if row["problems"]
+    ]
     total = {name: sum(float(str(row.get(name) or 0.0)) for row in rows) for name in ("moved", "arc_s", "stuck")}
     sound = [row for row in rows if not row.get("fault") and "velocities" in row]
     good = not wrong and world_lives and not any(total.values()) and not grows(memory)
     return {
         "state": "done" if good else "failed", "seconds": seconds, "cycles": len(rows),
-        "calibrated": sum(row["job"] == "calibrate" for row in rows), "welded": sum(row["job"] == "weld" for row in rows),
+        "calibrated": sum(row["job"] == "calibrate" for row in rows),
+        "welded": sum(row["job"] == "weld" for row in rows),
         "done": sum(row["state"] == "done" for row in rows), "held": sum(row["state"] == "held" for row in rows),
-        "faults": len(faults), "faults_held_by_name": sum(row["state"] == "held" and not row["problems"] for row in faults),
+        "faults": len(faults),
+        "faults_held_by_name": sum(row["state"] == "held" and not row["problems"] for row in faults),
         "faults_without_effect": sum(row["state"] == "done" and not row["problems"] for row in faults),
         "motions_without_a_command": total["moved"], "arc_without_a_command_s": total["arc_s"],
         "jobs_without_a_fault": len(sound),
@@ -198,13 +218,18 @@ def _summary(rows: list[dict[str, object]], seconds: float, *, world_lives: bool
         "of_them_over_8_ms_late": sum(int(str(row["over_8_ms"])) for row in sound),
         "latest_ms": max((float(str(row["latest_ms"])) for row in sound), default=0.0),
         "stuck_processes": total["stuck"], "world_lives": world_lives, "memory": memory, "wrong": wrong,
-        **({} if good else {"reason": wrong[0] if wrong else "Memory grew, a process is stuck, or the world has ended: see the table."}),
+        **({} if good else {"reason": wrong[0] if wrong else
+                              "Memory grew, a process is stuck, or the world has "
+                              "ended: see the table."}),
     }  # fmt: skip
 
 
 def _table(found: Mapping[str, object]) -> str:
-    rows = [(key.replace("_", " "), f"{value:.1f}" if isinstance(value, float) else str(value))
-            for key, value in found.items() if not isinstance(value, dict | list)]  # fmt: skip
+    rows = [
+        (key.replace("_", " "), f"{value:.1f}" if isinstance(value, float) else str(value))
+        for key, value in found.items()
+        if not isinstance(value, dict | list)
+    ]
     for name, m in found["memory"].items():  # type: ignore[attr-defined]
         slope = (
             "too short a run for a slope"
@@ -218,17 +243,28 @@ def _table(found: Mapping[str, object]) -> str:
 
 @command("benchmark soak", short_help="Calibrate and weld by wire for an hour with faults.", hidden=True)
 def soak(
-    call: Call,
-    minutes: Annotated[float, option("--minutes", "M", "How long new cycles begin.", min=0.1)] = 60.0,
+    call: Call, minutes: Annotated[float, option("--minutes", "M", "How long new cycles begin.", min=0.1)] = 60.0
 ) -> Outcome:
-    """Calibrate and weld by wire again and again with random faults: memory, stuck processes, faults by name, motion and arc."""
+    """Calibrate and weld by wire again and again with random faults: memory, stuck processes, faults by name, motion
+    and arc."""
     summary, table = run_soak(call.folder("benchmark", "soak"), minutes, call.seed, call.progress)
     return Outcome(summary, text=table)
 
 
 FAULT_COLUMNS = (
-    "device", "fault", "phase", "state", "reason", "torch_off_after_s", "rest_after_s", "named_after_s", "moved", "arc_s", "wall_s", "problems",
-)  # fmt: skip
+    "device",
+    "fault",
+    "phase",
+    "state",
+    "reason",
+    "torch_off_after_s",
+    "rest_after_s",
+    "named_after_s",
+    "moved",
+    "arc_s",
+    "wall_s",
+    "problems",
+)
 TIMES = ("torch_off_after_s", "rest_after_s", "named_after_s")
 
 
@@ -273,10 +309,14 @@ def _faults(found: Results) -> Figures:
     wrong = [f"{r['device']} {r['fault']} in {r['phase']}: {'; '.join(r['problems'])}" for r in rows if r["problems"]]
     wrong += [f"{name}: {result['reason']}" for name, result in found.items() if "rows" not in result]
     return {
-        "state": "failed" if wrong else "done", "faults": len(rows), "held_by_name": sum(r["state"] == "held" for r in rows),
-        "done_while_silent": sum(r["state"] == "done" for r in rows), "wrong": wrong, "rows": rows,
+        "state": "failed" if wrong else "done",
+        "faults": len(rows),
+        "held_by_name": sum(r["state"] == "held" for r in rows),
+        "done_while_silent": sum(r["state"] == "done" for r in rows),
+        "wrong": wrong,
+        "rows": rows,
         **({"reason": wrong[0]} if wrong else {}),
-    }  # fmt: skip
+    }
 
 
 def _fault_rows(figures: Figures) -> Iterable[Row]:
@@ -311,13 +351,11 @@ def wired_faults(
     devices: Annotated[list[str] | None, option("--device", "NAME", "Only this device; repeat for more.")] = None,
     phases: Annotated[list[str] | None, option("--phase", "NAME", "Only this phase; repeat for more.")] = None,
 ) -> Outcome:
-    """Kill, freeze and delay each device by wire, and let it send garbage, in each phase: the arm must stop, and the job say why."""
+    """Kill, freeze and delay each device by wire, and let it send garbage, in each phase: the arm must stop, and the
+    job say why."""
     folder = call.folder("benchmark", "wired-faults")
     found = WIRED_FAULTS.run(
         Farm.of(folder, call.given, call.progress), fault_cases(folder, call.seed, devices or (), phases or ())
     )
-    write_atomic(
-        folder / "faults.csv",
-        mappings_csv(found.figures["rows"], FAULT_COLUMNS),
-    )
+    write_atomic(folder / "faults.csv", mappings_csv(found.figures["rows"], FAULT_COLUMNS))
     return Outcome(found.figures, text=found.markdown())

@@ -41,9 +41,11 @@ _LIMIT_WORDS = {"≤": "at most ", "<": "under ", "≥": "at least ", "±": ""}
 _LARGER = 20.0
 SIGN_WORDS = {Sign.PRINTED: "as printed (−)", Sign.NONE: "left out", Sign.CORRECTED: "reversed (+)"}
 _TITLES = {
-    ("htm", 1): "six-parameter transforms, stage 1", ("dh", 1): "Denavit-Hartenberg, stage 1",
-    ("htm", 2): "affine pair on the transforms", ("dh", 2): "affine pair on Denavit-Hartenberg",
-}  # fmt: skip
+    ("htm", 1): "six-parameter transforms, stage 1",
+    ("dh", 1): "Denavit-Hartenberg, stage 1",
+    ("htm", 2): "affine pair on the transforms",
+    ("dh", 2): "affine pair on Denavit-Hartenberg",
+}
 
 
 @command("reproduce tablet", short_help="Repeat the tablet paper: Tables 7 to 12.")
@@ -174,7 +176,8 @@ def _table(r: Reproduced) -> dict[str, object]:
 
 
 def sign_residuals(touches: TabletTouches) -> bytes:
-    """For each sign of Eq. 20: the nine hand positions, and by how much a similarity of the tablet and a pen miss them."""
+    """For each sign of Eq. 20: the nine hand positions, and by how much a similarity of the tablet and a pen miss
+    them."""
     picture = Figure(figsize=(9.6, 3.0), layout="constrained")
     every = picture.subplots(1, 3, sharex=True, sharey=True)
     for axes, sign in zip(every, Sign, strict=True):

@@ -51,7 +51,8 @@ class Cost:
 
 @dataclass(frozen=True)
 class SignRow:
-    """Hand positions against the tablet alone, no camera: rms per axis (mm) and leave-one-out mean (mm) for one sign."""
+    """Hand positions against the tablet alone, no camera: rms per axis (mm) and leave-one-out mean (mm) for one
+    sign."""
 
     sign: Sign
     rigid_mm: float
@@ -61,7 +62,8 @@ class SignRow:
 
 @dataclass(frozen=True)
 class ModelRow:
-    """One model on the published data: unknowns, mean error of the hand in sample and left out, largest left out (mm)."""
+    """One model on the published data: unknowns, mean error of the hand in sample and left out, largest left out
+    (mm)."""
 
     name: str
     unknowns: int
@@ -178,8 +180,8 @@ def compare_models(touches: TabletTouches) -> tuple[ModelRow, ...]:
 
 
 def two_stage_errors(touches: TabletTouches, keep: NDArray[np.bool_], sign: Sign) -> tuple[Array, Array]:
-    """Hand errors (n, 2) m of the paper's stage 1 and of both its stages, fitted to some landmarks, at all of them, against
-    their own r' (Eq. 20)."""
+    """Hand errors (n, 2) m of the paper's stage 1 and of both its stages, fitted to some landmarks, at all of them,
+    against their own r' (Eq. 20)."""
     fitted = touches.pick(keep)
     first, second = _two_stages(fitted, sign)
     target = touches.hand_m + 1e-3 * sign * place_landmarks(touches, first, "htm").correction[0]

@@ -9,7 +9,7 @@ import numpy as np
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress
 from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.case import Case, run_case, study_config
+from weldcal.tools.worlds.weld.case import WeldCase, run_case, study_config
 from weldcal.tools.worlds.weld.metrics import RunMetrics, judge
 from weldcal.tools.worlds.weld.plant import StudyRun, simulate
 from weldcal.tools.worlds.weld.seams import TrueSeam, get_seam
@@ -22,7 +22,7 @@ class UnknownRow(InputError):
 
 
 @dataclass(frozen=True)
-class Target:
+class MetricTarget:
     """A bound on one figure of RunMetrics: `over` the seeds ("worst" or "mean") it is to be at most `limit`."""
 
     figure: str
@@ -37,16 +37,16 @@ class Row:
 
     key: str
     label: str
-    cases: tuple[Case, ...]
-    targets: tuple[Target, ...]
+    cases: tuple[WeldCase, ...]
+    targets: tuple[MetricTarget, ...]
 
 
 _CHORDS = (0.040, 0.060, 0.080)
 _EASY = ("straight", "s_r60", "l_r20_convex", "l_r20_concave")
-_BOUNDED = (Target("omega_rad_s", 0.8, unit="rad/s"), Target("tip_speed_mm_s", 40.0, unit="mm/s"))
+_BOUNDED = (MetricTarget("omega_rad_s", 0.8, unit="rad/s"), MetricTarget("tip_speed_mm_s", 40.0, unit="mm/s"))
 _GAP_10, _GAP_25 = ((0.145, 0.155),), ((0.1375, 0.1625),)
 
-_WRONG = (Target("mean_mm", 0.10, "mean"), Target("max_mm", 0.30), Target("height_mm", 0.65))
+_WRONG = (MetricTarget("mean_mm", 0.10, "mean"), MetricTarget("max_mm", 0.30), MetricTarget("height_mm", 0.65))
 _SINGLE = {
     "stamp_bias": "only: pictures stamped 10 ms early, poses 8 ms late",
     "stamp_jitter": "only: each stamp off by 2 ms (one sigma)",
@@ -63,85 +63,115 @@ ROWS: tuple[Row, ...] = (
     Row(
         "imperfect",
         "imperfect world: straight, S R60, L R20",
-        tuple(Case(seam, "imperfect") for seam in _EASY),
-        (*_WRONG, Target("space_mean_mm", 0.30, "mean"), Target("space_mm", 0.70), *_BOUNDED),
+        tuple(WeldCase(seam, "imperfect") for seam in _EASY),
+        (*_WRONG, MetricTarget("space_mean_mm", 0.30, "mean"), MetricTarget("space_mm", 0.70), *_BOUNDED),
     ),
     Row(
         "imperfect_corners",
         "imperfect world: R5 and R1 corners",
-        tuple(Case(f"l_{r}_{side}", "imperfect") for r in ("r5", "r1") for side in ("convex", "concave")),
-        (Target("mean_mm", 0.12, "mean"), Target("max_mm", 0.50), Target("height_mm", 0.65), *_BOUNDED),
+        tuple(WeldCase(f"l_{r}_{side}", "imperfect") for r in ("r5", "r1") for side in ("convex", "concave")),
+        (
+            MetricTarget("mean_mm", 0.12, "mean"),
+            MetricTarget("max_mm", 0.50),
+            MetricTarget("height_mm", 0.65),
+            *_BOUNDED,
+        ),
     ),
     *(
-        Row(name, f"S R60, L R20; {label}", tuple(Case(seam, name) for seam in ("s_r60", "l_r20_convex")), _WRONG)
+        Row(name, f"S R60, L R20; {label}", tuple(WeldCase(seam, name) for seam in ("s_r60", "l_r20_convex")), _WRONG)
         for name, label in _SINGLE.items()
     ),
     Row(
         "nominal",
         "perfectly known world: straight, S R60, L R20; chord 40, 60, 80 mm; nominal",
-        tuple(Case(seam, chord_m=d) for seam in _EASY for d in _CHORDS),
+        tuple(WeldCase(seam, chord_m=d) for seam in _EASY for d in _CHORDS),
         (
-            Target("mean_mm", 0.04, "mean"),
-            Target("max_mm", 0.15),
-            Target("cv_percent", 1.0, unit="%"),
-            Target("time_ratio", 1.02, unit="L/V"),
+            MetricTarget("mean_mm", 0.04, "mean"),
+            MetricTarget("max_mm", 0.15),
+            MetricTarget("cv_percent", 1.0, unit="%"),
+            MetricTarget("time_ratio", 1.02, unit="L/V"),
             *_BOUNDED,
         ),
     ),
     Row(
         "hard",
         "perfectly known world, hard budget, chord 60 mm",
-        tuple(Case(seam, "hard") for seam in _EASY),
-        (Target("mean_mm", 0.12, "mean"), Target("max_mm", 0.45), *_BOUNDED),
+        tuple(WeldCase(seam, "hard") for seam in _EASY),
+        (MetricTarget("mean_mm", 0.12, "mean"), MetricTarget("max_mm", 0.45), *_BOUNDED),
     ),
     Row(
         "hard_corners",
         "R5 and R1 corners, hard budget: completed",
-        tuple(Case(f"l_{r}_{side}", "hard") for r in ("r5", "r1") for side in ("convex", "concave")),
-        (Target("mean_mm", 0.12, "mean"), *_BOUNDED),
+        tuple(WeldCase(f"l_{r}_{side}", "hard") for r in ("r5", "r1") for side in ("convex", "concave")),
+        (MetricTarget("mean_mm", 0.12, "mean"), *_BOUNDED),
     ),
-    Row("r5", "L R5, nominal", (Case("l_r5_convex"), Case("l_r5_concave")), (Target("max_mm", 0.35), *_BOUNDED)),
-    Row("r1_concave", "L R1 concave, nominal", (Case("l_r1_concave"),), (Target("max_mm", 0.30), *_BOUNDED)),
-    Row("r1_convex", "L R1 convex, nominal", (Case("l_r1_convex"),), (Target("max_mm", 0.50), *_BOUNDED)),
+    Row(
+        "r5",
+        "L R5, nominal",
+        (WeldCase("l_r5_convex"), WeldCase("l_r5_concave")),
+        (MetricTarget("max_mm", 0.35), *_BOUNDED),
+    ),
+    Row("r1_concave", "L R1 concave, nominal", (WeldCase("l_r1_concave"),), (MetricTarget("max_mm", 0.30), *_BOUNDED)),
+    Row("r1_convex", "L R1 convex, nominal", (WeldCase("l_r1_convex"),), (MetricTarget("max_mm", 0.50), *_BOUNDED)),
     Row(
         "end",
         "end of the seam: straight, on an R60 arc",
-        (Case("straight"), Case("arc_r60_end")),
-        (Target("end_mm", 0.12), Target("end_step_mm_s", 0.5, unit="mm/s")),
+        (WeldCase("straight"), WeldCase("arc_r60_end")),
+        (MetricTarget("end_mm", 0.12), MetricTarget("end_step_mm_s", 0.5, unit="mm/s")),
     ),
-    Row("gap_10", "gap of 10 mm, straight and S", tuple(Case(s, gaps=_GAP_10) for s in _EASY[:2]), (Target("gap_mm", 0.12),)),
-    Row("gap_25", "gap of 25 mm, straight and S", tuple(Case(s, gaps=_GAP_25) for s in _EASY[:2]), (Target("gap_mm", 0.60),)),
-    Row("speed_16", "16 mm/s: S R60, L R20", tuple(Case(s, speed_m_s=0.016) for s in _EASY[1:]), (Target("max_mm", 0.20), *_BOUNDED)),
-    Row("speed_24", "24 mm/s: S R60, L R20", tuple(Case(s, speed_m_s=0.024) for s in _EASY[1:]), (Target("max_mm", 0.35), *_BOUNDED)),
+    Row(
+        "gap_10",
+        "gap of 10 mm, straight and S",
+        tuple(WeldCase(s, gaps=_GAP_10) for s in _EASY[:2]),
+        (MetricTarget("gap_mm", 0.12),),
+    ),
+    Row(
+        "gap_25",
+        "gap of 25 mm, straight and S",
+        tuple(WeldCase(s, gaps=_GAP_25) for s in _EASY[:2]),
+        (MetricTarget("gap_mm", 0.60),),
+    ),
+    Row(
+        "speed_16",
+        "16 mm/s: S R60, L R20",
+        tuple(WeldCase(s, speed_m_s=0.016) for s in _EASY[1:]),
+        (MetricTarget("max_mm", 0.20), *_BOUNDED),
+    ),
+    Row(
+        "speed_24",
+        "24 mm/s: S R60, L R20",
+        tuple(WeldCase(s, speed_m_s=0.024) for s in _EASY[1:]),
+        (MetricTarget("max_mm", 0.35), *_BOUNDED),
+    ),
     Row(
         "space",
         "on cylinders of R 150 and 300 mm, kinematic budget",
-        tuple(Case(f"{s}_on_{r}", "kinematic") for s in ("s_r60", "l_r20") for r in ("r150", "r300")),
+        tuple(WeldCase(f"{s}_on_{r}", "kinematic") for s in ("s_r60", "l_r20") for r in ("r150", "r300")),
         (
-            Target("mean_mm", 0.03, "mean"),
-            Target("space_mm", 0.03),
-            Target("work_deg", 3.0, unit="deg"),
-            Target("travel_error_deg", 0.1, unit="deg"),
+            MetricTarget("mean_mm", 0.03, "mean"),
+            MetricTarget("space_mm", 0.03),
+            MetricTarget("work_deg", 3.0, unit="deg"),
+            MetricTarget("travel_error_deg", 0.1, unit="deg"),
         ),
     ),
     *(
         Row(
             f"space_{um}um",
             f"the same L on R 300 mm, tag noise {um} um: what of the error is noise",
-            (Case("l_r20_on_r300", f"kinematic_{um}um"),),
-            (Target("space_mm", 0.03),),
+            (WeldCase("l_r20_on_r300", f"kinematic_{um}um"),),
+            (MetricTarget("space_mm", 0.03),),
         )
         for um in (0, 5, 10)
     ),
-)  # fmt: skip
+)
 
 _LAWS = ("printed", "literal", "open", "fixed", "dls", "guarded")
-COMPARED: tuple[Case, ...] = tuple(
-    Case(seam, law=law)
+COMPARED: tuple[WeldCase, ...] = tuple(
+    WeldCase(seam, law=law)
     for seam in ("straight", "s_r60", "l_r20_convex", "l_r5_convex", "l_r1_convex", "l_r1_concave")
     for law in _LAWS
 ) + tuple(
-    Case(seam, gaps=gaps, law=law)
+    WeldCase(seam, gaps=gaps, law=law)
     for seam, gaps in (("straight", _GAP_25), ("s_r60", _GAP_10), ("arc_r60_end", ()))
     for law in ("fixed", "fixed_zeroed", "guarded")
 )
@@ -164,7 +194,7 @@ def get_rows(names: tuple[str, ...]) -> tuple[Row, ...]:
 class Reached:
     """One figure held against its target: the mean and the worst over all runs of the row, and which run was worst."""
 
-    target: Target
+    target: MetricTarget
     mean: float
     worst: float
     worst_run: str
@@ -184,7 +214,7 @@ class Reached:
 class CaseResult:
     """All runs of one case: seeds and figures, in order."""
 
-    case: Case
+    case: WeldCase
     seeds: tuple[int, ...]
     metrics: tuple[RunMetrics, ...]
 
@@ -222,7 +252,7 @@ class RowResult:
         return self.completed == self.runs and all(r.met for r in self.reached)
 
 
-def hold_against(target: Target, cases: Iterable[CaseResult]) -> Reached:
+def hold_against(target: MetricTarget, cases: Iterable[CaseResult]) -> Reached:
     """A target's figure over all runs; a run that lacks it (it broke off before) counts as infinitely bad."""
     values = {
         f"{c.case.name} seed {seed}": v if math.isfinite(v) else math.inf
@@ -233,19 +263,19 @@ def hold_against(target: Target, cases: Iterable[CaseResult]) -> Reached:
     return Reached(target, float(np.mean(list(values.values()))), values[worst], worst)
 
 
-def measure_row(row: Row, results: dict[Case, CaseResult]) -> RowResult:
+def measure_row(row: Row, results: dict[WeldCase, CaseResult]) -> RowResult:
     """The row's table line from the results of its cases."""
     cases = tuple(results[case] for case in row.cases)
     return RowResult(row, cases, tuple(hold_against(t, cases) for t in row.targets))
 
 
 def run_cases(
-    cases: Iterable[Case],
+    cases: Iterable[WeldCase],
     seeds: tuple[int, ...],
-    keep: Callable[[Case, int, StudyRun, RunMetrics], None],
+    keep: Callable[[WeldCase, int, StudyRun, RunMetrics], None],
     progress: Progress,
-    known: dict[Case, CaseResult] | None = None,
-) -> dict[Case, CaseResult]:
+    known: dict[WeldCase, CaseResult] | None = None,
+) -> dict[WeldCase, CaseResult]:
     """Every case over every seed, each case once however many rows ask for it; `keep` sees each run as it ends.
 
     What is `known` of the same seeds already is not run again.
@@ -277,8 +307,8 @@ class TurnResult:
     Attributes:
         turn_deg, back_up_mm: by the true seam's chord map; possible: the map has no obstacle there.
         refused: before anything moved; phase, reason: how it ended; max_mm: error of what was welded in one go.
-        splits_mm: where the seam was split instead; pieces_done: how many of its pieces were welded; pieces_max_mm: their
-            largest error.
+        splits_mm: where the seam was split instead; pieces_done: how many of its pieces were welded; pieces_max_mm:
+            their largest error.
     """
 
     seam: str
@@ -316,8 +346,9 @@ class TurnResult:
 
 
 def run_turn(seam: str, chord_m: float, seed: int) -> TurnResult:
-    """Predict and then weld one seam with one chord, with the nominal budget's plan; what is refused is welded in pieces."""
-    case = Case(seam, chord_m=chord_m)
+    """Predict and then weld one seam with one chord, with the nominal budget's plan; what is refused is welded in
+    pieces."""
+    case = WeldCase(seam, chord_m=chord_m)
     config = study_config(case)
     true = get_seam(seam)
     line = SeamCurve.from_points(true.points, true.up)

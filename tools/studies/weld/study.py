@@ -28,7 +28,7 @@ from weldcal.tools.studies.weld.rows import (
     run_cases,
     run_turn,
 )
-from weldcal.tools.worlds.weld.case import Case, study_config
+from weldcal.tools.worlds.weld.case import WeldCase, study_config
 from weldcal.tools.worlds.weld.metrics import RunMetrics
 from weldcal.tools.worlds.weld.plant import COLUMNS, PHASES, StudyRun
 from weldcal.welding.record.process import path_error, speed_along
@@ -57,16 +57,16 @@ def weld(
 def run_study(
     folder: Path, names: tuple[str, ...], count: int, first: int, quick: bool, progress: Progress
 ) -> Measured:
-    """Run the rows of those names (all when none) with ``count`` seeds from ``first`` on; write the tables, runs.csv, and one CSV and two
-    pictures per pictured run."""
+    """Run the rows of those names (all when none) with ``count`` seeds from ``first`` on; write the tables, runs.csv,
+    and one CSV and two pictures per pictured run."""
     start = time.monotonic()
     everything = not names
     rows = get_rows(names)
     wanted = [case for row in rows for case in row.cases]
     seeds = tuple(range(first, first + count))
-    pictured: dict[str, tuple[Case, StudyRun]] = {}
+    pictured: dict[str, tuple[WeldCase, StudyRun]] = {}
 
-    def keep(case: Case, seed: int, run: StudyRun, figures: RunMetrics) -> None:
+    def keep(case: WeldCase, seed: int, run: StudyRun, figures: RunMetrics) -> None:
         # One run of each seam is drawn: the first seed, ours, nominal, as far as there is one.
         if seed == first and case.law == "guarded" and case.seam not in pictured:
             pictured[case.seam] = (case, run)
@@ -79,7 +79,7 @@ def run_study(
         for k, (name, chord) in enumerate(pairs):
             progress(name, 0.7 + 0.05 * k / len(pairs))
             turns.append(run_turn(name, chord, first))
-    compared: dict[Case, CaseResult] = {}
+    compared: dict[WeldCase, CaseResult] = {}
     if everything or "laws" in names:
         few = seeds[: 1 if quick else COMPARED_SEEDS]
         compared = run_cases(COMPARED, few, keep, lambda name, share: progress(name, 0.75 + 0.25 * share), results)
@@ -134,28 +134,49 @@ def _row_summary(row: RowResult) -> dict[str, object]:
         "completed": row.completed,
         "figures": {
             r.target.figure: {
-                "target": r.target.limit, "over": r.target.over, "unit": r.target.unit, "mean": r.mean, "worst": r.worst,
-                "met": r.met, "worst_run": r.worst_run,
+                "target": r.target.limit,
+                "over": r.target.over,
+                "unit": r.target.unit,
+                "mean": r.mean,
+                "worst": r.worst,
+                "met": r.met,
+                "worst_run": r.worst_run,
             }
             for r in row.reached
         },
-    }  # fmt: skip
+    }
 
 
 FIGURE_NAMES = {
-    "mean_mm": "torch, mean", "max_mm": "torch, largest", "space_mm": "torch in space, largest",
+    "mean_mm": "torch, mean",
+    "max_mm": "torch, largest",
+    "space_mm": "torch in space, largest",
     "space_mean_mm": "torch in space, mean",
-    "height_mm": "torch height, largest", "end_mm": "last chord, largest",
-    "gap_mm": "gap and 60 mm after, largest", "cv_percent": "torch speed CV", "time_ratio": "time over L/V",
-    "omega_rad_s": "turning rate", "tip_speed_mm_s": "tip speed", "end_step_mm_s": "robot's velocity step",
-    "work_deg": "work angle", "travel_error_deg": "travel angle against prediction",
-}  # fmt: skip
+    "height_mm": "torch height, largest",
+    "end_mm": "last chord, largest",
+    "gap_mm": "gap and 60 mm after, largest",
+    "cv_percent": "torch speed CV",
+    "time_ratio": "time over L/V",
+    "omega_rad_s": "turning rate",
+    "tip_speed_mm_s": "tip speed",
+    "end_step_mm_s": "robot's velocity step",
+    "work_deg": "work angle",
+    "travel_error_deg": "travel angle against prediction",
+}
 
 
 TURN_HEADER = ("seam", "chord mm", "turn deg", "back-up mm", "for a trailing torch", "what was done")
 LAW_HEADER = (
-    "weld", "law", "mean mm", "largest mm", "omega rad/s", "speed CV %", "torch mm/s", "outside ±25 % mm", "completed",
-)  # fmt: skip
+    "weld",
+    "law",
+    "mean mm",
+    "largest mm",
+    "omega rad/s",
+    "speed CV %",
+    "torch mm/s",
+    "outside ±25 % mm",
+    "completed",
+)
 
 
 def table_lines(rows: Iterable[RowResult]) -> list[tuple[str, str, str, str, str, str, str]]:
@@ -183,28 +204,42 @@ def _first_stop(row: RowResult) -> str:
 
 
 def compared_lines(results: Iterable[CaseResult]) -> list[tuple[str, ...]]:
-    """The laws in comparison: seam, law, mean, largest, peak turning rate, speed range, weld outside the band, completed."""
+    """The laws in comparison: seam, law, mean, largest, peak turning rate, speed range, weld outside the band,
+    completed."""
 
     def over_runs(c: CaseResult, name: str, digits: int, statistic: Callable[[np.ndarray], object] = np.max) -> str:
         good = c.figures(name)[np.isfinite(c.figures(name))]
         return fixed(float(statistic(good)) if len(good) else None, digits)  # type: ignore[arg-type]
 
     return [
-        (c.case.name.removesuffix(f"-{c.case.law}"), c.case.law, over_runs(c, "mean_mm", 3, np.mean),
-         over_runs(c, "max_mm", 2), over_runs(c, "omega_rad_s", 2), over_runs(c, "cv_percent", 1),
-         f"{over_runs(c, 'slowest_mm_s', 1, np.min)} to {over_runs(c, 'fastest_mm_s', 1)}",
-         over_runs(c, "outside_mm", 1), f"{c.completed} of {len(c.metrics)}")
+        (
+            c.case.name.removesuffix(f"-{c.case.law}"),
+            c.case.law,
+            over_runs(c, "mean_mm", 3, np.mean),
+            over_runs(c, "max_mm", 2),
+            over_runs(c, "omega_rad_s", 2),
+            over_runs(c, "cv_percent", 1),
+            f"{over_runs(c, 'slowest_mm_s', 1, np.min)} to {over_runs(c, 'fastest_mm_s', 1)}",
+            over_runs(c, "outside_mm", 1),
+            f"{c.completed} of {len(c.metrics)}",
+        )
         for c in results
-    ]  # fmt: skip
+    ]
 
 
 def turn_lines(turns: Iterable[TurnResult]) -> list[tuple[str, ...]]:
     """One line per turn and chord."""
     return [
-        (t.seam, fixed(t.chord_mm, 0), fixed(t.turn_deg, 0), fixed(t.back_up_mm, 1),
-         "possible" if t.possible else "impossible", t.outcome)
+        (
+            t.seam,
+            fixed(t.chord_mm, 0),
+            fixed(t.turn_deg, 0),
+            fixed(t.back_up_mm, 1),
+            "possible" if t.possible else "impossible",
+            t.outcome,
+        )
         for t in turns
-    ]  # fmt: skip
+    ]
 
 
 _EVERY = 4  # ticks per plotted point: 0.26 mm at 8 mm/s

@@ -42,11 +42,12 @@ home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
-    """How the parts lie and are found: deviations of the true part, and the source of its pose; and what is known of the arm.
+class PartTrial:
+    """How the parts lie and are found: deviations of the true part, and the source of its pose; and what is known of
+    the arm.
 
-    `arm_mm`: rms distance of the true flange from the reported one. `refine`: as calibration.refine; with any but none the cell is
-    calibrated before it welds, else it is given the scanner's pose.
+    `arm_mm`: rms distance of the true flange from the reported one. `refine`: as calibration.refine; with any but none
+    the cell is calibrated before it welds, else it is given the scanner's pose.
     """
 
     located_by: str = "scan"
@@ -59,9 +60,11 @@ class Trial:
     arm_mm: float = 0.4
 
     @classmethod
-    def of(cls, located_by: str, seam_mm: float | None = None, refine: str = PLAIN, arm_mm: float = 0.4) -> Trial:
-        """The trial by the source of the pose: a pose from the drawing must be nearer to the truth. Raises InputError: an unknown
-        refinement."""
+    def of(cls, located_by: str, seam_mm: float | None = None, refine: str = PLAIN, arm_mm: float = 0.4) -> PartTrial:
+        """The trial by the source of the pose: a pose from the drawing must be nearer to the truth.
+
+        Raises InputError: an unknown refinement.
+        """
         if refine not in REFINEMENTS:
             raise InputError(f"--refine must be {', '.join(REFINEMENTS[:-1])} or {REFINEMENTS[-1]}, not '{refine}'.")
         if located_by == "drawing":
@@ -94,7 +97,7 @@ class Trial:
         return known_camera(str(cell)) if self.refine == PLAIN else load_scenario(str(cell))
 
 
-def write_cell(part: MadePart, folder: Path, trial: Trial) -> Path:
+def write_cell(part: MadePart, folder: Path, trial: PartTrial) -> Path:
     """Write the part, its seam and a scenario that welds it; the scenario's path."""
     folder.mkdir(parents=True, exist_ok=True)
     part.write(folder)

@@ -115,7 +115,8 @@ def part_for(preset: str, shape: str) -> Workpiece:
 
 
 def scan(preset: str, shape: str, seed: int, widest_px: int | None = WIDEST_PX) -> Scene:
-    """A part under that preset, at most `widest_px` wide (None: as the scanner has it), in a random pose tilted by up to 5 deg."""
+    """A part under that preset, at most `widest_px` wide (None: as the scanner has it), in a random pose tilted by up
+    to 5 deg."""
     scanner = get_scanner(preset)
     scanner = scanner.resized(widest_px) if widest_px is not None and scanner.width > widest_px else scanner
     part = part_for(preset, shape)
@@ -152,8 +153,8 @@ PLANNED, REFUSED = "planned", "refused"
 
 @dataclass(frozen=True)
 class Trouble:
-    """A kind of scene. others: objects beside the part; drawing: what is looked for, None: the part itself; must: what the
-    answer has to be, empty where a plan with an honest sigma and a refusal are both right.
+    """A kind of scene. others: objects beside the part; drawing: what is looked for, None: the part itself; must: what
+    the answer has to be, empty where a plan with an honest sigma and a refusal are both right.
     """
 
     name: str

@@ -107,7 +107,8 @@ def without_spots(cloud_B: Floats, mesh_B: TriMesh, rng: np.random.Generator, co
 
 
 def clutter(mesh_B: TriMesh, rng: np.random.Generator, count: int) -> list[TriMesh]:
-    """Boxes, pipes and a fixture's clamps beside the part, none through it: each drawn anew until it is clear of its bounds."""
+    """Boxes, pipes and a fixture's clamps beside the part, none through it: each drawn anew until it is clear of its
+    bounds."""
     low, high = mesh_B.bounds
     found: list[TriMesh] = []
     for _ in range(200):
@@ -230,7 +231,7 @@ def scanned_mesh(mesh: TriMesh, rng: np.random.Generator) -> TriMesh:
 
 
 @dataclass(frozen=True, eq=False)
-class Refusal:
+class RefusedScene:
     """What lies in the scene, what is looked for, and the error with the words that must name why."""
 
     there: TriMesh
@@ -256,15 +257,17 @@ def _scaled(mesh: TriMesh, factor: float) -> TriMesh:
     return TriMesh(mesh.vertices * factor, mesh.triangles)
 
 
-REFUSALS: dict[str, Callable[[], Refusal]] = {
-    "plain plate": lambda: Refusal(box(0.2, 0.12, 0.012), box(0.2, 0.12, 0.012), AmbiguousPart, "turning it about its"),
-    "plain pipe": lambda: Refusal(
+REFUSALS: dict[str, Callable[[], RefusedScene]] = {
+    "plain plate": lambda: RefusedScene(
+        box(0.2, 0.12, 0.012), box(0.2, 0.12, 0.012), AmbiguousPart, "turning it about its"
+    ),
+    "plain pipe": lambda: RefusedScene(
         pipe(0.05, 0.005, 0.09), pipe(0.05, 0.005, 0.09), AmbiguousPart, "free to turn about its z axis|looks the same"
     ),
-    "sphere": lambda: Refusal(sphere(0.05), sphere(0.05), AmbiguousPart, "free to turn about its|looks the same"),
-    "two alike": lambda: Refusal(block(), block(), AmbiguousPart, "Two places in the scan", twice=True),
-    "another part": lambda: Refusal(block(), subject("lap").mesh, PartNotFound, "part"),
-    "another length": lambda: Refusal(box(0.2, 0.12, 0.03), box(0.26, 0.12, 0.03), PartNotFound, "part"),
-    "wrong unit": lambda: Refusal(block(), _scaled(block(), 25.4), PartNotFound, "part"),
-    "not there": lambda: Refusal(box(0.03, 0.03, 0.02), block(), PartNotFound, "part"),
+    "sphere": lambda: RefusedScene(sphere(0.05), sphere(0.05), AmbiguousPart, "free to turn about its|looks the same"),
+    "two alike": lambda: RefusedScene(block(), block(), AmbiguousPart, "Two places in the scan", twice=True),
+    "another part": lambda: RefusedScene(block(), subject("lap").mesh, PartNotFound, "part"),
+    "another length": lambda: RefusedScene(box(0.2, 0.12, 0.03), box(0.26, 0.12, 0.03), PartNotFound, "part"),
+    "wrong unit": lambda: RefusedScene(block(), _scaled(block(), 25.4), PartNotFound, "part"),
+    "not there": lambda: RefusedScene(box(0.03, 0.03, 0.02), block(), PartNotFound, "part"),
 }

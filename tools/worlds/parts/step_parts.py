@@ -19,8 +19,8 @@ Corners = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MadePart:
-    """A part in mm: its shape, its joint, points (N,3) on the seam's root in the order of travel, roughly (up to 0.3 mm), and
-    the exact length of the root.
+    """A part in mm: its shape, its joint, points (N,3) on the seam's root in the order of travel, roughly (up to 0.3
+    mm), and the exact length of the root.
 
     `up` (3,): out of the joint, for a line that needs it; `concave`: how many concave edges the file has.
     """
@@ -231,10 +231,16 @@ def bent_sheet() -> MadePart:
     """A sheet bent over a radius of 300 mm with a straight web across it: the seam bends in the web's plane."""
     half = math.asin(90.0 / 300.0)
     sheet = turned(
-        [(-300 * math.sin(half), -60, 300 * math.cos(half)), (-300 * math.sin(half), 60, 300 * math.cos(half)),
-         (-290 * math.sin(half), 60, 290 * math.cos(half)), (-290 * math.sin(half), -60, 290 * math.cos(half))],
-        (0, 0, 0), (0, 1, 0), 2.0 * half,
-    )  # fmt: skip
+        [
+            (-300 * math.sin(half), -60, 300 * math.cos(half)),
+            (-300 * math.sin(half), 60, 300 * math.cos(half)),
+            (-290 * math.sin(half), 60, 290 * math.cos(half)),
+            (-290 * math.sin(half), -60, 290 * math.cos(half)),
+        ],
+        (0, 0, 0),
+        (0, 1, 0),
+        2.0 * half,
+    )
     web = less(box((-80, -4, 280), (160, 8, 60)), cylinder((0, -100, 0), 295.0, 200.0, (0, 1, 0)))
     shape = fused(sheet, web)
     a = np.linspace(-math.asin(80.0 / 300.0), math.asin(80.0 / 300.0), 33)

@@ -67,7 +67,7 @@ class Stroke:
         return abs(self.speed) > SPEED_M_S - 1e-9 and self.place * self._sign < STROKE_M - RUNWAY_M
 
 
-class Stream(threading.Thread):
+class CommandThread(threading.Thread):
     """Commands at 125 Hz regardless of the link's state: no command after a fault may move the arm.
 
     `twist` changes what is sent: it takes the velocity that is due and gives another, or None to be silent.
@@ -129,13 +129,13 @@ class Bench:
         self.arm = load_arm()
         self.home = np.array(HOME)
         self.link: UrLink | None = None
-        self._stream: Stream | None = None
+        self._stream: CommandThread | None = None
         self._child: subprocess.Popen[str] | None = None
         self._workers: list[int] = []
         self.worst_gap_s = 0.0
 
     @property
-    def stream(self) -> Stream:
+    def stream(self) -> CommandThread:
         """The running one."""
         assert self._stream is not None, "start it first"
         return self._stream
@@ -165,12 +165,13 @@ class Bench:
             transport=self.transport,
             **self._torch,
         )
-        self._stream = Stream(self.link, self.arm, self.home)
+        self._stream = CommandThread(self.link, self.arm, self.home)
         self._stream.process = process
         self._stream.start()
 
     def start_elsewhere(self) -> list[int]:
-        """As `start`, with link and commands in a process of their own, which can be killed; that process's children."""
+        """As `start`, with link and commands in a process of their own, which can be killed; that process's
+        children."""
         self.emulator.do("reset_checker")
         command = [sys.executable, "-m", "weldcal.tools.worlds.robot.bench", self.host, self.transport]
         self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -271,14 +272,15 @@ class Bench:
 
 
 def main() -> None:
-    """Moves the arm at argv[1] over the transport argv[2] until stdin closes or the process is killed; answers each line when it cruises, or why it does not."""
+    """Moves the arm at argv[1] over the transport argv[2] until stdin closes or the process is killed; answers each
+    line when it cruises, or why it does not."""
     host, transport = sys.argv[1:]
     arm, config = load_arm(), UrRtde(host=host)
     load = tuple(config.payload_cog_m)
     link = UrLink.start(
         host, arm, config.limits(arm), payload_kg=config.payload_kg, payload_cog_m=load, transport=transport
     )
-    stream = Stream(link, arm, np.array(HOME))
+    stream = CommandThread(link, arm, np.array(HOME))
     stream.start()
     for _ in sys.stdin:
         until = time.monotonic() + CRUISE_LIMIT_S

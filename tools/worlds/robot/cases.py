@@ -21,7 +21,7 @@ ALL = frozenset(Fault) - {Fault.NONE}
 
 
 @dataclass(frozen=True)
-class Action:
+class RepairStep:
     """One step of a repair, and how long it takes (s)."""
 
     name: str
@@ -29,15 +29,18 @@ class Action:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
-    """A fault. `must` is STOP (at rest within `rest_s`, one of `faults` reported, nothing moves until a new start), GO, either,
-    or REFUSE: thrown in before the start, which must be refused. The arm begins with its last joint at `wrist_3` (rad)."""
+class FaultCase:
+    """A fault.
+
+    `must` is STOP (at rest within `rest_s`, one of `faults` reported, nothing moves until a new start), GO, either, or
+    REFUSE: thrown in before the start, which must be refused. The arm begins with its last joint at `wrist_3` (rad).
+    """
 
     name: str
     throw: Callable[[Bench], float]
     must: str
     faults: frozenset[Fault] = frozenset()
-    repair: tuple[Action, ...] = ()
+    repair: tuple[RepairStep, ...] = ()
     watch_s: float = 0.6
     rest_s: float = REST_S
     wrist_3: float = 0.0
@@ -115,68 +118,77 @@ def _joint(number: int, speed: float) -> Array:
     return qd
 
 
-CLEAR = (Action("clear_links"),)
-UNLOCK = (Action("clear_pstop_timer"), Action("unlock"))
-POWER = (Action("normal"), Action("power_on", 1.15))
+CLEAR = (RepairStep("clear_links"),)
+UNLOCK = (RepairStep("clear_pstop_timer"), RepairStep("unlock"))
+POWER = (RepairStep("normal"), RepairStep("power_on", 1.15))
 
 
 def _stops(
     name: str,
     throw: Callable[[Bench], float],
     faults: Fault | frozenset[Fault],
-    repair: tuple[Action, ...] = (),
+    repair: tuple[RepairStep, ...] = (),
     *,
     short: bool = True,
     **settings: Any,
-) -> Case:
+) -> FaultCase:
     """A fault that must stop the arm and be reported as one of these."""
     named = frozenset({faults}) if isinstance(faults, Fault) else faults
-    return Case(name=name, throw=throw, must=STOP, faults=named, repair=repair, short=short, **settings)
+    return FaultCase(name=name, throw=throw, must=STOP, faults=named, repair=repair, short=short, **settings)
 
 
-def _paused(name: str, throw: Callable[[Bench], float], play_s: float, *, short: bool = True) -> Case:
+def _paused(name: str, throw: Callable[[Bench], float], play_s: float, *, short: bool = True) -> FaultCase:
     """Nobody stops the program, and Play resumes it: nothing may move."""
     return _stops(name, throw, frozenset(), elsewhere=True, resumes=True, random=False, watch_s=play_s, short=short)
 
 
 def _either(
-    name: str, throw: Callable[[Bench], float], faults: Iterable[Fault], *repair: Action, short: bool = True
-) -> Case:
+    name: str, throw: Callable[[Bench], float], faults: Iterable[Fault], *repair: RepairStep, short: bool = True
+) -> FaultCase:
     """A fault in which the arm may go on, or stop and report one of these."""
-    return Case(name=name, throw=throw, must=GO_OR_STOP, faults=frozenset(faults), repair=repair, short=short)
+    return FaultCase(name=name, throw=throw, must=GO_OR_STOP, faults=frozenset(faults), repair=repair, short=short)
 
 
-def _refused(name: str, throw: Callable[[Bench], float], says: str, *, short: bool = True) -> Case:
+def _refused(name: str, throw: Callable[[Bench], float], says: str, *, short: bool = True) -> FaultCase:
     """A state of the controller in which a start must be refused with a sentence that contains `says`."""
-    return Case(name=f"start {name}", throw=throw, must=REFUSE, says=says, short=short)
+    return FaultCase(name=f"start {name}", throw=throw, must=REFUSE, says=says, short=short)
 
 
 REAL_OUTPUTS = (
-    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "speed_scaling", "target_speed_fraction",
-    "output_double_register_36", "output_double_register_37", "output_double_register_38",
-)  # fmt: skip
+    "timestamp",
+    "actual_q",
+    "actual_qd",
+    "actual_TCP_pose",
+    "speed_scaling",
+    "target_speed_fraction",
+    "output_double_register_36",
+    "output_double_register_37",
+    "output_double_register_38",
+)
 SHORT_NUMBERS = ("nan as actual_q", "inf as actual_TCP_pose", "nan as speed_scaling", "nan as timestamp")
 
 
-def _no_number(output: str, value: str, **settings: Any) -> Case:
+def _no_number(output: str, value: str, **settings: Any) -> FaultCase:
     """An output of real numbers that is not a finite number."""
     name, throw = f"{value} as {output}", _fault("wrong_number", output=output, value=float(value))
     named = name in SHORT_NUMBERS
     return _stops(name, throw, Fault.STATE_NOT_FINITE, CLEAR, **({"random": named, "short": named} | settings))
 
 
-RUNNING: tuple[Case, ...] = (
+RUNNING: tuple[FaultCase, ...] = (
     # the link
-    Case(name="no state for 20 ms", throw=_fault("drop", seconds=0.02), must=GO, short=False),
-    Case(name="state 30 ms late for 0.3 s", throw=_fault("delay", seconds=0.03, **{"for": 0.3}), must=GO, repair=CLEAR),
-    Case(name="10 % of the states lost", throw=_fault("drop_p", p=0.1), must=GO, repair=CLEAR),
+    FaultCase(name="no state for 20 ms", throw=_fault("drop", seconds=0.02), must=GO, short=False),
+    FaultCase(
+        name="state 30 ms late for 0.3 s", throw=_fault("delay", seconds=0.03, **{"for": 0.3}), must=GO, repair=CLEAR
+    ),
+    FaultCase(name="10 % of the states lost", throw=_fault("drop_p", p=0.1), must=GO, repair=CLEAR),
     # ur_rtde drops a state as soon as the next one's header has arrived, and so never has a whole one
-    Case(
+    FaultCase(
         name="states in torn pieces", throw=_fault("partial_writes", bytes=7), must=GO, repair=CLEAR, over_ur_rtde=LINK
     ),
-    Case(name="controller's frames jitter by 5 ms", throw=_fault("jitter", seconds=0.005), must=GO, repair=CLEAR),
-    Case(name="controller's clock 100 ppm fast", throw=_fault("clock_skew", ppm=100), must=GO),
-    Case(name="dashboard connection reset", throw=_fault("reset_tcp", kind="dashboard"), must=GO, short=False),
+    FaultCase(name="controller's frames jitter by 5 ms", throw=_fault("jitter", seconds=0.005), must=GO, repair=CLEAR),
+    FaultCase(name="controller's clock 100 ppm fast", throw=_fault("clock_skew", ppm=100), must=GO),
+    FaultCase(name="dashboard connection reset", throw=_fault("reset_tcp", kind="dashboard"), must=GO, short=False),
     _either("script connection reset", _fault("reset_tcp", kind="script"), LINK),
     _stops("no state for 100 ms", _fault("drop", seconds=0.1), LINK),
     _stops("no state any more", _fault("drop", seconds=1e9), LINK, CLEAR, short=False),
@@ -201,35 +213,42 @@ RUNNING: tuple[Case, ...] = (
     _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
     _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
     # the guard slows the arm, and the next number gives it its speed back
-    Case(name="numbers 15 ms late", throw=_fault("mute_input", seconds=0.015), must=GO, may_rest=True),
-    Case(name="numbers 30 ms late", throw=_fault("mute_input", seconds=0.030), must=GO, may_rest=True, short=False),
-    Case(name="numbers 60 ms late", throw=_fault("mute_input", seconds=0.060), must=GO, may_rest=True, short=False),
-    Case(name="numbers 120 ms late", throw=_fault("mute_input", seconds=0.120), must=GO, may_rest=True),
+    FaultCase(name="numbers 15 ms late", throw=_fault("mute_input", seconds=0.015), must=GO, may_rest=True),
+    FaultCase(
+        name="numbers 30 ms late", throw=_fault("mute_input", seconds=0.030), must=GO, may_rest=True, short=False
+    ),
+    FaultCase(
+        name="numbers 60 ms late", throw=_fault("mute_input", seconds=0.060), must=GO, may_rest=True, short=False
+    ),
+    FaultCase(name="numbers 120 ms late", throw=_fault("mute_input", seconds=0.120), must=GO, may_rest=True),
     _either("one byte wrong in a package", _fault("corrupt", n=1), ALL, *CLEAR),
     _either("bytes wrong in 20 packages", _fault("corrupt", n=20), ALL, *CLEAR, short=False),
     _either("one package of a wrong size", _fault("wrong_size", n=1), ALL, *CLEAR),
-    _stops("controller restarts", _fault("reboot", seconds=0.5), ALL, (Action("power_on", 1.15),)),
+    _stops("controller restarts", _fault("reboot", seconds=0.5), ALL, (RepairStep("power_on", 1.15),)),
     _stops(
         "controller's clock jumps 10 s ahead", _fault("timestamp_jump", seconds=10.0), Fault.CLOCK_JUMPED, short=False
     ),
     _stops("controller's clock jumps 10 s back", _fault("timestamp_jump", seconds=-10.0), Fault.CLOCK_JUMPED),
-    # each output of real numbers that the driver reads; those of a register are the number, the time and the passes of the guard
+    # each output of real numbers that the driver reads; those of a register are the number, the time and the passes of
+    # the guard
     *(_no_number(output, value) for output in REAL_OUTPUTS for value in ("nan", "inf")),
     replace(_no_number("speed_scaling", "nan", process=True, burns_s=0.06, short=True), name="nan, process on"),
     # the robot
-    Case(name="reduced mode", throw=_fault("reduced"), must=GO, repair=(Action("normal"),)),
-    Case(name="tool contact", throw=_fault("tool_contact", n=1), must=GO, short=False),
-    _either("pendant switched to local", _fault("local_mode"), ALL, Action("remote")),
+    FaultCase(name="reduced mode", throw=_fault("reduced"), must=GO, repair=(RepairStep("normal"),)),
+    FaultCase(name="tool contact", throw=_fault("tool_contact", n=1), must=GO, short=False),
+    _either("pendant switched to local", _fault("local_mode"), ALL, RepairStep("remote")),
     _stops("protective stop", _fault("protective_stop"), Fault.PROTECTIVE_STOP, UNLOCK),
     _stops("emergency stop on the robot", _fault("estop"), Fault.EMERGENCY_STOP, POWER),
     _stops("emergency stop of the cell", _fault("estop", system=True), Fault.EMERGENCY_STOP, POWER, short=False),
-    _stops("safeguard stop", _fault("safeguard"), Fault.SAFEGUARD_STOP, (Action("safeguard_release"),)),
-    _stops("recovery mode", _fault("safety_mode", value=4), Fault.RECOVERY_MODE, (Action("normal"),)),
+    _stops("safeguard stop", _fault("safeguard"), Fault.SAFEGUARD_STOP, (RepairStep("safeguard_release"),)),
+    _stops("recovery mode", _fault("safety_mode", value=4), Fault.RECOVERY_MODE, (RepairStep("normal"),)),
     _stops("safety violation", _fault("safety_mode", value=8), Fault.SAFETY_VIOLATION, POWER),
     _stops("safety fault", _fault("safety_mode", value=9), Fault.SAFETY_VIOLATION, POWER, short=False),
-    _stops("arm without power", _fault("robot_mode", value=3), Fault.ROBOT_NOT_RUNNING, (Action("power_on", 1.15),)),
     _stops(
-        "brakes on", _fault("robot_mode", value=5), Fault.ROBOT_NOT_RUNNING, (Action("power_on", 0.6),), short=False
+        "arm without power", _fault("robot_mode", value=3), Fault.ROBOT_NOT_RUNNING, (RepairStep("power_on", 1.15),)
+    ),
+    _stops(
+        "brakes on", _fault("robot_mode", value=5), Fault.ROBOT_NOT_RUNNING, (RepairStep("power_on", 0.6),), short=False
     ),
     _stops("program stopped", _fault("stop_program"), Fault.PROGRAM_STOPPED),
     _stops("program paused", _fault("pause_program"), Fault.PROGRAM_PAUSED),
@@ -261,14 +280,14 @@ RUNNING: tuple[Case, ...] = (
         "process off by somebody else", _output(False), Fault.PROCESS_OUTPUT, process=True, burns_s=0.01, random=False
     ),
     # the guard writes the output in the same frame: it never goes on
-    Case(
+    FaultCase(
         name="process on in another program",
         throw=_fault("foreign_program", script=SETS_OUTPUT),
         must=GO,
         wired=True,
         random=False,
     ),
-    Case(
+    FaultCase(
         name="numbers 30 ms late, process on",
         throw=_fault("mute_input", seconds=0.030),
         must=GO,
@@ -286,7 +305,7 @@ RUNNING: tuple[Case, ...] = (
         random=False,
     ),
     # this computer
-    Case(name="cell silent for 0.2 s", throw=lambda b: b.send(lambda qd: None, 0.2), must=GO, may_rest=True),
+    FaultCase(name="cell silent for 0.2 s", throw=lambda b: b.send(lambda qd: None, 0.2), must=GO, may_rest=True),
     _stops("cell silent for 0.7 s", lambda b: b.send(lambda qd: None, 0.7), Fault.COMMAND_LATE, watch_s=1.0),
     _stops(
         "cell silent for ever", lambda b: b.send(lambda qd: None, 1e9), Fault.COMMAND_LATE, short=False, watch_s=1.0
@@ -304,8 +323,8 @@ RUNNING: tuple[Case, ...] = (
     _stops("worker killed", lambda b: b.signal_worker(signal.SIGKILL), Fault.WORKER_DIED),
     _stops("worker crashes", lambda b: b.signal_worker(signal.SIGSEGV), Fault.WORKER_DIED, short=False),
     _stops("worker stopped (SIGSTOP)", lambda b: b.signal_worker(signal.SIGSTOP), Fault.WORKER_DIED),
-    Case(name="worker stands still for 60 ms", throw=_stands_still(0.060), must=GO, may_rest=True, random=False),
-    Case(
+    FaultCase(name="worker stands still for 60 ms", throw=_stands_still(0.060), must=GO, may_rest=True, random=False),
+    FaultCase(
         name="worker stands still for 120 ms",
         throw=_stands_still(0.120),
         must=GO,
@@ -313,7 +332,8 @@ RUNNING: tuple[Case, ...] = (
         random=False,
         short=False,
     ),
-    # No process is left that could stop the paused program: old commands must have no effect when an operator presses Play.
+    # No process is left that could stop the paused program: old commands must have no effect when an operator presses
+    # Play.
     _paused("computer dies, pause, Play after 3 s", _dies_and_is_paused, 3.0),
     _paused("pause, computer dies, Play after 3 s", _is_paused_and_dies, 3.0),
     _paused("computer dies, pause, Play after 0.5 s", _dies_and_is_paused, 0.5, short=False),
@@ -321,7 +341,7 @@ RUNNING: tuple[Case, ...] = (
     _stops("cell's process killed", lambda b: b.kill_child(), frozenset(), elsewhere=True, random=False, watch_s=1.0),
 )
 
-AT_START: tuple[Case, ...] = (
+AT_START: tuple[FaultCase, ...] = (
     _refused("in local mode", _fault("local_mode"), "Remote Control"),
     _refused("beside a foreign program", _fault("foreign_program"), "busy"),
     _refused("with registers in use", _fault("registers_in_use", names=["input_int_register_24"]), "in use"),

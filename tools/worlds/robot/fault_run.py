@@ -1,4 +1,5 @@
-"""One fault of the robot link on the test bench: it is injected, observed, repaired, and held against what must follow."""
+"""One fault of the robot link on the test bench: it is injected, observed, repaired, and held against what must
+follow."""
 
 import time
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.drivers.ur.wire.transport import UR_RTDE
 from weldcal.tools.worlds.robot.bench import OUTPUT, SPEED_M_S, Bench, StoppedUnasked
-from weldcal.tools.worlds.robot.cases import GO, GO_OR_STOP, REFUSE, REST_S, STOP, Case
+from weldcal.tools.worlds.robot.cases import GO, GO_OR_STOP, REFUSE, REST_S, STOP, FaultCase
 
 GOING_S = 0.4
 TURN_S = 0.5  # in which an arm that goes on is at its speed again
@@ -27,7 +28,7 @@ ENDED_S = 3.0  # a worker without its cell brakes, ends the program and closes i
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class FaultOutcome:
     """The result of one fault. Times count from the fault; `problems` is empty where the result is as required."""
 
     name: str
@@ -57,7 +58,7 @@ class Outcome:
         return ", ".join(parts) + (f": {self.sentence}" if self.sentence else "")
 
 
-def run_case(bench: Bench, case: Case, *, hasty: bool = False, attempts: int = STARTS) -> Outcome:
+def run_case(bench: Bench, case: FaultCase, *, hasty: bool = False, attempts: int = STARTS) -> FaultOutcome:
     """Injects one fault and observes; leaves the controller in order, without a link.
 
     `hasty`: after a stop the worker is killed instead of asked to end, and it is watched for less long. `attempts`: how
@@ -81,7 +82,7 @@ def run_case(bench: Bench, case: Case, *, hasty: bool = False, attempts: int = S
         finally:
             bench.end(kill=hasty)
             recover(bench)
-    return Outcome(
+    return FaultOutcome(
         name=case.name, must=case.must, did="failed", fault="", sentence=reason, problems=(reason,), retries=retries
     )
 
@@ -95,7 +96,7 @@ def recover(bench: Bench) -> None:
     emulator.do("set_q", q=bench.home.tolist())
 
 
-def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
+def _running(bench: Bench, case: FaultCase, hasty: bool) -> FaultOutcome:
     children: list[int] = []
     if case.wrist_3:
         bench.emulator.do("set_q", q=[*bench.home[:5].tolist(), case.wrist_3])
@@ -112,7 +113,7 @@ def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
             speed = _speed_of_the_way(bench)
             problems = [] if abs(speed - SPEED_M_S) < _SPEED_OFF else [f"its speed is {speed:.4f} m/s"]
             problems += _burnt(bench, case, at)
-            return Outcome(
+            return FaultOutcome(
                 name=case.name, must=case.must, did="went on", fault="", sentence="", problems=tuple(problems)
             )
     time.sleep(max(0.0, case.watch_s - GOING_S - (HASTE_S if hasty else 0.0)))
@@ -127,7 +128,7 @@ def _speed_of_the_way(bench: Bench) -> float:
     return speed
 
 
-def _stopped(bench: Bench, case: Case, at: float, children: Sequence[int], played_s: float) -> Outcome:
+def _stopped(bench: Bench, case: FaultCase, at: float, children: Sequence[int], played_s: float) -> FaultOutcome:
     found = bench.at_rest_after(at + case.slow_s, case.rest_s - case.slow_s)
     problems: list[str] = []
     rest, travel = found["rest_after_s"], found["travel_m"]
@@ -162,7 +163,7 @@ def _stopped(bench: Bench, case: Case, at: float, children: Sequence[int], playe
     problems += _burnt(bench, case, at)
     rest_ms, travel_mm = (None if value is None else 1e3 * float(value) for value in (rest, travel))
     name = fault.name if fault else ""
-    return Outcome(
+    return FaultOutcome(
         name=case.name,
         must=case.must,
         did="stopped",
@@ -176,7 +177,7 @@ def _stopped(bench: Bench, case: Case, at: float, children: Sequence[int], playe
     )
 
 
-def _burnt(bench: Bench, case: Case, at: float) -> list[str]:
+def _burnt(bench: Bench, case: FaultCase, at: float) -> list[str]:
     """What is wrong with the process output, where the case has one."""
     if not (case.wired or case.process):
         return []
@@ -185,7 +186,7 @@ def _burnt(bench: Bench, case: Case, at: float) -> list[str]:
     return [f"the process output was on {last:.3f} s after the fault"] if wrong else []
 
 
-def _repair_and_play(bench: Bench, case: Case, watch_s: float) -> str:
+def _repair_and_play(bench: Bench, case: FaultCase, watch_s: float) -> str:
     """Repair the fault and press Play without a new start, while commands continue to arrive."""
     for action in case.repair:
         bench.emulator.do(action.name)
@@ -195,7 +196,7 @@ def _repair_and_play(bench: Bench, case: Case, watch_s: float) -> str:
     return played
 
 
-def _at_start(bench: Bench, case: Case) -> Outcome:
+def _at_start(bench: Bench, case: FaultCase) -> FaultOutcome:
     bench.emulator.do("reset_checker")
     at = case.throw(bench)
     problems: list[str] = []
@@ -212,7 +213,9 @@ def _at_start(bench: Bench, case: Case) -> Outcome:
     found = bench.at_rest_after(at, REST_S)
     if not found["ok"]:
         problems.append("it moved")
-    return Outcome(name=case.name, must=case.must, did="refused", fault="", sentence=sentence, problems=tuple(problems))
+    return FaultOutcome(
+        name=case.name, must=case.must, did="refused", fault="", sentence=sentence, problems=tuple(problems)
+    )
 
 
 def _alive(process: int) -> bool:

@@ -35,11 +35,13 @@ class HostLateness:
         )
 
     def caused(self, jobs: Sequence[Lateness]) -> int:
-        """How many velocities of these jobs were over 8 ms late while the program above all others was not woken up in time either."""
+        """How many velocities of these jobs were over 8 ms late while the program above all others was not woken up in
+        time either."""
         return sum(job.shared_with(self.lateness, 8.0) for job in jobs)
 
     def judged(self, jobs: Sequence[Lateness]) -> str:
-        """How many velocities of these jobs were over 8 ms late, and for how many this computer itself was the cause."""
+        """How many velocities of these jobs were over 8 ms late, and for how many this computer itself was the
+        cause."""
         late, all_of = sum(job.over(8.0) for job in jobs), sum(sum(job.counts) for job in jobs)
         return f"{late} of {all_of} velocities over 8 ms late, {self.caused(jobs)} of them by this computer itself"
 
@@ -80,8 +82,9 @@ def watched_host() -> Iterator[HostLateness]:
 
 
 def probe(core: int, pipe: Connection) -> None:
-    """Wake up every TICK_S on one core until something comes through the pipe. Says first whether it has precedence, and at the end
-    its lateness.
+    """Wake up every TICK_S on one core until something comes through the pipe.
+
+    Says first whether it has precedence, and at the end its lateness.
     """
     os.sched_setaffinity(0, {core})
     try:

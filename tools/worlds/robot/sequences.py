@@ -9,7 +9,7 @@ import numpy as np
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.tools.worlds.robot.bench import Bench
-from weldcal.tools.worlds.robot.cases import RUNNING, STOP, Action, Case
+from weldcal.tools.worlds.robot.cases import RUNNING, STOP, FaultCase, RepairStep
 
 SEEN_S = 1.2  # a fault that must stop the arm is reported by then
 ANY_REPAIR = tuple({action.name: action for case in RUNNING for action in case.repair}.values())
@@ -86,7 +86,7 @@ def _start(bench: Bench, rng: np.random.Generator, done: Sequence) -> bool:
     return True
 
 
-def _throw(bench: Bench, rng: np.random.Generator, done: Sequence, cases: list[Case]) -> None:
+def _throw(bench: Bench, rng: np.random.Generator, done: Sequence, cases: list[FaultCase]) -> None:
     first, second = cases
     if not _injected(bench, done, first):
         return
@@ -106,8 +106,9 @@ def _throw(bench: Bench, rng: np.random.Generator, done: Sequence, cases: list[C
         bench.emulator.do("clear_links")
 
 
-def _injected(bench: Bench, done: Sequence, case: Case) -> bool:
-    """Inject it; False where the robot is not ready for it: no program starts, for one, where a fault has just taken the power.
+def _injected(bench: Bench, done: Sequence, case: FaultCase) -> bool:
+    """Inject it; False where the robot is not ready for it: no program starts, for one, where a fault has just taken
+    the power.
 
     Raises:
         WeldcalError: the robot was ready, and the fault could not be injected.
@@ -128,7 +129,7 @@ def _end(bench: Bench, rng: np.random.Generator, done: Sequence) -> None:
     # the arm brakes now; that it is at rest from then on is what the checker sees to
     bench.emulator.fault("tool_contact", n=0)
     time.sleep(rng.uniform(0.05, 0.6))
-    deeds: list[Action | None] = [None, *(ANY_REPAIR[k] for k in rng.choice(len(ANY_REPAIR), 4, replace=False))]
+    deeds: list[RepairStep | None] = [None, *(ANY_REPAIR[k] for k in rng.choice(len(ANY_REPAIR), 4, replace=False))]
     for k in rng.permutation(len(deeds)):
         action = deeds[k]
         if action is None:

@@ -17,7 +17,10 @@ STEP_JOINT = 5
 
 @dataclass(kw_only=True)
 class Tap:
-    """Stands between the arm's LeafSystem and its link, and notes when what passes. Times in s of the monotonic clock."""
+    """Stands between the arm's LeafSystem and its link, and notes when what passes.
+
+    Times in s of the monotonic clock.
+    """
 
     link: UrLink
     command_times: array[float] = field(default_factory=lambda: array("d"))

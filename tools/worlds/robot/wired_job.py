@@ -60,10 +60,12 @@ class Happening:
 
     @property
     def silent(self) -> bool:
-        """Whether no signal of the device differs from that of a sound one until the job ends, so that the job must be done, and right.
+        """Whether no signal of the device differs from that of a sound one until the job ends, so that the job must be
+        done, and right.
 
-        A scanner that is not asked says nothing, and nothing is asked of it after the scan of the workpiece; only its connection can
-        end. The inputs of a power source whose torch is never lit are off whether their wires are cut, stuck or slow.
+        A scanner that is not asked says nothing, and nothing is asked of it after the scan of the workpiece; only its
+        connection can end. The inputs of a power source whose torch is never lit are off whether their wires are cut,
+        stuck or slow.
         """
         if self.device == "scanner":
             return self.fault != "killed" and self.phase in ("approach", "feel", "weld")
@@ -75,8 +77,8 @@ def run_job(
 ) -> dict[str, object]:
     """Run one job, throw the fault in, repair it after the end, and judge by the world's record.
 
-    `problems` is empty where the job was held by the fault's name (or done, where the fault is silent), and neither arm nor torch
-    moved or burned without a command.
+    `problems` is empty where the job was held by the fault's name (or done, where the fault is silent), and neither arm
+    nor torch moved or burned without a command.
     """
     scenario = load_scenario(str(world.cell), CALIBRATES if calibrates else "")
     stage, thrown, named = [""], [0.0], [0.0]
@@ -138,7 +140,7 @@ def run_job(
         "arc_s": torch["on_s"],
         "problems": problems,
         **_lateness(result.run.clock),
-    }  # fmt: skip
+    }
 
 
 def _lateness(clock: WallClock | None) -> dict[str, object]:

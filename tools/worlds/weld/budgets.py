@@ -19,11 +19,13 @@ class Budget:
 
     Attributes:
         name: as in the tables.
-        tag_sigma_m, tag_gain, tag_yaw_rad, tag_bias_m: of the deflection that the finger camera measures; latency_s: its age.
+        tag_sigma_m, tag_gain, tag_yaw_rad, tag_bias_m: of the deflection that the finger camera measures; latency_s:
+            its age.
         lag_s: time constant of the robot's velocity.
         friction: between tip and walls; roughness_m: of the wall, one sigma; roughness_length_m: its correlation.
-        plan_shift_m, plan_angle_rad, plan_height_m: how the plan is displaced as a whole; plan_warp_m: largest bend of it;
-            plan_smoothing_m: sigma of the vision's smoothing; plan_noise_m: of each of its points, a millimetre apart.
+        plan_shift_m, plan_angle_rad, plan_height_m: how the plan is displaced as a whole; plan_warp_m: largest bend of
+            it; plan_smoothing_m: sigma of the vision's smoothing; plan_noise_m: of each of its points, a millimetre
+            apart.
         unknown: what the servo believes wrongly.
     """
 
@@ -147,7 +149,8 @@ def planned_seam(seam: TrueSeam, budget: Budget, rng: np.random.Generator) -> Se
 
 
 def roughness(length: float, budget: Budget, rng: np.random.Generator, spacing: float = 0.25e-3) -> Array:
-    """Sideways roughness (N,) m of the wall every `spacing` m: Gaussian, of the budget's sigma and correlation length."""
+    """Sideways roughness (N,) m of the wall every `spacing` m: Gaussian, of the budget's sigma and correlation
+    length."""
     n = max(4, int(length / spacing) + 2)
     if budget.roughness_m == 0.0:
         return np.zeros(n)

@@ -8,11 +8,11 @@ from weldcal.tools.worlds.weld.metrics import RunMetrics, judge
 from weldcal.tools.worlds.weld.plant import StudyRun, simulate
 from weldcal.tools.worlds.weld.seams import get_seam
 from weldcal.welding.seam.feasibility import SeamWindows
-from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchOnConfig
 
 
 @dataclass(frozen=True)
-class Case:
+class WeldCase:
     """One weld to be repeated over the seeds: seam, budget, chord m, torch speed m/s, gaps (from, to) m, law."""
 
     seam: str
@@ -36,14 +36,15 @@ class Case:
         return "-".join([*parts, self.budget, *([self.law] if self.law != "guarded" else [])])
 
 
-def study_config(case: Case) -> ServoConfig:
+def study_config(case: WeldCase) -> ServoConfig:
     """The servo's settings for a case: everything at its default but chord, speed, law and the touch-on calibration.
 
-    The paper's laws watch neither the torch's place nor its angles, so these are set wide open: they are to show what they do.
+    The paper's laws watch neither the torch's place nor its angles, so these are set wide open: they are to show what
+    they do.
     """
     config = ServoConfig(
         tool=ToolGeometry(torch_offset_m=case.chord_m),
-        touch=TouchConfig(calibrate_gain=True, zero_frames=30, feel_start=True),
+        touch=TouchOnConfig(calibrate_gain=True, zero_frames=30, feel_start=True),
         weld_speed_m_s=case.speed_m_s,
         law=case.law,
     )
@@ -58,7 +59,7 @@ def study_config(case: Case) -> ServoConfig:
     )
 
 
-def run_case(case: Case, seed: int) -> tuple[StudyRun, RunMetrics]:
+def run_case(case: WeldCase, seed: int) -> tuple[StudyRun, RunMetrics]:
     """One weld and its figures."""
     run = simulate(get_seam(case.seam), case.errors, study_config(case), seed, case.gaps)
     return run, judge(run, case.speed_m_s, case.chord_m, case.gaps)

@@ -11,9 +11,12 @@ from weldcal.tools.report.weld import FeltSeam, felt_seam
 
 @dataclass(frozen=True, kw_only=True)
 class CellRun:
-    """One weld. Lengths in mm: seam points sideways and in height against where the tool's numbers say a seated tip is
-    felt (sd about a smooth line through themselves, and mean); torch against the true line, sideways and in space; its speed's
-    coefficient of variation in %. `cpu_per_second`: processor seconds (all threads) per simulated second of the weld."""
+    """One weld.
+
+    Lengths in mm: seam points sideways and in height against where the tool's numbers say a seated tip is felt (sd
+    about a smooth line through themselves, and mean); torch against the true line, sideways and in space; its speed's
+    coefficient of variation in %. `cpu_per_second`: processor seconds (all threads) per simulated second of the weld.
+    """
 
     scenario: str
     law: str

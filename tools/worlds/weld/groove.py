@@ -94,7 +94,7 @@ class Groove:
         return 0.0 <= s <= self.line.length and not any(a < s < b for a, b in self.gaps)
 
 
-class Tip:
+class TipPlace:
     """Where the tip's centre is: along, across and above the groove's tip line, m."""
 
     def __init__(self, rest: Array, groove: Groove) -> None:

@@ -20,19 +20,21 @@ class RunMetrics:
     """Figures of one run; mm, mm/s, rad/s and degrees, since people read them. NaN where there is none.
 
     Attributes:
-        completed: ended DONE, the arc lit once and burning from one end of the true seam to the other, each within 10 mm
-            (a plan's error along the seam cannot be felt; start_mm and stop_mm say where), and never 5 mm off it;
+        completed: ended DONE, the arc lit once and burning from one end of the true seam to the other, each within 10
+            mm (a plan's error along the seam cannot be felt; start_mm and stop_mm say where), and never 5 mm off it;
             phase, reason: how it ended.
         reached_mm: how far along the true seam the torch came.
-        mean_mm, max_mm: torch to true line, sideways, where the arc burned within 0..L of the true seam; height_mm: largest.
+        mean_mm, max_mm: torch to true line, sideways, where the arc burned within 0..L of the true seam; height_mm:
+            largest.
         end_mm: largest over the last chord; gap_mm: over the gap and the 60 mm after it.
         cv_percent, outside_mm, slowest_mm_s, fastest_mm_s: torch speed where the arc burned, and its +-25 % band.
         time_ratio: time of the weld over its length at the wanted speed.
-        omega_rad_s, tip_speed_mm_s: largest commanded; end_step_mm_s: largest step between ticks from the seam's end on.
+        omega_rad_s, tip_speed_mm_s: largest commanded; end_step_mm_s: largest step between ticks from the seam's end
+            on.
         work_deg: largest lean across the chord against the normal at the torch; travel_deg: largest pitch of the chord
             against the surface at the torch; travel_error_deg: against what the chord map of the plan predicts.
-        space_mean_mm, space_mm: mean and largest distance in space; start_mm, stop_mm: where the arc went on and off, along the true seam
-            (from its start, and past its end).
+        space_mean_mm, space_mm: mean and largest distance in space; start_mm, stop_mm: where the arc went on and off,
+            along the true seam (from its start, and past its end).
         gain: the tag's gain as calibrated.
     """
 

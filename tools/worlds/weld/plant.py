@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.tools.worlds.weld.budgets import Budget, planned_seam, roughness
-from weldcal.tools.worlds.weld.groove import DROP_M, SEAT_M, Groove, Tip
+from weldcal.tools.worlds.weld.groove import DROP_M, SEAT_M, Groove, TipPlace
 from weldcal.tools.worlds.weld.seams import TrueSeam
-from weldcal.tools.worlds.weld.unknowns import World, draw_world
+from weldcal.tools.worlds.weld.unknowns import WeldUnknowns, draw_world
 from weldcal.welding.numerics import Array, norm
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.feel_start import with_touch_place
@@ -24,9 +24,9 @@ from weldcal.welding.servo.touch import touch_start_pose
 
 FRAME_PERIOD_S = 1.0 / 30.0
 COLUMNS = (
-    "time_s", "phase", "torch_on", "torch_x", "torch_y", "torch_z", "robot_x", "robot_y", "robot_z", "tip_x", "tip_y", "tip_z",
-    "v_x", "v_y", "v_z", "omega_rad_s", "n_d_dot_n_t", "delta_n_m", "delta_axial_m", "e_t_m", "s_torch_m", "s_tip_m",
-    "tip_speed_m_s", "ahead_x", "ahead_y", "ahead_z", "left_x", "left_y", "left_z",
+    "time_s", "phase", "torch_on", "torch_x", "torch_y", "torch_z", "robot_x", "robot_y", "robot_z", "tip_x", "tip_y",
+    "tip_z", "v_x", "v_y", "v_z", "omega_rad_s", "n_d_dot_n_t", "delta_n_m", "delta_axial_m", "e_t_m", "s_torch_m",
+    "s_tip_m", "tip_speed_m_s", "ahead_x", "ahead_y", "ahead_z", "left_x", "left_y", "left_z",
 )  # fmt: skip
 PHASES = tuple(Phase)
 _KEPT = 64  # poses: half a second
@@ -35,7 +35,7 @@ _KEPT = 64  # poses: half a second
 class Stamps:
     """Stamps poses and pictures as a world does; the servo's clock is the stamp of the newest pose."""
 
-    def __init__(self, world: World, seed: int) -> None:
+    def __init__(self, world: WeldUnknowns, seed: int) -> None:
         self._world = world
         self._exact = not any((world.image_bias_s, world.image_jitter_s, world.pose_bias_s, world.pose_jitter_s))
         self._rng = np.random.default_rng((seed, 2))
@@ -55,7 +55,8 @@ class Stamps:
         return stamp
 
     def picture(self, taken: DeflectionSample) -> DeflectionSample:
-        """The picture with its stamp, and with the pose that the poses' stamps give for that time; `pose` comes first."""
+        """The picture with its stamp, and with the pose that the poses' stamps give for that time; `pose` comes
+        first."""
         if self._exact:
             return taken
         stamp = taken.capture_time + self._world.image_bias_s + self._world.image_jitter_s * float(self._rng.normal())
@@ -73,7 +74,8 @@ class Stamps:
 
 
 Carrier = Callable[[Array, float], tuple[Array, Array, str | None]]
-"""Moves a tool by a velocity (6,) for a time s: its rotation (3, 3), its position (3,) m, and why it has stopped for good."""
+"""Moves a tool by a velocity (6,) for a time s: its rotation (3, 3), its position (3,) m, and why it has stopped for
+good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +101,8 @@ class StudyRun:
         return np.asarray(self.table[:, COLUMNS.index(name)])
 
     def points(self, name: str) -> Array:
-        """Points (N,3) m of "torch", "robot" or "tip", the velocity "v", or the tool's axes "ahead" (x_T) and "left" (y_T)."""
+        """Points (N,3) m of "torch", "robot" or "tip", the velocity "v", or the tool's axes "ahead" (x_T) and "left"
+        (y_T)."""
         first = COLUMNS.index(f"{name}_x")
         return np.asarray(self.table[:, first : first + 3])
 
@@ -139,7 +142,8 @@ def simulate(
 
     Args:
         gaps: (from, to) m of the groove that are missing; plan: in place of the budget's; hidden_s: from when to when
-            the tag is not seen; carrier: what moves the tool from where it is; None: a robot that follows every velocity.
+            the tag is not seen; carrier: what moves the tool from where it is; None: a robot that follows every
+            velocity.
 
     Source: the kinematic model of the design note, section B.3, with a V-groove for the side wall.
     """
@@ -158,7 +162,7 @@ def simulate(
     dt, p_TW = settings.period_s, settings.p_TW
     X_BT = touch_start_pose(plan, settings)
     R, p = np.array(X_BT.rotation().matrix()), np.array(X_BT.translation())
-    tip, state, V = Tip(p, groove), WeldingState(), np.zeros(6)
+    tip, state, V = TipPlace(p, groove), WeldingState(), np.zeros(6)
     yaw = RotationMatrix.MakeZRotation(budget.tag_yaw_rad).matrix() * budget.tag_gain
     bias = np.array((0.0, 0.0, budget.tag_bias_m))
     queue: list[DeflectionSample] = []
@@ -182,9 +186,9 @@ def simulate(
         commands.append(command)
         d = command.diagnostics
         rows.append(
-            (t, PHASES.index(command.phase), float(command.torch_on), *(p + R @ p_TW).tolist(), *p.tolist(), *centre.tolist(),
-             *command.V_BT[3:].tolist(), d.omega, d.n_d_dot_n_t, d.delta_n, d.delta_axial, d.e_t, d.s_torch, d.s_tip, d.tip_speed,
-             *R[:, 0].tolist(), *R[:, 1].tolist())
+            (t, PHASES.index(command.phase), float(command.torch_on), *(p + R @ p_TW).tolist(), *p.tolist(),
+             *centre.tolist(), *command.V_BT[3:].tolist(), d.omega, d.n_d_dot_n_t, d.delta_n, d.delta_axial, d.e_t,
+             d.s_torch, d.s_tip, d.tip_speed, *R[:, 0].tolist(), *R[:, 1].tolist())
         )  # fmt: skip
         stopped = stopped + 1 if command.phase in (Phase.DONE, Phase.FAULT) else 0
         if stopped > 30:
@@ -203,7 +207,8 @@ def simulate(
 
 
 def _lost(line: SeamCurve, p: Array, s_near: float) -> bool:
-    """Whether p (3,) m is more than 60 mm off a line, its straight extensions included; at s_near m it is probably not."""
+    """Whether p (3,) m is more than 60 mm off a line, its straight extensions included; at s_near m it is probably
+    not."""
     if norm(p - line.frame(s_near).position) <= 0.060:
         return False
     return float(np.linalg.norm(p - line.position(line.project(p)))) > 0.060

@@ -38,7 +38,7 @@ NOTHING_UNKNOWN = Unknowns()
 
 
 @dataclass(frozen=True, kw_only=True)
-class World:
+class WeldUnknowns:
     """One draw: as in Unknowns; `lag_share` NaN where the budget's lag holds."""
 
     image_bias_s: float = 0.0
@@ -66,8 +66,8 @@ class World:
         return budget_s if math.isnan(self.lag_share) else self.lag_share * believed_s
 
 
-def draw_world(unknowns: Unknowns, seed: int) -> World:
+def draw_world(unknowns: Unknowns, seed: int) -> WeldUnknowns:
     """The world of a seed, from a generator of its own: the other errors of a run do not change with it."""
     rng = np.random.default_rng((seed, 1))
-    ranges = zip((field.name for field in fields(World)), astuple(unknowns), strict=True)
-    return World(**{name: math.nan if r is None else float(rng.uniform(*r)) for name, r in ranges})
+    ranges = zip((field.name for field in fields(WeldUnknowns)), astuple(unknowns), strict=True)
+    return WeldUnknowns(**{name: math.nan if r is None else float(rng.uniform(*r)) for name, r in ranges})

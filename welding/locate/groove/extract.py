@@ -1,9 +1,10 @@
-"""Extracts the weld seam of a V-groove from a point cloud without a drawing, on flat faces and on faces bent over a cylinder.
+"""Extracts the weld seam of a V-groove from a point cloud without a drawing, on flat faces and on faces bent over a
+cylinder.
 
 Openings in faces are found coarsely (search); slices across them are fitted with a V (section), each slice with points
-of its own; the offsets of the centres are smoothed along the line, the line is moved by them until it
-converges (measure). A face bent over a cylinder is unrolled first, measured as a flat one and rolled back. Every figure has
-a sigma, scaled by the observed scatter of neighbouring slices.
+of its own; the offsets of the centres are smoothed along the line, the line is moved by them until it converges
+(measure). A face bent over a cylinder is unrolled first, measured as a flat one and rolled back. Every figure has a
+sigma, scaled by the observed scatter of neighbouring slices.
 """
 
 from dataclasses import replace
@@ -20,7 +21,7 @@ from weldcal.welding.locate.planes import Floats, thinned
 from weldcal.welding.seam.curve import SeamCurve
 
 MOST_RADIUS_M = 1.0  # over 0.3 m a larger radius sags by 11 mm or less, and counts as flat
-MARGIN_M = 0.020
+MARGIN_M = 0.020  # beyond the face found: a choice, a groove's own width and more; wider only costs points
 GROUND_REACH_M = 0.030  # the ends of a bent plate are inclined: the ground beyond is that much further away, unrolled
 COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006  # for the search: a groove 2 mm wide is still three cells wide
 
@@ -83,7 +84,8 @@ def _mm(p: Floats) -> str:
 def bent_seams(
     points: Floats, config: GrooveConfig, start_A: npt.ArrayLike | None
 ) -> tuple[list[GrooveSeam], Floats, list[WeldcalError]]:
-    """Grooves of all bent faces in a cloud (N,3) m, the points outside these faces, and the errors of grooves refused."""
+    """Grooves of all bent faces in a cloud (N,3) m, the points outside these faces, and the errors of grooves
+    refused."""
     seams: list[GrooveSeam] = []
     failures: list[WeldcalError] = []
     rng = np.random.default_rng(config.search.seed)
@@ -108,7 +110,8 @@ def bent_seams(
 
 
 def _rolled(seam: GrooveSeam, face: BentFace, start: str) -> GrooveSeam:
-    """Roll the seam of an unrolled face back onto the cylinder, in the cloud's frame, with the arc lengths of its root there."""
+    """Roll the seam of an unrolled face back onto the cylinder, in the cloud's frame, with the arc lengths of its root
+    there."""
     root = face.rolled(seam.root)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(root, axis=0), axis=1))])
 

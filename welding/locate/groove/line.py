@@ -1,4 +1,5 @@
-"""Lines in the plane of a face: arc length and lateral offset of points, smoothing, and sharp corners with their radius."""
+"""Lines in the plane of a face: arc length and lateral offset of points, smoothing, and sharp corners with their
+radius."""
 
 from __future__ import annotations
 
@@ -13,17 +14,19 @@ from scipy.spatial import cKDTree
 from weldcal.welding.locate.groove.seam import Profile
 from weldcal.welding.locate.planes import Floats, Mask
 
+# About a scanner's pitch or less; the curve between two places of an R5 bend is then 6 um off its chord.
 STEP_M = 0.0005
 SIDE_M = 0.015  # length of a side that is extended
 LEAST_RADIUS_M = 0.0005  # a seam curve needs a radius: at a right angle its apex is then 0.2 mm off
 RADII_M = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0]) * 1e-3
 CROWD = 4.0  # number of points near a corner whose errors are correlated
+# A radius is not known better than the grid shows an apex: standard deviation of a uniform pitch, 1 / sqrt(12).
 LEAST_SPREAD_PITCHES = 0.3
 WIDE_M = 0.010  # a bend of a larger radius is not a corner: the cross-sections follow it
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class SmoothLine:
     """A smooth line through points (N,2) m, about evenly spaced; s = 0 at its first point."""
 
     points: Floats
@@ -56,7 +59,8 @@ class Line:
         return np.asarray(np.sum(np.gradient(self.tangents, self.s, axis=0) * self.normals, axis=1))
 
     def tightest_bend(self, gap: tuple[float, float], over_m: float = 0.016) -> float:
-        """Largest curvature of the line's chords outside a gap, and of its turn from one side of the gap to the other."""
+        """Largest curvature of the line's chords outside a gap, and of its turn from one side of the gap to the
+        other."""
         step = max(1, round(over_m / (self.length / (len(self.points) - 1))))
         chords = self.points[step:] - self.points[:-step]
         heading = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
@@ -76,7 +80,7 @@ class Line:
         along = np.column_stack([normals[:, 1], -normals[:, 0]])
         return points + (s - inside)[:, None] * along, normals
 
-    def extended(self, before: float, after: float) -> Line:
+    def extended(self, before: float, after: float) -> SmoothLine:
         """The line extended straight beyond both ends, in the direction of its last 10 mm."""
         points = self.points
         for distance, end in ((before, 0), (after, -1)):
@@ -88,15 +92,16 @@ class Line:
             heading /= np.linalg.norm(heading)
             more = tip + np.arange(STEP_M, distance + STEP_M, STEP_M)[:, None] * heading
             points = np.vstack([more[::-1], points]) if end == 0 else np.vstack([points, more])
-        return Line(points).even()
+        return SmoothLine(points).even()
 
-    def even(self, step: float = STEP_M) -> Line:
+    def even(self, step: float = STEP_M) -> SmoothLine:
         """The same line, sampled evenly."""
         s = np.linspace(0.0, self.length, max(4, round(self.length / step) + 1))
-        return Line(np.column_stack([np.interp(s, self.s, self.points[:, k]) for k in range(2)]))
+        return SmoothLine(np.column_stack([np.interp(s, self.s, self.points[:, k]) for k in range(2)]))
 
     def coordinates(self, xy: Floats) -> tuple[Floats, Floats, Mask]:
-        """Arc length and offset (s, n) of points (M,2) by the nearest point on the line, and a mask of those within 30 mm."""
+        """Arc length and offset (s, n) of points (M,2) by the nearest point on the line, and a mask of those within 30
+        mm."""
         nearest = np.asarray(cKDTree(self.points).query(xy, distance_upper_bound=0.03)[1])
         far = nearest == len(self.points)
         nearest = np.where(far, 0, nearest)
@@ -108,7 +113,7 @@ class Line:
         beside = ~far & (((nearest > 0) & (nearest < len(self.points) - 1)) | (np.abs(along) < STEP_M))
         return self.s[nearest] + along, n, beside
 
-    def rolled(self) -> Line:
+    def rolled(self) -> SmoothLine:
         """The closed line with its start moved half-way round; its former joint is closed to the mean of both ends."""
         points = self.points.copy()
         gap, over = points[0] - points[-1], min(20, len(points) // 4)
@@ -116,9 +121,9 @@ class Line:
         points[:over] -= share * gap
         points[-over:] += share[::-1] * gap
         half = len(points) // 2
-        return Line(np.vstack([points[half:-1], points[: half + 1]])).even()
+        return SmoothLine(np.vstack([points[half:-1], points[: half + 1]])).even()
 
-    def bridged(self, a: float, b: float, side: float = 0.015) -> Line:
+    def bridged(self, a: float, b: float, side: float = 0.015) -> SmoothLine:
         """The line with its stretch from a to b replaced by a smooth curve that continues both sides, m."""
         (p, before, q, after), _ = self.at(np.array([a, max(a - side, 0.0), b, min(b + side, self.length)]))
         reach = float(np.linalg.norm(q - p))
@@ -128,12 +133,12 @@ class Line:
         curve = (
             (2 * t**3 - 3 * t**2 + 1) * p + (t**3 - 2 * t**2 + t) * u + (3 * t**2 - 2 * t**3) * q + (t**3 - t**2) * v
         )
-        return Line(np.vstack([self.points[self.s <= a], curve, self.points[self.s >= b]])).even()
+        return SmoothLine(np.vstack([self.points[self.s <= a], curve, self.points[self.s >= b]])).even()
 
-    def moved(self, s: Floats, left: Floats) -> Line:
+    def moved(self, s: Floats, left: Floats) -> SmoothLine:
         """The line moved to its left by amounts (M,) at arc lengths (M,), in between linearly."""
         amount = np.interp(self.s, s, left)
-        return Line(self.points + amount[:, None] * self.normals).even()
+        return SmoothLine(self.points + amount[:, None] * self.normals).even()
 
 
 def smoothing_weights(at: Floats, s: Floats, sigma: Floats, width: float) -> Floats:
@@ -158,7 +163,7 @@ def smoothing_weights(at: Floats, s: Floats, sigma: Floats, width: float) -> Flo
     return rows
 
 
-def tight_turns(line: Line, turn_rad: float = math.radians(40.0), within_m: float = 0.010) -> list[float]:
+def tight_turns(line: SmoothLine, turn_rad: float = math.radians(40.0), within_m: float = 0.010) -> list[float]:
     """Arc lengths m where a line turns by more than an angle within a short length."""
     heading = np.unwrap(np.arctan2(line.tangents[:, 1], line.tangents[:, 0]))
     step = max(1, round(within_m / (line.length / (len(line.points) - 1))))
@@ -199,8 +204,8 @@ def meeting_point(p: Floats, t: Floats, q: Floats, w: Floats) -> Floats:
 @dataclass(frozen=True, eq=False)
 class Corner:
     """A corner at arc length s m of the whole line, its apex (2,) m, its radius m, and how far to each side of s no
-    cross-section has points of its own, m; sigma: of the line sideways at s, m, as far as the radius is not known; wide: it is
-    certainly a bend."""
+    cross-section has points of its own, m; sigma: of the line sideways at s, m, as far as the radius is not known;
+    wide: it is certainly a bend."""
 
     s: float
     apex: Floats
@@ -210,7 +215,7 @@ class Corner:
     wide: bool = False
 
 
-def split_legs(line: Line, profile: Profile, wide: list[Floats]) -> tuple[list[Line], list[Corner]]:
+def split_legs(line: SmoothLine, profile: Profile, wide: list[Floats]) -> tuple[list[SmoothLine], list[Corner]]:
     """Split the line at its tight turns into straight legs, and return the corners between them; turns near
     the places (2,) in `wide` are not corners."""
     turns = [
@@ -228,15 +233,15 @@ def split_legs(line: Line, profile: Profile, wide: list[Floats]) -> tuple[list[L
         inside = (line.s >= low) & (line.s <= high)
         if np.count_nonzero(inside) * line.length / len(line.s) < SIDE_M:
             return [line], []
-        legs.append(Line(line.points[inside]).even())
+        legs.append(SmoothLine(line.points[inside]).even())
     for turn in turns:
         corners.append(Corner(turn, line.at(np.array([turn]))[0][0], 0.0, blind))
     return legs, corners
 
 
 def round_corners(
-    f: Floats, legs: list[Line], corners: list[Corner], profile: Profile, sigma: float, pitch: float
-) -> tuple[Line, list[Corner]]:
+    f: Floats, legs: list[SmoothLine], corners: list[Corner], profile: Profile, sigma: float, pitch: float
+) -> tuple[SmoothLine, list[Corner]]:
     """Join the legs over their corners, each with the radius that fits the points (N,3) m near it best."""
     half_width = profile.depth / min(profile.slopes)
     whole = legs[0].points
@@ -252,7 +257,7 @@ def round_corners(
             (apex, bend[len(bend) // 2], radius, spread * (1.0 / np.sin(half) - 1.0), radius - 2.0 * spread > WIDE_M)
         )
         whole = np.vstack([whole[:-1], bend, leg.points[1:]])
-    line = Line(whole).even(0.00025)
+    line = SmoothLine(whole).even(0.00025)
     out = []
     for (apex, place, radius, aside, wide), corner in zip(met, corners, strict=True):
         s = float(line.s[int(np.argmin(np.linalg.norm(line.points - place, axis=1)))])
@@ -286,11 +291,12 @@ def _radius(
     costs = []
     for radius in RADII_M:
         bend = filleted(before[-1], apex, after[0], float(radius))
-        path = Line(np.vstack([before[:-1], bend, after[1:]])).even(0.0001)
+        path = SmoothLine(np.vstack([before[:-1], bend, after[1:]])).even(0.0001)
         away = np.asarray(cKDTree(path.points).query(near[:, :2])[0])
         off = near[:, 2] - np.minimum(0.0, slope * away - profile.depth)
         costs.append(float(np.mean(np.square(off) / (np.square(off) + scale**2))))
-    # The cost is a share of c^2 = 2.5^2 sigma^2: where it is small, half the sum of squares over sigma^2 is 3.125 n of it.
+    # The cost is a share of c^2 = 2.5^2 sigma^2: where it is small, half the sum of squares over sigma^2 is 3.125 n of
+    # it.
     fine = np.arange(0.0, RADII_M[-1] + 1e-9, 0.00025)
     log_likelihood = -0.5 * 2.5**2 * len(near) / CROWD * np.interp(fine, RADII_M, costs)
     weight = np.exp(log_likelihood - log_likelihood.max())

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from weldcal.welding.locate.groove.line import Corner, Line, round_corners, smoothing_weights, split_legs
+from weldcal.welding.locate.groove.line import Corner, SmoothLine, round_corners, smoothing_weights, split_legs
 from weldcal.welding.locate.groove.seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain, Profile
 from weldcal.welding.locate.groove.search import CoarseGroove
 from weldcal.welding.locate.groove.section import (
@@ -27,13 +27,15 @@ from weldcal.welding.seam.curve import SeamCurve
 MOST_POINTS = 400_000  # about one groove
 THINNED = 0.9  # a pitch smaller than this times that of the search means that the cloud was thinned for the search
 SIGMA_SCALE = 1.1  # on the slices' own sigmas, for errors common to neighbouring slices
+# Common to the whole line, in point pitches: a choice, judged by tests of coverage (tests/welding/locate).
 SIGMA_FLOOR_PITCHES = 0.04
-SIGMA_FLOOR_NOISE = 0.20
+SIGMA_FLOOR_NOISE = 0.20  # the same, in the scanner's noise
 HEIGHT_FLOOR_NOISE = 0.25  # of the root: flying points off the walls increase with the scanner's noise
+# The edge of a face lies up to half a pitch off: near the standard deviation of that, 1 / sqrt(12).
 ONE_SIDED_PITCHES = 0.2
 END_PITCHES, END_REACH_M = 0.12, 0.006
-CORNER_REACH_M = 0.004
-GAP_ENDS = 0.6
+CORNER_REACH_M = 0.004  # a corner's error fades over the width of the sections beside it: no less than a groove is wide
+GAP_ENDS = 0.6  # at a shadow's ends, of the lever in its middle: its few sections beside it are as uncertain
 
 
 def measure_groove(
@@ -55,14 +57,15 @@ def measure_groove(
     fine = point_pitch(f[np.abs(f[:, 2]) < 0.003][:, :2])
     groove = replace(groove, pitch_m=fine) if fine < THINNED * groove.pitch_m else groove
     pitch, sigma = groove.pitch_m, groove.sigma_m
-    line = Line(groove.line_Q).even()
+    line = SmoothLine(groove.line_Q).even()
     if groove.closed:
-        line = Line(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
+        line = SmoothLine(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
     else:
-        # The farthest cells of an opening are its corners: the ends of the coarse line lead there, not along the groove.
+        # The farthest cells of an opening are its corners: the ends of the coarse line lead there, not along the
+        # groove.
         trim = min(groove.width_m, 0.25 * line.length)
         inner = (line.s >= trim) & (line.s <= line.length - trim)
-        line = Line(line.points[inner]).extended(trim + 0.006, trim + 0.006)
+        line = SmoothLine(line.points[inner]).extended(trim + 0.006, trim + 0.006)
     first_profile = measured_profile(f, line, groove, config)
     half_slice = max(0.0015, 1.5 * pitch, 0.003 * min(1.0, sigma / 0.0008))
     wide: list[Floats] = []
@@ -80,16 +83,17 @@ def measure_groove(
 
 def _traced(
     f: Floats,
-    line: Line,
+    line: SmoothLine,
     profile: Profile,
     groove: CoarseGroove,
     half_slice: float,
     config: GrooveConfig,
     wide: list[Floats],
-) -> tuple[Line, list[Corner], Profile]:
-    """Move the coarse line onto the groove in legs between its corners; the joined line, the corners and the common profile."""
+) -> tuple[SmoothLine, list[Corner], Profile]:
+    """Move the coarse line onto the groove in legs between its corners; the joined line, the corners and the common
+    profile."""
     pitch, sigma = groove.pitch_m, groove.sigma_m
-    lines: list[Line] = [line]
+    lines: list[SmoothLine] = [line]
     corners: list[Corner] = []
     for step in range(4):
         lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
@@ -112,7 +116,7 @@ def _traced(
 def _finish(
     f: Floats,
     around: Floats,
-    line: Line,
+    line: SmoothLine,
     slices: Slices,
     corners: list[Corner],
     groove: CoarseGroove,
@@ -140,8 +144,8 @@ def _finish(
     gaps = [(a, b) for a, b in gaps if a >= first and b <= last]
     if longest > config.longest_gap_m or missing > config.most_missing * (last - first):
         raise GrooveUncertain(
-            f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan again "
-            "from elsewhere."
+            f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan"
+            " again from elsewhere."
         )
     at = np.linspace(first, last, max(8, round((last - first) / STATION_M) + 1))
     for corner in corners:
@@ -189,15 +193,15 @@ def _finish(
     for corner in corners:
         if first < corner.s < last and corner.sigma > config.most_bridge_sigma_m:
             raise GrooveUncertain(
-                f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f} mm from this "
-                f"scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart): use a finer scanner or move it "
-                "nearer."
+                f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f}"
+                f" mm from this scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart): use a"
+                " finer scanner or move it nearer."
             )
     if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
         raise GrooveUncertain(
-            f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan "
-            f"(noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and "
-            f"{1e3 * config.most_sigma_m:.2f} mm are required: use a finer scanner or move it nearer."
+            f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan"
+            f" (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and"
+            f" {1e3 * config.most_sigma_m:.2f} mm are required: use a finer scanner or move it nearer."
         )
     if np.max(sigma[~seen], initial=0.0) > config.most_bridge_sigma_m:
         raise GrooveUncertain(
@@ -281,7 +285,7 @@ def _close(line: Floats, over: int = 8) -> None:
 
 
 def seen_extent(
-    f: Floats, line: Line, profile: Profile, slices: Slices, groove: CoarseGroove
+    f: Floats, line: SmoothLine, profile: Profile, slices: Slices, groove: CoarseGroove
 ) -> tuple[float, float, list[tuple[float, float]]]:
     """Arc lengths where the groove begins and ends, and the gaps in between that were not seen."""
     half_width = profile.depth / min(profile.slopes)
@@ -309,9 +313,10 @@ def seen_extent(
 
 
 def ends_at_edges(
-    f: Floats, ends: tuple[float, float], line: Line, profile: Profile, reach_m: float
+    f: Floats, ends: tuple[float, float], line: SmoothLine, profile: Profile, reach_m: float
 ) -> tuple[bool, bool]:
-    """Whether lower ground is seen within `reach_m` beyond each end, so that the plate ends there and not only the view."""
+    """Whether lower ground is seen within `reach_m` beyond each end, so that the plate ends there and not only the
+    view."""
     half_width = profile.depth / min(profile.slopes)
     tail = line.extended(reach_m + 0.001, reach_m + 0.001)
     s, n, beside = tail.coordinates(f[:, :2])
@@ -326,7 +331,7 @@ def ends_at_edges(
     return seen[0], seen[1]
 
 
-def refuse_gap(f: Floats, line: Line, slices: Slices, profile: Profile, steepest_rad: float) -> None:
+def refuse_gap(f: Floats, line: SmoothLine, slices: Slices, profile: Profile, steepest_rad: float) -> None:
     """Raise GrooveNotFound for a flat floor (as deep half-way to the shoulders as in the middle) or vertical walls."""
     if max(profile.slopes) > math.tan(steepest_rad):
         raise GrooveNotFound(

@@ -1,4 +1,5 @@
-"""Data of a V-groove: the expected profile, the measured seam with its sigmas, limits, and the errors that refuse it."""
+"""Data of a V-groove: the expected profile, the measured seam with its sigmas, limits, and the errors that refuse
+it."""
 
 import math
 from dataclasses import dataclass, field
@@ -32,13 +33,12 @@ class GrooveUncertain(WeldcalError):
 class GrooveConfig:
     """Limits of the groove extraction.
 
-    least_pitches  a groove must be this many point distances wide
-    smoothing_m    width of the Gaussian along the seam
-    most_sigma_m   a root that is less certain than this, outside gaps, is refused
-    longest_gap_m, most_missing   one gap, and the share of the whole seam, that may be bridged
-    steepest_wall_rad             steeper walls cannot be measured from above: an opening that has them is a gap
-    ground_reach_m                search length beyond an end for lower ground, which distinguishes the plate's end from the view's
-    most_bridge_sigma_m           how uncertain the line may be where it is bridged
+    least_pitches  a groove must be this many point distances wide smoothing_m    width of the Gaussian along the seam
+    most_sigma_m   a root that is less certain than this, outside gaps, is refused longest_gap_m, most_missing   one
+    gap, and the share of the whole seam, that may be bridged steepest_wall_rad             steeper walls cannot be
+    measured from above: an opening that has them is a gap ground_reach_m                search length beyond an end for
+    lower ground, which distinguishes the plate's end from the view's most_bridge_sigma_m           how uncertain the
+    line may be where it is bridged
     """
 
     search: SearchConfig = field(default_factory=SearchConfig)
@@ -64,17 +64,17 @@ class Profile:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GrooveSeam:
-    """A measured V-groove, sampled every millimetre of arc length from its start; metres, radians, in the cloud's frame A.
+    """A measured V-groove, sampled every millimetre of arc length from its start; metres, radians, in the cloud's frame
+    A.
 
-    curve                the root as a seam; at a sharp corner it and `root` are rounded with a radius of 0.5 mm
-    root, left, right    (N,3) root and shoulder lines, left as one travels; s (N,) arc length of the root
-    depth, angle         (N,) of the root below the face, and between the walls
-    sigma, sigma_height  (N,) standard deviations of the root sideways and in height
-    gaps                 (from, to) arc lengths that were bridged and not seen;
-    corners, apexes      arc lengths of tight corners, and (K,3) where the two sides meet there
-    ends_seen            whether first and last end lie at the edge of the face, not at the edge of what was seen
-    start                a phrase that says which end is the start
-    X_AF                 the face: origin on it, z up out of it; bend_radius of a face bent over a cylinder, negative for a hollow one
+    curve                the root as a seam; at a sharp corner it and `root` are rounded with a radius of 0.5 mm root,
+    left, right    (N,3) root and shoulder lines, left as one travels; s (N,) arc length of the root depth, angle
+    (N,) of the root below the face, and between the walls sigma, sigma_height  (N,) standard deviations of the root
+    sideways and in height gaps                 (from, to) arc lengths that were bridged and not seen; corners, apexes
+    arc lengths of tight corners, and (K,3) where the two sides meet there ends_seen            whether first and last
+    end lie at the edge of the face, not at the edge of what was seen start                a phrase that says which end
+    is the start X_AF                 the face: origin on it, z up out of it; bend_radius of a face bent over a
+    cylinder, negative for a hollow one
     """
 
     curve: SeamCurve
@@ -124,9 +124,9 @@ class GrooveSeam:
         """One sentence that describes the result."""
         kind = "closed V-groove" if self.closed else "V-groove"
         text = (
-            f"a {kind} {1e3 * self.s[-1]:.0f} mm long, {1e3 * self.width:.1f} mm wide, "
-            f"{1e3 * float(np.median(self.depth)):.1f} mm deep, {math.degrees(2.0 * self.half_angle):.0f} deg; its root is "
-            f"known to {1e3 * self.typical_sigma:.2f} mm; {self.start}"
+            f"a {kind} {1e3 * self.s[-1]:.0f} mm long, {1e3 * self.width:.1f} mm wide,"
+            f" {1e3 * float(np.median(self.depth)):.1f} mm deep, {math.degrees(2.0 * self.half_angle):.0f} deg; its"
+            f" root is known to {1e3 * self.typical_sigma:.2f} mm; {self.start}"
         )
         if math.isfinite(self.bend_radius):
             bent = "bent over" if self.bend_radius > 0.0 else "hollow with"

@@ -19,9 +19,9 @@ from weldcal.welding.locate.planes import Floats, Mask, into, point_pitch, robus
 class SearchConfig:
     """Thresholds for a face and for a groove in it; metres and radians.
 
-    max_width_m   wider openings are not grooves; shortest_m: shorter ones neither; max_depth_m: of the groove
-    max_gap_m     two pieces that continue each other across at most this, with no face seen between them, are one groove
-    steepest_rad  largest tilt of the face from the up direction
+    max_width_m   wider openings are not grooves; shortest_m: shorter ones neither; max_depth_m: of the groove max_gap_m
+    two pieces that continue each other across at most this, with no face seen between them, are one groove steepest_rad
+    largest tilt of the face from the up direction
     """
 
     max_width_m: float = 0.020
@@ -49,8 +49,8 @@ class CoarseGroove:
 
 
 def find_grooves(points: Floats, config: SearchConfig) -> tuple[list[CoarseGroove], float, float]:
-    """Find every groove-like opening in faces of a cloud (N,3) m whose z is up; the largest noise and the widest distance of
-    points on the faces seen, m.
+    """Find every groove-like opening in faces of a cloud (N,3) m whose z is up; the largest noise and the widest
+    distance of points on the faces seen, m.
     """
     rng = np.random.default_rng(config.seed)
     sample = points[rng.choice(len(points), size=min(len(points), 12000), replace=False)]
@@ -257,7 +257,8 @@ def _joined(
 
 
 def _bridge(a: Floats, b: Floats, level: Mask, cell: float, config: SearchConfig) -> tuple[float, Floats]:
-    """Cost (infinite: they are two) and points of a smooth bridge from the end of one line to the beginning of the other."""
+    """Cost (infinite: they are two) and points of a smooth bridge from the end of one line to the beginning of the
+    other."""
     none = (math.inf, np.empty((0, 2)))
     gap = b[0] - a[-1]
     distance = float(np.linalg.norm(gap))

@@ -1,8 +1,8 @@
 """Fits V-shaped cross-sections to slices of a groove and moves a coarse line onto their centres.
 
 The profile is z(n) = min(face, root + slope_side |n - centre|), n to the left of the seam. The noise of a scanner that
-looks down is in z, so z is regressed on n and no point is selected by its depth: on walls this steep, selecting by depth
-would bias their slopes.
+looks down is in z, so z is regressed on n and no point is selected by its depth: on walls this steep, selecting by
+depth would bias their slopes.
 """
 
 import math
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.welding.locate.groove.line import Corner, Line, smoothing_weights
+from weldcal.welding.locate.groove.line import Corner, SmoothLine, smoothing_weights
 from weldcal.welding.locate.groove.seam import GrooveConfig, GrooveNotFound, GrooveTooNarrow, Profile
 from weldcal.welding.locate.groove.search import CoarseGroove
 from weldcal.welding.locate.planes import Floats
@@ -20,14 +20,14 @@ ENOUGH = 3  # fewest points on a measured wall
 WIDE_M = 0.0015  # initial scale of the residuals in z, while the line is still off the groove
 SHOULDER_PITCHES = 1.5  # largest distance between the end of the face and the shoulder
 BAND_M = 0.006  # width of the face used beyond each shoulder
-STATION_M = 0.001
+STATION_M = 0.001  # between sections: some pitches of a scanner, and short against any bend
 FOLLOW = 3.0  # width relative to the last smoothing: repeated moves accumulate noise
 SLOPE_SIGMA = 0.06  # relative, of a slice about the common profile: 2 deg between the walls of a 45 deg groove
-DEPTH_SIGMA = 0.10
+DEPTH_SIGMA = 0.10  # relative, as SLOPE_SIGMA: a root face that is 10 % off its depth
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Section:
+class GrooveSection:
     """A fitted cross-section; metres, slopes as rise over run, left then right where there are two.
 
     centre, root    where the walls meet: n and z; covariance (2,2) of the two
@@ -69,7 +69,7 @@ class Section:
 
 def fit_section(
     n: Floats, z: Floats, guess: tuple[float, Profile], sigma: float, pitch: float, faces_known: bool = True
-) -> Section | None:
+) -> GrooveSection | None:
     """Fit a V to the points of one slice at n and z, each (N,); None where they show none.
 
     `guess`: the centre's n and the expected profile; `sigma` the noise of the face, `pitch` the distance of points.
@@ -139,7 +139,7 @@ def fit_section(
     if x[1] >= min(faces) or on_left + on_right < 5:
         return None
     spread = float(np.sqrt(np.mean(np.square(residual[good & on_wall]))))
-    return Section(
+    return GrooveSection(
         centre=float(x[0]),
         root=float(x[1]),
         slopes=(float(x[2]), float(x[3])),
@@ -174,7 +174,7 @@ class Slices:
     """Fitted sections along a line: where, and their sigma sideways and in height (not yet scaled)."""
 
     s: Floats
-    sections: list[Section]
+    sections: list[GrooveSection]
     half_slice: float
 
     def column(self, name: str) -> Floats:
@@ -189,7 +189,7 @@ class Slices:
         return np.sqrt([section.covariance[1, 1] for section in self.sections])
 
 
-def measured_profile(f: Floats, line: Line, groove: CoarseGroove, config: GrooveConfig) -> Profile:
+def measured_profile(f: Floats, line: SmoothLine, groove: CoarseGroove, config: GrooveConfig) -> Profile:
     """Fit the groove's cross-section over its whole length, about the coarse line."""
     _, n, beside = line.coordinates(f[:, :2])
     beside &= np.abs(n) < 0.5 * groove.width_m + BAND_M + 0.003
@@ -223,7 +223,9 @@ def measured_profile(f: Floats, line: Line, groove: CoarseGroove, config: Groove
     return Profile((slope, slope), best.depth)
 
 
-def common_profile(f: Floats, line: Line, slices: Slices, profile: Profile, sigma: float, pitch: float) -> Profile:
+def common_profile(
+    f: Floats, line: SmoothLine, slices: Slices, profile: Profile, sigma: float, pitch: float
+) -> Profile:
     """Fit one profile to all points about the slices' centres; it is accurate enough to constrain the next slices."""
     if len(slices.s) < 5:
         return profile
@@ -241,14 +243,14 @@ def common_profile(f: Floats, line: Line, slices: Slices, profile: Profile, sigm
 
 def _too_narrow(width: float, pitch: float, config: GrooveConfig) -> GrooveTooNarrow:
     return GrooveTooNarrow(
-        f"The groove is {1e3 * width:.1f} mm wide and the scan's points are {1e3 * pitch:.1f} mm apart: "
-        f"{width / pitch:.1f} of the {config.least_pitches:.0f} point distances it takes; move the scanner nearer or use "
-        "a finer one."
+        f"The groove is {1e3 * width:.1f} mm wide and the scan's points are {1e3 * pitch:.1f} mm apart:"
+        f" {width / pitch:.1f} of the {config.least_pitches:.0f} point distances it takes; move the scanner nearer or"
+        " use a finer one."
     )
 
 
 def cut_slices(
-    f: Floats, line: Line, profile: Profile, sigma: float, pitch: float, half_slice: float, corners: list[Corner]
+    f: Floats, line: SmoothLine, profile: Profile, sigma: float, pitch: float, half_slice: float, corners: list[Corner]
 ) -> Slices:
     """Fit consecutive sections along a line, each to points of its own; none within reach of a sharp corner."""
     half_width = profile.depth / min(profile.slopes)
@@ -291,14 +293,14 @@ def agreed(slices: Slices) -> Slices:
 
 def followed(
     f: Floats,
-    line: Line,
+    line: SmoothLine,
     profile: Profile,
     sigma: float,
     pitch: float,
     half_slice: float,
     config: GrooveConfig,
     settled: bool,
-) -> Line:
+) -> SmoothLine:
     """Move the line smoothly onto the centres of its sections."""
     slices = cut_slices(f, line, profile, sigma, pitch, half_slice, [])
     slices = agreed(slices) if settled else slices
@@ -315,7 +317,8 @@ def followed(
         weight = np.where(off > 4.0 * np.median(off) + 5e-5, 10.0, 1.0) * slices.sigma
     W = smoothing_weights(np.clip(at, slices.s[0], slices.s[-1]), slices.s, weight, width)
     moved = line.moved(at, W @ r)
-    # Where nothing was seen the coarse line is not reliable: it is replaced by a bridge between the sides that were seen.
+    # Where nothing was seen the coarse line is not reliable: it is replaced by a bridge between the sides that were
+    # seen.
     stretch = moved.length / line.length
     for k in np.flatnonzero(np.diff(slices.s) > 0.010)[::-1]:
         a, b = stretch * float(slices.s[k]), stretch * float(slices.s[k + 1])

@@ -1,7 +1,8 @@
 """Fits a part's pose to a scan: points to the surface, and the rims of the seen faces to the part's sharp edges.
 
-A flat face does not fix the pose along itself. What does is where it ends: at an edge beyond which the part faces away from
-the scanner, the outermost points of the face lie a share of a point distance inside the edge. That share is estimated too.
+A flat face does not fix the pose along itself. What does is where it ends: at an edge beyond which the part faces away
+from the scanner, the outermost points of the face lie a share of a point distance inside the edge. That share is
+estimated too.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Linearised equations in P: rows (M,6) of rotation and translation, and residuals (M,) m, with weights and clusters (M,)."""
+    """Linearised equations in P: rows (M,6) of rotation and translation, and residuals (M,) m, with weights and
+    clusters (M,)."""
 
     rows: Floats
     residual: Floats
@@ -53,7 +55,7 @@ class Equations:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class PartFit:
     """A pose with its covariance (6,6), of the motion in P; rms_m of the surface."""
 
     X_BP: RigidTransform
@@ -78,7 +80,8 @@ def _within(p: Floats, middle: Floats, reach: float) -> Mask:
 
 
 def surface_rows(p: Floats, n: Floats, model: PartModel, gate: float, same: float = SAME_SIDE_COS) -> Equations:
-    """Point-to-plane equations of the points p (N,3) in P with normals n (N,3) that lie within `gate` of the surface."""
+    """Point-to-plane equations of the points p (N,3) in P with normals n (N,3) that lie within `gate` of the
+    surface."""
     near = _within(p, model.center, model.radius + gate)
     p, n = p[near], n[near]
     q, m = model.closest(p) if len(p) else (p, n)
@@ -90,7 +93,8 @@ def surface_rows(p: Floats, n: Floats, model: PartModel, gate: float, same: floa
 
 
 def contour(model: PartModel, eye: Floats) -> SharpEdges:
-    """The samples of sharp edges that, seen from the eye (3,) in P, end a face the scanner measures and hide nothing of it."""
+    """The samples of sharp edges that, seen from the eye (3,) in P, end a face the scanner measures and hide nothing of
+    it."""
     e = model.edges
     if not len(e.point):
         return e
@@ -136,8 +140,9 @@ def rim_rows(
 ) -> Equations | None:
     """Equations of the outermost points of the faces among p (N,3) in P against the edges that end them.
 
-    A face may also end where something hides it, or where nothing was measured. So just beyond its outermost point the scan has to
-    show something behind it; where no edge does, for nothing lies in the scanner's range behind the part, all edges are used.
+    A face may also end where something hides it, or where nothing was measured. So just beyond its outermost point the
+    scan has to show something behind it; where no edge does, for nothing lies in the scanner's range behind the part,
+    all edges are used.
     """
     pitch = view.pitch_m
     if len(edges.point) < 4 or not len(p):
@@ -169,8 +174,8 @@ def rim_rows(
 
 
 def _ends_itself(beyond: Floats, normal: Floats, view: View, behind: float, X_BP: RigidTransform) -> Mask:
-    """Whether around points (N,3) of P, just beyond the rims of faces with normals (N,3), the scan shows something behind the
-    faces and nothing before them."""
+    """Whether around points (N,3) of P, just beyond the rims of faces with normals (N,3), the scan shows something
+    behind the faces and nothing before them."""
     R = X_BP.rotation().matrix()
     at = beyond @ R.T + X_BP.translation()
     d = at - view.eye
@@ -210,7 +215,8 @@ def _rim_weights(rims: Equations, pitch: float, reach: float) -> Floats:
 def step(
     surface: Equations, rims: Equations | None, c: float, sigma: float, pitch: float, reach: float = 0.0
 ) -> Floats | None:
-    """The motion (6,) of one Gauss-Newton step, the inset of the rims estimated with it; None where too few points are near.
+    """The motion (6,) of one Gauss-Newton step, the inset of the rims estimated with it; None where too few points are
+    near.
 
     reach: how far off, m, rims still count: where a few of many sides are, they would be taken for others.
     """
@@ -250,7 +256,7 @@ def coarse_fit(
     return X
 
 
-def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> Fit | None:
+def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> PartFit | None:
     """Fit surface and rims from a pose good to the gate, with its covariance; None where too few points are near."""
     pitch, gate = scan.pitch_m, max(FINE_GATE_M, FINE_GATE * model.radius)
     middle, around = X.multiply(model.center), model.radius + 0.02
@@ -289,7 +295,7 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform) -> Fit | N
             if math.hypot(model.radius * float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))) < STILL_M:
                 break
     assert surface is not None
-    return Fit(
+    return PartFit(
         X,
         covariance(surface, rims, sigma, pitch),
         float(np.sqrt(np.mean(np.square(surface.residual[np.abs(surface.residual) < max(4.0 * sigma, 0.0004)])))),
@@ -308,10 +314,12 @@ def _patches(equations: Equations, size: float) -> npt.NDArray[np.int64]:
 
 
 def covariance(surface: Equations, rims: Equations | None, sigma: float, pitch: float) -> Floats:
-    """(6,6) of the pose by the sandwich of the normal equations, with errors that points of a patch, or of an edge, share.
+    """(6,6) of the pose by the sandwich of the normal equations, with errors that points of a patch, or of an edge,
+    share.
 
-    The points of a patch of PATCHES point distances are one cluster, those of a piece of an edge another (Liang and Zeger 1986).
-    Added are errors that a patch or a side has in common: CREEP_M in a patch, SLOW_M in one of SHARED_M, RIM_FLOOR on a side.
+    The points of a patch of PATCHES point distances are one cluster, those of a piece of an edge another (Liang and
+    Zeger 1986). Added are errors that a patch or a side has in common: CREEP_M in a patch, SLOW_M in one of SHARED_M,
+    RIM_FLOOR on a side.
     """
     w = tukey(surface.residual, max(4.0 * sigma, 0.0004)) / (SURFACE_RATIO * sigma**2)
     A = np.zeros((7, 7))

@@ -1,7 +1,9 @@
-"""Measures the joint along the drawn seam in the scan: its two walls in cuts square to the seam, and the root between them.
+"""Measures the joint along the drawn seam in the scan: its two walls in cuts square to the seam, and the root between
+them.
 
-The unknowns are the root's shift in the cut and each wall's tilt, at knots along the seam. They follow from the distances of the
-scan's points from the drawn walls; the drawing is a weak prior, and a second difference keeps them smooth.
+The unknowns are the root's shift in the cut and each wall's tilt, at knots along the seam. They follow from the
+distances of the scan's points from the drawn walls; the drawing is a weak prior, and a second difference keeps them
+smooth.
 """
 
 from __future__ import annotations
@@ -46,9 +48,8 @@ KNOWN_SHARE = 0.4  # of the deviation by the drawing alone: a knot that is known
 class MeasuredJoint:
     """A seam as measured, in the base, and how far it lies from where the drawing has it.
 
-    seam      the drawn seam with its root moved
-    shift_m   (N,) of the root, at each of the seam's points
-    share     of the seam along which the root was measured in both directions of the cut; share_one: in at least one, for one
+    seam      the drawn seam with its root moved shift_m   (N,) of the root, at each of the seam's points share     of
+    the seam along which the root was measured in both directions of the cut; share_one: in at least one, for one
               wall was seen. Across the other the drawing holds.
     sigma_m   of the root sideways, rms over what was measured in both; nan where nothing was
     fit_up    how the two parts stand to each other
@@ -108,7 +109,8 @@ def measure_joint(points: Floats, normals: Floats, pitch_m: float, model: PartMo
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """The scan about the seam: points and normals (N,3), the seam's nearest point k (N,), and the offset from it (N,3)."""
+    """The scan about the seam: points and normals (N,3), the seam's nearest point k (N,), and the offset from it
+    (N,3)."""
 
     points: Floats
     normals: Floats
@@ -185,8 +187,8 @@ def _gap_rows(cut: _Cut, seam: DrawnSeam, pitch: float) -> Rows | None:
 
 
 def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Knots (K,) m along the seam with the shifts to the left and along the bisector (K,) m, their covariance (K,2,2), and the
-    deviation (K,) by the drawing alone.
+    """Knots (K,) m along the seam with the shifts to the left and along the bisector (K,) m, their covariance (K,2,2),
+    and the deviation (K,) by the drawing alone.
     """
     count = max(3, math.ceil(length / KNOT_M) + 1)
     at = np.linspace(0.0, length, count)
@@ -222,8 +224,8 @@ def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, Floa
 class FitUp:
     """How two parts stand to each other along a seam, by the scan; NaN where it does not show that.
 
-    s_m    (K,) places along the seam, m
-    values gap (m, between the edges of the two sides), misalignment (m, the left face above the right one) and angle (rad, how much wider
+    s_m    (K,) places along the seam, m values gap (m, between the edges of the two sides), misalignment (m, the left
+    face above the right one) and angle (rad, how much wider
            the joint opens than drawn), each (K,); sigmas: their standard deviations
     """
 
@@ -245,7 +247,9 @@ class FitUpOutside(WeldcalError):
 
 
 def read_limits(path: Path) -> dict[str, tuple[float, float]]:
-    """Read a table of limits: quantity, unit, least, most; an empty cell is no limit. Angles are deviations from the drawing.
+    """Read a table of limits: quantity, unit, least, most; an empty cell is no limit.
+
+    Angles are deviations from the drawing.
 
     Returns:
         (least, most) in m and rad, by quantity.
@@ -275,7 +279,8 @@ def check_fit_up(found: FitUp, limits: Mapping[str, tuple[float, float]], joint:
     """Check a fit-up against limits; what the scan shows nowhere is out of its limits too.
 
     Raises:
-        FitUpOutside: with the place, the value and the limit, of the quantity that is farthest beyond in units of its sigma.
+        FitUpOutside: with the place, the value and the limit, of the quantity that is farthest beyond in units of its
+            sigma.
     """
     beyond, worst = 0.0, ""
     for name, (least, most) in limits.items():
@@ -291,18 +296,20 @@ def check_fit_up(found: FitUp, limits: Mapping[str, tuple[float, float]], joint:
         if over[k] > beyond:
             beyond, limit = float(over[k]), most if value[k] > most else least
             worst = (
-                f"The fit-up is out of its limits: at {1e3 * found.s_m[k]:.0f} mm of the seam the {name} is {factor * value[k]:.2f} {unit} "
-                f"(sigma {factor * sigma[k]:.2f}), and its limit is {factor * limit:g} {unit}. Fit the parts anew and scan again."
+                f"The fit-up is out of its limits: at {1e3 * found.s_m[k]:.0f} mm of the seam the {name} is"
+                f" {factor * value[k]:.2f} {unit} (sigma {factor * sigma[k]:.2f}), and its limit is {factor * limit:g}"
+                f" {unit}. Fit the parts anew and scan again."
             )
     if worst:
         raise FitUpOutside(worst)
 
 
 def measure_fit_up(points: Floats, normals: Floats, pitch_m: float, model: PartModel, seam: DrawnSeam) -> FitUp:
-    """Measure gap, misalignment and angle of a joint in windows along its seam; the arguments are those of `measure_joint`.
+    """Measure gap, misalignment and angle of a joint in windows along its seam; the arguments are those of
+    `measure_joint`.
 
-    On each side a plane is fitted to the points of the wall. The gap is the distance between the places where the two sides' points end,
-    and the drawing only says which points are of which side.
+    On each side a plane is fitted to the points of the wall. The gap is the distance between the places where the two
+    sides' points end, and the drawing only says which points are of which side.
     """
     cut = _cut(points, normals, seam)
     s = seam.arc_length_m[cut.k]
@@ -321,8 +328,8 @@ def measure_fit_up(points: Floats, normals: Floats, pitch_m: float, model: PartM
 
 
 class _Side(NamedTuple):
-    """A wall in a window: directions along it and out of it (2,), its height over the drawn one and slope with their sigmas (2,), its points
-    (M,3) by left, up and along the seam, and their noise."""
+    """A wall in a window: directions along it and out of it (2,), its height over the drawn one and slope with their
+    sigmas (2,), its points (M,3) by left, up and along the seam, and their noise."""
 
     along: Floats
     out: Floats
@@ -388,7 +395,8 @@ def _fit_up_at(
 
 
 def _opening(rows: Floats, pitch: float) -> tuple[float, float]:
-    """Width m of the gap between level faces, by the widest step across the seam between points (M,3) of both, in strips; and its sigma."""
+    """Width m of the gap between level faces, by the widest step across the seam between points (M,3) of both, in
+    strips; and its sigma."""
     widest, usual = [], []
     for x in _strips(rows[:, 0], rows[:, 2]):
         steps = np.diff(x)
@@ -404,13 +412,15 @@ def _opening(rows: Floats, pitch: float) -> tuple[float, float]:
 
 
 def _strips(x: Floats, s: Floats) -> list[Floats]:
-    """Ascending values x (M,) in strips of the places s (M,) along the seam, each once: a point may be of both sides."""
+    """Ascending values x (M,) in strips of the places s (M,) along the seam, each once: a point may be of both
+    sides."""
     strip = np.floor(s / STRIP_M)
     return [np.unique(x[strip == k]) for k in np.unique(strip)]
 
 
 def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> tuple[float, float]:
-    """Distance m from the root (2,) along a wall at which its points end, and its sigma; 0 where they reach the other wall.
+    """Distance m from the root (2,) along a wall at which its points end, and its sigma; 0 where they reach the other
+    wall.
 
     Points nearer to the other wall than `clear` may be of either.
     """
@@ -434,7 +444,8 @@ def _end(side: _Side, root: Floats, d: Floats, other: Floats, clear: float) -> t
 
 
 def _faces_apart(cut: _Cut, model: PartModel, seam: DrawnSeam, tilt: float | None = None) -> tuple[float, float, float]:
-    """How far the sheet on the left of a lap lies above that on the right, m, against the drawing, its sigma, and the tilt of both, or that given.
+    """How far the sheet on the left of a lap lies above that on the right, m, against the drawing, its sigma, and the
+    tilt of both, or that given.
 
     NaN where one of them is not seen.
     """

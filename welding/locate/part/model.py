@@ -29,8 +29,8 @@ SMOOTHED, SMOOTHED_M, SMOOTHED_COS = 32, 0.010, (math.cos(math.radians(40.0)), m
 class SharpEdges:
     """Samples of the convex edges, one row for each face beside an edge: m and unit vectors.
 
-    point (N,3), tangent (N,3), normal (N,3) of the face, outward (N,3) in the face and away from it, other (N,3) the normal of
-    the face beyond the edge, chain (N,) the number of the straight edge.
+    point (N,3), tangent (N,3), normal (N,3) of the face, outward (N,3) in the face and away from it, other (N,3) the
+    normal of the face beyond the edge, chain (N,) the number of the straight edge.
     """
 
     point: Floats
@@ -70,8 +70,8 @@ class PartModel:
     def smooth_normals(self) -> Floats:
         """(M,3) unit normals of the triangles, averaged over near ones of nearly the same direction.
 
-        The small triangles of a mesh from a scan are tilted by its noise. Taken as they are, they would keep a flat face from
-        sliding along itself.
+        The small triangles of a mesh from a scan are tilted by its noise. Taken as they are, they would keep a flat
+        face from sliding along itself.
         """
         tree = cKDTree(self.mesh.vertices[self.mesh.triangles].mean(axis=1))
         away, k = tree.query(tree.data, k=min(SMOOTHED, tree.n), distance_upper_bound=SMOOTHED_M)
@@ -103,7 +103,8 @@ class PartModel:
 
     @cached_property
     def directions(self) -> list[Floats]:
-        """Directions (3,) of P that may point up: the part rests on a face of its hull, or a large flat face lies up."""
+        """Directions (3,) of P that may point up: the part rests on a face of its hull, or a large flat face lies
+        up."""
         found: list[tuple[float, Floats]] = []
         hull = ConvexHull(self.mesh.vertices)
         corners = self.mesh.vertices[hull.simplices]

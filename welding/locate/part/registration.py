@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.mesh import TriMesh
 from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near, views_off
-from weldcal.welding.locate.part.fit import Fit, coarse_fit, fine_fit
+from weldcal.welding.locate.part.fit import PartFit, coarse_fit, fine_fit
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.result import AmbiguousPart, PartConfig, PartNotFound, PartRegistration
 from weldcal.welding.locate.part.rivals import (
@@ -52,7 +52,7 @@ ELSEWHERE = 0.85  # of the best score: a rival at another place with less is wor
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    fit: Fit
+    fit: PartFit
     agreement: Agreement
 
     @property
@@ -150,8 +150,8 @@ def _check_size(scan: PreparedScan, model: PartModel) -> None:
     seen, size = scan.extent_m, 2.0 * model.radius
     if size > LARGEST * seen or size < SMALLEST * scan.pitch_m:
         raise PartNotFound(
-            f"The part is {size:.3g} m across, and the scan shows {seen:.3g} m with {1e3 * scan.pitch_m:.2g} mm between its points: "
-            "check the unit of the part's file."
+            f"The part is {size:.3g} m across, and the scan shows {seen:.3g} m with {1e3 * scan.pitch_m:.2g} mm between"
+            " its points: check the unit of the part's file."
         )
 
 
@@ -211,7 +211,8 @@ def _screened(
 def _fine(
     scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 5
 ) -> list[_Judged]:
-    """Fit the best starts finely, different ones only, best first; after `enough` a good and clean one ends the search."""
+    """Fit the best starts finely, different ones only, best first; after `enough` a good and clean one ends the
+    search."""
     judged: list[_Judged] = []
     for X in starts[:most]:
         known = [j.agreement for j in judged]
@@ -264,8 +265,8 @@ def _check_near(X: RigidTransform, guess: RigidTransform, model: PartModel, conf
     shift = float(np.linalg.norm(E.multiply(model.center) - model.center))
     if turn > config.reach_rad or shift > config.reach_m:
         raise PartNotFound(
-            f"The part fits the scan only {1e3 * shift:.0f} mm and {math.degrees(turn):.0f} deg from the guess: correct the guess, "
-            "or search without one."
+            f"The part fits the scan only {1e3 * shift:.0f} mm and {math.degrees(turn):.0f} deg from the guess: correct"
+            " the guess, or search without one."
         )
 
 
@@ -337,9 +338,9 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
         )
     elif size > LARGER * shown:
         advice = (
-            f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: "
-            "scan it from several poses with a scanner on the flange (weldcal new FOLDER --part FILE --from carried_scanner "
-            "writes them to planning.scan_poses_deg)"
+            f"the part is {size:.2g} m across, larger than the {shown:.2g} m of the scan: scan it from several poses"
+            " with a scanner on the flange (weldcal new FOLDER --part FILE --from carried_scanner writes them to"
+            " planning.scan_poses_deg)"
         )
         check = advice
     if a.n_met < config.min_points:
@@ -356,13 +357,13 @@ def _check_fit(best: _Judged, scan: PreparedScan, model: PartModel, config: Part
         )
     if a.met < config.min_met:
         raise PartNotFound(
-            f"The part does not fit the scan: only {100 * a.met:.0f} % of the rays that should meet it do, for something stands before it: "
-            "clear the view, or check which part this is."
+            f"The part does not fit the scan: only {100 * a.met:.0f} % of the rays that should meet it do, for"
+            " something stands before it: clear the view, or check which part this is."
         )
     if a.met < config.min_agreement * (1.0 - a.hidden) or a.passed > config.max_violation:
         raise PartNotFound(
-            f"The part does not fit the scan: of the rays that should meet it {100 * a.met:.0f} % do and {100 * a.passed:.0f} % pass "
-            "through it; check which part this is, the file's unit and the calibration."
+            f"The part does not fit the scan: of the rays that should meet it {100 * a.met:.0f} % do and"
+            f" {100 * a.passed:.0f} % pass through it; check which part this is, the file's unit and the calibration."
         )
 
 
@@ -412,15 +413,16 @@ def _decided(
     shown = best.agreement
     if harmful and (shown.met < POOR_MET * (1.0 - shown.hidden) or shown.passed > POOR_PASSED):
         raise PartNotFound(
-            f"The part does not fit the scan: in its best pose {100 * shown.passed:.0f} % of the rays pass through it, and other poses "
-            "fit as badly; check which part this is and the file's unit."
+            f"The part does not fit the scan: in its best pose {100 * shown.passed:.0f} % of the rays pass through it,"
+            " and other poses fit as badly; check which part this is and the file's unit."
         )
     if harmful:
         motion = best.X_BP.InvertAndCompose(harmful[0].X_BP)
         near = float(np.linalg.norm(motion.multiply(model.center) - model.center)) < 0.5 * model.radius
         if near:
             raise AmbiguousPart(
-                f"The part's pose is ambiguous: {describe_turn(motion)}; give a guess of its pose, or scan it from where its sides differ."
+                f"The part's pose is ambiguous: {describe_turn(motion)}; give a guess of its pose, or scan it from"
+                " where its sides differ."
             )
         a, b = (_in_mm(x.X_BP.multiply(model.center)) for x in (best, harmful[0]))
         raise AmbiguousPart(
@@ -441,8 +443,8 @@ def _check_known(best: _Judged, model: PartModel, matters_P: Floats | None, conf
     harmful = [f.name for f in free if not harmless(f, matters_P)]
     if harmful:
         raise AmbiguousPart(
-            f"The part was found, but the scan does not fix its pose: it is {' and '.join(harmful)}; scan it so that more of its sides or "
-            "ends are seen, or give its pose."
+            f"The part was found, but the scan does not fix its pose: it is {' and '.join(harmful)}; scan it so that"
+            " more of its sides or ends are seen, or give its pose."
         )
 
 
@@ -467,7 +469,8 @@ def _result(best: _Judged, runner_up: float, note: str, model: PartModel, matter
     word = "high" if confidence > 0.85 else "fair" if confidence > 0.65 else "low"
     what = "the part" if matters_P is None else "the drawn seam"
     summary = (
-        f"{word} confidence {confidence:.2f}: {100 * a.met:.0f} % of the rays that should meet the part do, {100 * a.passed:.0f} % pass through it, "
-        f"{100 * a.seen:.0f} % of its visible surface is seen; {what} is known to {1e3 * sigma:.2f} mm{note}"
+        f"{word} confidence {confidence:.2f}: {100 * a.met:.0f} % of the rays that should meet the part do,"
+        f" {100 * a.passed:.0f} % pass through it, {100 * a.seen:.0f} % of its visible surface is seen; {what} is known"
+        f" to {1e3 * sigma:.2f} mm{note}"
     )
     return replace(found, summary=summary)

@@ -156,9 +156,15 @@ def prepare(scans: list[Floats], eye_B: npt.ArrayLike | None, least: int, seed: 
     near = normals[np.asarray(cKDTree(points).query(coarse)[1])]
     coarse_normals = coarse_normals * np.where(np.sum(coarse_normals * near, axis=1) < 0.0, -1.0, 1.0)[:, None]
     return PreparedScan(
-        points=points, normals=normals, view=view, coarse=coarse, coarse_normals=coarse_normals, planes=planes,
-        views=tuple(View(e, p, pitch) for e, p in zip(eyes, scans, strict=True)), pitch_m=pitch,
-    )  # fmt: skip
+        points=points,
+        normals=normals,
+        view=view,
+        coarse=coarse,
+        coarse_normals=coarse_normals,
+        planes=planes,
+        views=tuple(View(e, p, pitch) for e, p in zip(eyes, scans, strict=True)),
+        pitch_m=pitch,
+    )
 
 
 def _own_level(plane: Plane, points: Floats) -> Plane:

@@ -1,7 +1,8 @@
 """Finds rough poses of a part in a scan by its silhouettes from above and its heights.
 
-The part is turned into every direction in which it can rest and every angle about the vertical. Its silhouette is correlated with
-the cells in which the scan shows something above the ground; at the best shifts the heights are compared, up to a common lift.
+The part is turned into every direction in which it can rest and every angle about the vertical. Its silhouette is
+correlated with the cells in which the scan shows something above the ground; at the best shifts the heights are
+compared, up to a common lift.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _BOX = {n: np.ones((n, n), np.uint8) for n in (1, 3, 2 * RING_CELLS + 1)}
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class RoughPose:
     """A rough pose and its score, 1 for a perfect match; covered: judged by what nothing above the part hides."""
 
     score: float
@@ -62,7 +63,7 @@ def frame_with_z(z: Floats) -> Floats:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Place]:
+def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[RoughPose]:
     """Rough poses of the part in the scan, best first: at most MOST_PLACES of each kind."""
     ups: list[tuple[Floats, Plane | None]] = []
     large = grounds(scan, model)
@@ -76,13 +77,13 @@ def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> li
             known = [g for g in known if g is plane or g is None or abs(g.level - plane.level) < SAME_HEIGHT_M]
         if len(ups) < MOST_UPS and not known:
             ups.append((plane.normal, plane if is_ground else large[0] if large else None))
-    places: list[Place] = []
+    places: list[RoughPose] = []
     for k, (up, ground) in enumerate(ups or [(np.array([0.0, 0.0, 1.0]), None)]):
         places += _places_for(scan, model, config, up, config.turn_step_rad * (1.0 if k == 0 else 1.5), ground)
     places.sort(key=lambda place: -place.score)
     # 2: the part would stick in its ground; 1: something covers it; 0: neither.
     kinds = [2 if sinks(scan, model, p.X_BP) else int(p.covered) for p in places]
-    kept: list[Place] = []
+    kept: list[RoughPose] = []
     for kind, more in enumerate(MOST_PLACES):
         most = len(kept) + more
         for place in (p for p, k in zip(places, kinds, strict=True) if k == kind):
@@ -126,7 +127,7 @@ def _near(A: RigidTransform, B: RigidTransform, model: PartModel) -> bool:
 
 def _places_for(
     scan: PreparedScan, model: PartModel, config: PartConfig, up: Floats, step: float, ground: Plane | None
-) -> list[Place]:
+) -> list[RoughPose]:
     """Places with one direction of the base up."""
     R_BU = frame_with_z(up)
     q = scan.coarse @ R_BU
@@ -151,7 +152,7 @@ def _places_for(
     around = _BOX[3] if cell > WIDE_CELLS * config.cell_m else _BOX[1]
     known_ground = known & ~body_seen
     everything = _scene(top, known_ground, around, full, False)
-    places: list[Place] = []
+    places: list[RoughPose] = []
     points, normals = model.points - model.center, model.normals
     level_ground = ground is not None and float(ground.normal @ up) > LEVEL_GROUND_COS and model.radius > LARGE_M
     under = ground.level - UNDER * model.radius if ground is not None and level_ground else -math.inf
@@ -215,14 +216,15 @@ def _places_for(
                     lift = float(np.mean(difference[level])) if level.any() else lift
                     origin = R_BU @ np.array([middle[0], middle[1], lift]) - R @ model.center
                     X = RigidTransform(RotationMatrix(_orthogonal(R)), origin)
-                    places.append(Place(score, X, scene.covered))
+                    places.append(RoughPose(score, X, scene.covered))
     places.sort(key=lambda place: -place.score)
     return [p for p in places if not p.covered][:400] + [p for p in places if p.covered][:400]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Scene:
-    """What the search compares: heights (H,W), NaN: none, their limits around a cell, and the transforms of the masks."""
+    """What the search compares: heights (H,W), NaN: none, their limits around a cell, and the transforms of the
+    masks."""
 
     top: npt.NDArray[np.floating]
     lowest: npt.NDArray[Any]

@@ -1,4 +1,5 @@
-"""A folder into which another program writes, as a source of frames: the first complete file after a request answers it."""
+"""A folder into which another program writes, as a source of frames: the first complete file after a request answers
+it."""
 
 import json
 import math
@@ -84,7 +85,8 @@ class FileTrigger:
 
 
 class TcpTrigger:
-    """Sends the line `scan N` over a TCP connection that stays open; the other program may answer `ok N` or `error TEXT`."""
+    """Sends the line `scan N` over a TCP connection that stays open; the other program may answer `ok N` or `error
+    TEXT`."""
 
     def __init__(self, host: str, port: int) -> None:
         self._at = (host, port)
@@ -159,8 +161,8 @@ def trigger_of(text: str) -> Trigger:
     if text.startswith("tcp://") and host and port.isdigit() and 0 < int(port) < 65536:
         return TcpTrigger(host, int(port))
     raise InputError(
-        f"scanner.trigger must be empty, file:PATH or tcp://HOST:PORT, not '{text[:100]}': give the port at which the program "
-        "that scans listens, such as tcp://127.0.0.1:5020."
+        f"scanner.trigger must be empty, file:PATH or tcp://HOST:PORT, not '{text[:100]}': give the port at which the"
+        " program that scans listens, such as tcp://127.0.0.1:5020."
     )
 
 
@@ -180,10 +182,10 @@ class _Growing:
 class NewFiles:
     """Files of some suffixes that appear in a folder, or change, after `start`.
 
-    A file is complete when its size and time of change have been the same for `settle_s`; one that was renamed into the folder
-    and last changed before that is complete at once, unless the computer's clock was set since `start`.
-    Names that begin with a dot or end as unfinished downloads do are never
-    looked at. The folder is polled: network folders do not report changes.
+    A file is complete when its size and time of change have been the same for `settle_s`; one that was renamed into the
+    folder and last changed before that is complete at once, unless the computer's clock was set since `start`. Names
+    that begin with a dot or end as unfinished downloads do are never looked at. The folder is polled: network folders
+    do not report changes.
     """
 
     def __init__(
@@ -201,7 +203,10 @@ class NewFiles:
         self._offset = self._unix() - time.monotonic()
 
     def complete(self) -> list[Path]:
-        """New complete files, oldest change first, each of them once. Raises OSError where the folder cannot be read."""
+        """New complete files, oldest change first, each of them once.
+
+        Raises OSError where the folder cannot be read.
+        """
         now, unix = time.monotonic(), self._unix()
         clock_was_set = abs(unix - now - self._offset) > SET_S
         listed = self._listed()
@@ -252,7 +257,8 @@ SIDECAR = ".json"
 
 
 class FolderSource(Source[Datum]):
-    """What `read` makes of the files of some suffixes; it raises InputError for one that may not be complete, Garbage for a bad one."""
+    """What `read` makes of the files of some suffixes; it raises InputError for one that may not be complete, Garbage
+    for a bad one."""
 
     def __init__(
         self,
@@ -334,7 +340,10 @@ class FolderSource(Source[Datum]):
             raise DeviceLost(f"the folder '{self.folder}' cannot be read: {error.strerror}") from error
 
     def _read(self, path: Path) -> Delivery[Datum] | None:
-        """The datum of a settled file; None where it may still be incomplete. Raises Garbage where it cannot be used."""
+        """The datum of a settled file; None where it may still be incomplete.
+
+        Raises Garbage where it cannot be used.
+        """
         try:
             datum = self._read_file(path)
         except InputError as error:
@@ -366,7 +375,8 @@ class FolderSource(Source[Datum]):
         )
 
     def _sidecar(self, path: Path) -> tuple[float | None, int | None, float | None, str]:
-        """Capture time (Unix, s), request's number, the time of the scanner's own clock (s), and where the time is from."""
+        """Capture time (Unix, s), request's number, the time of the scanner's own clock (s), and where the time is
+        from."""
         beside = path.with_suffix(SIDECAR)
         if not beside.is_file():
             return None, None, None, "its arrival"

@@ -16,7 +16,7 @@ from weldcal.systems.drivers.sensors.genicam.device import Component
 
 
 @dataclass(frozen=True)
-class Profile:
+class DeviceProfile:
     """What profiles.yaml says of one kind of device."""
 
     settings: dict[str, str] = field(default_factory=dict)
@@ -32,14 +32,14 @@ class Profile:
 
 
 @cache
-def profiles() -> dict[str, Profile]:
+def profiles() -> dict[str, DeviceProfile]:
     """All profiles by name."""
     with as_file(files(__package__).joinpath("profiles.yaml")) as path:
         document = read_document(path)
-    return {name: replace(Profile(), **keys) for name, keys in document.items()}
+    return {name: replace(DeviceProfile(), **keys) for name, keys in document.items()}
 
 
-def get_profile(name: str) -> Profile:
+def get_profile(name: str) -> DeviceProfile:
     """The named profile; raises InputError naming the known ones."""
     found = profiles().get(name)
     if found is None:
@@ -78,7 +78,8 @@ def cloud_of(parts: Sequence[Component]) -> NDArray[np.float32]:
 def profile_of(parts: Sequence[Component], scaling: Scaling = UNIT_SCALING) -> NDArray[np.float64]:
     """The last line of a frame as points (W, 2) [x, z] in the device's unit, NaN where nothing was measured.
 
-    Of Coord3D_AC32f, Coord3D_ABC32f or its planes as they are; of the range Coord3D_C16, whose x is the column, by `scaling`.
+    Of Coord3D_AC32f, Coord3D_ABC32f or its planes as they are; of the range Coord3D_C16, whose x is the column, by
+    `scaling`.
 
     Raises:
         Garbage: the frame has no such component.

@@ -63,8 +63,9 @@ class Component:
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
-    """A frame: components copied out of the buffer, its number, its stamp (s of the device's clock; None: it has none)."""
+class CopiedFrame:
+    """A frame: components copied out of the buffer, its number, its stamp (s of the device's clock; None: it has
+    none)."""
 
     components: tuple[Component, ...]
     number: int | None
@@ -75,7 +76,8 @@ class Taken:
 class GenicamDevice:
     """A device and its image acquirer. `wanted` is its serial number, model, name or id; empty where there is only one.
 
-    A process opens one device of a producer at a time: to look for devices harvesters closes the producer and opens it again.
+    A process opens one device of a producer at a time: to look for devices harvesters closes the producer and opens it
+    again.
     """
 
     def __init__(self, producer: str, wanted: str, features: Mapping[str, str], alive: str = "") -> None:
@@ -110,8 +112,11 @@ class GenicamDevice:
             self.close()
             raise
 
-    def take(self, timeout_s: float) -> Taken | None:
-        """The oldest frame that waits; None where none came in time. Raises DeviceLost, and Garbage for an empty one."""
+    def take(self, timeout_s: float) -> CopiedFrame | None:
+        """The oldest frame that waits; None where none came in time.
+
+        Raises DeviceLost, and Garbage for an empty one.
+        """
         if self._acquirer is None:
             raise DeviceLost("it is not open")
         buffer = self._acquirer.try_fetch(timeout=timeout_s)
@@ -131,7 +136,7 @@ class GenicamDevice:
             buffer.queue()
         if not parts:
             raise Garbage("it sent a frame without components")
-        return Taken(tuple(parts), number, stamp, arrived)
+        return CopiedFrame(tuple(parts), number, stamp, arrived)
 
     def execute(self, command: str) -> None:
         """Run a command of the device. Raises DeviceLost."""

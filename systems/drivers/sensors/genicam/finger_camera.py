@@ -6,7 +6,7 @@ from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.components import get_profile, picture_of
 from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
-from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_camera
 from weldcal.systems.drivers.sensors.wired_camera import (
     Picture,
@@ -20,7 +20,8 @@ from weldcal.systems.drivers.station_build import StationBuild
 
 @dc.dataclass(kw_only=True)
 class GenicamFingerCamera(WiredFingerCamera):
-    """`!GenicamFingerCamera`: the maker's GenTL producer, the device, and its features; `exposure_ms` sets ExposureTime."""
+    """`!GenicamFingerCamera`: the maker's GenTL producer, the device, and its features; `exposure_ms` sets
+    ExposureTime."""
 
     producer: str = ""
     device: str = ""
@@ -35,7 +36,7 @@ class GenicamFingerCamera(WiredFingerCamera):
     def source(self) -> Source[Picture]:
         """The device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamPictures(self)  # the keys are checked here, not in the process
-        return OwnProcess(self.title, GenicamPictures, self)
+        return SourceProcess(self.title, GenicamPictures, self)
 
 
 class GenicamPictures(GenicamSource[Picture]):

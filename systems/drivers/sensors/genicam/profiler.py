@@ -7,7 +7,7 @@ from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.components import UNIT_SCALING, get_profile, profile_of
 from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
-from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_profiler import (
     Profile,
@@ -25,8 +25,8 @@ _METRES = {"m": 1.0, "mm": 1e-3}
 class GenicamProfiler(WiredProfiler):
     """`!GenicamProfiler`: the maker's GenTL producer, the device, and its features.
 
-    The last line of a frame is the profile. A range picture (Coord3D_C16) is scaled by the device's Scan3dCoordinateScale and
-    Scan3dCoordinateOffset of its coordinates A and C.
+    The last line of a frame is the profile. A range picture (Coord3D_C16) is scaled by the device's
+    Scan3dCoordinateScale and Scan3dCoordinateOffset of its coordinates A and C.
     """
 
     producer: str = ""
@@ -43,7 +43,7 @@ class GenicamProfiler(WiredProfiler):
     def source(self) -> Source[Profile]:
         """The device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamProfiles(self)  # the keys are checked here, not in the process
-        return OwnProcess(self.title, GenicamProfiles, self)
+        return SourceProcess(self.title, GenicamProfiles, self)
 
 
 class GenicamProfiles(GenicamSource[Profile]):

@@ -6,7 +6,7 @@ from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.components import cloud_of, get_profile
 from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
-from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud
 from weldcal.systems.drivers.station_build import StationBuild
@@ -43,7 +43,7 @@ class GenicamScanner(WiredScanner):
     def source(self) -> Source[Cloud]:
         """The device in a process of its own. Raises InputError for keys that cannot be used."""
         GenicamClouds(self)  # the keys are checked here, not in the process
-        return OwnProcess(self.title, GenicamClouds, self)
+        return SourceProcess(self.title, GenicamClouds, self)
 
 
 class GenicamClouds(GenicamSource[Cloud]):

@@ -1,4 +1,5 @@
-"""FrameReplay: outputs frames that were rendered beforehand at a scanner's rate, with the joints of the arm that they show."""
+"""FrameReplay: outputs frames that were rendered beforehand at a scanner's rate, with the joints of the arm that they
+show."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,7 +27,8 @@ class FrameReplay(LeafSystem):
         - joints
         - time
 
-    A frame arrives ``delay_s`` after its capture. ``joints`` gives the arm's (6,) rad at a time (s) from the first cloud on.
+    A frame arrives ``delay_s`` after its capture. ``joints`` gives the arm's (6,) rad at a time (s) from the first
+    cloud on.
     """
 
     def __init__(

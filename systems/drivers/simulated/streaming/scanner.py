@@ -1,4 +1,5 @@
-"""Simulated streaming scanner: frames at its own rate that arrive later with stamps of its own clock, and single scans at rest."""
+"""Simulated streaming scanner: frames at its own rate that arrive later with stamps of its own clock, and single scans
+at rest."""
 
 import dataclasses as dc
 from collections.abc import Sequence
@@ -105,8 +106,8 @@ class DepthStream(LeafSystem):
         - stream
         - newest_capture
 
-    The instants of an exposure are whole steps of the plant. `newest_capture` (2), the number and the true time (s) of the newest
-    exposed frame, is for reports and tests only. `streaming` (1) may stay open: nothing streams then.
+    The instants of an exposure are whole steps of the plant. `newest_capture` (2), the number and the true time (s) of
+    the newest exposed frame, is for reports and tests only. `streaming` (1) may stay open: nothing streams then.
     """
 
     def __init__(
@@ -117,7 +118,8 @@ class DepthStream(LeafSystem):
         n, step = config.exposure_samples, plant_period_s
         spacing = max(1, round(timing.exposure_s / n / step))
         period = max(n * spacing, round(1.0 / timing.fps / step)) * step
-        # before a tick's own update the plant's pictures show its last step, and the first exposure ends after n - 1 spacings
+        # before a tick's own update the plant's pictures show its last step, and the first exposure ends after n - 1
+        # spacings
         self._capture_before_s = 0.5 * (n - 1) * spacing * step + step
         self._streaming = self.DeclareVectorInputPort("streaming", 1)
         self._depth = self.DeclareAbstractInputPort(
@@ -173,7 +175,10 @@ class DepthStream(LeafSystem):
 
 
 def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTransform:
-    """Mount the scanner as a RenderedScanner is, add its stream and its single scans. Returns its true pose in its carrier's frame."""
+    """Mount the scanner as a RenderedScanner is, add its stream and its single scans.
+
+    Returns its true pose in its carrier's frame.
+    """
     if not 1 <= config.exposure_samples <= 16:
         raise InputError(f"scanner.exposure_samples must be from 1 to 16, and it is {config.exposure_samples}.")
     timing, world = config.stream(), build.require(SimulatedWorld)
@@ -192,7 +197,8 @@ def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTra
 
 
 def _add_static_mode(config: StreamingScanner, build: StationBuild, mounted: MountedScanner) -> None:
-    """Add the mode that takes a scan per trigger: the device's own errors are those of the stream, its noise is smaller."""
+    """Add the mode that takes a scan per trigger: the device's own errors are those of the stream, its noise is
+    smaller."""
     own, at_rest = mounted.device.noise, get_scanner(config.static_preset).noise
     kept = ("scale_error", "gradient_per_m", "warp_m", "device")
     noise = dc.replace(at_rest, **{name: getattr(own, name) for name in kept})

@@ -1,4 +1,5 @@
-"""Reads a robot's factory kinematics and joint limits from its primary port, and checks the kinematics against the flange pose."""
+"""Reads a robot's factory kinematics and joint limits from its primary port, and checks the kinematics against the
+flange pose."""
 
 import re
 import struct
@@ -15,7 +16,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.systems.drivers.ur.faults import RobotRefused
 from weldcal.systems.drivers.ur.readiness import operator_actions as actions
-from weldcal.systems.drivers.ur.wire.line import Line
+from weldcal.systems.drivers.ur.wire.line import SocketLine
 
 PRIMARY_PORT = 30001
 # With the right calibration FK agrees with the controller to 10-20 um; without it, to millimetres.
@@ -36,9 +37,9 @@ _EXACT = 1e-9
 class KinematicsInfo:
     """Denavit-Hartenberg numbers (6,) rad and m: link i is RotZ(q_i + theta_i) Tz(d_i) Tx(a_i) RotX(alpha_i).
 
-    `calibrated`: the numbers are a factory calibration of one robot; `checksum` identifies them. Nearly parallel axes make d_2
-    and d_3 hundreds of metres that cancel. Multiply the plain chain, or use `calibrated_arm`, whose link frames lie in the
-    links.
+    `calibrated`: the numbers are a factory calibration of one robot; `checksum` identifies them. Nearly parallel axes
+    make d_2 and d_3 hundreds of metres that cancel. Multiply the plain chain, or use `calibrated_arm`, whose link
+    frames lie in the links.
     """
 
     theta: Array
@@ -67,14 +68,14 @@ def read_kinematics(
 ) -> tuple[KinematicsInfo, JointLimits | None]:
     """Read the kinematics that the controller at `host` computes with, and its joint limits.
 
-    They are in the packages KinematicsInfo and ConfigurationData of the primary port. The limits are None where the controller reports
-    none, or numbers that are no limits.
+    They are in the packages KinematicsInfo and ConfigurationData of the primary port. The limits are None where the
+    controller reports none, or numbers that are no limits.
 
     Raises:
         RobotUnreachable: nothing answers in time, or what answers is not the primary interface.
         RobotRefused: the controller does not report its arm yet, because the arm has no power.
     """
-    with Line(host, port, "Primary Client Interface", timeout_s) as line:
+    with SocketLine(host, port, "Primary Client Interface", timeout_s) as line:
         until = line.deadline()
         while True:
             size, kind = _HEADER.unpack(line.read(_HEADER.size, until))
@@ -87,7 +88,7 @@ def read_kinematics(
                 return _parse(body), _limits(_part(package, _CONFIGURATION, line))
 
 
-def _part(package: bytes, wanted: int, line: Line) -> bytes | None:
+def _part(package: bytes, wanted: int, line: SocketLine) -> bytes | None:
     """The body of one sub-package of a robot state; None where the state does not contain it."""
     at = 0
     while at + _PART.size <= len(package):
@@ -108,8 +109,8 @@ def _parse(body: bytes) -> KinematicsInfo:
         values.setflags(write=False)
     if not np.isfinite([theta, a, d, alpha]).all() or not (np.any(a) and np.any(d)):
         raise RobotRefused(
-            "The controller does not report the arm's kinematics yet: switch the arm on (Initialize at the lower left of "
-            "the pendant, ON) and try again."
+            "The controller does not report the arm's kinematics yet: switch the arm on (Initialize at the lower left"
+            " of the pendant, ON) and try again."
         )
     square = alpha / (np.pi / 2.0)
     exact = max(np.abs(theta).max(), np.abs(square - np.round(square)).max(), abs(d[1]), abs(d[2]), abs(a[0])) < _EXACT
@@ -148,7 +149,8 @@ def limited_arm(arm: ArmModel, limits: JointLimits | None) -> ArmModel:
 
 
 def model_finding(told: str, wanted: str) -> tuple[bool, str, str]:
-    """Whether the controller's name of its arm, such as UR10, fits the scenario's arm; what was found; the operator action."""
+    """Whether the controller's name of its arm, such as UR10, fits the scenario's arm; what was found; the operator
+    action."""
     if not (found := _ROBOT_MODEL.search(told)):
         return True, f"the dashboard says {told!r}; the kinematics tell", ""
     same = found[0].upper() in (CONTROLLER_MODELS[wanted][0], wanted.upper().rstrip("E"))
@@ -170,7 +172,8 @@ def calibrated_arm(nominal: ArmModel, info: KinematicsInfo) -> ArmModel:
         )
     stack = np.tile(np.eye(4), (6, 1, 1))
     for i in range(6):
-        # Tx(a) RotX(alpha) of the previous link, then Tz(d) RotZ(theta) of this one, which commutes with the joint angle
+        # Tx(a) RotX(alpha) of the previous link, then Tz(d) RotZ(theta) of this one, which commutes with the joint
+        # angle
         a, alpha = (info.a[i - 1], info.alpha[i - 1]) if i else (0.0, 0.0)
         before = RigidTransform(RotationMatrix.MakeXRotation(alpha), [a, 0.0, 0.0])
         turn = RigidTransform(RotationMatrix.MakeZRotation(info.theta[i]), [0.0, 0.0, info.d[i]])

@@ -40,15 +40,15 @@ TCP = (
 )
 NO_PAYLOAD = "The controller does not report its payload: update PolyScope to 5.12 or newer."
 MANUAL = (
-    "The robot is in Manual mode, in which the arm moves only while the three-position enabling device is held: tap the mode at "
-    "the upper right of the pendant and choose Automatic."
+    "The robot is in Manual mode, in which the arm moves only while the three-position enabling device is held: tap the"
+    " mode at the upper right of the pendant and choose Automatic."
 )
 SLIDER = (
     "The speed slider is not at 100 %: drag the slider at the bottom of the pendant's screen all the way to the right."
 )
 REGISTERS = (
-    "Input registers are in use by EtherNet/IP, PROFINET or another client: press Disable under Installation > Fieldbus "
-    "> EtherNet/IP and > PROFINET on the pendant, and close every other program that controls this robot."
+    "Input registers are in use by EtherNet/IP, PROFINET or another client: press Disable under Installation > Fieldbus"
+    " > EtherNet/IP and > PROFINET on the pendant, and close every other program that controls this robot."
 )
 NO_REGISTERS = "The controller lacks the input registers that the driver needs: update PolyScope to 5.12 or newer."
 POSE = (
@@ -101,46 +101,49 @@ def safety(safety_mode: int) -> str:
                 f"release it, and {_ON_START}."
             )
     return (
-        f"The safety system reports {SAFETY_MODES.get(safety_mode, safety_mode)}: read the Log tab of the pendant, correct "
-        "the error that it shows, and press Restart Safety in the pop-up."
+        f"The safety system reports {SAFETY_MODES.get(safety_mode, safety_mode)}: read the Log tab of the pendant,"
+        " correct the error that it shows, and press Restart Safety in the pop-up."
     )
 
 
 def outputs(missing: list[str]) -> str:
     """The operator action where a controller of a supported version does not report what each of them reports."""
     return (
-        f"The controller does not report {', '.join(missing)}, which every supported PolyScope reports: restart the control box, and "
-        "connect this computer to it directly, not through a program that passes RTDE on."
+        f"The controller does not report {', '.join(missing)}, which every supported PolyScope reports: restart the"
+        " control box, and connect this computer to it directly, not through a program that passes RTDE on."
     )
 
 
 def payload(owner: str, text: str) -> str:
     """The operator action where the payload is not the expected one."""
     return (
-        f"The payload is not that of {owner}: set {text} under Installation > General > Payload on the pendant and save the "
-        "installation, or give what hangs on the flange as payload_kg and payload_cog_m in the scenario."
+        f"The payload is not that of {owner}: set {text} under Installation > General > Payload on the pendant and save"
+        " the installation, or give what hangs on the flange as payload_kg and payload_cog_m in the scenario."
     )
 
 
 def mounting(wanted: str) -> str:
     """The operator action where the robot is mounted in another way than in the scenario."""
     return (
-        "The robot's mounting is not that of the scenario: set it under Installation > General > Mounting on the pendant, or correct "
-        f"base.rpy_deg in the scenario, by which up is {wanted} in the robot's base."
+        "The robot's mounting is not that of the scenario: set it under Installation > General > Mounting on the"
+        f" pendant, or correct base.rpy_deg in the scenario, by which up is {wanted} in the robot's base."
     )
 
 
 def model(told: str, wanted: str) -> str:
     """The operator action where the controller's arm is another model than the scenario's."""
     return (
-        f"The controller says that its arm is a {told}, and the scenario's is a {wanted}: connect a {wanted}, or write this robot's "
-        "arm in the scenario as arm."
+        f"The controller says that its arm is a {told}, and the scenario's is a {wanted}: connect a {wanted}, or write"
+        " this robot's arm in the scenario as arm."
     )
 
 
 def limits(joint: str) -> str:
     """The operator action where a joint is too near its limit."""
-    return f"The {joint} joint is less than 5 degrees from its limit, or beyond it: turn it back with the Move tab of the pendant."
+    return (
+        f"The {joint} joint is less than 5 degrees from its limit, or beyond it: turn it back with the Move tab of the"
+        " pendant."
+    )
 
 
 def program(state: str, name: str) -> str:

@@ -154,7 +154,8 @@ def preflight(
 
     Args:
         host: name or address of the controller.
-        upper_registers: whether the driver will use the registers from 24 on, which fieldbuses do not use; None: it will.
+        upper_registers: whether the driver will use the registers from 24 on, which fieldbuses do not use; None: it
+            will.
         timeout_s: longest time of each request to the controller.
         nominal: the expected arm; a UR10e where None.
         load: the payload that the job needs; shown and not compared where None.
@@ -183,9 +184,7 @@ def require_ready(report: Preflight) -> None:
 class _Look:
     """Performs the checks, one method each; each stores its result in `_done`."""
 
-    def __init__(
-        self, host: str, timeout_s: float, nominal: ArmModel, load: ExpectedLoad | None, doubles: int
-    ) -> None:  # fmt: skip
+    def __init__(self, host: str, timeout_s: float, nominal: ArmModel, load: ExpectedLoad | None, doubles: int) -> None:
         self._load, self._doubles = load, doubles
         self._host, self._timeout_s, self._nominal = host, timeout_s, nominal
         self._done: dict[str, Check] = {}
@@ -345,7 +344,8 @@ class _Look:
 
     def _check_speed(self) -> None:
         slider, scaling = self._number("target_speed_fraction"), self._number("speed_scaling")
-        # the trajectory limiter's value while no program runs is not documented: it is shown here and checked during motion
+        # the trajectory limiter's value while no program runs is not documented: it is shown here and checked during
+        # motion
         found = f"{100 * slider:.0f} %" + (f" (scaling {100 * scaling:.0f} %)" if scaling < FULL_SPEED else "")
         self._state("speed slider", slider >= FULL_SPEED, found, actions.SLIDER)
 

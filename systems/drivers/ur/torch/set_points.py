@@ -35,7 +35,8 @@ class ArcInputs:
 
 @dataclass
 class Gas:
-    """The gas valve's sequence, s of the controller's time: `before_s` of gas, then the torch, then `after_s` of gas."""
+    """The gas valve's sequence, s of the controller's time: `before_s` of gas, then the torch, then `after_s` of
+    gas."""
 
     before_s: float = 0.0
     after_s: float = 0.0
@@ -43,7 +44,8 @@ class Gas:
     _needed_at: float = float("-inf")
 
     def step(self, now: float, wanted: bool) -> tuple[bool, bool]:
-        """Whether the valve is open, and whether the torch may be on, at `now` while the cell wants the torch or not."""
+        """Whether the valve is open, and whether the torch may be on, at `now` while the cell wants the torch or
+        not."""
         if wanted:
             self._opened_at = now if self._opened_at is None else self._opened_at
             self._needed_at = now
@@ -65,7 +67,8 @@ DOMAINS = 2  # bit of output 0 in analog_io_types; the inputs' come before it
 
 @dc.dataclass
 class AnalogSetPoint:
-    """A set point of the power source at a standard analog output of the controller, and how the power source reads it."""
+    """A set point of the power source at a standard analog output of the controller, and how the power source reads
+    it."""
 
     output: int = 0  # standard analog output, 0 or 1
     unit: str = VOLT  # of the output: V (0 to 10) or mA (4 to 20)
@@ -88,15 +91,16 @@ class AnalogSetPoint:
         share = (self.value - self.at_zero) / (self.at_full - self.at_zero)
         if not 0.0 < share <= 1.0:
             raise InputError(
-                f"robot.{key}.value must be between at_zero ({self.at_zero:g}, which is off) and at_full ({self.at_full:g}), "
-                f"not {self.value:g}."
+                f"robot.{key}.value must be between at_zero ({self.at_zero:g}, which is off) and at_full"
+                f" ({self.at_full:g}), not {self.value:g}."
             )
         return Level(self.output, self.unit == VOLT, share)
 
 
 @dc.dataclass(frozen=True)
 class Level:
-    """A standard analog output, whether its range is 0 to 10 V or 4 to 20 mA, and the share of its range that is wanted."""
+    """A standard analog output, whether its range is 0 to 10 V or 4 to 20 mA, and the share of its range that is
+    wanted."""
 
     output: int
     volts: bool
@@ -110,7 +114,10 @@ class Level:
 
 
 def levels_of(wire_feed: AnalogSetPoint | None, arc_voltage: AnalogSetPoint | None) -> tuple[Level, ...]:
-    """The levels of the set points that are wired. Raises InputError where one cannot be shown, or both are at one output."""
+    """The levels of the set points that are wired.
+
+    Raises InputError where one cannot be shown, or both are at one output.
+    """
     named = {"wire_feed": wire_feed, "arc_voltage": arc_voltage}
     found = tuple(point.level(key) for key, point in named.items() if point is not None)
     if len({level.output for level in found}) < len(found):
@@ -159,7 +166,8 @@ ANALOG = (
 
 
 class OffSwitch:
-    """Turns the torch's output off and its analog outputs (`levels`) to zero; only the guard script turns it on, because it detects a lost client.
+    """Turns the torch's output off and its analog outputs (`levels`) to zero; only the guard script turns it on,
+    because it detects a lost client.
 
     The connection is opened at the start and held, so that turning off takes one small package.
 

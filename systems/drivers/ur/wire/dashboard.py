@@ -1,7 +1,7 @@
 """Client of the PolyScope 5 dashboard: sends one command line and reads one answer, on a new connection each time."""
 
 from weldcal.systems.drivers.ur.faults import RobotUnreachable
-from weldcal.systems.drivers.ur.wire.line import Line
+from weldcal.systems.drivers.ur.wire.line import SocketLine
 
 DASHBOARD_PORT = 29999
 SCRIPT_PORT = 30003
@@ -19,7 +19,7 @@ def ask(host: str, command: str, timeout_s: float = 2.0, port: int = DASHBOARD_P
     Raises:
         RobotUnreachable: no dashboard answers in time (PolyScope X has none).
     """
-    with Line(host, port, "Dashboard Server", timeout_s) as line:
+    with SocketLine(host, port, "Dashboard Server", timeout_s) as line:
         until = line.deadline()
         if not line.read_line(until).startswith("Connected"):
             raise line.nonsense()
@@ -30,8 +30,8 @@ def ask(host: str, command: str, timeout_s: float = 2.0, port: int = DASHBOARD_P
 def stop_program(host: str, timeout_s: float = 2.0) -> str:
     """Stop the running or paused program; returns "Stopped", the controller's refusal, or an empty text.
 
-    After a fault only a stop is safe: `play` would continue with the velocity that the registers still hold. Where there
-    is no dashboard (PolyScope X), the command goes to the script port, which does not answer.
+    After a fault only a stop is safe: `play` would continue with the velocity that the registers still hold. Where
+    there is no dashboard (PolyScope X), the command goes to the script port, which does not answer.
 
     Raises:
         RobotUnreachable: neither port answers in time.
@@ -39,6 +39,6 @@ def stop_program(host: str, timeout_s: float = 2.0) -> str:
     try:
         return ask(host, "stop", timeout_s)
     except RobotUnreachable:
-        with Line(host, SCRIPT_PORT, "Script", timeout_s) as line:
+        with SocketLine(host, SCRIPT_PORT, "Script", timeout_s) as line:
             line.send(b"stop program\n")
         return ""

@@ -14,7 +14,7 @@ from weldcal.systems.drivers.ur.faults import RobotUnreachable
 RELEASE_WAIT_S = 0.3
 
 
-class Line:
+class SocketLine:
     """One connection; each read or write call ends within `timeout_s`, even where data arrive byte by byte.
 
     Raises (all methods):
@@ -40,7 +40,7 @@ class Line:
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def __enter__(self) -> Line:
+    def __enter__(self) -> SocketLine:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -110,8 +110,8 @@ class Line:
 
     def _lost(self, what: str) -> RobotUnreachable:
         return RobotUnreachable(
-            f"{self._host} accepts a connection on its {self._service} port {self._port} but {what}: check that this is "
-            "the robot's address, and restart the control box if it is."
+            f"{self._host} accepts a connection on its {self._service} port {self._port} but {what}: check that this is"
+            " the robot's address, and restart the control box if it is."
         )
 
     def close(self) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from types import TracebackType
 
 from weldcal.systems.drivers.ur.faults import Fault, RobotUnreachable, reported_as, sentence
-from weldcal.systems.drivers.ur.wire.line import Line
+from weldcal.systems.drivers.ur.wire.line import SocketLine
 
 RTDE_PORT = 30004
 IN_USE, NOT_FOUND = "IN_USE", "NOT_FOUND"
@@ -54,7 +54,7 @@ class RtdeProbe:
     """
 
     def __init__(self, host: str, timeout_s: float = 2.0, port: int = RTDE_PORT) -> None:
-        self._line = Line(host, port, "RTDE", timeout_s)
+        self._line = SocketLine(host, port, "RTDE", timeout_s)
         try:
             (accepted,) = self._unpack(">?", self._request(_PROTOCOL, struct.pack(">H", PROTOCOL_VERSION)))
             if not accepted:
@@ -140,7 +140,8 @@ class RtdeProbe:
         return self._line.release()
 
     def grant(self, names: Sequence[str]) -> int | None:
-        """Claim these inputs for `write`, and start; returns the recipe's number, or None where one of them is not free."""
+        """Claim these inputs for `write`, and start; returns the recipe's number, or None where one of them is not
+        free."""
         payload = self._request(_INPUTS, ",".join(names).encode())
         if {IN_USE, NOT_FOUND} & set(self._types(payload, len(names))):
             return None

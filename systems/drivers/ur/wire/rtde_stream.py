@@ -1,4 +1,5 @@
-"""The stream of packages between the worker and the controller: the newest outputs are read, the command registers written.
+"""The stream of packages between the worker and the controller: the newest outputs are read, the command registers
+written.
 
 One connection, no thread: the worker's loop reads what has arrived. Packages as in `rtde_client`.
 """
@@ -21,11 +22,12 @@ HEADER = struct.Struct(">HB")
 
 
 class RtdeStream:
-    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed; without `inputs` it
-    only reads.
+    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed; without `inputs`
+    it only reads.
 
     Raises:
-        RobotUnreachable: nothing answers, or not as RTDE does. RobotRefused: the inputs are taken, or an output is unknown.
+        RobotUnreachable: nothing answers, or not as RTDE does. RobotRefused: the inputs are taken, or an output is
+            unknown.
     """
 
     def __init__(self, host: str, outputs: Sequence[str], inputs: Sequence[str]) -> None:
@@ -57,11 +59,17 @@ class RtdeStream:
         self.not_finite = ""  # an output of the newest package that was dropped because it is not a finite number
 
     def poll(self) -> None:
-        """Read all packages that have arrived; the newest finite one counts. `connected` shows whether the connection has ended."""
+        """Read all packages that have arrived; the newest finite one counts.
+
+        `connected` shows whether the connection has ended.
+        """
         self.packages()
 
     def packages(self) -> list[tuple[float, ...]]:
-        """Every package since the last call, oldest first: the recipe's number, then the outputs' numbers in order. See poll."""
+        """Every package since the last call, oldest first: the recipe's number, then the outputs' numbers in order.
+
+        See poll.
+        """
         found = [package for at in self._arrived() if (package := self._finite(at)) is not None]
         self._newest = found[-1] if found else self._newest
         del self._inbox[: self._read]

@@ -9,7 +9,7 @@ from typing import Protocol
 from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET
 from weldcal.systems.drivers.ur.torch.set_points import ANALOG, MASK, VALUE, Level, OffSwitch
 from weldcal.systems.drivers.ur.wire.dashboard import SCRIPT_PORT
-from weldcal.systems.drivers.ur.wire.line import Line
+from weldcal.systems.drivers.ur.wire.line import SocketLine
 from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, RtdeProbe
 from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream
 
@@ -20,7 +20,8 @@ READY, DONE = 1, 2
 PLAYING = 2
 LINE_LIMIT_S = 2.0
 LOOK_S = 0.01
-# On two cores jobs over ur_rtde had 115 of 50,702 velocities over 8 ms late, natively 6 of 50,376 (docs/hardware.md); three were not tried.
+# On two cores jobs over ur_rtde had 115 of 50,702 velocities over 8 ms late, natively 6 of 50,376 (docs/hardware.md);
+# three were not tried.
 ENOUGH_CORES = 4
 
 
@@ -87,7 +88,7 @@ class NativeTransport(RtdeStream):
 
     def upload(self, script: str, started: Callable[[], bool], until: float) -> bool:
         """See Transport."""
-        with Line(self._host, SCRIPT_PORT, "Script", LINE_LIMIT_S) as line:
+        with SocketLine(self._host, SCRIPT_PORT, "Script", LINE_LIMIT_S) as line:
             line.send(script.encode())
             # the connection stays open until the program runs: to close one with unread data would reset it
             while time.monotonic() < until:
@@ -119,13 +120,19 @@ LIMITS: tuple[tuple[Callable[[Situation], bool], str], ...] = (
     (lambda s: not s.installed, "ur-rtde is not installed; it has no wheel for Python 3.13"),
     (lambda s: s.own_time, "an emulated controller with a time of its own is only timed with the native transport"),
     (lambda s: s.version >= (10,), "ur_rtde cannot stop a program of PolyScope X, which has no dashboard"),
-    (lambda s: s.set_points, "ur_rtde neither writes the registers of the set points nor reads the ranges of the analog outputs"),
+    (
+        lambda s: s.set_points,
+        "ur_rtde neither writes the registers of the set points nor reads the ranges of the analog outputs",
+    ),
     (lambda s: bool(s.taken), "ur_rtde also claims inputs that are not free"),
-)  # fmt: skip
+)
 
 
 def choose(wanted: str, found: Situation) -> tuple[str, str]:
-    """The transport, and why in a sentence. For `ur_rtde` that is wanted where it cannot be used, the first is `native`."""
+    """The transport, and why in a sentence.
+
+    For `ur_rtde` that is wanted where it cannot be used, the first is `native`.
+    """
     why = next((reason for holds, reason in LIMITS if holds(found)), "")
     if wanted == NATIVE:
         return NATIVE, "Transport native: the scenario asks for it."

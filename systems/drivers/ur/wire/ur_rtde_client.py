@@ -1,7 +1,7 @@
 """The transport that uses the client library ur_rtde, with the guard as its control script. Only the worker imports it.
 
-Its constructors hold the interpreter's lock, it connects again by itself, and it may crash after a lost connection: the worker
-leaves at the first sign of one, and the guard obeys a number once only.
+Its constructors hold the interpreter's lock, it connects again by itself, and it may crash after a lost connection: the
+worker leaves at the first sign of one, and the guard obeys a number once only.
 """
 
 import contextlib
@@ -140,7 +140,8 @@ class UrRtdeTransport:
             self._control.setCustomScriptFile(file.name)
             while time.monotonic() < until:
                 self.wait(transport.LOOK_S)
-                # its control interface has a connection of its own, and gives no command before it has seen the program run
+                # its control interface has a connection of its own, and gives no command before it has seen the program
+                # run
                 if started() and self._control.isProgramRunning():
                     return True
         return False
@@ -158,7 +159,10 @@ class UrRtdeTransport:
 
 
 class UrRtdeSwitch:
-    """See Switch. A lost connection makes ur_rtde connect again for as long as it takes: that must not hold the worker."""
+    """See Switch.
+
+    A lost connection makes ur_rtde connect again for as long as it takes: that must not hold the worker.
+    """
 
     def __init__(self, io: RTDEIOInterface, output: int, gas: int | None) -> None:
         self._io, self._output, self._gas = io, output, gas
@@ -181,8 +185,8 @@ class UrRtdeSwitch:
 def send_at_once(port: int) -> int:
     """Turn Nagle's algorithm off on this process's connections to a port; returns on how many it was on.
 
-    ur_rtde sets the option before it connects, which opens another socket. Without it a command waits up to 40 ms for the
-    controller's next package, which is long where states are lost.
+    ur_rtde sets the option before it connects, which opens another socket. Without it a command waits up to 40 ms for
+    the controller's next package, which is long where states are lost.
     """
     changed = 0
     for name in os.listdir("/proc/self/fd"):

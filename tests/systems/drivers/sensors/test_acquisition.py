@@ -12,14 +12,7 @@ import numpy as np
 import pytest
 
 from tests.systems.drivers.sensors.scripted import Scripted, wait_until
-from weldcal.systems.drivers.sensors.acquisition import (
-    Acquisition,
-    Delivery,
-    DeviceFault,
-    DeviceLost,
-    Garbage,
-    Rules,
-)
+from weldcal.systems.drivers.sensors.acquisition import Acquisition, Delivery, DeviceFault, DeviceLost, Garbage, Rules
 
 CAMERA = Rules(silent_s=0.1, frozen_s=0.1, late_s=0.3, lost_s=0.1)
 

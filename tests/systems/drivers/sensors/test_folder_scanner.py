@@ -1,4 +1,5 @@
-"""Clouds that another program drops into a folder: whole ones only, those that were asked for, with the time they were taken."""
+"""Clouds that another program drops into a folder: whole ones only, those that were asked for, with the time they were
+taken."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from weldcal.systems.drivers.sensors.genicam.device import Component
 from weldcal.systems.drivers.sensors.genicam.finger_camera import GenicamFingerCamera
 from weldcal.systems.drivers.sensors.genicam.profiler import GenicamProfiler, GenicamProfiles
 from weldcal.systems.drivers.sensors.genicam.scanner import GenicamClouds, GenicamScanner
-from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.wired_camera import acquire_pictures
 from weldcal.systems.drivers.sensors.wired_profiler import acquire_profiles
 from weldcal.systems.drivers.sensors.wired_scanner import acquire
@@ -161,7 +161,7 @@ def test_a_library_that_crashes_is_a_lost_device_and_the_next_process_opens_it_a
     keys = {"producer": producer(), "device": "0", "settings": BOTH, "preset": "ideal", "streams": True}
     config = GenicamScanner(**keys)  # type: ignore[arg-type]
     source = config.source()
-    assert isinstance(source, OwnProcess)
+    assert isinstance(source, SourceProcess)
     acquisition = acquire(config, source)
     running = start(acquisition, True)
     assert source._process is not None

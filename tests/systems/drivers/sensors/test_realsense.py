@@ -1,4 +1,5 @@
-"""RealSense through its real library: a software device takes depth pictures of a flange and gives them back as points."""
+"""RealSense through its real library: a software device takes depth pictures of a flange and gives them back as
+points."""
 
 from __future__ import annotations
 

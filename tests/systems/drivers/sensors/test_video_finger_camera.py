@@ -1,4 +1,5 @@
-"""Pictures over HTTP and from a file: each with the time it was taken, and every way in which a camera fails is named."""
+"""Pictures over HTTP and from a file: each with the time it was taken, and every way in which a camera fails is
+named."""
 
 from __future__ import annotations
 

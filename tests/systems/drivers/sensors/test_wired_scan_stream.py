@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from weldcal.systems.drivers.sensors.acquisition import Acquisition, Frame
+from weldcal.systems.drivers.sensors.acquisition import AcquiredFrame, Acquisition
 from weldcal.systems.drivers.sensors.cell_time import HostTime
 from weldcal.systems.drivers.sensors.stamps import Stamp
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanStream
@@ -29,15 +29,15 @@ class Host:
         self.now += seconds
 
 
-def frame(number: int, captured: float) -> Frame[Any]:
+def frame(number: int, captured: float) -> AcquiredFrame[Any]:
     """A frame that the device has taken at this time of the host."""
     stamp = Stamp(captured, "host")
-    return Frame(
+    return AcquiredFrame(
         number=number, datum=CLOUD, arrived=captured + DELAY_S, stamp=stamp, device_time=DEVICE_0_S + captured - 50.0
     )
 
 
-def device_times(clock: WallClock | None, frames: list[Frame[Any]]) -> list[float | None]:
+def device_times(clock: WallClock | None, frames: list[AcquiredFrame[Any]]) -> list[float | None]:
     source = SimpleNamespace(frames=lambda: tuple(frames), time=HostTime())
     stream = WiredScanStream(cast("Acquisition[Any]", source), clock)
     simulator = Simulator(stream)

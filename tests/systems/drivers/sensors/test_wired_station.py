@@ -1,4 +1,5 @@
-"""A cell whose scanner is a folder: the same result as with the scanner in the Diagram, and a lost device holds the job by name."""
+"""A cell whose scanner is a folder: the same result as with the scanner in the Diagram, and a lost device holds the job
+by name."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.compliance import Compliance, Nominal
-from weldcal.tools.emulators.ur.controller.motions import REST_RAD_S, STEP_S, Motion, MotionRefused, slowed
+from weldcal.tools.emulators.ur.controller.motions import REST_RAD_S, STEP_S, ControllerMotion, MotionRefused, slowed
 from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, rotation_vector
 
 # [M] how the arm slows when its program stops, pauses, or a safety function acts
@@ -31,7 +31,7 @@ class EmulatedArm:
         self.qd_target, self.qdd_target, self.qd = np.zeros(6), np.zeros(6), np.zeros(6)
         self.X_FT = np.eye(4)
         self.p_FT = np.zeros(3)
-        self.motion: Motion | None = None
+        self.motion: ControllerMotion | None = None
         self.compliance: Compliance | None = None
         self.touch: Callable[[], Array] = lambda: np.zeros(6)
         self.lag_s = 0.0

@@ -1,7 +1,8 @@
-"""Force mode and freedrive: a deviation from the commanded motion that forces on the tool drive [M]; and what touches the tool.
+"""Force mode and freedrive: a deviation from the commanded motion that forces on the tool drive [M]; and what touches
+the tool.
 
-The arm that the motions see is `nominal`; the real one is it, moved by a deviation along and about the task frame's axes.
-The deviation's speed is (force asked for + force felt) / DAMPING, up to the axis' limit.
+The arm that the motions see is `nominal`; the real one is it, moved by a deviation along and about the task frame's
+axes. The deviation's speed is (force asked for + force felt) / DAMPING, up to the axis' limit.
 """
 
 from dataclasses import dataclass, field
@@ -36,7 +37,8 @@ class Nominal:
 
 @dataclass
 class Task:
-    """What force_mode was asked for: frame as a matrix in the base, 1 where compliant, [f; t] to press with, type, limits."""
+    """What force_mode was asked for: frame as a matrix in the base, 1 where compliant, [f; t] to press with, type,
+    limits."""
 
     frame: Array
     selection: Array
@@ -95,7 +97,8 @@ def free_task(frame: list[float], free_axes: Array) -> Task:
 
 
 def _axes(task: Task, p: Array, v: Array) -> Array:
-    """Axes (3, 3) of the task frame in the base: type 1 turns y towards the frame's origin, type 3 x along the motion."""
+    """Axes (3, 3) of the task frame in the base: type 1 turns y towards the frame's origin, type 3 x along the
+    motion."""
     R = task.frame[:3, :3]
     if task.kind == 1:
         y = task.frame[:3, 3] - p
@@ -116,7 +119,7 @@ def _axes(task: Task, p: Array, v: Array) -> Array:
 
 
 @dataclass
-class Surroundings:
+class ElasticContact:
     """An elastic half-space and a hand; wrenches are [f; t] on the tool centre point in base axes (N, N m)."""
 
     point: Array = field(default_factory=lambda: np.zeros(3))

@@ -38,7 +38,7 @@ class ArmState(Protocol):
     p_FT: Array
 
 
-class Motion(Protocol):
+class ControllerMotion(Protocol):
     """A motion under way."""
 
     streamed: bool

@@ -52,7 +52,8 @@ class Terminals:
         self.digital_outputs = 0
         # of standard outputs: what set_runstate_standard_digital_output_to_value chose
         self.runstate: dict[int, int] = {}
-        # outputs that somebody else than the program writes in every frame (Modbus, a PLC): level, and until which frame
+        # outputs that somebody else than the program writes in every frame (Modbus, a PLC): level, and until which
+        # frame
         self.foreign: dict[int, tuple[bool, int]] = {}
         self.analog_outputs = [0.0, 0.0]  # shares of their ranges
         self.analog_output_types = 0  # a bit for each: 0 is 4 to 20 mA, 1 is 0 to 10 V

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
-from weldcal.tools.emulators.ur.controller.compliance import ForceSensor, Surroundings
+from weldcal.tools.emulators.ur.controller.compliance import ElasticContact, ForceSensor
 from weldcal.tools.emulators.ur.controller.events import ErrorCode, Event, SafetyChanged
 from weldcal.tools.emulators.ur.controller.modes import MOVING, POWERLESS, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
@@ -31,7 +31,7 @@ class ControllerState:
         self.arm = EmulatedArm(model, q)
         self.arm.touch = self.touch
         self.inputs, self.outputs, self.terminals = Registers(), Registers(), Terminals()
-        self.surroundings, self.sensor = Surroundings(), ForceSensor()
+        self.surroundings, self.sensor = ElasticContact(), ForceSensor()
         self.force_gain_scaling = 1.0
         self.gravity = [0.0, 0.0, 9.82]
         self.random = np.random.default_rng(0)  # of the script's random(): the same row after every start
@@ -151,7 +151,8 @@ class ControllerState:
         self.arm.set_tcp(self.tcp_offset)
 
     def touch(self) -> Array:
-        """The wrench on the tool centre point in base axes, as the surroundings make it, or a client's sensor says it."""
+        """The wrench on the tool centre point in base axes, as the surroundings make it, or a client's sensor says
+        it."""
         if self.sensor.external:
             X = self.arm.flange(self.arm.q)[:3, :3]
             return np.concatenate([X @ self.sensor.written[:3], X @ self.sensor.written[3:]])

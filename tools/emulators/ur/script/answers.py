@@ -71,7 +71,8 @@ CALCULATIONS: dict[str, Callable[..., Any]] = {
     "pose_dist": lambda pose_from, pose_to: math.dist(pose_from[:3], pose_to[:3]),
     "point_dist": lambda p_from, p_to: math.dist(p_from[:3], p_to[:3]),
     "norm": lambda a: math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a)),
-    "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(min(l, 64))],  # noqa: E741  (URScript's own name)
+    # l is URScript's own name.
+    "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(min(l, 64))],  # noqa: E741
     "d2r": lambda d: math.radians(d),
     "r2d": lambda r: math.degrees(r),
     "pow": math.pow,

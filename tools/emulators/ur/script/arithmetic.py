@@ -1,6 +1,7 @@
 """URScript's operators on values: numbers, lists, matrices and structs, as the compiled program calls them.
 
-Values are bounded, since a program may not take the emulator's memory or time: see LARGEST, MOST_PARTS, DEEPEST and EFFORT.
+Values are bounded, since a program may not take the emulator's memory or time: see LARGEST, MOST_PARTS, DEEPEST and
+EFFORT.
 """
 
 import math

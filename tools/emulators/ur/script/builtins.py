@@ -1,7 +1,7 @@
 """URScript functions of the controller, as far as the client's script and a guard script call them.
 
-Motions and the reads of sockets are generators that take frames; all other functions answer at once. What the emulator has no
-physics for (friction, conveyors) is accepted and noted in the log.
+Motions and the reads of sockets are generators that take frames; all other functions answer at once. What the emulator
+has no physics for (friction, conveyors) is accepted and noted in the log.
 """
 
 import math

@@ -17,7 +17,7 @@ _OPERATORS = {"+": "added", "-": "subtracted", "*": "multiplied", "/": "divided"
 _LOGICAL = ("not", "and", "or", "xor")
 _BOOLEAN = (*_LOGICAL, "==", "!=", "<", "<=", ">", ">=")
 _HELPERS = ("Pose", "copied", "listed", "item", "place", "truth", "negated", "number", "method")
-_SHARED = syntax.Name | syntax.Index | syntax.Call | syntax.Method  # values that somebody else may hold
+_SHARED = syntax.Name | syntax.Index | syntax.CallExpression | syntax.Method  # values that somebody else may hold
 _SPEND = f"spend({arithmetic.LOOP_EFFORT})"
 Slices = Generator[None, None, Any]
 
@@ -153,7 +153,7 @@ class _Emitter:
                 self.emit(depth, f"while {self._truth(condition)}:")
                 self.emit(depth + 1, _SPEND)
                 self._body(body, depth + 1)
-            case syntax.Command():
+            case syntax.ControlStatement():
                 self._command(statement, depth)
 
     def _assign(self, statement: syntax.Assign, depth: int) -> None:
@@ -170,7 +170,7 @@ class _Emitter:
         indices = "".join(f"{self.value(index)}, " for index in statement.indices)
         self.emit(depth, f"place(v_{statement.name}, ({indices}), {value})")
 
-    def _command(self, statement: syntax.Command, depth: int) -> None:
+    def _command(self, statement: syntax.ControlStatement, depth: int) -> None:
         value = self.value(statement.value) if statement.value is not None else ""
         match statement.word:
             case "halt":
@@ -199,7 +199,7 @@ class _Emitter:
                 return f"Pose({listed})" if pose else listed
             case syntax.Index(target=target, index=index):
                 return f"item({self.value(target)}, {self.value(index)})"
-            case syntax.Call():
+            case syntax.CallExpression():
                 return self._call(expression)
             case syntax.Method(target=target, name=name, arguments=arguments):
                 indices: list[str] = []
@@ -214,7 +214,8 @@ class _Emitter:
                 return self._operation(operator, [self.value(operand) for operand in operands])
 
     def _truth(self, expression: Expression) -> str:
-        """The expression as a condition; what can only be True or False is not asked what it is, a hundred times a frame."""
+        """The expression as a condition; what can only be True or False is not asked what it is, a hundred times a
+        frame."""
         value = self.value(expression)
         boolean = isinstance(expression, syntax.Operation) and expression.operator in _BOOLEAN
         return value if boolean else f"truth({value})"
@@ -232,7 +233,7 @@ class _Emitter:
             return f"{_OPERATORS[operator]}({left}, {right})"
         return f"({left} {operator} {right})"
 
-    def _call(self, call: syntax.Call) -> str:
+    def _call(self, call: syntax.CallExpression) -> str:
         if call.name in self._routines:
             arguments = [self._own(argument) for argument in call.arguments]
             arguments += [f"v_{key}={self._own(value)}" for key, value in call.keywords]

@@ -8,9 +8,9 @@ import numpy as np
 from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.motions import (
     STEP_S,
+    ControllerMotion,
     JointTorque,
     JointVelocity,
-    Motion,
     Servo,
     Stop,
     ToolVelocity,
@@ -137,7 +137,7 @@ class Motions(Sockets):
         arm = self._controller.arm
         return np.asarray(arm.flange(arm.commanded.q_target) @ arm.X_FT, dtype=np.float64)
 
-    def _drive(self, motion: Motion | None, t: float = 0.0) -> Slices:
+    def _drive(self, motion: ControllerMotion | None, t: float = 0.0) -> Slices:
         """Holds the arm until the motion is done, or for t seconds of the program where that is given.
 
         The speed slider stretches these seconds: with it UR's own test follows a spline sent as steps of speedj.

@@ -135,13 +135,13 @@ class _Parser:
             if self.at("("):
                 self.take()
                 self.expect(")")
-            return syntax.Command(line, word)
+            return syntax.ControlStatement(line, word)
         if self.at("kill", "join"):
-            return syntax.Command(line, self.take().text, self.expression())
+            return syntax.ControlStatement(line, self.take().text, self.expression())
         if self.at("return"):
             self.take()
             nothing = self.token.kind in ("newline", "end") or self.at("end", "else", "elif")
-            return syntax.Command(line, "return", None if nothing else self.expression())
+            return syntax.ControlStatement(line, "return", None if nothing else self.expression())
         scope = self.take().text if self.at("global", "local") else ""
         target = self.expression()
         if self.at("="):
@@ -233,7 +233,7 @@ class _Parser:
             return syntax.Items(self.items("]"), pose=False)
         if token.text == "run":
             call = self.primary()
-            if not isinstance(call, syntax.Call):
+            if not isinstance(call, syntax.CallExpression):
                 raise self.error("what follows run")
             return dataclasses.replace(call, run=True)
         if token.kind == "word":
@@ -255,7 +255,7 @@ class _Parser:
             return syntax.Items(items, pose=True)
         return syntax.Name(token.text)
 
-    def call(self, name: Token) -> syntax.Call:
+    def call(self, name: Token) -> syntax.CallExpression:
         self.expect("(")
         arguments: list[Expression] = []
         keywords: list[tuple[str, Expression]] = []
@@ -274,7 +274,7 @@ class _Parser:
                 arguments.append(self.expression())
 
         self.listed(")", take_one)
-        return syntax.Call(name.text, tuple(arguments), tuple(keywords), line=name.line, column=name.column)
+        return syntax.CallExpression(name.text, tuple(arguments), tuple(keywords), line=name.line, column=name.column)
 
     def items(self, closing: str) -> tuple[Expression, ...]:
         found: list[Expression] = []

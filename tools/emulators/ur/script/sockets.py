@@ -159,7 +159,10 @@ class Sockets(Forces):
         return opened is not None and opened.send(data)
 
     def _read(self, name: str, timeout: float, whole: Callable[[bytearray], int]) -> Slices:
-        """What `whole` says is complete, taken off the inbox; nothing when the time is up. A timeout of 0 waits for ever."""
+        """What `whole` says is complete, taken off the inbox; nothing when the time is up.
+
+        A timeout of 0 waits for ever.
+        """
         opened = self._program.sockets.get(name)
         if opened is None:
             raise ScriptError(f"The socket {name!r} is not open.")
@@ -171,7 +174,8 @@ class Sockets(Forces):
                 data = bytes(opened.inbox[:length])
                 del opened.inbox[:length]
                 if 2 * Effort.left < EFFORT:
-                    yield  # a client that sends faster than its program reads costs the program frames, and does not end it
+                    # a client that sends faster than its program reads costs the program frames, and does not end it
+                    yield
                 return data
             if timeout > 0.0 and frames * STEP_S >= timeout:
                 return b""

@@ -43,7 +43,7 @@ class Items:
 
 
 @dataclass(frozen=True)
-class Call:
+class CallExpression:
     """name(a, b, key=c); `run` is set where the call starts a thread."""
 
     name: str
@@ -79,7 +79,7 @@ class Operation:
     operands: tuple[Expression, ...]
 
 
-Expression = Literal | Name | Items | Call | Method | Index | Operation
+Expression = Literal | Name | Items | CallExpression | Method | Index | Operation
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Loop:
 
 
 @dataclass(frozen=True)
-class Command:
+class ControlStatement:
     """return, break, continue, halt, pass, kill, join, enter_critical or exit_critical, with what it applies to."""
 
     line: int
@@ -128,7 +128,7 @@ class Command:
     value: Expression | None = None
 
 
-Statement = Assign | Evaluate | Conditional | Loop | Command
+Statement = Assign | Evaluate | Conditional | Loop | ControlStatement
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.checker import Checker
-from weldcal.tools.emulators.ur.controller.compliance import ForceSensor, Surroundings
+from weldcal.tools.emulators.ur.controller.compliance import ElasticContact, ForceSensor
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
@@ -23,7 +23,7 @@ Request = Mapping[str, Any]
 LARGEST = 1e9  # of the numbers that a request may hold
 
 
-class World:
+class LoopWorld:
     """What the loop itself needs to know: how long it stands still, is unplugged, jitters, and when it ends."""
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class ControlServer(Server):
         external: ExternalControl,
         checker: Checker,
         lockstep: Lockstep,
-        world: World,
+        world: LoopWorld,
         more_faults: Mapping[str, Callable[[Request, float], None]] | None = None,
     ) -> None:
         self._controller, self._network, self._external = controller, network, external
@@ -167,7 +167,8 @@ class ControlServer(Server):
             if request.get(kind) in questions:
                 return questions[request[kind]](request)
         raise InputError(
-            "Send fault, do, check (at_rest_after, output_after, output_on_after, summary) or ask (state, log, program, connections)."
+            "Send fault, do, check (at_rest_after, output_after, output_on_after, summary) or ask (state, log, program,"
+            " connections)."
         )
 
     def _links(self, request: Request) -> list[Connection]:
@@ -231,7 +232,7 @@ class ControlServer(Server):
         c.terminals.foreign.clear()
         c.terminals.analog_foreign.clear()
         c.terminals.digital_inputs = 0
-        c.surroundings, c.sensor = Surroundings(), ForceSensor()
+        c.surroundings, c.sensor = ElasticContact(), ForceSensor()
 
     def _close(self, request: Request, *, reset: bool) -> None:
         for connection in self._links(request):

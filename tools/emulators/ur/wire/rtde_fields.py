@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from weldcal.models.arms.kinematics import link_frames
@@ -91,8 +92,9 @@ def _register_outputs(direction: str) -> dict[str, Output]:
     for i in range(64, N_BITS):
         fields[f"{direction}_bit_register_{i}"] = Output("BOOL", lambda c, i=i: bank(c).bits[i])  # type: ignore[misc]
     for i in range(N_NUMBERS):
-        fields[f"{direction}_int_register_{i}"] = Output("INT32", lambda c, i=i: bank(c).integers[i])  # type: ignore[misc]
-        fields[f"{direction}_double_register_{i}"] = Output("DOUBLE", lambda c, i=i: bank(c).doubles[i])  # type: ignore[misc]
+        of_int, of_double = f"{direction}_int_register_{i}", f"{direction}_double_register_{i}"
+        fields[of_int] = Output("INT32", lambda c, i=i: bank(c).integers[i])  # type: ignore[misc]
+        fields[of_double] = Output("DOUBLE", lambda c, i=i: bank(c).doubles[i])  # type: ignore[misc]
     return fields
 
 
@@ -181,6 +183,10 @@ _SCALARS: dict[str, dict[str, Getter]] = {
 }
 
 
+def _set(bank: str, i: int, c: Controller, value: Any) -> None:
+    getattr(c.inputs, bank)[i] = value
+
+
 def inputs() -> dict[str, Input]:
     """All plain input fields; the masked ones (terminals, slider) are applied together by `apply_masked`."""
     fields = {
@@ -189,10 +195,10 @@ def inputs() -> dict[str, Input]:
         "external_force_torque": Input("VECTOR6D", _set_wrench),
     }
     for i in range(64, N_BITS):
-        fields[f"input_bit_register_{i}"] = Input("BOOL", lambda c, v, i=i: c.inputs.bits.__setitem__(i, v))  # type: ignore[misc]
+        fields[f"input_bit_register_{i}"] = Input("BOOL", partial(_set, "bits", i))
     for i in range(N_NUMBERS):
-        fields[f"input_int_register_{i}"] = Input("INT32", lambda c, v, i=i: c.inputs.integers.__setitem__(i, v))  # type: ignore[misc]
-        fields[f"input_double_register_{i}"] = Input("DOUBLE", lambda c, v, i=i: c.inputs.doubles.__setitem__(i, v))  # type: ignore[misc]
+        fields[f"input_int_register_{i}"] = Input("INT32", partial(_set, "integers", i))
+        fields[f"input_double_register_{i}"] = Input("DOUBLE", partial(_set, "doubles", i))
     for name, kind in MASKED.items():
         fields[name] = Input(kind, _nothing)
     return fields

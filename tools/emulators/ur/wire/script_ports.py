@@ -172,7 +172,8 @@ class ExternalControl(Server):
     """External Control node of a program on the pendant: fetches its URScript from a client on play, one at a time.
 
     This is the only way in on PolyScope X before 10.10, where ur_rtde neither opens the script port nor uploads. As the
-    URCap does, it connects to the client's script sender, asks `request_program`, and takes what comes until 0.1 s of silence.
+    URCap does, it connects to the client's script sender, asks `request_program`, and takes what comes until 0.1 s of
+    silence.
     """
 
     kind = "external_control"
@@ -212,7 +213,8 @@ class ExternalControl(Server):
 
 
 def kinematics_info(model: ArmModel) -> bytes:
-    """The body of KinematicsInfo: six checksums, theta, a, d, alpha of the chain in use, and whether it is calibrated."""
+    """The body of KinematicsInfo: six checksums, theta, a, d, alpha of the chain in use, and whether it is
+    calibrated."""
     dh = dh_parameters(model)
     numbers = [*dh.theta, *dh.a, *dh.d, *dh.alpha]
     packed = struct.pack(">24d", *numbers)

@@ -34,7 +34,8 @@ from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.console import Progress
 
 ICP_POINTS = 2_500
-"""Points of a face that the repeated registrations use, of some 12 000: they differ by less than what they cannot see."""
+"""Points of a face that the repeated registrations use, of some 12 000: they differ by less than what they cannot
+see."""
 METHODS = {
     "algorithm1": "Alg. 1, circles, point-to-point",
     "compensated": "the same, compensated (Eq. 21)",
@@ -49,8 +50,8 @@ RUNS_OF_ALGORITHM1 = ("algorithm1", "plane", "edges")
 
 @dataclass(frozen=True, eq=False)
 class CircleRow:
-    """The circle of one cloud: 3-D rms (m) of the published centre over seeds, its offset (3,) m in R from the edges' centre,
-    and how far apart the centres from the two random halves of the cloud are, both methods (m)."""
+    """The circle of one cloud: 3-D rms (m) of the published centre over seeds, its offset (3,) m in R from the edges'
+    centre, and how far apart the centres from the two random halves of the cloud are, both methods (m)."""
 
     id: str
     repeat_m: float
@@ -61,8 +62,8 @@ class CircleRow:
 
 @dataclass(frozen=True, eq=False)
 class SightRow:
-    """A kind of registration against a good calibration: ``value`` (6,) it reports (rad, m, at the flange centre), ``share`` (6,) of
-    a known error it shows, the components it names blind."""
+    """A kind of registration against a good calibration: ``value`` (6,) it reports (rad, m, at the flange centre),
+    ``share`` (6,) of a known error it shows, the components it names blind."""
 
     title: str
     value: Array
@@ -72,8 +73,8 @@ class SightRow:
 
 @dataclass(frozen=True, eq=False)
 class SplitRow:
-    """One way to calibrate, over all splits: errors (m) on held-out scans, and what it reports itself, by split (NaN: no
-    figure of its own)."""
+    """One way to calibrate, over all splits: errors (m) on held-out scans, and what it reports itself, by split (NaN:
+    no figure of its own)."""
 
     name: str
     held_out: Array
@@ -82,9 +83,12 @@ class SplitRow:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CloudsOutcome:
-    """A folder of scans. ``table1_camera``, ``table1_flange`` (n, 6): e_icp of the all-circles H with each scan as the
-    verification, at the camera (roll, pitch, yaw, x, y, z) and at the flange; ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11)
-    and ``path_true`` (orders, steps) m, the median error on scans outside its pool at that step."""
+    """A folder of scans.
+
+    ``table1_camera``, ``table1_flange`` (n, 6): e_icp of the all-circles H with each scan as the verification, at the
+    camera (roll, pitch, yaw, x, y, z) and at the flange; ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11) and
+    ``path_true`` (orders, steps) m, the median error on scans outside its pool at that step.
+    """
 
     name: str
     title: str
@@ -117,7 +121,8 @@ class CloudsOutcome:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Material:
-    """What both methods see of one folder: our observations and the published circles of the same scans, and the CAD."""
+    """What both methods see of one folder: our observations and the published circles of the same scans, and the
+    CAD."""
 
     data: Dataset
     standard: FlangeStandard
@@ -155,9 +160,9 @@ def study_clouds(
     progress: Progress,
     circles: int | None = None,
 ) -> CloudsOutcome:
-    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on held-out
-    scans, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than ten show a
-    flange to both methods."""
+    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on
+    held-out scans, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than
+    ten show a flange to both methods."""
     progress("circles and edges", 0.0)
     material = read_material(data, standard, seed)
     ids = [o.id for o in material.circles]
@@ -227,8 +232,8 @@ def read_material(data: Dataset, standard: FlangeStandard, seed: int) -> Materia
 def split_once(material: Material, fit: list[str], seed: int) -> Mapping[str, tuple[Array, float]]:
     """Every method of METHODS on the scans ``fit``: errors (m) on all others, at our centres, and its own figure (m).
 
-    Scored on weldcal's centres for all: they repeat to a fiftieth of what is judged. The scans that Algorithm 1 is verified with
-    are among ``fit``; nobody sees the others.
+    Scored on weldcal's centres for all: they repeat to a fiftieth of what is judged. The scans that Algorithm 1 is
+    verified with are among ``fit``; nobody sees the others.
     """
     pairs = {o.id: o for o in material.circles}
     rest = [material.good[id] for id in pairs if id not in fit]
@@ -318,7 +323,8 @@ def _sights(material: Material, held: str) -> tuple[SightRow, ...]:
 
 
 def _path(material: Material, held: str, rng: np.random.Generator) -> tuple[Array, Array]:
-    """One shuffled run: e_icp (steps, 6) at the camera and the true median error (steps,) m after each scan from the fourth on."""
+    """One shuffled run: e_icp (steps, 6) at the camera and the true median error (steps,) m after each scan from the
+    fourth on."""
     pairs = [o for o in material.circles if o.id != held]
     state = algorithm1_start(1e-12, 1000)
     verifier = material.verifier(held, "algorithm1")

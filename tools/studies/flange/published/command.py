@@ -21,7 +21,7 @@ from weldcal.tools.studies.flange.published.pairs import (
     study_pairs,
 )
 from weldcal.tools.studies.flange.published.report import COST_HEADER, cost_rows, pictures, tables
-from weldcal.tools.studies.flange.published.results import Found
+from weldcal.tools.studies.flange.published.results import PublishedResults
 from weldcal.tools.studies.flange.published.simulation import simulate
 from weldcal.tools.studies.flange.published.sphere import run_sphere_study, sphere_rows
 from weldcal.tools.studies.harness import Study
@@ -35,7 +35,7 @@ _LEAST_CLOUDS = 10
 _USUAL_CLOUDS = 18  # more scans make each run of Algorithm 1 longer: fewer runs then, and the same time
 
 
-def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> Found:
+def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> PublishedResults:
     """Everything, or the simulated parts where no folder of datasets is given.
 
     Raises:
@@ -78,16 +78,19 @@ def compute(data: Path | None, seed: int, quick: bool, progress: Progress) -> Fo
                 splits=3 if quick else max(5, round(60 * effort)),
                 circles=4 if quick else None,
                 seed=seed,
-                progress=lambda what, done, at=begin, part=width: progress(what, at + part * done),  # type: ignore[misc]
+                progress=lambda what, done, a=begin, b=width: progress(what, a + b * done),  # type: ignore[misc]
             )
             clouds.append(outcome)
-    return Found(
+    return PublishedResults(
         simulation=simulation, pairs=tuple(pairs), clouds=tuple(clouds), kinect=tuple(kinect), notes=tuple(notes)
     )
 
 
 def find_datasets(folder: Path) -> list[Dataset]:
-    """Every dataset in the folders of a folder (or the one that it is), by name. Raises InputError where there is none."""
+    """Every dataset in the folders of a folder (or the one that it is), by name.
+
+    Raises InputError where there is none.
+    """
     if not folder.is_dir():
         raise InputError(f"There is no folder '{folder}'; give the one that holds the recorded datasets.")
     inside = (
@@ -143,13 +146,16 @@ def flange_sphere(
     scans: Annotated[int, option("--scans", "N", "Scans of the flange with a sphere on it.", min=20)] = 48,
     draws: Annotated[int, option("--draws", "N", "Random draws of 4 and of 16 of them.", min=1)] = 40,
 ) -> Outcome:
-    """Repeat Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same scans; and the false
-    segmentations of Table 1."""
+    """Repeat Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same
+    scans; and the false segmentations of Table 1."""
     folder = call.folder("reproduce", "flange-sphere")
     summary = run_sphere_study(scans, draws, call.seed, call.progress)
     sphere = Study(
         name="flange-sphere",
-        what="Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same scans.",
+        what=(
+            "Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same"
+            " scans."
+        ),
         group="reproduce",
         figures=lambda results: results["all"],
         header=("calibration", "error at the flange"),

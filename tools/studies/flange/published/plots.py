@@ -14,9 +14,13 @@ from weldcal.tools.studies.flange.published.simulation import Simulation
 
 # the paper's order and grouping: x, y, z above roll, pitch, yaw
 PANELS = (
-    (3, "x", "mm", 1e3), (4, "y", "mm", 1e3), (5, "z", "mm", 1e3),
-    (0, "roll", "degrees", np.degrees(1.0)), (1, "pitch", "degrees", np.degrees(1.0)), (2, "yaw", "degrees", np.degrees(1.0)),
-)  # fmt: skip
+    (3, "x", "mm", 1e3),
+    (4, "y", "mm", 1e3),
+    (5, "z", "mm", 1e3),
+    (0, "roll", "degrees", np.degrees(1.0)),
+    (1, "pitch", "degrees", np.degrees(1.0)),
+    (2, "yaw", "degrees", np.degrees(1.0)),
+)
 REPORTED = ("reported translation, mm", "reported rotation, degrees")
 COLOURS = ("#c2503f", "#3f8f5b", "#2f6fb0")
 
@@ -39,7 +43,8 @@ def fig9(s: Simulation) -> bytes:
 
 
 def fig10(s: Simulation) -> bytes:
-    """Errors at the camera against the scans used, 1 mm of noise, and the error that the paper does not plot: at the flanges."""
+    """Errors at the camera against the scans used, 1 mm of noise, and the error that the paper does not plot: at the
+    flanges."""
     steps = np.arange(4, 4 + len(s.history))
     picture, true = _steps(steps, s.history.transpose(1, 0, 2), ("translation at the camera, mm", "rotation, degrees"))
     high = 1e3 * s.history_tcp
@@ -104,9 +109,12 @@ def costs(s: Simulation) -> bytes:
     picture = Figure(figsize=(7.6, 2.9), layout="constrained")
     axes = picture.subplots()
     names = {
-        "truth": "cost: the truth", "verification": "cost: a measured pose", "median": "cost: median residual",
-        "all": "all pairs, SVD", "ours": "weldcal",
-    }  # fmt: skip
+        "truth": "cost: the truth",
+        "verification": "cost: a measured pose",
+        "median": "cost: median residual",
+        "all": "all pairs, SVD",
+        "ours": "weldcal",
+    }
     y = np.arange(len(s.costs))[::-1]
     camera = [1e3 * float(np.linalg.norm(e.e[:, 3:], axis=1).mean()) for e in s.costs.values()]
     flanges = [1e3 * float(e.at_tcp.mean()) for e in s.costs.values()]
@@ -119,7 +127,8 @@ def costs(s: Simulation) -> bytes:
 
 
 def circles(c: CloudsOutcome) -> bytes:
-    """Where the published circle puts the centre, in the flange's own plane: seed to seed, scan by scan; ours is the origin."""
+    """Where the published circle puts the centre, in the flange's own plane: seed to seed, scan by scan; ours is the
+    origin."""
     picture = Figure(figsize=(7.6, 3.2), layout="constrained")
     axes, halves = picture.subplots(1, 2, width_ratios=(1.0, 1.2))
     k = np.arange(len(c.circles))

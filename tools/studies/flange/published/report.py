@@ -9,7 +9,7 @@ from weldcal.models.arrays import Array
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.flange.published import plots
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
-from weldcal.tools.studies.flange.published.results import TABLE1, Found, in_mm
+from weldcal.tools.studies.flange.published.results import TABLE1, PublishedResults, in_mm
 from weldcal.tools.studies.flange.published.simulation import COSTS
 from weldcal.tools.studies.harness import Results, Row, Table
 
@@ -26,7 +26,7 @@ SHORT = {
 }
 
 
-def table1_rows(study: Found) -> list[Row]:
+def table1_rows(study: PublishedResults) -> list[Row]:
     """Table 1: the paper's row, then ours where there are data."""
     rows: list[Row] = []
     for name, numbers in TABLE1.items():
@@ -45,7 +45,7 @@ def table1_rows(study: Found) -> list[Row]:
     return rows
 
 
-def cost_rows(study: Found) -> list[Row]:
+def cost_rows(study: PublishedResults) -> list[Row]:
     """Section 3.1 at 1 mm: spread of the error at the camera, and the true error at the 75 flange centres."""
     rows: list[Row] = []
     for name, e in study.simulation.costs.items():
@@ -65,7 +65,7 @@ def held_out_rows(outcome: CloudsOutcome) -> list[Row]:
     return rows
 
 
-def pairs_rows(study: Found) -> list[Row]:
+def pairs_rows(study: PublishedResults) -> list[Row]:
     """Per robot known by pairs: the paper's 50 runs, all pairs, ours; held-out errors."""
     rows: list[Row] = []
     for p in study.pairs:
@@ -86,7 +86,7 @@ def sight_rows(outcome: CloudsOutcome) -> list[Row]:
     return rows
 
 
-def kinect_rows(study: Found) -> list[Row]:
+def kinect_rows(study: PublishedResults) -> list[Row]:
     """The all-pairs SVD, held out, ours, and the compensated one, errors at the wrist ring."""
     return [
         (what, *_numbers(in_mm(errors).values(), 2))
@@ -100,7 +100,7 @@ def kinect_rows(study: Found) -> list[Row]:
     ]
 
 
-def tables(study: Found) -> list[Table]:
+def tables(study: PublishedResults) -> list[Table]:
     """Every table of the study that has lines."""
     found: list[Table] = []
     if study.pairs or study.clouds:
@@ -130,7 +130,7 @@ def _held_out(name: str, reported_mm: float | None, errors_m: Array, digits: int
     return (name, fixed(reported_mm, digits), *_numbers(true.values(), digits), ratio)
 
 
-def pictures(study: Found) -> dict[str, Callable[[Results], bytes]]:
+def pictures(study: PublishedResults) -> dict[str, Callable[[Results], bytes]]:
     """What draws every figure, by the name of its file."""
     sim = study.simulation
     drawn: dict[str, Callable[[], bytes]] = {
@@ -143,4 +143,5 @@ def pictures(study: Found) -> dict[str, Callable[[Results], bytes]]:
         drawn[f"fig11_{c.name}"] = partial(plots.fig11_rerun, c)
         drawn[f"held_out_{c.name}"] = partial(plots.held_out, c)
         drawn[f"circles_{c.name}"] = partial(plots.circles, c)
-    return {f"figures/{name}.svg": lambda results, draw=draw: draw() for name, draw in drawn.items()}  # type: ignore[misc]
+    figures = {f"figures/{name}.svg": draw for name, draw in drawn.items()}
+    return {path: lambda results, draw=draw: draw() for path, draw in figures.items()}  # type: ignore[misc]

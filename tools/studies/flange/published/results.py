@@ -20,7 +20,7 @@ TABLE1: dict[str, tuple[float, ...]] = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Found:
+class PublishedResults:
     """All outcomes; ``notes`` are sentences about data that were missing or not usable."""
 
     simulation: Simulation

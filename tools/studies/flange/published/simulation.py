@@ -23,7 +23,8 @@ GRID = (5, 5, 3)
 WORKSPACE_CENTRE_M = (0.6, -0.0125, 0.1)
 """The paper gives the workspace's size, not its place: here it lies under the camera and stands on the table."""
 TILT_PER_MM = np.radians(0.05)
-"""Noise of the verification pose's rotation per millimetre of noise of its position: 1 mm at the edge of a flange is more."""
+"""Noise of the verification pose's rotation per millimetre of noise of its position: 1 mm at the edge of a flange is
+more."""
 ROBUST_RUNS = 40
 
 COSTS = {
@@ -38,8 +39,8 @@ COSTS = {
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of K calibrations: ``e`` (K, 6) roll, pitch, yaw (rad) and x, y, z (m) of X_est^-1 X_true, as the paper takes
-    them; ``at_tcp`` (K, 75) m, how far each flange centre is put from where it is."""
+    """Errors of K calibrations: ``e`` (K, 6) roll, pitch, yaw (rad) and x, y, z (m) of X_est^-1 X_true, as the paper
+    takes them; ``at_tcp`` (K, 75) m, how far each flange centre is put from where it is."""
 
     e: Array
     at_tcp: Array
@@ -47,9 +48,10 @@ class Errors:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Simulation:
-    """``levels_m`` (L,) noise; standard deviations (L, 6) and means (L, 6) of all pairs and of Algorithm 1 judged by the truth
-    (Fig. 9); ``history`` (75 - 3, K, 6) of it at 1 mm (Fig. 10) with ``history_tcp`` (75 - 3, K) m, the mean true error;
-    ``costs`` at 1 mm, by name of COSTS; ``best_of_three`` the best, by the truth, of three shuffled runs at 1 mm."""
+    """``levels_m`` (L,) noise; standard deviations (L, 6) and means (L, 6) of all pairs and of Algorithm 1 judged by
+    the truth (Fig. 9); ``history`` (75 - 3, K, 6) of it at 1 mm (Fig. 10) with ``history_tcp`` (75 - 3, K) m, the mean
+    true error; ``costs`` at 1 mm, by name of COSTS; ``best_of_three`` the best, by the truth, of three shuffled runs at
+    1 mm."""
 
     levels_m: Array
     all_mean: Array
@@ -68,7 +70,8 @@ class Simulation:
 
     @property
     def ratio(self) -> Array:
-        """All pairs over Algorithm 1 (6,), standard deviations, averaged over the levels: the paper says 7 for x and y."""
+        """All pairs over Algorithm 1 (6,), standard deviations, averaged over the levels: the paper says 7 for x and
+        y."""
         return np.asarray((self.all_std / self.truth_std).mean(axis=0))
 
 
@@ -90,7 +93,8 @@ def algorithm1_batch(
     """Algorithm 1 on K realisations at once: p_B (n, 3), p_C (K, n, 3) m, ``orders`` (K, n) the order of the scans.
 
     ``cost`` takes R (K, m, 3, 3) and t (K, m, 3) and gives (K, m). The new pair enters at most once, as in
-    iterative.algorithm1_step (a test holds the two against each other). Returns R (K, 3, 3), t (K, 3) and their history.
+    iterative.algorithm1_step (a test holds the two against each other). Returns R (K, 3, 3), t (K, 3) and their
+    history.
     """
     K = len(orders)
     rows = np.arange(K)
@@ -137,7 +141,10 @@ def errors_of(R: Array, t: Array, p_B: Array) -> Errors:
 
 
 def simulate(*, levels: int = 50, realisations: int = 100, seed: int = 0, progress: Progress) -> Simulation:
-    """Fig. 9 (noise to 10 mm in ``levels`` steps), Fig. 10 and the comparison of costs at 1 mm. Deterministic for ``seed``."""
+    """Fig. 9 (noise to 10 mm in ``levels`` steps), Fig. 10 and the comparison of costs at 1 mm.
+
+    Deterministic for ``seed``.
+    """
     p_B = grid_points()
     rng = np.random.default_rng(seed)
     R_true, t_true = X_BC_TRUE.rotation().matrix(), X_BC_TRUE.translation()
@@ -205,7 +212,8 @@ def _all_pairs(p_B: Array, p_C: Array) -> tuple[Array, Array]:
 
 
 def _measured_camera(K: int, sigma: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """The camera's pose as one verification flange gives it: R (K, 3, 3), t (K, 3); the flange under the middle of the grid."""
+    """The camera's pose as one verification flange gives it: R (K, 3, 3), t (K, 3); the flange under the middle of the
+    grid."""
     p_B = np.array(WORKSPACE_CENTRE_M)
     p_C = X_BC_TRUE.inverse() @ p_B + sigma * rng.standard_normal((K, 3))
     turn = Rotation.from_rotvec(1e3 * sigma * TILT_PER_MM * rng.standard_normal((K, 3))).as_matrix()

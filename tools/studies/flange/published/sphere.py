@@ -1,4 +1,5 @@
-"""Table 2 of the flange paper repeated in a simulated cell: a calibration sphere on the flange beside the flange, in the same scans."""
+"""Table 2 of the flange paper repeated in a simulated cell: a calibration sphere on the flange beside the flange, in
+the same scans."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +28,8 @@ FALSE, OF = 3, 54
 
 
 def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
-    """X_BC from centres of a sphere (n >= 4) whose place on the flange is estimated, too; least squares, as commercial software does it.
+    """X_BC from centres of a sphere (n >= 4) whose place on the flange is estimated, too; least squares, as commercial
+    software does it.
 
     Gauss-Newton on X_BC c_k - X_BF,k p_FS, from the place as it was meant.
     """
@@ -49,7 +51,8 @@ def sphere_calibration(scans: Sequence[SphereScan]) -> RigidTransform:
 def compare_sphere(
     seed: int = 0, draws: int = 30, pool: int = 32, progress: Progress = no_progress
 ) -> tuple[list[dict[str, object]], dict[str, object]]:
-    """Sphere and flange in the same scans with 4 and with 16 pairs, judged at the flange on the others; and Table 1's false segmentations.
+    """Sphere and flange in the same scans with 4 and with 16 pairs, judged at the flange on the others; and Table 1's
+    false segmentations.
 
     Every judged scan is one that the calibration did not use. "flange, weldcal" corrects the scanner.
     """
@@ -84,8 +87,8 @@ def compare_sphere(
 def false_segmentations(flanges: Sequence[Observation], seed: int = 0) -> dict[str, object]:
     """Table 1's UR5: the same share of pairs (3 of 54) from another part of the arm, a link behind the flange.
 
-    Each false centre lies 60 to 160 mm behind and beside the flange, as a wrist's tube does. The errors are those of the true scans, under
-    the least squares of all pairs (the paper's SVD) and under the robust estimate.
+    Each false centre lies 60 to 160 mm behind and beside the flange, as a wrist's tube does. The errors are those of
+    the true scans, under the least squares of all pairs (the paper's SVD) and under the robust estimate.
     """
     rng = np.random.default_rng(seed)
     count = max(1, round(len(flanges) * FALSE / OF))
@@ -128,11 +131,14 @@ def run_sphere_study(scans: int, draws: int, seed: int, progress: Progress = no_
 def sphere_rows(summary: dict[str, Any]) -> dict[str, str]:
     """Rows for the terminal."""
     rows = {
-        f"{r['method']}, {r['pairs']} pairs": f"median {r['median_mm']:.2f} mm, 95 % {r['p95_mm']:.2f} mm, largest {r['max_mm']:.2f} mm"
+        f"{r['method']}, {r['pairs']} pairs": (
+            f"median {r['median_mm']:.2f} mm, 95 % {r['p95_mm']:.2f} mm, largest {r['max_mm']:.2f} mm"
+        )
         for r in summary["rows"]
     }
     f = summary["false_segmentations"]
     rows["false segmentations"] = (
-        f"{f['false']} of {f['pairs']} pairs: least squares {f['svd_mm']:.1f} mm, weldcal {f['robust_mm']:.2f} mm, {f['named']} named"
+        f"{f['false']} of {f['pairs']} pairs: least squares {f['svd_mm']:.1f} mm, weldcal {f['robust_mm']:.2f} mm,"
+        f" {f['named']} named"
     )
     return rows
