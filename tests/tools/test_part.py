@@ -118,7 +118,7 @@ def test_the_planner_refuses_in_part_what_it_refuses_in_new(tmp_path: Path) -> N
     write_step(assembly(box((0, 0, -10), (200, 100, 10)), box((8, 46, 0), (184, 8, 60)), *walls), tmp_path / "h.step")
     shape = read_shape(tmp_path / "h.step")
     inner = next(joint for joint in shape.joints if joint.length_m == pytest.approx(0.184))
-    asked = Seam(inner, None, "")
+    asked = Seam(joint=inner, radius_m=None, reason="")
     found = with_plans(shape, [asked], 1, tmp_path / "h.step", None, WELDING, lambda stage, share: None)[0]
     assert found.planned
     written, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "h.step", inner.edges), WELDING)

@@ -94,7 +94,6 @@ HEAD = """# yaml-language-server: $schema={schema}
 """
 TOOL = "tool.yaml"
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
-SAME_PLACE_M = 0.005  # between the middles of part and seam: they are tried as one
 TABLE_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
 PLACE_M = (0.65, 0.0)  # of the part's middle, where the demo's plate lies
@@ -141,25 +140,22 @@ def new(
         raise typer.BadParameter("--format is for --dataset")
     if dataset:
         written = write_example(folder, call.seed, call.progress, form)
-        following = f"weldcal calibrate {written}"
+        following, note = f"weldcal calibrate {written}", {}
     else:
         numbers = tuple(edge_numbers(edges))
         own = None if part is None else OwnPart(part, numbers, joint, units)
         written, reason = write_cell(folder, base, own, tool_file(tool_of or WELDING) if tool or tool_of else None)
         following = f"weldcal demo --scenario {written}"
-        if reason and written.name == CELL:
-            summary = {"state": "done", "written": str(written), "note": reason, "next": following}
-            return Outcome(summary, values={"written": str(written), "note": reason, "next": following})
-        if reason:
-            assert part is not None
+        if part is not None and written.name == UNFINISHED:
             problem = (
                 f"The arm cannot weld {part.name} in any of the poses that were tried: {reason} "
                 f"Choose other edges from weldcal part {part} and give --edges, or change {written}."
             )
             summary = {"state": "unfinished", "reason": problem, "written": str(written)}
             return Outcome(summary, values={"written": str(written)}, problem=problem)
-    summary = {"state": "done", "written": str(written), "next": following}
-    return Outcome(summary, values={"written": str(written), "next": following})
+        note = {"note": reason} if reason else {}
+    values = {"written": str(written), **note, "next": following}
+    return Outcome({"state": "done", **values}, values=values)
 
 
 def edge_numbers(text: str) -> list[int]:
@@ -230,7 +226,7 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
         add_tool(scenario, folder, tool)
     write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
     unfinished = folder / UNFINISHED
-    state, note = RUNS, ""
+    note = ""
     if part is not None:
         assert scenario.workpiece is not None
         standing, nearest = scenario.workpiece.pose_guess, ""
@@ -250,8 +246,7 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
             return unfinished, reason
         if note:
             note = f"{note} As a whole: {nearest}"
-            state = f"{RUNS}\n# {_comment(note)}"
-    _write(path, scenario, state.format(path=path))
+    _write(path, scenario, (RUNS + f"\n# {_comment(note)}" * bool(note)).format(path=path))
     unfinished.unlink(missing_ok=True)
     return path, note
 
@@ -405,7 +400,7 @@ def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig
         seams = [numbered(part, k) for k in range(seam_count(part))]
         line = np.concatenate([seam.seam_P for seam in seams])
         middles = [0.5 * part.mesh.bounds.sum(axis=0), 0.5 * (line.min(axis=0) + line.max(axis=0))]
-        middles = middles[: 1 + bool(np.ptp(middles, axis=0).max() > SAME_PLACE_M)]
+        middles = middles[: 1 + bool(np.ptp(middles, axis=0).max() > 0.005)]  # nearer they are one place
         for guess in (_standing(part.mesh, turn, middle, scenario) for middle in middles for turn in TURNS_DEG):
             welded, reason = _first_refusal(scenario, station, seams, guess)
             if not reason:

@@ -34,7 +34,7 @@ SHORT_M = 0.02  # the end of a sheet is such an edge: too short for the tip to c
 NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Seam:
     """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it
     can).
@@ -91,7 +91,9 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
     found = []
     for joint in shape.joints:
         radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
-        found.append(Seam(joint, min(radii, default=None), *_obstacle(shape, joint, tool)))
+        reason, short_m, felt = _obstacle(shape, joint, tool)
+        radius = min(radii, default=None)
+        found.append(Seam(joint=joint, radius_m=radius, reason=reason, short_m=short_m, felt=felt))
     return sorted(found, key=lambda seam: (bool(seam.reason), not seam.felt, seam.short_m, -seam.joint.length_m))
 
 
@@ -165,13 +167,12 @@ def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], s
 
     Each with a note of the pieces, "" for the whole.
     """
-    found = [([SeamConfig(edges=list(ids))], "")]
+    found, named = [([SeamConfig(edges=list(ids))], "")], ", ".join(map(str, ids))
     line, closed = chained(shape, ids)
     steps = np.diff(line[np.linalg.norm(np.diff(line, axis=0, prepend=np.nan), axis=1) != 0.0], axis=0)
-    length = np.linalg.norm(steps, axis=1)
-    t = steps / length[:, None]
+    t = steps / np.linalg.norm(steps, axis=1)[:, None]
     if closed and (np.vecdot(t, np.roll(t, 1, axis=0)) > CORNER_COS).all():
-        whole = 1e3 * float(length.sum())
+        whole = 1e3 * sum(shape.edge(id).length_m for id in ids)
         ends = [round(share * whole, 1) for share in (0.25, 0.5)]
         edges, rest = list(ids), round(whole - ends[0] - LAP_MM, 1)
         # Both halves begin at one place: there the arm turns one way for the one and back for the other.
@@ -179,21 +180,17 @@ def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], s
             SeamConfig(edges=edges, direction="reverse", start_mm=round(whole - ends[1] - LAP_MM, 1)),
             SeamConfig(edges=edges, start_mm=ends[1], end_mm=-LAP_MM),
         ]
-        found.append((halves, f"The ring {_listed(ids)} in two halves that overlap by {LAP_MM:g} mm."))
+        found.append((halves, f"The ring {named} in two halves that overlap by {LAP_MM:g} mm."))
         following = f"start_mm: {ends[0]:g}, end_mm: {round(rest - ends[0], 1):g}"
         quarter = f"For the next, subtract 90 from the last of pose_guess.rpy_deg and write {following}; and so on."
-        found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {_listed(ids)}. {quarter}"))
+        found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {named}. {quarter}"))
         return found
     by_length = sorted(ids, key=lambda id: -shape.edge(id).length_m) if len(ids) > 1 else []
     long = [id for id in ids if shape.edge(id).length_m > SHORT_M]
     if 1 < len(long) < len(ids):
-        without = f"Without the short edges {_listed([id for id in ids if id not in long])}."
+        without = f"Without the short edges {', '.join(str(id) for id in ids if id not in long)}."
         found.append(([SeamConfig(edges=[id]) for id in long], without))
-    return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {_listed(ids)}.") for id in by_length]
-
-
-def _listed(ids: Sequence[int]) -> str:
-    return ", ".join(map(str, ids))
+    return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {named}.") for id in by_length]
 
 
 def joint_of(edge: PartEdge) -> str:
