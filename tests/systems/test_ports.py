@@ -50,7 +50,7 @@ from weldcal.systems.drivers.simulated.rendered_profiler import (
 )
 from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
-from weldcal.systems.drivers.simulated.streaming.scanner import DepthStream, FrameReplay, StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import DepthStream, FrameReplay, StreamingScanner
 from weldcal.systems.drivers.simulated.tablet_world import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.tools.emulators.cell.physics import STEP_S
 from weldcal.tools.emulators.cell.streamer import IDLE_S, LIMIT_S, Exposure, Streamer, Waiter
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, RobotUnreachable, reported_as
+from weldcal.systems.drivers.ur.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
+from weldcal.systems.drivers.ur.set_points import ArcInputs, Level, apart
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
-from weldcal.systems.drivers.ur.torch.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
-from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Level, apart
 from weldcal.systems.drivers.ur.wire.rtde_client import (
     DOUBLES,
     SET_POINTS,

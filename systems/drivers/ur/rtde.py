@@ -23,8 +23,8 @@ from weldcal.systems.drivers.ur.faults import RobotRefused
 from weldcal.systems.drivers.ur.link import StartFailed, UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.set_points import SETTLES_S, AnalogSetPoint, levels_of
 from weldcal.systems.drivers.ur.supervisor import Limits
-from weldcal.systems.drivers.ur.torch.set_points import SETTLES_S, AnalogSetPoint, levels_of
 from weldcal.systems.drivers.ur.wire.line import stop_program
 from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose, installed, taken
 from weldcal.systems.leaf_system import LeafSystem

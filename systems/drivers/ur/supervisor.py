@@ -9,7 +9,7 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault, reported_as
-from weldcal.systems.drivers.ur.torch.set_points import apart
+from weldcal.systems.drivers.ur.set_points import apart
 
 NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
 SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7

@@ -19,6 +19,7 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.robot import ControllerStream, Refused
+from weldcal.systems.drivers.ur.set_points import ArcInputs, Gas, Level, SetPoints, apart
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import (
     PLAYING,
@@ -30,7 +31,6 @@ from weldcal.systems.drivers.ur.supervisor import (
     Supervisor,
     VelocityCommand,
 )
-from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas, Level, SetPoints, apart
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.pacing import take_priority
 

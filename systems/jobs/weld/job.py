@@ -13,7 +13,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator

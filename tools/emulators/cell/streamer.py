@@ -15,7 +15,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, darkness
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner, exposed_cloud
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner, exposed_cloud
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.emulators.cell.physics import STEP_S, still, true_station
 from weldcal.tools.emulators.cell.scanner_process import drop

@@ -22,10 +22,10 @@ from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.systems.drivers.sensors.stamps import unix_now
 from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamera
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
+from weldcal.systems.drivers.ur.set_points import AnalogSetPoint
 from weldcal.systems.drivers.ur.touch_probe import UrTouchProbe
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.parts import nominal_arm

@@ -23,7 +23,7 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.models.scanners import depth_to_points
 from weldcal.systems.background import OwnProcess
-from weldcal.systems.drivers.simulated.streaming.scanner import FrameReplay
+from weldcal.systems.drivers.simulated.streaming_scanner import FrameReplay
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand
 from weldcal.systems.motion.buffers import FrameQueue, PoseRecorder

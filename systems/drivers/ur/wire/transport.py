@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
 
-from weldcal.systems.drivers.ur.torch.set_points import ANALOG, MASK, VALUE, Level, OffSwitch
+from weldcal.systems.drivers.ur.set_points import ANALOG, MASK, VALUE, Level, OffSwitch
 from weldcal.systems.drivers.ur.wire.line import SCRIPT_PORT, SocketLine
 from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, UPPER_OFFSET, RtdeProbe
 from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream

@@ -20,7 +20,7 @@ from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
 
 from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.torch.set_points import Level
+from weldcal.systems.drivers.ur.set_points import Level
 from weldcal.systems.drivers.ur.wire import transport
 from weldcal.systems.drivers.ur.wire.rtde_client import RTDE_PORT, NotFinite
 
