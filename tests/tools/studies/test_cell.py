@@ -12,7 +12,7 @@ import pytest
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.studies.cell.study import STUDY, TARGETS, cases, targets
-from weldcal.tools.worlds.weld.cell_run import CellRun, scatter
+from weldcal.tools.worlds.weld.case import CellRun, scatter
 
 GOOD = vars(
     CellRun(

@@ -19,7 +19,7 @@ from weldcal.tools.report.render import fixed
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.harness import Cases, Figures, Results, Study, Table, whole
 from weldcal.tools.studies.targets import Target
-from weldcal.tools.worlds.weld.cell_run import figures
+from weldcal.tools.worlds.weld.case import figures
 from weldcal.welding.servo.laws import get_law
 
 # (figure, name, worst or mean over the runs, limit, unit); a real-time factor is a lower bound and depends on the

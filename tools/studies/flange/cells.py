@@ -14,7 +14,7 @@ from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, statistics
 from weldcal.tools.worlds.arm_cells import calibrate_cell
 from weldcal.tools.worlds.light_runs import LightRuns, study_light_runs
-from weldcal.tools.worlds.wrong_arm import Found, judged, station, study_station
+from weldcal.tools.worlds.wrong_models import Found, judged, station, study_station
 
 
 def wrong_arm(seed: int, kind: str) -> Mapping[str, object]:

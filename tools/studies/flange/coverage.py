@@ -22,8 +22,8 @@ from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.report.render import fixed, write_atomic
 from weldcal.tools.studies.harness import Figures, Row, Study
-from weldcal.tools.worlds import warped_scanner
-from weldcal.tools.worlds.warped_scanner import as_measured, seen_by_a_wrong_scanner, simulated_observations
+from weldcal.tools.worlds import wrong_models
+from weldcal.tools.worlds.wrong_models import as_measured, seen_by_a_wrong_scanner, simulated_observations
 
 LEVEL = 0.95
 _ARM_M = 1.5e-4  # per axis, what recorded arms leave of a calibration
@@ -146,15 +146,15 @@ def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Cov
     stated, true = [], []
 
     def calibrate(device: int) -> Calibrated:
-        _, estimate = warped_scanner.calibrate_warped(device, poses)
-        seen = warped_scanner.warped_point(warped_scanner.WORK_C, device)
+        _, estimate = wrong_models.calibrate_warped(device, poses)
+        seen = wrong_models.warped_point(wrong_models.WORK_C, device)
         stated.append(float(np.mean(estimate.held_out.position_m)))
-        true.append(float(np.mean(warped_scanner.new_errors(device, estimate))))
+        true.append(float(np.mean(wrong_models.new_errors(device, estimate))))
         found = seen if estimate.correction is None else estimate.correction.points(seen)
-        return estimate, warped_scanner.X_BC, estimate.X_BC @ found
+        return estimate, wrong_models.X_BC, estimate.X_BC @ found
 
     name = f"calibrations of {poses} scans by a warped scanner"
-    pose, point = _inside(calibrate, name, runs, progress, warped_scanner.WORK_C)
+    pose, point = _inside(calibrate, name, runs, progress, wrong_models.WORK_C)
     return Coverage(
         poses=poses,
         runs=runs,
@@ -217,8 +217,8 @@ def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: b
     seen."""
     stated, true = [], []
     for device in range(runs):
-        observations, patterns = warped_scanner.warped_observations(device, poses, 0, warp_m, arm_m)
-        new, _ = warped_scanner.warped_observations(device, 60, 1, warp_m, arm_m)
+        observations, patterns = wrong_models.warped_observations(device, poses, 0, warp_m, arm_m)
+        new, _ = wrong_models.warped_observations(device, 60, 1, warp_m, arm_m)
         found = calibrate(observations, Steps(patterns=patterns, refine="local" if local else PLAIN))
         correction, refined = found.correction, found.refined
         seen = new if correction is None else [corrected_observation(correction, o) for o in new]

@@ -22,8 +22,8 @@ from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.weld import calibration_error
 from weldcal.tools.studies.harness import Figures, Row, Study
 from weldcal.tools.studies.targets import Target
-from weldcal.tools.worlds.perfect_world import perfect
-from weldcal.tools.worlds.redrawn import Redrawn, RedrawnStation, bound_covariance, joined, joints_of, redraw
+from weldcal.tools.worlds.light_runs import Redrawn, RedrawnStation, bound_covariance, joined, joints_of, redraw
+from weldcal.tools.worlds.scaled_arms import perfect
 
 SCENARIO = "calibrate_only"
 TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))

@@ -18,7 +18,7 @@ from weldcal.tools.report.first_screen import USE
 from weldcal.tools.report.mounting import MountingReport, RecordedMounting
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.harness import Figures, Results, Row, Study
-from weldcal.tools.worlds.imperfect_cells import KINDS, WEIGHTINGS, ratios
+from weldcal.tools.worlds.hand_eye import KINDS, WEIGHTINGS, ratios
 from weldcal.tools.worlds.light_runs import MountedWorld, mounted_world
 
 MARGIN = 0.02  # by which a method must be better to count as ahead

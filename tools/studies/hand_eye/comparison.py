@@ -34,7 +34,7 @@ from weldcal.tools.studies.hand_eye.cells import hand_eye_cells, mountings
 from weldcal.tools.studies.hand_eye.conventions import hand_eye_conventions as conventions
 from weldcal.tools.studies.hand_eye.pictures import hand_eye_pictures as pictures
 from weldcal.tools.studies.harness import Figures, Row, Study, Table
-from weldcal.tools.worlds.hand_eye_mistakes import fuzz
+from weldcal.tools.worlds.hand_eye import fuzz
 
 _PLAIN = HandEyeConfig(folds=0)
 _SHARE = 0.02  # by which a method must be better to count as ahead

@@ -29,8 +29,14 @@ from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, Table
 from weldcal.tools.studies.motion import plots
 from weldcal.tools.studies.targets import Target, all_met
-from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
-from weldcal.tools.worlds.static_scans import Look, StaticMode, noise_of_face
+from weldcal.tools.worlds.motion import (
+    Look,
+    MotionOptions,
+    MotionWorld,
+    StaticMode,
+    noise_of_face,
+    write_motion_dataset,
+)
 
 _ICP_FRAMES, _QUICK_FRAMES = 120, 10  # for Table 1 and Fig. 6
 _REACH_M = 0.01

@@ -21,8 +21,7 @@ from weldcal.tools.studies.robot.stream import TRANSPORT, one_transport, stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING
-from weldcal.tools.worlds.robot.fault_run import FaultOutcome, run_case
-from weldcal.tools.worlds.robot.sequences import Sequence, run_sequence
+from weldcal.tools.worlds.robot.fault_run import FaultOutcome, Sequence, run_case, run_sequence
 
 OUTCOME_COLUMNS = (
     "name",

@@ -23,7 +23,7 @@ from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import write_json
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.studies.robot.stream import TRANSPORT, one_transport
-from weldcal.tools.worlds.robot.host_probe import HostLateness, watched_host
+from weldcal.tools.worlds.robot.timing import HostLateness, watched_host
 
 BUSY = "while True: pass"
 

@@ -28,7 +28,7 @@ from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.worlds.robot.fault_run import LOADED
-from weldcal.tools.worlds.robot.tap import STEP_JOINT, STEP_RAD_S, Tap
+from weldcal.tools.worlds.robot.timing import STEP_JOINT, STEP_RAD_S, Tap
 
 RATE_HZ = 125.0
 READ_S = 0.002

@@ -28,8 +28,7 @@ from weldcal.tools.studies.weld.rows import (
     run_cases,
     run_turn,
 )
-from weldcal.tools.worlds.weld.case import WeldCase, study_config
-from weldcal.tools.worlds.weld.metrics import RunMetrics
+from weldcal.tools.worlds.weld.case import RunMetrics, WeldCase, study_config
 from weldcal.tools.worlds.weld.plant import COLUMNS, PHASES, StudyRun
 from weldcal.welding.record.process import path_error, speed_along
 from weldcal.welding.seam.chord_map import chord_map

@@ -19,7 +19,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.studies.harness import statistics
-from weldcal.tools.worlds.sphere_cell import P_FS, SphereScan, cell_scans
+from weldcal.tools.worlds.flange_frames import P_FS, SphereScan, cell_scans
 
 TABLE2 = {4: (-1.94, -0.90, -0.86, -0.07, 0.04, -0.10), 16: (-0.98, -1.01, -0.83, -0.07, 0.09, -0.11)}
 """The paper's Table 2 by its number of pairs: x, y, z in mm, roll, pitch, yaw in degrees."""
