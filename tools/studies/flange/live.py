@@ -20,8 +20,7 @@ from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.weld import calibration_error
-from weldcal.tools.studies.harness import Figures, Row, Study
-from weldcal.tools.studies.targets import Target
+from weldcal.tools.studies.harness import Figures, Row, Study, Target
 from weldcal.tools.worlds.light_runs import Redrawn, RedrawnStation, bound_covariance, joined, joints_of, redraw
 from weldcal.tools.worlds.scaled_arms import perfect
 

@@ -15,8 +15,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, switch
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.flange.cells import arm, imperfect
-from weldcal.tools.studies.flange.coverage import honesty, stated
+from weldcal.tools.studies.flange.coverage import arm, honesty, imperfect, stated
 from weldcal.tools.studies.flange.live import live
 from weldcal.tools.studies.flange.recorded import few, halves, parts
 from weldcal.tools.studies.flange.scans import frames, hidden, holes

@@ -31,8 +31,8 @@ from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, swit
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.hand_eye.cells import hand_eye_cells, mountings
+from weldcal.tools.studies.hand_eye.cells import hand_eye_pictures as pictures
 from weldcal.tools.studies.hand_eye.conventions import hand_eye_conventions as conventions
-from weldcal.tools.studies.hand_eye.pictures import hand_eye_pictures as pictures
 from weldcal.tools.studies.harness import Figures, Row, Study, Table
 from weldcal.tools.worlds.hand_eye import fuzz
 

@@ -17,9 +17,8 @@ from weldcal.calibration.profiler.sphere.arc import find_arc
 from weldcal.calibration.profiler.sphere.joint import leave_one_out_m
 from weldcal.calibration.profiler.sphere.model import SphereData
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.studies.profiler.edge import TARGETS
-from weldcal.tools.studies.profiler.sphere import METHODS, SEAM_FEATURES, WorldResult
-from weldcal.tools.studies.targets import Target
+from weldcal.tools.studies.harness import Target
+from weldcal.tools.studies.profiler.papers import SEAM_FEATURES, SPHERE_METHODS, TARGETS, WorldResult
 from weldcal.tools.worlds.edge_trials import MM, NOISE, EdgeError, EdgeTrial, fixed_edge_trials, rms, sigma_of
 from weldcal.tools.worlds.profiler_parts import fixed_worlds
 
@@ -47,7 +46,7 @@ RAW: tuple[tuple[str, Literal["bar", "step", "apex"], tuple[float, float]], ...]
 SOLVED = (0.31, 0.30)  # deg, mm: farther off, the paper's method, which states no covariance, is wrong
 SILENT = 22.5  # normalised error squared that one sound answer of a thousand exceeds (chi-square, 6 degrees)
 FEATURES = (0.02, 0.035, 0.02)
-PUBLISHED = {METHODS[0]: 4.523, METHODS[1]: 0.840}
+PUBLISHED = {SPHERE_METHODS[0]: 4.523, SPHERE_METHODS[1]: 0.840}
 
 
 def figure_text(value: float, unit: str) -> str:

@@ -11,12 +11,19 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
 from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.harness import Figures, Row, Study, Table
-from weldcal.tools.studies.profiler import edge, sphere
-from weldcal.tools.studies.profiler.edge import EdgeRow, edge_figures, edge_rows, edge_targets
+from weldcal.tools.studies.harness import Figures, Row, Study, Table, Target, all_met
+from weldcal.tools.studies.profiler import papers
 from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines, published_lines, require_files
-from weldcal.tools.studies.profiler.sphere import WorldResult, measure, sphere_figures, sphere_targets
-from weldcal.tools.studies.targets import Target, all_met
+from weldcal.tools.studies.profiler.papers import (
+    EdgeRow,
+    WorldResult,
+    edge_figures,
+    edge_rows,
+    edge_targets,
+    measure,
+    sphere_figures,
+    sphere_targets,
+)
 from weldcal.tools.worlds.edge_trials import SETS, EdgeTrial, fixed_edge_trials, made_edge_trials
 from weldcal.tools.worlds.profiler_parts import fixed_worlds, made_worlds
 
@@ -104,7 +111,7 @@ def _missed(figures: Figures) -> list[Target]:
 def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[Table]:
     """Tables 1 to 3 of the edge paper, over 10 to 25 rotations, as printed for its three objects and of every set and
     method; and the calibration's own error, which those criteria hardly show."""
-    n = edge.COUNTS
+    n = papers.COUNTS
     by = {(r.name, r.method, r.rotations): r for r in rows}
     names = list(dict.fromkeys(name for name, _, _ in by))
 
@@ -113,23 +120,23 @@ def _edge_tables(rows: Iterable[EdgeRow]) -> Iterable[Table]:
 
     tables: tuple[list[Row], list[Row], list[Row]] = ([], [], [])
     for j, thing in enumerate(("bar", "scale", "blade")):
-        alpha = (pair(edge.PRINTED_ALPHA[k][j], edge.PRINTED_ALPHA_STD[k][j], 2) for k in n)
-        d = (pair(edge.PRINTED_D[k][j], edge.PRINTED_D_STD[k][j], 2) for k in n)
-        radius = (fixed(edge.PRINTED_RADIUS[k][j], 2) for k in n)
+        alpha = (pair(papers.PRINTED_ALPHA[k][j], papers.PRINTED_ALPHA_STD[k][j], 2) for k in n)
+        d = (pair(papers.PRINTED_D[k][j], papers.PRINTED_D_STD[k][j], 2) for k in n)
+        radius = (fixed(papers.PRINTED_RADIUS[k][j], 2) for k in n)
         for table, cells in zip(tables, (alpha, d, radius), strict=True):
             table.append(("printed", thing, *cells))
     errors: list[Row] = []
     for name in names:
-        for method in edge.METHODS:
+        for method in papers.EDGE_METHODS:
             found = [by[name, method, k] for k in n]
             alpha = (pair(r.alpha_mean_deg, r.alpha_std_deg, 2) for r in found)
             d = (pair(r.d_mean_mm, r.d_std_mm, 3) for r in found)
             for table, cells in zip(tables, (alpha, d, (fixed(r.radius_mm, 3) for r in found)), strict=True):
-                table.append((edge.TITLES[name], method, *cells))
+                table.append((papers.TITLES[name], method, *cells))
         for k in n:
-            p, q = (by[name, m, k] for m in edge.METHODS)
+            p, q = (by[name, m, k] for m in papers.EDGE_METHODS)
             three = ((p.rotation_deg, p.translation_mm), (q.rotation_deg, q.translation_mm), (q.crb_deg, q.crb_mm))
-            errors.append((edge.TITLES[name], str(k), *(f"{fixed(deg, 3)} / {fixed(mm, 3)}" for deg, mm in three)))
+            errors.append((papers.TITLES[name], str(k), *(f"{fixed(deg, 3)} / {fixed(mm, 3)}" for deg, mm in three)))
     yield "Edge: true errors, deg / mm", ("set", "rotations", "paper", "joint", "Cramér-Rao bound"), errors
     counts = tuple(f"{k} rotations" for k in n)
     for title, lines in zip(("1: angle, deg", "2: distance, mm", "3: radius, mm"), tables, strict=True):
@@ -141,21 +148,21 @@ def _sphere_tables(results: Iterable[WorldResult]) -> Iterable[Table]:
     points: list[Row] = []
     seam: list[Row] = []
     boss: list[Row] = []
-    for method in sphere.METHODS:
+    for method in papers.SPHERE_METHODS:
         found = [r for r in results if r.method == method]
-        printed = sphere.PRINTED_POINTS.get(method)
+        printed = papers.PRINTED_POINTS.get(method)
         mean = np.mean([r.points_mm for r in found], axis=0)
         points.append((method, *_printed(printed), *(fixed(v, 3) for v in (*mean, float(mean.mean())))))
         best = method == "compensated"
         s = np.mean([r.seam_mm for r in found if r.seam_mm is not None], axis=0)
-        seam.append((method, *_printed(sphere.PRINTED_SEAM if best else None), *(fixed(v, 3) for v in s)))
+        seam.append((method, *_printed(papers.PRINTED_SEAM if best else None), *(fixed(v, 3) for v in s)))
         b = zip(*(r.boss for r in found if r.boss is not None), strict=True)
-        shown = _printed(sphere.PRINTED_BOSS if best else None, 2)
+        shown = _printed(papers.PRINTED_BOSS if best else None, 2)
         boss.append((method, *shown, *(f"{fixed(min(v), 3)} to {fixed(max(v), 3)}" for v in b)))
     three = ("point 1", "point 2", "point 3")
     for title, names, lines in (
         ("1: sensed to touched, mm", (*(f"printed, {p}" for p in three), *three, "mean"), points),
-        ("2: seam, mm", (*(f"printed, {p}" for p in sphere.SEAM_FEATURES), *sphere.SEAM_FEATURES), seam),
+        ("2: seam, mm", (*(f"printed, {p}" for p in papers.SEAM_FEATURES), *papers.SEAM_FEATURES), seam),
         ("3: frustum", ("printed, length mm", "printed, angle deg", "length mm", "angle deg"), boss),
     ):
         yield f"Sphere paper, Table {title}", ("method", *names), lines

@@ -16,8 +16,7 @@ from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.harness import statistics
-from weldcal.tools.studies.robot.jobs import jobs
-from weldcal.tools.studies.robot.stream import TRANSPORT, one_transport, stream
+from weldcal.tools.studies.robot.stream import TRANSPORT, jobs, one_transport, stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING

@@ -16,7 +16,7 @@ from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
 from weldcal.tools.report.pictures import OURS, THEIRS, svg
 from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.harness import Figures, Row, Study, Table
+from weldcal.tools.studies.harness import Figures, Row, Study, Table, Target, all_met
 from weldcal.tools.studies.tablet.study import (
     PUBLISHED_EVALUATIONS,
     Reproduced,
@@ -26,7 +26,6 @@ from weldcal.tools.studies.tablet.study import (
     held_out,
     reproduce_stages,
 )
-from weldcal.tools.studies.targets import Target, all_met
 from weldcal.tools.worlds.tablet import STAGE_1, TABLE_NUMBER, TOUCHING_MM, printed_stage, published_touches
 
 PUBLISHED_TRIALS = 20

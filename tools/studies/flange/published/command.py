@@ -20,8 +20,7 @@ from weldcal.tools.studies.flange.published.pairs import (
     study_kinect,
     study_pairs,
 )
-from weldcal.tools.studies.flange.published.report import COST_HEADER, cost_rows, pictures, tables
-from weldcal.tools.studies.flange.published.results import PublishedResults
+from weldcal.tools.studies.flange.published.report import COST_HEADER, PublishedResults, cost_rows, pictures, tables
 from weldcal.tools.studies.flange.published.simulation import simulate
 from weldcal.tools.studies.flange.published.sphere import run_sphere_study, sphere_rows
 from weldcal.tools.studies.harness import Study
