@@ -1,4 +1,4 @@
-"""`weldcal plan-motion`: which motion tells most of the scanner's pose and clock, before anything is recorded."""
+"""weldcal plan-motion and plan-poses: the motion, or the poses of scans, that determine most, before any recording."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -11,19 +11,27 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.data.results import load_result
+from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.motion.expected import PredictedSigma, expected_of_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.moves import closed_moves, recorded_stream
+from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.kinematics_choice import LEAST
+from weldcal.calibration.refinement.kinematics_fit import KINDS
+from weldcal.calibration.refinement.poses import informative_poses
+from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic
 from weldcal.systems.jobs.motion.job import MotionJob, plan_corners
+from weldcal.systems.jobs.weld.settings import plan_poses as plan_scan_poses
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
-from weldcal.tools.report.files import write_json
+from weldcal.tools.report.files import csv_text, write_json
 
 _EDGES, _LEANS = (0.5, 1.0, 1.25), (5.0, 15.0, 25.0)  # of the scenario's cube; degrees
 _SPEED_M_S = 0.25  # of a part to be scanned: what an error of the clock costs
@@ -188,3 +196,88 @@ def _script(planned: Planned, speed_m_s: float) -> str:
     ]
     lines += [f"movej([{', '.join(f'{v:.6f}' for v in q)}], a=1.2, v=0.4)" for q in radians]
     return "\n".join(lines) + "\n"
+
+
+_POOL = (6, 4, 3, 2, 1)
+"""Times the scans: how many poses to choose from, as many as the cell allows."""
+
+
+@command("plan-poses", short_help="Find the poses of scans for calibrate --refine.")
+def plan_poses(
+    call: Call,
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="Arm, scanner and its guess: a scenario by name or YAML file.")
+    ] = "calibrate_only",
+    scans: Annotated[int, option("--scans", "N", "Number of scans.", min=12)] = 20,
+    kind: Annotated[str, option("--kind", "KIND", "The refinement that they are for: links or joints.")] = "links",
+) -> Outcome:
+    """Choose flange poses that the arm reaches and the scanner sees, and write them as a table and URScript. Nothing
+    moves."""
+
+    found = plan_refining_poses(
+        scenario, call.folder("plan-poses", scenario), scans=scans, kind=kind, seed=call.seed, progress=call.progress
+    )
+    values = {k: found[k] for k in ("scans", "chosen_from", "written_to")}
+    return Outcome(found, values={k.replace("_", " "): v for k, v in values.items()})
+
+
+def plan_refining_poses(
+    scenario: str,
+    out: Path,
+    *,
+    scans: int = 20,
+    kind: str = "links",
+    seed: int = 0,
+    progress: Progress = lambda stage, fraction: None,
+) -> dict[str, object]:
+    """Choose ``scans`` poses of a scenario's arm before its scanner (at its guess); write poses.csv, poses.script and
+    plan.json to ``out``.
+
+    poses.csv is the table of a dataset with the joint angles as planned; replace them by those that the robot reports
+    at each scan. Nothing moves. Raises InputError: an unknown ``kind``, fewer scans than `--refine` needs, or a cell in
+    which no such poses exist.
+    """
+    if kind not in KINDS:
+        raise InputError(f"There is no refinement '{kind}' of an arm; choose one of {', '.join(KINDS)}.")
+    if scans < LEAST:
+        raise InputError(f"Errors of the arm need {LEAST} scans and more, not {scans}.")
+    loaded = load_scenario(scenario)
+    arm = load_chain(loaded.arm, None if loaded.kinematics is None else Path(loaded.kinematics))
+    progress("poses", 0.0)
+    station = make_station(loaded, seed)
+    pool: tuple[PlannedPose, ...] = ()
+    try:
+        for k, times in enumerate(_POOL):
+            try:
+                pool = plan_scan_poses(loaded, station, seed, count=times * scans)
+                break
+            except UnreachableScanner:
+                if times == _POOL[-1]:
+                    raise
+                progress("poses", (k + 1) / (len(_POOL) + 1))
+    finally:
+        station.close()
+    q = np.array([p.q for p in pool])
+    chosen = [pool[i] for i in informative_poses(arm, loaded.calibration.mounting_guess.pose(), q, scans, kind)]
+    rows = []
+    for i, p in enumerate(chosen, start=1):
+        w = p.X_BF.rotation().ToQuaternion().wxyz()
+        rows.append([f"pose{i:02d}", *(f"{v:.6f}" for v in (*p.X_BF.translation(), *w, *p.q))])
+    names = ("id", "x", "y", "z", "qw", "qx", "qy", "qz", *(f"q{j + 1}" for j in range(arm.n)))
+    moves = [
+        f"movej([{', '.join(f'{v:.6f}' for v in p.q)}], a=1.2, v=0.4)  # {r[0]}: scan"
+        for p, r in zip(chosen, rows, strict=True)
+    ]
+    result: dict[str, object] = {
+        "state": "done",
+        "kind": kind,
+        "scans": len(chosen),
+        "chosen_from": len(pool),
+        "turn_deg": turn_deg([p.X_BF for p in chosen]),
+        "joints_deg": [[round(float(v), 3) for v in np.degrees(p.q)] for p in chosen],
+    }
+    write_atomic(out / "poses.csv", csv_text(names, rows))
+    write_atomic(out / "poses.script", "\n".join(["# move to each pose and scan there", *moves]) + "\n")
+    write_json(out / "plan.json", result)
+    progress("poses", 1.0)
+    return result | {"written_to": str(out)}
