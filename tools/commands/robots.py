@@ -1,4 +1,4 @@
-"""weldcal robots, check-robot, emulate-ur: known robots, checks of a controller before a run, an emulated controller."""
+"""weldcal robots, check-robot, emulate-ur: known robots, a controller's readiness, a controller on loopback."""
 
 import math
 import shutil
