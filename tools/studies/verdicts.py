@@ -12,8 +12,7 @@ from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.doctor import worded
 from weldcal.tools.report.fleet import FINE, LOOK, VISIT
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
-from weldcal.tools.worlds.doctor import CAUSES, clean
-from weldcal.tools.worlds.fleet_cells import FAULTS, write_fleet
+from weldcal.tools.worlds.doctor import CAUSES, FAULTS, clean, write_fleet
 
 NONE = "none"
 CLEAN_SEEDS = 10_000  # sets without a cause have seeds of their own

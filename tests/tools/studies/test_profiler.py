@@ -12,12 +12,10 @@ from typer.testing import CliRunner
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.profiler import reproduce
-from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines
 from weldcal.tools.studies.profiler.papers import SPHERE_METHODS, edge_rows, measure
-from weldcal.tools.studies.profiler.reproduce import compute
+from weldcal.tools.studies.profiler.reproduce import compute, figure_text, fixed_lines
 from weldcal.tools.worlds.edge_trials import made_edge_trials
-from weldcal.tools.worlds.profiler import SphereWorld, sphere_trial
-from weldcal.tools.worlds.profiler_parts import WorldData, groove_mesh, scan_groove
+from weldcal.tools.worlds.profiler import SphereWorld, WorldData, groove_mesh, scan_groove, sphere_trial
 
 
 def test_on_other_edges_the_joint_method_is_near_its_bound_and_the_papers_is_not() -> None:

@@ -15,7 +15,7 @@ from weldcal.calibration.profiler.sphere.arc import fit_circle
 from weldcal.calibration.profiler.sphere.joint import sphere_joint
 from weldcal.calibration.profiler.sphere.linear import compensate, fit_touch_sphere, sphere_center, sphere_linear
 from weldcal.tools.worlds.edge_trials import TRANSLATIONS, EdgeTrial
-from weldcal.tools.worlds.profiler_parts import WorldData
+from weldcal.tools.worlds.profiler import WorldData
 
 COUNTS = (10, 15, 20, 25)
 EDGE_METHODS = ("paper", "joint")

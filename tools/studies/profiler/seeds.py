@@ -35,7 +35,7 @@ from weldcal.tools.studies.profiler.papers import (
     sphere_targets,
 )
 from weldcal.tools.worlds.edge_trials import fixed_edge_trials, made_edge_trials, rms
-from weldcal.tools.worlds.profiler_parts import MM, WorldData, fixed_worlds, made_worlds
+from weldcal.tools.worlds.profiler import MM, WorldData, fixed_worlds, made_worlds
 
 TRIALS = {"free": 20}
 WORLDS, GROOVES, BOSSES = 8, 3, 2
