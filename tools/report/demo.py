@@ -34,7 +34,7 @@ from weldcal.tools.report.first_screen import (
 from weldcal.tools.report.monitor import drift_document
 from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, svg
 from weldcal.tools.report.plots_weld import WeldTrace
-from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.render import fixed, render, sigma_rows
 from weldcal.tools.report.run import RunOptions, robot_timing
 from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, heat_input_kJ_mm
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
@@ -309,12 +309,7 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
     estimate = status.estimate
     pose = []
     if estimate is not None:
-        sigma = np.sqrt(np.diag(estimate.covariance))
-        pose = [
-            ("one sigma of the position, mm", "  ".join(fixed(1e3 * float(v), 3) for v in sigma[3:])),
-            ("one sigma of the rotation, deg", "  ".join(fixed(float(np.degrees(v)), 4) for v in sigma[:3])),
-            ("ROS 2", export_ros2(estimate.X_BC).strip()),
-        ]
+        pose = [*sigma_rows(estimate.covariance), ("ROS 2", export_ros2(estimate.X_BC).strip())]
     return render(
         "demo.html.j2",
         result=result,

@@ -117,6 +117,11 @@ class Tolerance:
         return f"{value:.3f} {self.unit}".strip()
 
 
+def limit_tolerance(what: str, figure: float, limit_mm: float | None) -> Tolerance | None:
+    """The figure named ``what`` (mm) against the limit that --limit-mm states; None where it states none."""
+    return None if limit_mm is None else Tolerance(f"the {what},", figure, limit_mm, "--limit-mm")
+
+
 @dataclass(frozen=True)
 class ExpectedError:
     """The error to expect: `what` is measured, the figure with its unit, and what backs it, in words."""

@@ -9,25 +9,51 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import CalibrationResult, export_ros2, matrix4, target_document
+from weldcal.calibration.data.results import CalibrationResult, export_ros2, matrix4, software_version, target_document
 from weldcal.calibration.data.scanner_clock import DEVICE
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.models.arrays import Array
-from weldcal.tools.report.calibration import scanner_pose
+from weldcal.tools.report.calibration import error_summary, pose_records, scanner_pose, tilt_summary
 from weldcal.tools.report.first_screen import (
     NO_TOLERANCE,
     Findings,
     FirstScreen,
     Next,
-    Tolerance,
     expected_error,
+    limit_tolerance,
     point_covariance,
     radius_95,
     refused_note,
 )
 from weldcal.tools.report.pictures import GREY, OURS, TRUTH, svg
-from weldcal.tools.report.render import fixed, fixed_row, render
+from weldcal.tools.report.render import fixed, render, sigma_rows
+
+
+def motion_result(
+    e: MotionEstimate, ids: Sequence[str], refused: Sequence[tuple[str, str]], **more: Any
+) -> CalibrationResult:
+    """The estimate as a result folder holds it; ``more`` are the names of robot, flange and scanner, and other fields."""
+    values = {
+        "residual_mm": 1e3 * e.residual_m,
+        "held_out_mm": 1e3 * e.held_out_m,
+        "tilt_deg": np.degrees(e.tilt_rad),
+        "held_out_tilt_deg": np.degrees(e.held_out_tilt_rad),
+    }
+    return CalibrationResult(
+        X_BC=e.X_BC,
+        covariance=e.covariance,
+        held_out_mm=error_summary(1e3 * e.held_out_m[e.inliers]),
+        tilt_deg=tilt_summary(e.held_out_tilt_rad[e.inliers]),
+        poses=pose_records(ids, e.inliers, values, refused),
+        unobservable=e.unobservable,
+        sigma_position_mm=1e3 * e.sigma_position_m,
+        sigma_normal_deg=float(np.degrees(e.sigma_normal_rad)),
+        software=software_version(),
+        clock=e.clock,
+        clock_covariance=e.joint,
+        **more,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,9 +162,7 @@ def motion_screen(
     place = "in the middle of the frames" if r.symbol == "X_BC" else "at the target"
     what = f"error {place}, 95 %"
     expected, larger = expected_error(what, own, p95, len(held), "frames")
-    tolerance = None
-    if limit_mm is not None:
-        tolerance = Tolerance(f"the {what},", larger, limit_mm, "--limit-mm")
+    tolerance = limit_tolerance(what, larger, limit_mm)
     notes = refused_note(refused, len(p_C) + len(refused), "frames")
     concerns = (*r.warnings, *r.unobservable)
     found = Findings(
@@ -165,7 +189,6 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
     """The whole report as one self-contained HTML text."""
     r, e = report.result, report.estimate
     clock = e.clock
-    sigma = np.sqrt(np.diag(r.covariance))
     before, after = report.along_rms_mm
     facts = [
         ("clock used", f"{clock.kind}. {clock.reason}"),
@@ -195,11 +218,7 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
         offset_ms=None if clock.offset_s is None else 1e3 * clock.offset_s,
         offset_sigma_ms=None if clock.sigma_s is None else 1e3 * clock.sigma_s,
         first=report.first,
-        pose_facts=[
-            ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
-            ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
-            ("ROS 2", export_ros2(r.X_BC).strip()),
-        ],
+        pose_facts=[*sigma_rows(r.covariance), ("ROS 2", export_ros2(r.X_BC).strip())],
         clock_facts=facts,
         along=_along(report),
         cost=_cost(report),

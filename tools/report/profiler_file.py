@@ -17,13 +17,13 @@ from weldcal.tools.report.first_screen import (
     FirstScreen,
     Next,
     ShownPose,
-    Tolerance,
     expected_error,
+    limit_tolerance,
     point_covariance,
     radius_95,
 )
 from weldcal.tools.report.pictures import OURS, error_bars, svg
-from weldcal.tools.report.render import fixed, fixed_row, render
+from weldcal.tools.report.render import fixed, render, sigma_rows
 
 _NAMES = {
     "scans": ("scans", ""),
@@ -94,9 +94,7 @@ class ProfilerFile:
         p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
         what = "error in the middle of the profiles, 95 %"
         expected, larger = expected_error(what, own, p95, len(held), "scans")
-        tolerance = None
-        if self.limit_mm is not None:
-            tolerance = Tolerance(f"the {what},", larger, self.limit_mm, "--limit-mm")
+        tolerance = limit_tolerance(what, larger, self.limit_mm)
         grave, notes = scan_notes(self.found)
         found = Findings(
             tolerance=tolerance, unseen=len(held), concerns=(*self.found.get("warnings", ()), *grave), notes=notes
@@ -148,9 +146,7 @@ class ProfilerSeam:
                 f"{own:.3f} mm",
                 f"of the profiler's calibration; {fit}; no point of the groove was measured otherwise",
             )
-        tolerance = None
-        if self.limit_mm is not None:
-            tolerance = Tolerance(f"the {what},", float("nan") if own is None else own, self.limit_mm, "--limit-mm")
+        tolerance = limit_tolerance(what, float("nan") if own is None else own, self.limit_mm)
         grave, notes = scan_notes(self.found)
         found = Findings(tolerance=tolerance, concerns=(*self.found.get("warnings", ()), *grave), notes=notes)
         after = Next("Touch some points of the groove with a pointer of known length, and compare them with seam.csv.")
@@ -177,7 +173,6 @@ def profiler_report(made: ProfilerFile) -> str:
     """The page of a calibration from a file, as one self-contained HTML text."""
     held = made.held_out_mm
     judged = bool(np.isfinite(held).any())
-    sigma = None if made.record.covariance is None else np.sqrt(np.diag(made.record.covariance))
     return render(
         "profiler_file.html.j2",
         first=made.first,
@@ -191,14 +186,7 @@ def profiler_report(made: ProfilerFile) -> str:
         seen=_seen(made.points),
         seam=None,
         rows=_rows(made.found),
-        sigma=(
-            []
-            if sigma is None
-            else [
-                ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
-                ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
-            ]
-        ),
+        sigma=[] if made.record.covariance is None else sigma_rows(made.record.covariance),
         warnings=list(made.found.get("warnings", ())),
         lists=_lists(made.found),
         digest=made.record.data_sha256,

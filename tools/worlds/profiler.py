@@ -335,7 +335,7 @@ TOP_M, HIP_M = 0.040, 0.050
 
 @dataclass(frozen=True, eq=False)
 class GrooveScan:
-    """Joints (n, 6), raw profiles (n, m, 2) m, true features (n, 3, 2) m as the sensor shows them, touches (n, 3, 6)."""
+    """Joints (n, 6), raw profiles (n, m, 2) m, true features (n, 3, 2) m as the sensor shows it, touches (n, 3, 6)."""
 
     q: Floats
     profiles: Floats
