@@ -46,7 +46,7 @@ from weldcal.tools.report.first_screen import (
     work_point_error,
     work_point_expected,
 )
-from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, svg
+from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, subplots, svg
 from weldcal.tools.report.render import fixed, render, sigma_rows
 
 
@@ -404,13 +404,11 @@ def _scanner_rows(report: CalibrationReport) -> list[tuple[str, ...]]:
 
 def _convergence(report: CalibrationReport) -> bytes:
     c = report.convergence
-    figure = Figure(figsize=(8.2, 3.9), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.9)
     _band(axes, c.counts, 1e3 * c.held_out, OURS, "this calibration, on unused scans")
     _band(axes, c.counts, 1e3 * c.figure_true, TRUTH, "Algorithm 1, on unused scans")
     _band(axes, c.counts, 1e3 * c.figure, THEIRS, "figure reported by Algorithm 1")
-    axes.set_xlabel("number of scans")
-    axes.set_ylabel("error at the flange, mm")
+    axes.set(xlabel="number of scans", ylabel="error at the flange, mm")
     axes.set_ylim(bottom=0.0)
     if axes.lines:
         axes.legend(frameon=False, fontsize=9)
@@ -471,8 +469,7 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
             markersize=15,
             label="best next pose",
         )
-        axes.set_xlabel(f"base {'xyz'[i]}, mm")
-        axes.set_ylabel(f"base {'xyz'[j]}, mm")
+        axes.set(xlabel=f"base {'xyz'[i]}, mm", ylabel=f"base {'xyz'[j]}, mm")
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_aspect("equal")
     assert drawn is not None

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
@@ -32,7 +31,7 @@ from weldcal.tools.report.first_screen import (
     work_point_expected,
 )
 from weldcal.tools.report.monitor import drift_document
-from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, svg
+from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, subplots, svg
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.report.render import fixed, render, sigma_rows
 from weldcal.tools.report.run import RunOptions, robot_timing
@@ -420,8 +419,7 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
     """Expected and held-out error of the estimate in use and Algorithm 1's own figure, against the scans taken (Fig.
     11)."""
     n, expected, held_out, figure = (np.array(c, dtype=float) for c in zip(*status.history, strict=True))
-    picture = Figure(figsize=(7.2, 3.4), layout="constrained")
-    axes = picture.subplots()
+    picture, axes = subplots(7.2, 3.4)
     axes.semilogy(n, 1e3 * expected, "o-", color=OURS, label="expected at the work point (one sigma, 3-D)")
     axes.semilogy(n, 1e3 * held_out, "s--", color=ROBOT, label="held out, at the ring (median)")
     if np.isfinite(figure).any():

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import CalibrationResult, export_ros2, matrix4, software_version, target_document
 from weldcal.calibration.data.scanner_clock import DEVICE
@@ -26,14 +25,14 @@ from weldcal.tools.report.first_screen import (
     radius_95,
     refused_note,
 )
-from weldcal.tools.report.pictures import GREY, OURS, TRUTH, svg
+from weldcal.tools.report.pictures import GREY, OURS, TRUTH, subplots, svg
 from weldcal.tools.report.render import fixed, render, sigma_rows
 
 
 def motion_result(
     e: MotionEstimate, ids: Sequence[str], refused: Sequence[tuple[str, str]], **more: Any
 ) -> CalibrationResult:
-    """The estimate as a result folder holds it; ``more`` are the names of robot, flange and scanner, and other fields."""
+    """The estimate as a result folder holds it; ``more``: the names of robot, flange and scanner, and other fields."""
     values = {
         "residual_mm": 1e3 * e.residual_m,
         "held_out_mm": 1e3 * e.held_out_m,
@@ -235,8 +234,7 @@ def _ms_text(seconds: float | None) -> str:
 def _along(report: MotionReport) -> bytes:
     """Residual along the motion against time, before and after synchronisation."""
     e = report.estimate
-    figure = Figure(figsize=(8.2, 5.4), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
+    figure, (upper, lower) = subplots(8.2, 5.4, 2, 1, sharex=True)
     t = e.capture - e.capture[0]
     for axes, values, color, name in (
         (upper, e.before_m, TRUTH, "arrivals taken for captures"),
@@ -260,16 +258,15 @@ def _along(report: MotionReport) -> bytes:
 def _cost(report: MotionReport) -> bytes:
     """Rms of the rigid fit against the delay of the frames' times."""
     start, clock = report.estimate.start, report.estimate.clock
-    figure = Figure(figsize=(8.2, 3.4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.4)
     good = np.isfinite(start.rms_m)
     axes.plot(1e3 * start.delays[good], 1e3 * start.rms_m[good], color=OURS, linewidth=1.6)
     axes.axvline(1e3 * start.delay_s, color=TRUTH, linewidth=1, linestyle="--")
-    axes.set_xlabel(
-        "offset of the arrivals, ms"
+    axes.set(
+        xlabel="offset of the arrivals, ms"
         if clock.kind != DEVICE
-        else "device time behind the median arrival less capture, ms"
+        else "device time behind the median arrival less capture, ms",
+        ylabel="rms of the rigid fit, mm",
     )
-    axes.set_ylabel("rms of the rigid fit, mm")
     axes.set_ylim(bottom=0.0)
     return svg(figure, axes)

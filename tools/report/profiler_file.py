@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.profiler.record import ProfilerRecord
@@ -22,7 +21,7 @@ from weldcal.tools.report.first_screen import (
     point_covariance,
     radius_95,
 )
-from weldcal.tools.report.pictures import OURS, error_bars, svg
+from weldcal.tools.report.pictures import OURS, error_bars, subplots, svg
 from weldcal.tools.report.render import fixed, render, sigma_rows
 
 _NAMES = {
@@ -230,12 +229,10 @@ def _lists(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _seen(points: Array) -> bytes:
     """Where in the scan plane the points (n, 2) m were measured: the calibration is good there."""
-    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.6)
     axes.plot(1e3 * points[:, 0], 1e3 * points[:, 1], ".", color=OURS, markersize=2.5)
     axes.plot(*(1e3 * points.mean(axis=0)), "+", color="#000000", markersize=12, markeredgewidth=1.6)
-    axes.set_xlabel("x in the scan plane, mm")
-    axes.set_ylabel("z, mm")
+    axes.set(xlabel="x in the scan plane, mm", ylabel="z, mm")
     axes.invert_yaxis()
     axes.set_aspect("equal", adjustable="datalim")
     return svg(figure, axes)
@@ -243,12 +240,10 @@ def _seen(points: Array) -> bytes:
 
 def _line(root_mm: Array) -> bytes:
     """The root (n, 3) mm of a groove in the base, from above and from the side."""
-    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
-    both = figure.subplots(1, 2)
+    figure, both = subplots(8.2, 3.6, 1, 2)
     for axes, (i, j), title in zip(both, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         axes.plot(root_mm[:, i], root_mm[:, j], ".", color=OURS, markersize=4)
-        axes.set_xlabel(f"base {'xyz'[i]}, mm")
-        axes.set_ylabel(f"base {'xyz'[j]}, mm")
+        axes.set(xlabel=f"base {'xyz'[i]}, mm", ylabel=f"base {'xyz'[j]}, mm")
         axes.set_title(title, fontsize=10, loc="left")
         axes.margins(0.1)
     return svg(figure, *both)

@@ -187,8 +187,7 @@ def miss_arrows(shown: Shown) -> bytes:
     axes.set_aspect("equal", adjustable="datalim")
     axes.invert_yaxis()
     axes.margins(0.2)
-    axes.set_xlabel("page x, mm")
-    axes.set_ylabel("page y, mm")
+    axes.set(xlabel="page x, mm", ylabel="page y, mm")
     axes.set_title(f"residuals, enlarged {times:g} times (largest {largest:.2f} mm)", fontsize=9, loc="left")
     return svg(figure, axes)
 

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from matplotlib.figure import Figure
 from pydrake.math import RigidTransform
 from scipy.stats import binom, chi2
 
@@ -22,7 +21,7 @@ from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.pictures import svg
+from weldcal.tools.report.pictures import subplots, svg
 from weldcal.tools.report.render import fixed, write_atomic
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, statistics
 from weldcal.tools.worlds import wrong_models
@@ -133,8 +132,7 @@ def _inside(
 
 def coverage_picture(studies: list[Coverage]) -> bytes:
     """Shares inside their stated 95 % regions against the number of scans, and the band in which exact regions fall."""
-    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
+    figure, axes = subplots(8.2, 3.6, 1, 2, sharey=True)
     low, high = studies[0].chance()
     for ax, corrected, title in zip(
         axes, (False, True), ("an exact scanner", "a scanner off by 0.2 %, corrected"), strict=True
@@ -145,8 +143,7 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
         ax.axhline(95.0, color="#444", linewidth=1, linestyle="--")
         ax.plot(n, [100 * s.pose for s in chosen], color="#1d5f8a", marker="o", label="X_BC")
         ax.plot(n, [100 * s.point for s in chosen], color="#b08a2e", marker="s", label="the work point")
-        ax.set_xticks(n)
-        ax.set_xlabel("number of scans")
+        ax.set(xticks=n, xlabel="number of scans")
         ax.set_title(title, fontsize=10, loc="left")
         ax.set_ylim(88.0, 100.0)
     axes[0].set_ylabel("inside the stated 95 % region, %")

@@ -26,7 +26,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.console import Progress
-from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, svg
+from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, subplots, svg
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, Table, Target, all_met
 from weldcal.tools.worlds.motion import (
@@ -73,8 +73,7 @@ def _components(axes: Axes, t: Array, errors: Array, first: int) -> None:
 def history_picture(t: Array, before: Array, after: Array) -> bytes:
     """Fig. 6: components (N, 6) of the calibration's error by ICP over time (N,) s, before and after
     synchronisation."""
-    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-    every = figure.subplots(2, 2, sharex=True, sharey="row")
+    figure, every = subplots(9.0, 6.0, 2, 2, sharex=True, sharey="row")
     both = (("poses at arrival", before), ("joint estimate of X_BC and clock", after))
     for column, (title, errors) in enumerate(both):
         for row, (first, unit) in enumerate(((3, "mm"), (0, "degrees"))):
@@ -97,8 +96,7 @@ def after_picture(t: Array, errors: Array) -> bytes:
 
 def quality_picture(faces: Mapping[str, Array], titles: Mapping[str, str]) -> bytes:
     """Fig. 9: points (N, 3) mm of the flange in both modes, from the front by height and from the side."""
-    figure = Figure(figsize=(9.0, 6.4), layout="constrained")
-    every = figure.subplots(2, 2, height_ratios=[3.0, 1.0], sharex=True)
+    figure, every = subplots(9.0, 6.4, 2, 2, height_ratios=[3.0, 1.0], sharex=True)
     for column, (name, points) in enumerate(faces.items()):
         front, side = every[:, column]
         dots = front.scatter(
@@ -107,8 +105,7 @@ def quality_picture(faces: Mapping[str, Array], titles: Mapping[str, str]) -> by
         front.set_aspect("equal")
         front.set_title(titles[name], fontsize=10)
         plain(front, "", "mm")
-        front.set_xlim(-36, 36)
-        front.set_ylim(-36, 36)
+        front.set(xlim=(-36, 36), ylim=(-36, 36))
         band = np.abs(points[:, 1]) < 2.0
         side.plot(points[band, 0], points[band, 2], ".", ms=1.5, color=OURS, rasterized=True)
         side.set_ylim(-10.0, 4.0)

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_plane_motion, hand_over
@@ -27,7 +26,7 @@ from weldcal.models.arrays import Array
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.report.pictures import OURS, THEIRS, svg
+from weldcal.tools.report.pictures import OURS, THEIRS, subplots, svg
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.harness import Figures, Row, Study, Table, Target, all_met
 from weldcal.tools.worlds.tablet import (
@@ -450,8 +449,7 @@ def _table(r: Reproduced) -> dict[str, object]:
 def sign_residuals(touches: TabletTouches) -> bytes:
     """For each sign of Eq. 20: the nine hand positions, and by how much a similarity of the tablet and a pen miss
     them."""
-    picture = Figure(figsize=(9.6, 3.0), layout="constrained")
-    every = picture.subplots(1, 3, sharex=True, sharey=True)
+    picture, every = subplots(9.6, 3.0, 1, 3, sharex=True, sharey=True)
     for axes, sign in zip(every, Sign, strict=True):
         points = touches.pitch_m * (touches.landmark_px - sign * touches.delta_px)
         x = fit_plane_motion(points, touches.hand_m, touches.theta_rad, free_scale=True)
@@ -462,8 +460,7 @@ def sign_residuals(touches: TabletTouches) -> bytes:
         axes.plot(*hand.T, "o", color="black", ms=3)
         rms = float(np.sqrt((e**2).mean()))
         axes.set_title(f"{SIGN_WORDS[sign]}: {rms:.2f} mm per axis", fontsize=10)
-        axes.set_aspect("equal")
-        axes.set_xlabel("hand x, mm")
+        axes.set(aspect="equal", xlabel="hand x, mm")
         axes.margins(0.15)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from weldcal.models.arrays import Array
-from weldcal.tools.report.pictures import OURS, PLANNED, THEIRS, TRUTH, plain, svg
+from weldcal.tools.report.pictures import OURS, PLANNED, THEIRS, TRUTH, plain, subplots, svg
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
 from weldcal.tools.studies.flange.published.pairs import PAPER_E_RPY_DEG, PAPER_E_XYZ_MM, KinectOutcome, PairsOutcome
@@ -184,8 +184,7 @@ def fig11_rerun(c: CloudsOutcome) -> bytes:
 
 def held_out(c: CloudsOutcome) -> bytes:
     """Errors on held-out scans, method by method, and what each reports of itself."""
-    picture = Figure(figsize=(7.6, 3.2), layout="constrained")
-    axes = picture.subplots()
+    picture, axes = subplots(7.6, 3.2)
     rows = []
     for s in c.splits:
         colour = OURS if s.name in ("rigid", "ours") else PLANNED if s.name == "svd" else TRUTH
@@ -203,8 +202,7 @@ def held_out(c: CloudsOutcome) -> bytes:
 
 def costs(s: Simulation) -> bytes:
     """Simulated, 1 mm of noise: error at the camera's origin, which the cost uses, and at the flanges."""
-    picture = Figure(figsize=(7.6, 2.9), layout="constrained")
-    axes = picture.subplots()
+    picture, axes = subplots(7.6, 2.9)
     names = {
         "truth": "cost: the truth",
         "verification": "cost: a measured pose",
@@ -226,8 +224,7 @@ def costs(s: Simulation) -> bytes:
 def circles(c: CloudsOutcome) -> bytes:
     """Where the published circle puts the centre, in the flange's own plane: seed to seed, scan by scan; ours is the
     origin."""
-    picture = Figure(figsize=(7.6, 3.2), layout="constrained")
-    axes, halves = picture.subplots(1, 2, width_ratios=(1.0, 1.2))
+    picture, (axes, halves) = subplots(7.6, 3.2, 1, 2, width_ratios=(1.0, 1.2))
     k = np.arange(len(c.circles))
     halves.bar(k - 0.2, [1e3 * r.halves_published_m for r in c.circles], 0.4, color=THEIRS, label="published circle")
     halves.bar(k + 0.2, [1e3 * r.halves_ours_m for r in c.circles], 0.4, color=OURS, label="weldcal's edges")
@@ -248,8 +245,7 @@ def circles(c: CloudsOutcome) -> bytes:
 
 def _steps(steps: NDArray[np.int64], values: Array, labels: tuple[str, str]) -> tuple[Figure, Axes]:
     """Translations and rotations (runs, steps, 6) over the scans in two panels, and a third panel to draw in."""
-    picture = Figure(figsize=(7.6, 2.7), layout="constrained")
-    *both, third = picture.subplots(1, 3)
+    picture, (*both, third) = subplots(7.6, 2.7, 1, 3)
     for axes, panels, label in zip(both, (PANELS[:3], PANELS[3:]), labels, strict=True):
         _bands(axes, steps, values, panels)
         _plain(axes, "scans", label)
