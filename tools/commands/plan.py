@@ -1,9 +1,8 @@
 """weldcal plan-motion and plan-poses: the motion, or the poses of scans, that determine most, before any recording."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -60,21 +59,30 @@ def plan_motion(
     The error is that of a point among the flange's places, one sigma, of noise alone.
     """
 
-    found = plan_motions(
-        scenario,
-        call.folder("plan-motion", scenario),
-        streams=stream or (),
-        calibration=calibration,
-        seconds=seconds,
-        device=device_clock,
-        seed=call.seed,
-        progress=call.progress,
-    )
-    rows = {str(p["name"]): _line(p) for p in found["motions"]}  # type: ignore[attr-defined]
-    return Outcome(found, values={"written to": found["written_to"]}, rows=rows)
+    out, loaded = call.folder("plan-motion", scenario), load_scenario(scenario)
+    X_BC = loaded.calibration.mounting_guess.pose() if calibration is None else load_result(calibration).X_BC
+    jitter_s = 1e-4 if device_clock else 0.015
+    found = [_of_stream(path, loaded.arm, X_BC, jitter_s) for path in stream or ()]
+    if not stream:
+        found = _of_cubes(loaded, X_BC, seconds, jitter_s, call.seed, call.progress)
+    found.sort(key=lambda p: p.cost_mm)
+    motions = [_plain(p) for p in found]
+    result: dict[str, object] = {
+        "state": "done",
+        "best": motions[0],
+        "motions": motions,
+        "device_times": device_clock,
+        "seconds": None if stream else seconds,
+    }
+    write_json(out / "plan.json", result)
+    if found[0].corners_deg:
+        speed = (loaded.part(MotionJob) or MotionJob()).speed_m_s
+        write_atomic(out / "best.script", _script(found[0], speed))
+    rows = {str(p["name"]): _line(p) for p in motions}
+    return Outcome(result | {"written_to": str(out)}, values={"written to": str(out)}, rows=rows)
 
 
-def _line(p: dict[str, float | None]) -> str:
+def _line(p: dict[str, Any]) -> str:
     shown = (("error_mm", "mm", 3), ("rotation_deg", "deg", 4), ("clock_offset_ms", "ms", 3))
     return ", ".join("open" if p[k] is None else f"{p[k]:.{digits}f} {unit}" for k, unit, digits in shown)
 
@@ -91,47 +99,6 @@ class Planned:
     shared: float
     cost_mm: float
     corners_deg: tuple[tuple[float, ...], ...] = ()
-
-
-def plan_motions(
-    scenario: str,
-    out: Path,
-    *,
-    streams: Sequence[Path] = (),
-    calibration: Path | None = None,
-    seconds: float = 20.0,
-    device: bool = True,
-    seed: int = 0,
-    progress: Progress = lambda stage, fraction: None,
-) -> dict[str, object]:
-    """Compare motions and write plan.json, and best.script with the moves of the best cube, to ``out``.
-
-    The motions are ``streams``, tables as stream.csv that the robot's program has written without a scanner; without
-    any, cubes about the scenario's centre, of several sizes and leans, whose moves are free. ``calibration`` tells
-    where the scanner stands, else the scenario's guess. ``seconds`` is how long the scanner streams, ``device`` whether
-    its frames have device times. Raises InputError: no motion can be planned, or a file cannot be read.
-    """
-    loaded = load_scenario(scenario)
-    X_BC = loaded.calibration.mounting_guess.pose() if calibration is None else load_result(calibration).X_BC
-    jitter_s = 1e-4 if device else 0.015
-    found = [_of_stream(path, loaded.arm, X_BC, jitter_s) for path in streams]
-    if not streams:
-        found = _of_cubes(loaded, X_BC, seconds, jitter_s, seed, progress)
-    found.sort(key=lambda p: p.cost_mm)
-    best = found[0]
-    out.mkdir(parents=True, exist_ok=True)
-    result: dict[str, object] = {
-        "state": "done",
-        "best": _plain(best),
-        "motions": [_plain(p) for p in found],
-        "device_times": device,
-        "seconds": None if streams else seconds,
-    }
-    write_json(out / "plan.json", result)
-    if best.corners_deg:
-        speed = (loaded.part(MotionJob) or MotionJob()).speed_m_s
-        write_atomic(out / "best.script", _script(best, speed))
-    return result | {"written_to": str(out)}
 
 
 def _of_stream(path: Path, arm: str, X_BC: RigidTransform, jitter_s: float) -> Planned:
@@ -183,7 +150,7 @@ def _planned(name: str, told: PredictedSigma, corners: tuple[tuple[float, ...], 
     )
 
 
-def _plain(planned: Planned) -> dict[str, object]:
+def _plain(planned: Planned) -> dict[str, Any]:
     """As plain values; what a motion does not show is None."""
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(planned).items()}
 

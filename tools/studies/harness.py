@@ -151,7 +151,7 @@ class Study:
         what: one sentence for the page of all studies.
         case: a module's function; keyword arguments to a mapping of JSON values. None: the results are computed
             elsewhere.
-        figures: from the results of the cases, failed ones included, to the JSON object.
+        figures: from the results of the cases, failed ones included, to the JSON object; without cases see `found`.
         header: names of the table's columns.
         rows: the table's lines, from the figures.
         targets: the bounds that the figures are judged against, from the figures.
@@ -163,9 +163,9 @@ class Study:
 
     name: str
     what: str
-    figures: Callable[[Results], Figures]
     header: Row
     rows: Callable[[Figures], Iterable[Row]]
+    figures: Callable[[Results], Figures] = lambda results: results["all"]
     case: Callable[..., Mapping[str, object]] | None = None
     targets: Callable[[Figures], Sequence[Target]] = lambda figures: ()
     plots: Mapping[str, Callable[[Results], bytes]] = field(default_factory=dict)
@@ -202,6 +202,10 @@ class Study:
         if found and not done(found):
             raise InputError(str(next(iter(found.values()))["reason"]))
         return self.measured(found, farm.folder, cases)
+
+    def found(self, figures: Figures, folder: Path) -> Outcome:
+        """The outcome of a study that computes its figures without cases; the files of its result are written."""
+        return self.measured({"all": figures}, folder).outcome()
 
     def measured(self, results: Results, folder: Path | None = None, cases: Cases | None = None) -> "Measured":
         """The figures, the table and the verdicts of results; with a folder their files are written there."""

@@ -1,4 +1,9 @@
-"""weldcal profiler clock and seam: the offset of a calibrated profiler's clock, and a V-groove mapped into the base."""
+"""weldcal profiler clock and seam: the offset of a calibrated profiler's clock, and a V-groove mapped into the base.
+
+The folder of `profiler clock` holds stream.csv, as a recording in motion, and the profiles: profiles.csv with time,x,z,
+the export of an instrument, or a folder with one file per profile. Of a profile of many points the feature at the side
+is found; one point is the crossing. times.csv gives the time of each profile where the export holds none.
+"""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -62,30 +67,6 @@ def clock(
 ) -> Outcome:
     """Find the offset of a profiler's clock while the arm weaves across one straight edge: capture = stamp - offset."""
     out = call.folder("profiler", folder.resolve().name)
-    return Outcome(
-        find_clock(folder, calibration, out, robot=robot, unit=unit, feature=feature, side=side, pitch_mm=pitch)
-    )
-
-
-def find_clock(
-    folder: Path,
-    calibration: Path,
-    out: Path,
-    *,
-    robot: str = "",
-    unit: str = "m",
-    feature: str = "bar",
-    side: str = "left",
-    pitch_mm: float | None = None,
-) -> dict[str, object]:
-    """Find the offset of a profiler's clock and write clock.json to ``out``.
-
-    ``folder`` holds stream.csv (as a recording in motion) and the profiles: profiles.csv with time,x,z, the export of
-    an instrument, or a folder with one file per profile. Of a profile of many points the ``feature`` at the ``side`` is
-    found; one point is the crossing. times.csv gives the time of each profile where the export holds none.
-    ``pitch_mm``: of an export with heights only. Raises InputError: the files cannot be used; TooFewPoses,
-    UndeterminedPoses: the motion does not show the offset.
-    """
     if unit not in ("m", "mm"):
         raise InputError(f"The unit '{unit}' is not known; write m or mm.")
     if feature not in _KINDS or side not in _SIDES:
@@ -93,7 +74,7 @@ def find_clock(
     record = load_record(calibration)
     source = _source(folder, {calibration.resolve(), out.resolve()})
     stream, said = read_stream(folder / _STREAM, robot=robot, unit=unit)
-    profiles = profiles_of(source, pitch_mm)[0]
+    profiles = profiles_of(source, pitch)[0]
     motion = ContinuousMotion(stream)
     stamps, time_unit = _stamps(folder, profiles, motion)
     time, points, lost = _crossings(profiles, stamps, UNITS[profile_unit(profiles, unit)], feature, side)
@@ -113,7 +94,7 @@ def find_clock(
         "warnings": said,
     }
     write_json(out / "clock.json", result)
-    return result | {"written_to": str(out)}
+    return Outcome(result | {"written_to": str(out)})
 
 
 def _source(folder: Path, skip: set[Path]) -> Path:

@@ -186,7 +186,6 @@ def _coverage_rows(f: Figures) -> Iterable[Row]:
 HONESTY = Study(
     name="flange-honesty",
     what="How often stated 95 % regions hold the truth, and the ratio of held-out to true errors.",
-    figures=lambda results: results["all"],
     header=("scans", "scanner", "X_BC inside", "work point inside", "held-out over true error"),
     rows=_coverage_rows,
     numbers=3,
@@ -203,7 +202,7 @@ def honesty(
     studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
     studies.append(study_warped(12, max(10, runs // 5), call.progress))
     write_atomic(folder / "coverage.svg", coverage_picture(studies))
-    return HONESTY.measured({"all": {"studies": [vars(s) for s in studies]}}, folder).outcome()
+    return HONESTY.found({"studies": [vars(s) for s in studies]}, folder)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +264,6 @@ def _stated_rows(f: Figures) -> Iterable[Row]:
 STATED = Study(
     name="flange-stated",
     what="The stated mean error over the true one, in generated worlds with errors of scanner and arm.",
-    figures=lambda results: results["all"],
     header=("scans", "way", "scanner off, mm", "arm off, mm", "worlds", "true mean error, mm", "stated over true"),
     rows=_stated_rows,
     numbers=5,
@@ -285,7 +283,7 @@ def stated(
             call.progress(f"{poses} scans", k / len(sizes))
             classes.append(study_stated(poses, warp_m, _ARM_M, runs, local=local))
     mean = float(np.mean([s.stated_over_true for s in classes]))
-    return STATED.measured({"all": {"classes": [vars(s) for s in classes], "mean": mean}}, folder).outcome()
+    return STATED.found({"classes": [vars(s) for s in classes], "mean": mean}, folder)
 
 
 def wrong_arm(seed: int, kind: str) -> Mapping[str, object]:
@@ -366,7 +364,6 @@ IMPERFECT = Study(
         "Live calibrations with an imperfect scanner and arm, without rendering: errors, and how often they lie in the"
         " region."
     ),
-    figures=lambda results: results["all"],
     header=("", "found"),
     rows=_imperfect_rows,
 )
@@ -384,7 +381,7 @@ def imperfect(
     in the stated 95 % region."""
     folder = IMPERFECT.folder(call)
     found = study_light_runs(load_scenario(scenario), runs, seed=call.seed, progress=call.progress)
-    return IMPERFECT.measured({"all": _imperfect(found)}, folder).outcome()
+    return IMPERFECT.found(_imperfect(found), folder)
 
 
 def _start_figures(results: Results) -> Figures:

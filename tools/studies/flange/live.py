@@ -187,7 +187,6 @@ def _live_rows(f: Figures) -> Iterable[Row]:
 LIVE = Study(
     name="flange-live",
     what="The error of the live calibration in simulation, beside the least that its poses, arm and scanner allow.",
-    figures=lambda results: results["all"],
     header=("error", "mean", "rms", "worst", "Cramer-Rao, rms"),
     rows=_live_rows,
     targets=lambda f: (
@@ -217,4 +216,4 @@ def live(
     )
     if redraws:
         write_atomic(folder / "live.svg", live_picture(rows))
-    return LIVE.measured({"all": live_figures(rows, scans, repeatability)}, folder).outcome()
+    return LIVE.found(live_figures(rows, scans, repeatability), folder)

@@ -279,7 +279,6 @@ def _few_rows(f: Figures) -> Iterable[Row]:
 FEW = Study(
     name="flange-few",
     what="Calibrations from few of the recorded scans, judged on the scans that were not used.",
-    figures=lambda results: results["all"],
     header=("scans", "median mm", "95 % mm", "tilt deg", "scanner corrected", "draws refused"),
     rows=_few_rows,
     numbers=5,
@@ -294,7 +293,7 @@ def few(
 ) -> Outcome:
     """Calibrate from 1, 2, 3, 4, 6, 8 or 12 of the scans and measure the error on the scans that were not used."""
     folder, found = FEW.folder(call), study_few_scans(dataset, draws, call.seed, progress=call.progress)
-    return FEW.measured({"all": _few(found, draws)}, folder).outcome()
+    return FEW.found(_few(found, draws), folder)
 
 
 def _halves_rows(f: Figures) -> Iterable[Row]:
@@ -306,7 +305,6 @@ def _halves_rows(f: Figures) -> Iterable[Row]:
 HALVES = Study(
     name="flange-halves",
     what="The held-out error that random halves of recorded scans state, against the error on the other halves.",
-    figures=lambda results: results["all"],
     header=("", "found"),
     rows=_halves_rows,
 )
@@ -324,7 +322,7 @@ def halves(
     """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the
     other half."""
     folder, found = HALVES.folder(call), study_halves(dataset, draws, call.seed, call.progress, local=local)
-    return HALVES.measured({"all": found}, folder).outcome()
+    return HALVES.found(found, folder)
 
 
 def _part_rows(f: Figures) -> Iterable[Row]:
@@ -335,7 +333,6 @@ def _part_rows(f: Figures) -> Iterable[Row]:
 PARTS = Study(
     name="flange-parts",
     what="The distance between the flange centres from two parts of one recorded cloud, and its lower bound.",
-    figures=lambda results: results["all"],
     header=("points each", "apart, rms mm", "least possible mm", "stated mm"),
     rows=_part_rows,
     numbers=3,
@@ -350,4 +347,4 @@ def parts(call: Call, dataset: DatasetArgument) -> Outcome:
         raise InputError(f"'{dataset}' holds no clouds to divide. Give a dataset with scans.")
     folder, clouds = PARTS.folder(call), [data.cloud(id) for id in data.clouds]
     rows = study_parts(clouds, get_flange(data.header.flange), seed=call.seed, progress=call.progress)
-    return PARTS.measured({"all": {"rows": rows}}, folder).outcome()
+    return PARTS.found({"rows": rows}, folder)

@@ -388,7 +388,6 @@ def _checks(figures: Figures) -> Iterable[Table]:
 SETS = Study(
     name="hand-eye",
     what="The hand-eye solvers beside OpenCV's seven methods on public sets, and checks in simulation.",
-    figures=lambda results: results["all"],
     rows=_set_rows,
     others=_checks,
     header=(
@@ -414,7 +413,7 @@ def hand_eye_sets(
     """Compare the hand-eye solvers with OpenCV's on public data, and test them in simulation."""
     folder = SETS.folder(call)
     found = run_hand_eye_benchmark(data, quick=quick, seed=call.seed, progress=call.progress)
-    return SETS.measured({"all": found.summary()}, folder).outcome()
+    return SETS.found(found.summary(), folder)
 
 
 @command("benchmark hand-eye", short_help="Compare the hand-eye solvers with OpenCV's.", options=FARM)

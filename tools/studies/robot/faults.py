@@ -3,12 +3,10 @@
 from collections import Counter
 from collections.abc import Sequence as Several
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.pacing import no_long_garbage_collections
-from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import FARM, Call, command, option
 from weldcal.tools.cli.options import Outcome as Printed
 from weldcal.tools.cli.subject import one_of
@@ -84,37 +82,6 @@ class FaultReport:
         }
 
 
-def run_fault_benchmark(
-    out: Path,
-    *,
-    address: str | None = None,
-    sequences: int = 20,
-    seconds: float = 60.0,
-    seed: int = 0,
-    transport: str = NATIVE,
-    progress: Progress = no_progress,
-) -> FaultReport:
-    """The matrix, then the random sequences, each on a controller of its own; faults.csv and sequences.csv grow row by
-    row."""
-    report = FaultReport([], [])
-    share = 150.0 / (150.0 + sequences * seconds)
-
-    cases = RUNNING + AT_START
-    with emulator_process(host=address, seed=seed) as emulator, no_long_garbage_collections():
-        bench = Bench(emulator, transport=transport)
-        for k, case in enumerate(cases):  # each must be able to start after the one before
-            progress(case.name, share * k / len(cases))
-            report.outcomes.append(run_case(bench, case, hasty=False))
-            write_atomic(out / "faults.csv", _table(OUTCOME_COLUMNS, report.outcomes))
-    for k in range(sequences):
-        progress(f"sequence {k + 1} of {sequences}", share + (1.0 - share) * k / sequences)
-        with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
-            report.sequences.append(run_sequence(Bench(emulator, transport=transport), seed + k, seconds))
-        write_atomic(out / "sequences.csv", _table(SEQUENCE_COLUMNS, report.sequences))
-    write_json(out / "robot_faults.json", report.summary())
-    return report
-
-
 def _spread(values: Several[float | None]) -> dict[str, float]:
     found = [value for value in values if value is not None]
     return statistics(found, "median", "max") if found else {}
@@ -148,16 +115,23 @@ def faults(
 ) -> Printed:
     """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say
     why."""
-    result = run_fault_benchmark(
-        call.folder("benchmark", "robot-faults"),
-        address=call.given["address"],
-        sequences=sequences,
-        seconds=seconds,
-        seed=call.seed,
-        transport=one_transport(transport),
-        progress=call.progress,
-    )
-    return Printed(result.summary(), rows={outcome.name: outcome.line for outcome in result.outcomes})
+    out, address, seed = call.folder("benchmark", "robot-faults"), call.given["address"], call.seed
+    transport = one_transport(transport)
+    report, cases = FaultReport([], []), RUNNING + AT_START
+    share = 150.0 / (150.0 + sequences * seconds)
+    with emulator_process(host=address, seed=seed) as emulator, no_long_garbage_collections():
+        bench = Bench(emulator, transport=transport)
+        for k, case in enumerate(cases):  # each must be able to start after the one before
+            call.progress(case.name, share * k / len(cases))
+            report.outcomes.append(run_case(bench, case, hasty=False))
+            write_atomic(out / "faults.csv", _table(OUTCOME_COLUMNS, report.outcomes))
+    for k in range(sequences):
+        call.progress(f"sequence {k + 1} of {sequences}", share + (1.0 - share) * k / sequences)
+        with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
+            report.sequences.append(run_sequence(Bench(emulator, transport=transport), seed + k, seconds))
+        write_atomic(out / "sequences.csv", _table(SEQUENCE_COLUMNS, report.sequences))
+    write_json(out / "robot_faults.json", report.summary())
+    return Printed(report.summary(), rows={outcome.name: outcome.line for outcome in report.outcomes})
 
 
 @command("benchmark robot", short_help="Measure the robot link and the cell by wire.", options=("address", *FARM))
