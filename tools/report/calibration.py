@@ -47,7 +47,7 @@ from weldcal.tools.report.first_screen import (
     work_point_expected,
 )
 from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, subplots, svg
-from weldcal.tools.report.render import fixed, render, sigma_rows
+from weldcal.tools.report.render import fixed, known, render, sigma_rows
 
 
 def error_summary(values: Array) -> dict[str, float]:
@@ -67,7 +67,7 @@ def error_summary(values: Array) -> dict[str, float]:
 def tilt_summary(tilts_rad: Array) -> dict[str, float | None]:
     """Median and 95th percentile of tilts (n,) in degrees; None where there are none."""
     s = error_summary(np.degrees(tilts_rad))
-    return {k: s[k] if np.isfinite(s[k]) else None for k in ("median", "p95")}
+    return {k: known(s[k]) for k in ("median", "p95")}
 
 
 def pose_records(
@@ -77,7 +77,7 @@ def pose_records(
     reasons = dict(refused)
     records = []
     for k, id in enumerate(ids):
-        numbers = {name: float(v[k]) if np.isfinite(v[k]) else None for name, v in values.items()}
+        numbers = {name: known(v[k]) for name, v in values.items()}
         records.append(PoseRecord(id=id, used=bool(used[k]), reason=reasons.pop(id, ""), **numbers))
     return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 

@@ -27,6 +27,7 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
     after_hold,
     refused_note,
+    upper,
     work_point_error,
     work_point_expected,
 )
@@ -355,7 +356,7 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
     plan = result.run.cell.job.planned_seam(result.run.root)
     if plan.seam is None:
         return []
-    rows = [("planned", plan.summary[:1].upper() + plan.summary[1:])] if plan.summary else []
+    rows = [("planned", upper(plan.summary))] if plan.summary else []
     if np.isfinite(plan.sigma_m):
         rows.append(
             ("sigma of the planned root, sideways", f"{fixed(1e3 * plan.sigma_m, 3)} mm, as the planner states it")

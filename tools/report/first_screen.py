@@ -213,7 +213,7 @@ def decide(found: Findings) -> tuple[str, str]:
         return found.settled
     if found.against:
         return DO_NOT, found.against[0]
-    said = found.no_tolerance if found.tolerance is None else _upper(found.tolerance.sentence)
+    said = found.no_tolerance if found.tolerance is None else upper(found.tolerance.sentence)
     if found.tolerance is not None and not found.tolerance.met:
         return DO_NOT, said
     if found.unseen is not None and found.unseen < ENOUGH_UNSEEN:
@@ -386,5 +386,6 @@ def _first_few(texts: Iterable[str]) -> tuple[str, ...]:
     return (*kept, f"{len(every) - len(kept)} more are listed in the report.")
 
 
-def _upper(text: str) -> str:
+def upper(text: str) -> str:
+    """The text with a capital first letter."""
     return text[:1].upper() + text[1:]

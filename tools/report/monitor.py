@@ -13,7 +13,16 @@ from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftEvent
 from weldcal.calibration.motion.drift.watch import DriftHistory
 from weldcal.models.arrays import Array
-from weldcal.tools.report.first_screen import SCANNER, ExpectedError, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.report.first_screen import (
+    SCANNER,
+    ExpectedError,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    upper,
+)
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, subplots, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
@@ -42,7 +51,7 @@ class MonitorReport:
         w = self.watched
         largest = float(np.nanmax(w.statistic)) if len(w.statistic) else float("nan")
         source = f"--false-alarms {self.false_alarms_per_hour:g} per hour"
-        against = [f"{self.verdict[:1].upper()}{self.verdict[1:]}: {self.change}"] if self.moves else []
+        against = [f"{upper(self.verdict)}: {self.change}"] if self.moves else []
         concerns = [*self.warnings]
         if self.verdict == WARMED:
             concerns = [f"The scanner warms up: {self.change}", *concerns]
@@ -94,7 +103,7 @@ class MonitorReport:
             return f"from {e.time_s:.1f} s on its scale changed by {1e6 * e.scale:.0f} ppm; the pose is unchanged."
         return (
             f"at {e.time_s:.2f} s (robot clock) by {d['translation_mm']:.3f} mm and {d['rotation_deg']:.4f} degrees, "
-            f"found {max(e.found_s - e.time_s, 0.0):.1f} s later. {self.cause[:1].upper()}{self.cause[1:]}".rstrip(". ")
+            f"found {max(e.found_s - e.time_s, 0.0):.1f} s later. {upper(self.cause)}".rstrip(". ")
             + "."
         )
 

@@ -26,7 +26,7 @@ from weldcal.tools.report.first_screen import (
     refused_note,
 )
 from weldcal.tools.report.pictures import GREY, OURS, TRUTH, subplots, svg
-from weldcal.tools.report.render import fixed, render, sigma_rows
+from weldcal.tools.report.render import fixed, known, render, sigma_rows
 
 
 def motion_result(
@@ -96,7 +96,7 @@ class MotionReport:
         """The JSON object of `calibrate` in motion: the keys of the calibration at rest, and those of the clock."""
         e, r = self.estimate, self.result
         clock = e.clock
-        before, after = (None if not np.isfinite(v) else v for v in self.along_rms_mm)
+        before, after = map(known, self.along_rms_mm)
         return {
             "state": "done",
             "mode": "motion",
@@ -117,7 +117,7 @@ class MotionReport:
             "rolling_ms": _ms(clock.rolling_s),
             "late": list(clock.late),
             "scanner_correction": None,
-            "held_out_mm": {k: _number(r.held_out_mm[k]) for k in ("median", "mean", "p95")},
+            "held_out_mm": {k: known(r.held_out_mm[k]) for k in ("median", "mean", "p95")},
             "held_out_interval_mm": None,
             "tilt_deg": r.tilt_deg,
             "rms_mm": self.rms_mm,
@@ -126,7 +126,7 @@ class MotionReport:
             "warnings": list(r.warnings),
             "unobservable": list(r.unobservable),
             "seconds": self.seconds,
-            "k_fold_mm": {k: _number(v) for k, v in r.held_out_mm.items()},
+            "k_fold_mm": {k: known(v) for k, v in r.held_out_mm.items()},
             "axis_turn_deg": None,
             "advice": [],
             "features": [],
@@ -136,10 +136,6 @@ class MotionReport:
 
 def _ms(seconds: float | None) -> float | None:
     return None if seconds is None else 1e3 * seconds
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def motion_screen(

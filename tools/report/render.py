@@ -75,6 +75,11 @@ def fixed_row(values: Iterable[float], digits: int = 2) -> str:
     return "  ".join(fixed(float(value), digits) for value in values)
 
 
+def known(value: float) -> float | None:
+    """The number for a JSON object; None where it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
 def sigma_rows(covariance: Array) -> list[tuple[str, str]]:
     """The two rows of one sigma of a pose with covariance (6, 6) [rotation; translation], rad and m."""
     sigma = np.sqrt(np.diag(covariance))

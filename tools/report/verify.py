@@ -24,7 +24,7 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
 )
 from weldcal.tools.report.pictures import error_bars, error_field
-from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.render import fixed, known, render
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class VerifyReport:
     def tilt_deg(self) -> dict[str, float | None]:
         """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
         found = error_summary(np.array([p.tilt_deg for p in self.poses], dtype=float))
-        return {key: found[key] if np.isfinite(found[key]) else None for key in ("median", "p95")}
+        return {key: known(found[key]) for key in ("median", "p95")}
 
     def summary(self) -> dict[str, Any]:
         """The JSON object of `verify`. A refused scan is named in the warnings."""
@@ -301,9 +301,7 @@ class TouchReport:
             "inside": int(f.inside.sum()),
             "most_outside": f.most_outside,
             "error_mm": error_summary(1e3 * np.abs(f.error_m)),
-            "relative_mm": {
-                k: v if np.isfinite(v) else None for k, v in error_summary(1e3 * np.abs(f.relative_m)).items()
-            },
+            "relative_mm": {k: known(v) for k, v in error_summary(1e3 * np.abs(f.relative_m)).items()},
             "touches": [
                 {
                     "id": id,
@@ -311,8 +309,8 @@ class TouchReport:
                     "error_mm": float(e),
                     "limit_mm": float(limit),
                     "inside": inside,
-                    "relative_mm": float(r) if np.isfinite(r) else None,
-                    "relative_limit_mm": float(rl) if np.isfinite(rl) else None,
+                    "relative_mm": known(r),
+                    "relative_limit_mm": known(rl),
                 }
                 for id, feature, e, limit, inside, r, rl in rows
             ],

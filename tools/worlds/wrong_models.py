@@ -90,15 +90,14 @@ def warped_observations(
             X_BR = RigidTransform(X_BR.rotation(), X_BR.translation() - arm_error(X_BR.translation(), device, arm_m))
         observations.append(Observation(name, X_BR, p_C, normal / np.linalg.norm(normal)))
         ratio = 0.5 * float(np.linalg.norm(x) + np.linalg.norm(y)) + NOISE_RATIO * rng.standard_normal()
-        patterns[name] = HolePattern(
-            holes_C=np.zeros((4, 3)),
-            angles_rad=np.zeros(4),
-            center_C=p_C,
-            X_CR=RigidTransform(R_CR, p_C),
-            ratio=ratio,
-            rms_m=0.0,
-        )
+        patterns[name] = _circle(RigidTransform(R_CR, p_C), p_C, ratio)
     return observations, patterns
+
+
+def _circle(X_CR: RigidTransform, center_C: Array, ratio: float) -> HolePattern:
+    """The hole circle of a flange of which only the size counts: ``ratio`` times the drawn one."""
+    nothing = {"holes_C": np.zeros((4, 3)), "angles_rad": np.zeros(4)}
+    return HolePattern(**nothing, center_C=center_C, X_CR=X_CR, ratio=ratio, rms_m=0.0)
 
 
 def arm_error(p_B: Array, device: int, arm_m: float) -> Array:
@@ -176,14 +175,7 @@ def seen_by_a_wrong_scanner(
         x, y = np.linalg.svd(np.asarray(o.n_C)[None])[2][1:]
         ratio = 2.0 / float(x @ J @ x + y @ J @ y) + SIGMA_RATIO * rng.standard_normal()
         R = RotationMatrix(np.column_stack([x, np.cross(o.n_C, x), o.n_C]))
-        patterns[o.id] = HolePattern(
-            holes_C=np.zeros((4, 3)),
-            angles_rad=np.zeros(4),
-            center_C=seen,
-            X_CR=RigidTransform(R, seen),
-            ratio=ratio,
-            rms_m=0.0,
-        )
+        patterns[o.id] = _circle(RigidTransform(R, seen), seen, ratio)
     return out, patterns
 
 
@@ -290,9 +282,7 @@ def _seen(
         c = _distorted(p, bend) + _CENTRE_M * rng.normal(size=3)
         out.append(_observation(f"{name}{i}", stated[i], c, z))
         X_CR = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), c)
-        patterns[out[-1].id] = HolePattern(
-            holes_C=np.zeros((4, 3)), angles_rad=np.zeros(4), center_C=c, X_CR=X_CR, ratio=ratio, rms_m=0.0
-        )
+        patterns[out[-1].id] = _circle(X_CR, c, ratio)
     return out, patterns
 
 
