@@ -205,7 +205,7 @@ class Study:
 
     def found(self, figures: Figures, folder: Path) -> Outcome:
         """The outcome of a study that computes its figures without cases; the files of its result are written."""
-        return self.measured({"all": figures}, folder).outcome()
+        return self.measured({"all": dict(figures)}, folder).outcome()
 
     def measured(self, results: Results, folder: Path | None = None, cases: Cases | None = None) -> "Measured":
         """The figures, the table and the verdicts of results; with a folder their files are written there."""
