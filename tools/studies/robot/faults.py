@@ -1,7 +1,7 @@
 """Benchmark of the hardware link under faults: a matrix of faults, and random sequences of them."""
 
 from collections import Counter
-from collections.abc import Sequence as Several
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -18,7 +18,7 @@ from weldcal.tools.studies.robot.stream import TRANSPORT, jobs, one_transport, s
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING
-from weldcal.tools.worlds.robot.fault_run import FaultOutcome, Sequence, run_case, run_sequence
+from weldcal.tools.worlds.robot.fault_run import FaultOutcome, FaultSequence, run_case, run_sequence
 
 OUTCOME_COLUMNS = (
     "name",
@@ -53,7 +53,7 @@ class FaultReport:
     """All outcomes and all sequences."""
 
     outcomes: list[FaultOutcome]
-    sequences: list[Sequence]
+    sequences: list[FaultSequence]
 
     def summary(self) -> dict[str, object]:
         """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names the results that are
@@ -82,12 +82,12 @@ class FaultReport:
         }
 
 
-def _spread(values: Several[float | None]) -> dict[str, float]:
+def _spread(values: Sequence[float | None]) -> dict[str, float]:
     found = [value for value in values if value is not None]
     return statistics(found, "median", "max") if found else {}
 
 
-def _table(columns: tuple[str, ...], rows: Several[object]) -> str:
+def _table(columns: tuple[str, ...], rows: Sequence[object]) -> str:
     return csv_text(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
 
 

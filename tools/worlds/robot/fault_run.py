@@ -231,7 +231,7 @@ ANY_REPAIR = tuple({action.name: action for case in RUNNING for action in case.r
 
 
 @dataclass(kw_only=True)
-class Sequence:
+class FaultSequence:
     """What happened in one sequence, and what the emulator's checker has counted."""
 
     seed: int
@@ -260,10 +260,10 @@ class Sequence:
         )
 
 
-def run_sequence(bench: Bench, seed: int, seconds: float) -> Sequence:
+def run_sequence(bench: Bench, seed: int, seconds: float) -> FaultSequence:
     """Inject random faults for this long; the result is what the checker counted."""
     before = bench.emulator.ask(check="summary")
-    rng, done = np.random.default_rng(seed), Sequence(seed=seed)
+    rng, done = np.random.default_rng(seed), FaultSequence(seed=seed)
     cases = [case for case in RUNNING if case.random]
     started = time.monotonic()
     while time.monotonic() < started + seconds:
@@ -285,7 +285,7 @@ def run_sequence(bench: Bench, seed: int, seconds: float) -> Sequence:
     return done
 
 
-def _start(bench: Bench, rng: np.random.Generator, done: Sequence) -> bool:
+def _start(bench: Bench, rng: np.random.Generator, done: FaultSequence) -> bool:
     """Repair everything, in one of five cases only in part, and start."""
     if rng.random() < 0.8:
         bench.emulator.do("recover")
@@ -301,7 +301,7 @@ def _start(bench: Bench, rng: np.random.Generator, done: Sequence) -> bool:
     return True
 
 
-def _throw(bench: Bench, rng: np.random.Generator, done: Sequence, cases: list[FaultCase]) -> None:
+def _throw(bench: Bench, rng: np.random.Generator, done: FaultSequence, cases: list[FaultCase]) -> None:
     first, second = cases
     if not _injected(bench, done, first):
         return
@@ -321,7 +321,7 @@ def _throw(bench: Bench, rng: np.random.Generator, done: Sequence, cases: list[F
         bench.emulator.do("clear_links")
 
 
-def _injected(bench: Bench, done: Sequence, case: FaultCase) -> bool:
+def _injected(bench: Bench, done: FaultSequence, case: FaultCase) -> bool:
     """Inject it; False where the robot is not ready for it: no program starts, for one, where a fault has just taken
     the power.
 
@@ -339,7 +339,7 @@ def _injected(bench: Bench, done: Sequence, case: FaultCase) -> bool:
     return True
 
 
-def _end(bench: Bench, rng: np.random.Generator, done: Sequence) -> None:
+def _end(bench: Bench, rng: np.random.Generator, done: FaultSequence) -> None:
     """After a fault: from here on nothing may move, whatever is repaired and pressed, while commands keep coming."""
     # the arm brakes now; that it is at rest from then on is what the checker sees to
     bench.emulator.fault("tool_contact", n=0)
