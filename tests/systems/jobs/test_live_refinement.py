@@ -28,7 +28,7 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.parts import corrected_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.wrong_arm import WrongArmStation, station
+from weldcal.tools.worlds.wrong_models import WrongArmStation, station
 
 
 def status_of(world: WrongArmStation) -> CalibrationStatus:

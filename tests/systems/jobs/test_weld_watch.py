@@ -20,7 +20,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.weld import measure
 from weldcal.tools.report.demo import DemoResult, demo_report
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.worlds.perfect_world import perfect
+from weldcal.tools.worlds.scaled_arms import perfect
 
 KNOCK_MM = [0.0, 1.2, 0.9]
 POSE = "X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"

@@ -39,7 +39,7 @@ from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command
-from weldcal.tools.commands.robot.check import emit_table, state_of
+from weldcal.tools.commands.robots import emit_table, state_of
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
 from weldcal.welding.finger.deformation import TagModel, detect_tag

@@ -1,14 +1,18 @@
-"""Counts which cause the doctor names first in sets with an injected one, and what it names in sets without."""
+"""Counts what the doctor and the fleet name in simulated sets and cells, disturbed and undisturbed."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Annotated
 
 from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
+from weldcal.tools.commands.fleet import run_fleet
+from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.doctor import worded
+from weldcal.tools.report.fleet import FINE, LOOK, VISIT
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
-from weldcal.tools.worlds.doctor import CAUSES, clean
+from weldcal.tools.worlds.doctor import CAUSES, FAULTS, clean, write_fleet
 
 NONE = "none"
 CLEAN_SEEDS = 10_000  # sets without a cause have seeds of their own
@@ -27,7 +31,7 @@ def cases(runs: int, cleans: int, seed: int) -> Cases:
     return {f"{cause}, set {s}": {"cause": cause, "seed": s} for cause, s in wanted}
 
 
-def _figures(found: Results) -> Figures:
+def _doctor_figures(found: Results) -> Figures:
     counts = {
         cause: Counter(str(r["named"]) for r in found.values() if r["cause"] == cause) for cause in (*CAUSES, NONE)
     }
@@ -42,19 +46,19 @@ def _figures(found: Results) -> Figures:
     }
 
 
-def _rows(figures: Figures) -> Iterable[Row]:
+def _doctor_rows(figures: Figures) -> Iterable[Row]:
     for cause, count in figures["named"].items():
         others = ", ".join(f"{name} {n}" for name, n in Counter(count).most_common() if name != cause)
         yield cause, f"{count.get(cause, 0)} of {sum(count.values())}", others
 
 
-STUDY = Study(
+DOCTOR = Study(
     name="doctor",
     what="The cause that `weldcal doctor` names first in simulated sets of scans with one injected cause, and without.",
     case=named_first,
-    figures=_figures,
+    figures=_doctor_figures,
     header=("injected", "named first", "instead"),
-    rows=_rows,
+    rows=_doctor_rows,
 )
 
 
@@ -65,4 +69,58 @@ def doctor(
     cleans: Annotated[int, option("--clean", "N", "Sets without a cause.", min=0)] = 200,
 ) -> Outcome:
     """Inject each cause into simulated sets of scans, and count which one `weldcal doctor` names first."""
-    return STUDY.outcome(call, cases(runs, cleans, call.seed))
+    return DOCTOR.outcome(call, cases(runs, cleans, call.seed))
+
+
+RIGHT = {"none": (FINE,), "moved": (VISIT,), "drifts": (VISIT, LOOK), "broken": (VISIT,)}
+
+
+def _fleet_figures(found: Results) -> Figures:
+    return found["fleet"]
+
+
+def _fleet_rows(figures: Figures) -> Iterable[Row]:
+    for fault in FAULTS:
+        yield fault, *(str(figures[fault][state]) for state in (VISIT, LOOK, FINE))
+
+
+FLEET = Study(
+    name="fleet",
+    what="What `weldcal fleet` says of simulated cells that are fine, moved, drift or are broken.",
+    figures=_fleet_figures,
+    header=("fault", VISIT, LOOK, FINE),
+    rows=_fleet_rows,
+    numbers=3,
+)
+
+
+@command("benchmark fleet", short_help="Count what weldcal fleet states about made cells.", options=FARM)
+def fleet(
+    call: Call,
+    cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 25,
+    datasets: Annotated[int, option("--datasets", "N", "Datasets of each.", min=1)] = 8,
+) -> Outcome:
+    """Write made cells, some of which move, drift or break, and count what `weldcal fleet` says of them."""
+    folder = call.folder("benchmark", "fleet")
+    faults = write_fleet(folder / "cells", cells, datasets, call.seed)
+    farm = Farm.of(folder, call.given, call.progress)
+    report = run_fleet(
+        folder / "cells", Farm(folder / "page", farm.workers, farm.scheduler, farm.progress), seed=call.seed
+    )
+    states = {cell.name: cell.state for cell in report.cells}
+    counts = {
+        fault: {
+            state: sum(states[n] == state for n, f in faults.items() if f == fault) for state in (VISIT, LOOK, FINE)
+        }
+        for fault in FAULTS
+    }
+    wrong = [f"{name} ({fault}): {states[name]}" for name, fault in faults.items() if states[name] not in RIGHT[fault]]
+    found = {
+        "cells": cells,
+        "datasets": cells * datasets,
+        "right": len(faults) - len(wrong),
+        "wrong": wrong,
+        **counts,
+        "page": str(Path(report.out) / "report.html"),
+    }
+    return FLEET.measured({"fleet": found}, folder).outcome()

@@ -1,8 +1,12 @@
-"""weldcal profiler clock: the offset of a profiler's clock from profiles of one straight edge, taken while the arm
-moves."""
+"""weldcal profiler clock and seam: the offset of a calibrated profiler's clock, and a V-groove mapped into the base.
+
+The folder of `profiler clock` holds stream.csv, as a recording in motion, and the profiles: profiles.csv with time,x,z,
+the export of an instrument, or a folder with one file per profile. Of a profile of many points the feature at the side
+is found; one point is the crossing. times.csv gives the time of each profile where the export holds none.
+"""
 
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 import typer
@@ -13,15 +17,31 @@ from weldcal.calibration.motion.line_clock import offset_from_line
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.profiler.edge.features import Kind, extract_edge
 from weldcal.calibration.profiler.exports import SECONDS, TABLES, TREES, UNITS, Profiles
+from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.importing import profile_unit, profiles_of
+from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.record import load_record
 from weldcal.calibration.profiler.text_blocks import blocks_of
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
-from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.commands.profiler.result import PitchOption
-from weldcal.tools.report.files import write_json
+from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, option
+from weldcal.tools.commands.profiler.files import Measurements, PosesStated, read_profiler_file
+from weldcal.tools.commands.profiler.result import (
+    FileArgument,
+    FormOption,
+    PitchOption,
+    PosesOption,
+    TrialOption,
+    UnitOption,
+    check_number,
+    outcome_of,
+    with_warnings,
+)
+from weldcal.tools.report.files import csv_text, write_json
+from weldcal.tools.report.first_screen import check_limit
+from weldcal.tools.report.profiler_file import ProfilerSeam, middle_error_mm, seam_report
+from weldcal.tools.report.render import write_atomic
 
 _KINDS, _SIDES = ("bar", "step", "apex"), ("left", "right")
 _STREAM, _TIMES = "stream.csv", "times.csv"
@@ -47,30 +67,6 @@ def clock(
 ) -> Outcome:
     """Find the offset of a profiler's clock while the arm weaves across one straight edge: capture = stamp - offset."""
     out = call.folder("profiler", folder.resolve().name)
-    return Outcome(
-        find_clock(folder, calibration, out, robot=robot, unit=unit, feature=feature, side=side, pitch_mm=pitch)
-    )
-
-
-def find_clock(
-    folder: Path,
-    calibration: Path,
-    out: Path,
-    *,
-    robot: str = "",
-    unit: str = "m",
-    feature: str = "bar",
-    side: str = "left",
-    pitch_mm: float | None = None,
-) -> dict[str, object]:
-    """Find the offset of a profiler's clock and write clock.json to ``out``.
-
-    ``folder`` holds stream.csv (as a recording in motion) and the profiles: profiles.csv with time,x,z, the export of
-    an instrument, or a folder with one file per profile. Of a profile of many points the ``feature`` at the ``side`` is
-    found; one point is the crossing. times.csv gives the time of each profile where the export holds none.
-    ``pitch_mm``: of an export with heights only. Raises InputError: the files cannot be used; TooFewPoses,
-    UndeterminedPoses: the motion does not show the offset.
-    """
     if unit not in ("m", "mm"):
         raise InputError(f"The unit '{unit}' is not known; write m or mm.")
     if feature not in _KINDS or side not in _SIDES:
@@ -78,7 +74,7 @@ def find_clock(
     record = load_record(calibration)
     source = _source(folder, {calibration.resolve(), out.resolve()})
     stream, said = read_stream(folder / _STREAM, robot=robot, unit=unit)
-    profiles = profiles_of(source, pitch_mm)[0]
+    profiles = profiles_of(source, pitch)[0]
     motion = ContinuousMotion(stream)
     stamps, time_unit = _stamps(folder, profiles, motion)
     time, points, lost = _crossings(profiles, stamps, UNITS[profile_unit(profiles, unit)], feature, side)
@@ -98,7 +94,7 @@ def find_clock(
         "warnings": said,
     }
     write_json(out / "clock.json", result)
-    return result | {"written_to": str(out)}
+    return Outcome(result | {"written_to": str(out)})
 
 
 def _source(folder: Path, skip: set[Path]) -> Path:
@@ -177,3 +173,91 @@ def _crossings(profiles: Profiles, stamps: Array, scale: float, feature: str, si
             kept.append(float(t))
             points.append(at[0])
     return np.array(kept), np.array(points).reshape(-1, 2), lost
+
+
+@command("profiler seam", short_help="Map a V-groove in the base frame.")
+def seam(
+    call: Call,
+    file: FileArgument,
+    calibration: Annotated[Path, option("--calibration", "FOLDER", "Result folder of edge, sphere or compensate.")],
+    unit: UnitOption = None,
+    trial: TrialOption = None,
+    poses: PosesOption = None,
+    robot_form: FormOption = "",
+    pitch: PitchOption = None,
+    limit_mm: LimitOption = None,
+) -> Outcome:
+    """Map both edges and the root of a V-groove from raw profiles into the base frame, as seam.csv."""
+    check_limit(limit_mm)
+    folder = call.folder("profiler", file.stem)
+    data = read_profiler_file(file, unit=unit, trial=trial, stated=PosesStated(poses, robot_form, pitch))
+    data = _as_calibrated(data, calibration)
+    found = with_warnings(data, map_seam(data, calibration, folder))
+    return outcome_of(call, found, finish_seam(found, calibration, file.name, folder, limit_mm))
+
+
+def _as_calibrated(data: Measurements, calibration: Path) -> Measurements:
+    """The measurements with their poses read as those of the calibration were. Raises InputError where several readings
+    are left."""
+    if len(data.readings) > 1:
+        data = data.with_form(str(load_record(calibration).figures.get("robot_form", "")))
+    if len(data.readings) > 1:
+        one, other = data.readings[:2]
+        raise InputError(
+            f"A seam does not show how its poses are written: as {one.words}, or as {other.words} ({len(data.readings)}"
+            f" readings). State it, for example with --robot-form {one.form} or --robot-form {other.form}."
+        )
+    return data
+
+
+def map_seam(file: Measurements, calibration: Path, folder: Path) -> dict[str, Any]:
+    """Writes a V-groove's three features of every profile in the base frame as seam.csv; returns the summary."""
+    record = load_record(calibration)
+    if file.profiles is None:
+        raise InputError("The file has no 'profiles' of the groove. Give (n, m, 2), or 'xz' with the lengths 'n'.")
+    poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
+    check_number(poses, (len(file.profiles),), "profiles")
+    columns = ["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"]
+    rows, lost, rms, seen = [], [], [], []
+    for k, p in enumerate(file.profiles):
+        try:
+            f = groove_features(p)
+        except FeatureNotFound:
+            lost.append(k)
+            continue
+        seen.append(record.points_F(f.points))
+        at = seen[-1] @ poses.rotation[k].T + poses.translation[k]
+        rows.append([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * f.rms_m:.4f}"])
+        rms.append(f.rms_m)
+    if not rms:
+        raise FeatureNotFound(
+            "No profile of the file shows a V-groove with plate on both sides. Check the file and its unit."
+        )
+    write_atomic(folder / "seam.csv", csv_text(columns, rows))
+    return {
+        "scans": len(poses),
+        "found": len(rms),
+        "without_groove": lost,
+        "rms_mm": 1e3 * float(np.median(rms)),
+        "error_95_mm": middle_error_mm(record, np.vstack(seen)),
+        "method": record.method,
+    }
+
+
+def finish_seam(
+    found: dict[str, Any], calibration: Path, source: str, out: Path, limit_mm: float | None
+) -> ProfilerSeam:
+    """Write the report of a mapped seam, from the seam.csv beside it."""
+    columns = np.genfromtxt(out / "seam.csv", delimiter=",", names=True)
+    root = np.column_stack([np.atleast_1d(columns[f"root_{a}_mm"]) for a in "xyz"])
+    seam = ProfilerSeam(
+        record=load_record(calibration),
+        found=found,
+        root_mm=root,
+        source=source,
+        calibration=calibration,
+        out=out,
+        limit_mm=limit_mm,
+    )
+    write_atomic(out / "report.html", seam_report(seam))
+    return seam
