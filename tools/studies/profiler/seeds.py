@@ -46,8 +46,7 @@ def one_seed(seed: int | None = None, data: str | None = None) -> Mapping[str, o
 
     Returns:
         values and bounds (mm or deg) by the names of their targets, and the squared errors of the edge's trials in
-            units of
-        the bound.
+        units of the bound.
     """
     if data is not None:
         trials = {n: fixed_edge_trials(Path(data), n) for n in TARGETS}
