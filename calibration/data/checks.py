@@ -30,6 +30,7 @@ IN_HAND = "eye_in_hand"
 CARRIED = ("eye_on_arm_target_on_flange", "eye_on_arm_target_on_base", "co_manipulation")
 """Other mountings, which are calibrated from scans at rest."""
 ALIASES = {"eye_on_arm": CARRIED[0], "eye_on_arm_base": CARRIED[1]}
+# a choice: ten times what a maker's calibration leaves (ARM_ERROR_M); a larger figure is micrometres
 LARGEST_ARM_MM = 5.0
 MODES = ("static", "motion")
 _SAMPLE = 10_000  # points whose distance is enough to tell metres from millimetres

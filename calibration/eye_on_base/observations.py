@@ -23,7 +23,7 @@ from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
-CHANCE = 1e-6
+CHANCE = 1e-6  # a choice: a wrong refusal in a million; a factor of two moves the limit by less than 10 %
 """Chance that the right reading is rejected in favour of a wrong one."""
 FEWEST = 5
 _KEPT = 0.7  # share of the scans that must agree: the others may be outliers

@@ -28,13 +28,13 @@ Flags = NDArray[np.bool_]
 
 _GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion at the rim of its field reaches five
 _WIDEST_GATE = 10.0  # so many times wider at most, where three spare numbers or fewer set the scale
-_HUBER = 2.0
+_HUBER = 2.0  # sigmas per axis, a choice: 99 % of least squares' information on a normal axis; 1.0 keeps 90 %
 _START_POSES = 500  # at most: more do not make a start better
 _HELD_OUT_FITS = 100  # at most, so that the time grows with the number of poses and not with its square
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _WORST_TILT_RAD = 0.17  # of the normals' median: no arm, scanner or fit is ten degrees off
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
-_NORMAL_FLOOR_RAD = 1e-6
+_NORMAL_FLOOR_RAD = 1e-6  # below any scanner or arm, as _POSITION_FLOOR_M
 USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
 """What robot and scanner together are off, an axis, where too few scans show it: as on the recorded arms."""
 

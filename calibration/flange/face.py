@@ -18,6 +18,7 @@ _CHAMFER_SHARE = 0.2  # of the edge: more than flying pixels and noise could mak
 _HIDDEN_LESS = 0.25  # of the chamfer: the half of an edge that hides its wall loses more pixels, and counts less
 _WIDEST = 1.5  # connected parts much wider than a flange are tables and plates
 _ALONE = 0.5  # of the outer edge; less of it counts only beside a part of the bore
+# a choice: a quarter of the bore's edge still places its centre, beside less than half of the outer edge
 _BORE_SEEN = 0.25
 _FILLED = 0.4  # share of the bore's core that must not be face
 _HOLLOW = 0.7  # share of the ring between the edges that must be face; its holes take up to a seventh of it

@@ -6,9 +6,8 @@ from scipy import ndimage
 
 from weldcal.models.arrays import Array
 
-_SECTOR_PITCHES = (
-    3.0  # a sector is this many point pitches wide: so narrow that many edge points average, yet none is empty
-)
+# point pitches of a sector: so narrow that many edge points average, yet none is empty
+_SECTOR_PITCHES = 3.0
 
 
 def plane_axes(normal: Array) -> tuple[Array, Array]:

@@ -19,11 +19,11 @@ _GATE = 8.0  # sigma per axis, as in the eye-on-base solver: only gross outliers
 _AGREEING = 0.6  # share of the poses that a trimmed fit keeps: the others may be outliers
 _SUSPECT = 2.0  # sigma per axis of a residual that makes a trimmed fit worth its time
 _WORST_SHARE = 0.1  # of the extent: residuals beyond it are no calibration
-_WORST_TURN_RAD = 0.2
+_WORST_TURN_RAD = 0.2  # 11 degrees, a choice: a camera that turns so much is another convention; none measures so badly
 _SUBSETS = 60
 
 
-USUAL_DISCORD_RAD = 5e-3
+USUAL_DISCORD_RAD = 5e-3  # six pixels of the principal point over a focal length of 1,200 pixels
 """Angle, an axis, by which positions and rotations of usual cameras disagree: six pixels of the principal point at a
 focal length of 1,200."""
 

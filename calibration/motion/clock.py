@@ -10,7 +10,7 @@ from weldcal.models.arrays import Array
 
 _MOST_LACKING = 0.2  # of the frames may have no device time; those are left out then
 _APART_S = 1.0  # a device time that deviates so far from the arrivals' straight line is of a clock that was reset
-_MOST_DRIFT = 1e-2
+_MOST_DRIFT = 1e-2  # a choice: a hundred times what crystals are off (100 ppm); beyond, the unit is not seconds
 
 
 @dataclass(frozen=True, eq=False)

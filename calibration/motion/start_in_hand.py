@@ -17,7 +17,7 @@ _MOST_FRAMES = 100
 _ARM_M = 0.1  # a lever that turns an error of the normal into a length
 _SHARE = 0.8  # of the frames that must agree
 _FEWEST = 8
-_ROBUST_M = 3e-3
+_ROBUST_M = 3e-3  # a choice: a nominal arm's errors are inliers, a wrong frame of 10 mm and more is not
 _STEP_RAD = 1.5e-8  # of a difference: the root of the machine's precision
 
 

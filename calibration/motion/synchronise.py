@@ -17,7 +17,7 @@ _STEP_S, _FINE_S = 0.01, 0.001
 _MOST_FRAMES = 150
 _FEWEST = 12
 _SHOWN = 4.0  # times its own least: a spread of residuals that rises so much over the delays shows the clock
-_LEAST_SHOWN_M = 2e-3
+_LEAST_SHOWN_M = 2e-3  # a choice: the scatter of arm and scanner at 0.15 mm, ten times over
 _WORST_S = 0.01  # a less certain offset is not used
 
 

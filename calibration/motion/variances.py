@@ -12,7 +12,7 @@ Flags = NDArray[np.bool_]
 
 _FLOOR = np.array([1e-6, 1e-14, 1e-14, 1e-14])  # factor, m^2, rad^2, s^2
 _TOLD = 0.5  # residuals that a variance explains: with fewer it is not estimated
-_MOST_JITTER_S = 0.2
+_MOST_JITTER_S = 0.2  # a choice: as two frames at 10 Hz; beyond, no clock can be fitted
 FREE_S2 = 1.0  # variance of the time of a frame that is grossly late
 
 

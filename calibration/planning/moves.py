@@ -13,7 +13,7 @@ from weldcal.models.arrays import Array
 
 ROBOT = "ur10e"
 SPEED, ACCELERATION = 0.25, 1.2  # m/s, m/s^2
-PAUSE_S = 0.1
+PAUSE_S = 0.1  # a choice: a controller's settling between two moves
 
 
 @dataclass(frozen=True, eq=False)

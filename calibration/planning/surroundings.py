@@ -15,10 +15,9 @@ from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh
 from weldcal.models.profilers import make_scene
 
-_SPACING = (
-    0.5  # of the points along a capsule's axis, in its radii: a gap is too large by a thirtieth of the radius at most
-)
-_STEP_RAD = 0.05
+# of the points along a capsule's axis, in its radii: a gap is too large by a thirtieth of the radius at most
+_SPACING = 0.5
+_STEP_RAD = 0.05  # a choice: 5 cm of the flange at a reach of 1 m; a step of half the size takes twice the time
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,7 +40,7 @@ _UNIT = re.compile(r"(.*?)[ _.]*(?<![a-zµμ])[\[(]?(m|mm|cm|µm|μm|um|inch)[\]
 _KEYS = re.compile(r"(?i)(scan_?line|profiles?|points?|line|xz|data)")
 _REPEATED = 5  # rows with one and the same pose that make a profile
 _RAW = 1e5  # integers beyond it are raw heights, in units of 0.01 micrometres
-_RAW_MM = 1e-5
+_RAW_MM = 1e-5  # 0.01 micrometres, see _RAW
 _EVEN = 0.02  # of the step: columns of x are evenly spaced
 _FEWEST_COLUMNS = 8  # of a grid of heights
 

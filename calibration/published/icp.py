@@ -23,7 +23,7 @@ COMPONENTS = (
 )
 """Names of the six components of an error at the flange, [rotation; translation] in frame R."""
 
-UNOBSERVABLE_SHARE = 0.01
+UNOBSERVABLE_SHARE = 0.01  # a choice between 0.005 of stray points and 0.04 of chamfers, see below
 """A component is called unobservable where less than one point in a hundred speaks for it: the chamfers of a whole ISO
 9409-1-50 face hold one in six, at 45 degrees, and speak for a shift with 4 %; stray points at an edge make half a per
 cent."""
@@ -99,6 +99,7 @@ def _to_segment(at: Array, a: Array, b: Array) -> Array:
 
 Method = Literal["point_to_point", "point_to_plane"]
 
+# share of points with a partner, a choice: a third of a face registers; with less any surface would do
 _MIN_FITNESS = 0.3
 _UNSEEN_SHARE = 0.5  # a component of which less than half shows is called unseen
 

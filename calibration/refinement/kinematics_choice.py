@@ -33,14 +33,13 @@ from weldcal.models.errors import InputError
 
 LEAST = 12
 """Poses from which on errors of an arm are sought."""
-LEAST_TURN_DEG = 20.0
+LEAST_TURN_DEG = 20.0  # a choice: at 20 deg a lever's error changes by a third of itself
 """Turn between poses from which on they show in more than one orientation."""
-WRONG_FILE = 8.0
+WRONG_FILE = 8.0  # a choice: nominal arms are off by some millimetres, factory files by some tenths
 """Times a factory's errors: the prior of an arm whose kinematics are those of another robot, or nominal."""
 _FOLDS = 10
-_MIXED = (
-    1.5  # growth of a standard deviation by the scanner's factors at which an error counts as not separable from them
-)
+# growth of a standard deviation by the scanner's factors at which an error counts as not separable
+_MIXED = 1.5
 _NAMED = 6  # errors in a sentence; the JSON object has all
 _SHOWN = 0.8  # of the prior: below it the poses have said something
 

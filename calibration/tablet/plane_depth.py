@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 
 from weldcal.calibration.errors import LandmarksNotFound
+from weldcal.calibration.geometry.robust import TUKEY
 from weldcal.models.arrays import Array
 
 _LEAST_PIXELS = 50
-_TUNING = 4.685  # Tukey's biweight: 95 % efficiency for normal noise
 
 
 def plane_depth(depth_m: Array, uv_px: Array, focal_px: Array, centre_px: Array) -> Array:
@@ -32,7 +32,7 @@ def plane_depth(depth_m: Array, uv_px: Array, focal_px: Array, centre_px: Array)
     for _ in range(15):
         r = inverse - A @ plane
         scale = max(1.4826 * float(np.median(np.abs(r))), 1e-9)
-        w = np.clip(1.0 - (r / (_TUNING * scale)) ** 2, 0.0, None)
+        w = np.clip(1.0 - (r / (TUKEY * scale)) ** 2, 0.0, None)
         better = np.linalg.lstsq(w[:, None] * A, w * inverse, rcond=None)[0]
         settled = bool(np.abs(better - plane).max() < 1e-12)
         plane = better

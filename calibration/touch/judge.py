@@ -33,8 +33,8 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-LEVEL = 0.95
-FALSE_ALARM = 0.01
+LEVEL = 0.95  # the usual level of a region, as everywhere in the reports
+FALSE_ALARM = 0.01  # the usual level of a test
 """Of verifications of a calibration as good as it states in which more touches lie outside than the limit allows."""
 _PRIOR = FactoryPrior()
 USUAL_TILT_RAD = float(np.sqrt((6.0 * _PRIOR.offset_rad**2 + 12.0 * _PRIOR.turn_rad**2) / 3.0))
@@ -42,7 +42,7 @@ USUAL_TILT_RAD = float(np.sqrt((6.0 * _PRIOR.offset_rad**2 + 12.0 * _PRIOR.turn_
 each axis."""
 _DRAWS, _SEED = 4000, 1
 _FIELD_LENGTH_M = 0.2  # over which what an arm leaves at another orientation is alike
-_LEAST_FREE = 3.0
+_LEAST_FREE = 3.0  # as in stated_error.py
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

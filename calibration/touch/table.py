@@ -13,6 +13,7 @@ from weldcal.calibration.data.checks import check_reach, row_numbers, table_rows
 from weldcal.calibration.data.clouds import read_cloud
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import DatasetError
+from weldcal.calibration.geometry.robust import TUKEY
 from weldcal.calibration.touch.touches import (
     EDGE,
     FEATURES,
@@ -30,7 +31,6 @@ from weldcal.models.errors import InputError
 
 LEAST_POINTS = 30
 _STEPS = 20
-_TUKEY = 4.685
 
 
 def around(points_C: Array, p_C: Array, within_m: float, name: str, least: int = LEAST_POINTS) -> Array:
@@ -63,7 +63,7 @@ def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
         n = np.linalg.eigh((away * w[:, None]).T @ away)[1][:, 0]
         e = away @ n
         scale = max(1.4826 * float(np.median(np.abs(e))), 1e-7)
-        w = np.maximum(1.0 - (e / (_TUKEY * scale)) ** 2, 0.0) ** 2
+        w = np.maximum(1.0 - (e / (TUKEY * scale)) ** 2, 0.0) ** 2
     return middle, n if n @ middle < 0.0 else -n, scale / float(np.sqrt(w.sum()))
 
 
@@ -85,7 +85,7 @@ def fit_touched_sphere(
         d = np.linalg.norm(v, axis=1)
         e, J = d - radius_m, -v / d[:, None]
         scale = max(1.4826 * float(np.median(np.abs(e))), 1e-7)
-        w = np.maximum(1.0 - (e / (_TUKEY * scale)) ** 2, 0.0) ** 2
+        w = np.maximum(1.0 - (e / (TUKEY * scale)) ** 2, 0.0) ** 2
         N = (J * w[:, None]).T @ J
         c = c - np.linalg.solve(N + 1e-9 * np.eye(3), (J * w[:, None]).T @ e)
     sigma = scale * float(np.sqrt(1.0 / max(np.linalg.eigvalsh(N)[0], 1e-9)))
@@ -102,9 +102,9 @@ TIP = ("tip_x", "tip_y", "tip_z", "tip_radius")
 CAMERA = ("camera_x", "camera_y", "camera_z")
 DIRECTION = ("camera_nx", "camera_ny", "camera_nz")
 REQUIRED = ("id", "feature", *POSE, *TIP, *CAMERA)
-_WITHIN_M = 0.01
-_LONGEST_TIP_M = 2.0
-_LARGEST_RADIUS_M = 0.2
+_WITHIN_M = 0.01  # a choice: the points of a ball of 20 mm; the column "within" sets another
+_LONGEST_TIP_M = 2.0  # a choice: longer than any tool, shorter than millimetres that are called metres
+_LARGEST_RADIUS_M = 0.2  # a choice: larger than any ball, smaller than millimetres that are called metres
 
 
 def read_touches(path: Path, correction: ScannerCorrection | None = None) -> tuple[Touch, ...]:

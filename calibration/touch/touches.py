@@ -12,11 +12,11 @@ from weldcal.models.errors import InputError
 
 POINT, PLANE, SPHERE, EDGE = "point", "plane", "sphere", "edge"
 FEATURES = (POINT, PLANE, SPHERE, EDGE)
-SIGMA_TIP_M = 5e-5
+SIGMA_TIP_M = 5e-5  # a choice; the column sigma_tip sets another
 """Assumed standard deviation per axis of the tip's place on the flange, as a TCP is taught with care."""
-SIGMA_RADIUS_M = 1e-5
+SIGMA_RADIUS_M = 1e-5  # a choice: a diameter by caliper to 0.02 mm; the column sigma_radius sets another
 """Assumed standard deviation of the tip's radius."""
-SIGMA_SCAN_M = 5e-5
+SIGMA_SCAN_M = 5e-5  # a choice: a fit to some hundred points; the column sigma_scan sets another
 """Assumed standard deviation of a feature in the scan, per axis."""
 
 

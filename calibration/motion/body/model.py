@@ -13,10 +13,10 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, o3d
 
 _SAMPLES_PER_M2 = 6e5  # one in 1.3 mm
-_INSIDE_M = 1e-4
-_VOXEL_M = 0.0015
+_INSIDE_M = 1e-4  # a choice: above the rounding of float32 at 1 m (1e-7), below any gap between links
+_VOXEL_M = 0.0015  # a choice: about the samples of a mesh (1.3 mm); half leaves voxels empty, twice rounds edges
 _LEAST_SHARE, _LEAST_FRAMES = 0.5, 4  # of the frames a voxel must be seen in: what moves otherwise is not of the body
-_PITCHES = 1.5
+_PITCHES = 1.5  # point pitches of a voxel, a choice: at one, many voxels stay empty
 _NORMAL_VOXELS = 4.0  # radius of the neighbours that tell a normal
 _SAMPLE = 2000
 _FEWEST = 300

@@ -19,11 +19,11 @@ from weldcal.models.mesh import o3d
 
 _STAGES = ((0.03, 12), (0.008, 12), (0.0025, 25))  # largest distance of a pair (m) and iterations
 _POINTS = 5000  # of a scan that are registered
-_MARGIN_M = 0.03
+_MARGIN_M = 0.03  # how far the first stage pairs points (_STAGES)
 _FEWEST = 250
 _LEAST_SHARE = 0.5  # of the points at the end of the first stage that must stay in the last
 _LEAST_HELD = 2e-4  # mean square of what the surface moves along its normals, of the move that it holds least
-_WORST_RMS_M = 1.5e-3
+_WORST_RMS_M = 1.5e-3  # 2.5 mm / sqrt(3): what pairs of the last stage (_STAGES) leave on any surface
 _CORRELATED = 4.0  # pixels that share their noise
 
 pairs = o3d.pipelines.registration

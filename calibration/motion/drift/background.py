@@ -19,7 +19,7 @@ _STEP_M = 0.004  # in depth between neighbours: an edge, whose normal says nothi
 _LEAST_PIXELS = 2000
 _SURE = 0.15  # sigma of the share from which on it decides
 _CORRELATED = 25.0  # pixels that share their noise
-_CLIP = 4.0
+_CLIP = 4.0  # robust deviations, a choice: 6 in 100,000 normal draws lie beyond
 
 SCANNER, BASE = "the scanner moved", "the robot's base moved, and the scanner did not"
 

@@ -23,8 +23,8 @@ from weldcal.models.errors import InputError
 
 _GROSS = 60.0  # chi-square with 5 of a frame that shows something else
 _LARGE_M, _LARGE_RAD = 1e-3, 2e-3  # a move that may have disturbed the clock's fit
-_CLOCK_S = 2e-3
-_MOST_SPREAD_M = 5e-4
+_CLOCK_S = 2e-3  # a choice: one period of a robot's stream at 500 Hz
+_MOST_SPREAD_M = 5e-4  # a choice: three times the usual spread of solve.py; more would hide a move of a millimetre
 _ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show it
 
 

@@ -26,16 +26,15 @@ from weldcal.models.errors import InputError
 
 MINIMUM_POSES = 6
 STARTING_POSES = 60  # spread over all of them, are enough to find where to start
-CAUCHY = (
-    2.385  # in sigmas of one coordinate: the constant that keeps 95 % of least squares' information in Gaussian noise
-)
-EFFICIENCY = 0.95
+# sigmas of one coordinate: the constant that keeps 95 % of least squares' information in Gaussian noise
+CAUCHY = 2.385
+EFFICIENCY = 0.95  # of CAUCHY, see above
 OUTLIER = 4.5  # in sigmas of a point: one of 25 000 good points lies beyond
 SINGULAR = 1e-4  # least over largest singular value of the Jacobian with columns of unit length
 RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more
 APART_RAD = np.radians(1.0)
 OPEN_RAD = np.radians(5.0)
-CONSISTENT_SHARE = 0.7
+CONSISTENT_SHARE = 0.7  # a choice: up to three in ten points may be bad, as in other solvers; more is no single edge
 ITERATIONS = 60
 NEAR, SETTLED = 1e-2, 1e-7  # in sigmas of the unknowns: steps that end the descent, and the settling after it
 

@@ -15,7 +15,7 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats, times_own, 
 ITERATIONS = 60
 SETTLED = 1e-6  # of the cost, in one step: the reprojection goes on from there
 KEPT = 3  # different optima that are polished
-SAME_RAD = 0.02
+SAME_RAD = 0.02  # a choice: nearer ends of descents are one optimum; half only polishes the same one twice
 ROBUST = 2.5  # Cauchy scale in robust sigmas of the distances
 
 

@@ -28,7 +28,7 @@ from weldcal.models.errors import InputError
 
 Model = Literal["rigid", "affine", "affine+joints"]
 MINIMUM_POSES = 5
-SINGULAR = 1e-5
+SINGULAR = 1e-5  # a choice between rounding and poor motions, of columns of unit length
 WRONG_POSE = 5.0  # times the others' residual (its mean, or its rms) at which a scan is named
 MOST_WRONG = 0.25  # of the scans may be excluded as wrong
 RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more

@@ -12,7 +12,7 @@ from weldcal.calibration.profiler.sphere.arc import fit_circle
 POINTS = 7  # of each profile
 ITERATIONS = 80
 KEPT = 3
-SAME_RAD = 0.02
+SAME_RAD = 0.02  # as in edge/start.py
 WORSE = 3.0  # times the best one's mean distance: what explains the sphere so badly is not polished
 
 
