@@ -10,9 +10,8 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RotationMatrix
 
+from weldcal.calibration.data.cloud_files.body import VIEWPOINTS, measured
 from weldcal.calibration.data.cloud_files.depth import checked_intrinsics
-from weldcal.calibration.data.cloud_files.form import VIEWPOINTS
-from weldcal.calibration.data.cloud_files.grid import measured
 from weldcal.calibration.data.clouds import CloudError, CloudForm, read_cloud
 from weldcal.calibration.data.header import DatasetHeader, Feature, PoseForm, ScannerGuess, SecondRobot, Units
 from weldcal.calibration.data.poses.names import mounting_name

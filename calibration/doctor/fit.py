@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from weldcal.calibration.doctor.case import DoctorCase
-from weldcal.calibration.geometry.rigid import drawn_triples, fit_rigid, fit_rigid_sets
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import drawn_triples, exp_rotation, fit_rigid, fit_rigid_sets, skew
 from weldcal.models.arrays import Array
 
 NU = 6.0  # degrees of freedom of Student's t, a choice between heavy tails (3) and normal noise (30)

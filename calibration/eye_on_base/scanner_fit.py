@@ -18,8 +18,7 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.compiled_rotation import cross_rows, rotation_of
-from weldcal.calibration.geometry.robust import chi2_share
+from weldcal.calibration.geometry.robust import chi2_share, cross_rows, rotation_of
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled

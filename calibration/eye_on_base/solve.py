@@ -14,10 +14,8 @@ from scipy.special import gammaincinv
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.compiled_rotation import cross_rows, rotation_of
-from weldcal.calibration.geometry.rigid import drawn_triples, fit_all_rigid_sets, fit_rigid_sets, fit_rotation
-from weldcal.calibration.geometry.robust import chi2_quantile, f_quantile
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.robust import chi2_quantile, cross_rows, f_quantile, rotation_of
+from weldcal.calibration.geometry.se3 import drawn_triples, fit_all_rigid_sets, fit_rigid_sets, fit_rotation, skew
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled

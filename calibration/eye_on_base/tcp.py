@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.geometry.robust import f_tail
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, skew
 from weldcal.models.arrays import Array
 
 FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone

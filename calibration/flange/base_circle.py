@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import CircleFitError, FlangeNotFound, PlaneFitError
-from weldcal.calibration.flange.edge_labels import refine_circle
+from weldcal.calibration.flange.edge_labels import RayModel, refine_circle
+from weldcal.calibration.flange.face import coverage, plane_axes
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess
-from weldcal.calibration.flange.rays import RayModel
-from weldcal.calibration.flange.rim import coverage, plane_axes
 from weldcal.calibration.flange.search import window_about
 from weldcal.calibration.geometry.circle import CircleFit, fit_circle
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, local_planes

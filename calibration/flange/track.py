@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import CircleFitError
-from weldcal.calibration.flange.edge_labels import refine_pair
+from weldcal.calibration.flange.edge_labels import pinhole_rays, pinhole_window, refine_pair
 from weldcal.calibration.flange.face import (
     FaceMeasurements,
     FaceRefusal,
@@ -16,10 +16,9 @@ from weldcal.calibration.flange.face import (
     clear_band,
     judge,
     lowered_by,
+    plane_axes,
     thickness,
 )
-from weldcal.calibration.flange.rays import pinhole_rays, pinhole_window
-from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, plane_steps, shared_noise
 from weldcal.calibration.geometry.robust import TUKEY

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
-from weldcal.calibration.flange.edge_labels import refine_circle
+from weldcal.calibration.flange.edge_labels import RayModel, refine_circle
 from weldcal.calibration.flange.face import (
     FaceMeasurements,
     FaceRefusal,
@@ -17,10 +17,9 @@ from weldcal.calibration.flange.face import (
     clear_band,
     judge,
     lowered_by,
+    plane_axes,
     thickness,
 )
-from weldcal.calibration.flange.rays import RayModel
-from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
 from weldcal.models.arrays import Array

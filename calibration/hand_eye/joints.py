@@ -10,11 +10,19 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import IDENTITY, flange_poses, inverse, log_rotation, mean_pose
-from weldcal.calibration.hand_eye.linearisation import TINY, inverse_information
 from weldcal.calibration.hand_eye.mountings import chain as mounted
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
-from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, full_problem, linearise, residuals
+from weldcal.calibration.hand_eye.problem import (
+    NAMES,
+    TINY,
+    Problem,
+    State,
+    full_problem,
+    inverse_information,
+    linearise,
+    residuals,
+)
 from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     HandEyeHeldOut,

@@ -6,9 +6,8 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
-from weldcal.calibration.motion.clock import FrameClock, choose_clock
 from weldcal.calibration.motion.clock_fit import DRIFT, OFFSET, ClockFit, fit_clock
-from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.motion.observed import FrameClock, ObservedFrames, choose_clock
 from weldcal.calibration.motion.start import EARLIEST_S, LATEST_S
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array

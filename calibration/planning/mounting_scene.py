@@ -14,8 +14,7 @@ from scipy.spatial.distance import cdist
 from weldcal.calibration.geometry.se3 import IDENTITY
 from weldcal.calibration.hand_eye.mountings import Mounting, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import Problem, State
-from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, lowest_point, occludes
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import LinkCapsule, Surroundings, arm_bodies, lowest_point, occludes
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.scanners import ScannerPreset

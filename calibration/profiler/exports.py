@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.columns import columns_of
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.names import number_of
+from weldcal.calibration.data.poses.names import columns_of, number_of
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.text import table_lists
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.profiler.gocator import gocator_profiles, is_gocator
 from weldcal.calibration.profiler.motion import Floats
-from weldcal.calibration.profiler.text_blocks import NumberRows, blocks_of
+from weldcal.calibration.profiler.text_blocks import NumberRows, blocks_of, gocator_profiles, is_gocator
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, MOST_COLUMNS, read_text, require_short_numbers
 

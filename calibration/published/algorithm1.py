@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid
+from weldcal.calibration.geometry.se3 import fit_rigid
 from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

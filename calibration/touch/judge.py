@@ -24,9 +24,9 @@ from weldcal.calibration.eye_on_base.stated_error import (
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.kinematics_fit import FactoryPrior
 from weldcal.calibration.refinement.local_field import field_from_document
-from weldcal.calibration.refinement.stated_arm import shared_error
 from weldcal.calibration.touch.arm_prior import arm_effect
 from weldcal.calibration.touch.touches import PLANE, POINT, SPHERE, Touch, require_touches
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.workpieces.mesh_files import read_surface

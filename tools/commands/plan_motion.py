@@ -11,9 +11,8 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.data.results import load_result
-from weldcal.calibration.motion.expected import PredictedSigma, expected_of_motion
+from weldcal.calibration.motion.expected import PredictedSigma, closed_moves, expected_of_motion, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import closed_moves, recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import write_atomic

@@ -11,8 +11,7 @@ from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_choice import LEAST
-from weldcal.calibration.refinement.kinematics_fit import KINDS
-from weldcal.calibration.refinement.poses import informative_poses
+from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_poses
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.settings import plan_poses as plan_scan_poses

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, rotation_vector
 from weldcal.calibration.motion.drift.residuals import Rows, rows_of
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import load_arm

@@ -8,8 +8,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import difference, exp_rotation, inverse, skew
+from weldcal.calibration.motion.expected import ROBOT, Moves, closed_moves
 from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.calibration.planning.moves import ROBOT, Moves, closed_moves
 from weldcal.models.arms.chain import chain_inverse, load_chain
 from weldcal.models.arrays import Array
 

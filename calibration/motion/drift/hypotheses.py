@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from weldcal.calibration.motion.drift.noise import FrameNoise
-from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, Rows
+from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, FrameNoise, Rows
 from weldcal.models.arrays import Array
 
 

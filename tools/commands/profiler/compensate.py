@@ -8,8 +8,8 @@ from weldcal.calibration.profiler.motion import Floats, rotation_groups
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere import linear as published
 from weldcal.calibration.profiler.sphere.arc import fit_circle
+from weldcal.calibration.profiler.sphere.joint import check_radius
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
-from weldcal.calibration.profiler.sphere.radius import check_radius
 from weldcal.models.errors import InputError
 from weldcal.tools import console
 from weldcal.tools.cli.options import Call, LimitOption, Outcome, command, switch

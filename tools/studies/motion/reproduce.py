@@ -14,8 +14,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
 from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, rotation_vector
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames

@@ -8,9 +8,8 @@ from typing import Annotated, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.tablet.planar.fit import fit_plane_motion, hand_over
-from weldcal.calibration.tablet.published.calibration import StageResult
-from weldcal.calibration.tablet.published.two_stage import Sign
+from weldcal.calibration.tablet.planar_fit import fit_plane_motion, hand_over
+from weldcal.calibration.tablet.published import Sign, StageResult
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress

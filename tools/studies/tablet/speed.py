@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 
-from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar
-from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
-from weldcal.calibration.tablet.published.calibration import tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.planar_fit import PlanarConfig, fit_linear, fit_planar, solve_closed_form, touched_rays
+from weldcal.calibration.tablet.published import tablet_stage1, tablet_stage2
 from weldcal.tools.cli.options import Call, command
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
