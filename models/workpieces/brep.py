@@ -290,6 +290,8 @@ def _edge_along(line: Floats) -> Any:
     if not closed and (len(line) == 2 or _beside_chord(line) < ROUGH_MM):
         return BRepBuilderAPI_MakeEdge(p, q).Edge()
     line = line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > EXACT_MM])]
+    if len(line) - closed < 3:
+        return BRepBuilderAPI_MakeEdge(p, gp_Pnt(*line[1])).Edge()  # there and back
     k = len(line) // 3
     circle = GC_MakeCircle(p, gp_Pnt(*line[k]), gp_Pnt(*line[2 * k])) if len(line) > 4 else None
     if circle is not None and circle.IsDone():

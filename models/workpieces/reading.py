@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
+import resource
+import subprocess
+import sys
 from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -14,6 +19,8 @@ from weldcal.models.workpieces.step import read_step, referenced
 LEAST_SIZE_M, LARGEST_SIZE_M = 0.005, 10.0
 STEP_SUFFIXES = (".step", ".stp")
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
+LARGE_BYTES = 250_000  # a file from here on is read in a process of its own
+MOST_S = 60  # of processor time for it: OpenCascade may go on for ever, and answers no signal then
 
 
 def read_shape(path: Path, units: str | None = None) -> PartShape:
@@ -39,20 +46,55 @@ def _stamp(file: Path) -> tuple[Path, int, int]:
 
 @lru_cache(maxsize=1)
 def _read(path: Path, units: str | None, written: tuple[tuple[Path, int, int], ...]) -> PartShape:
-    """Read a part once while its files, with their times and sizes, stay as they are: each seam that is planned asks
-    for it."""
-    suffix = path.suffix.lower()
-    if suffix in STEP_SUFFIXES:
-        shape = read_step(path, units)
-    elif suffix in MESH_SUFFIXES:
-        from weldcal.models.workpieces.mesh_files import read_mesh_shape
-
-        shape = read_mesh_shape(path, UNITS_M[units or "mm"])
-    else:
-        kinds = ", ".join((*STEP_SUFFIXES, *MESH_SUFFIXES))
-        raise InputError(f"'{path.name}' is no part that can be read: give a file that ends in {kinds}.")
+    """Read a part once while its files, with their times and sizes, stay as they are; each plan asks for it."""
+    size = sum(written_size for _, _, written_size in written)
+    shape = _bounded(path, units) if size > LARGE_BYTES else _parsed(path, units)
     _check_size(path, shape)
     return shape
+
+
+def _parsed(path: Path, units: str | None) -> PartShape:
+    suffix = path.suffix.lower()
+    if suffix in STEP_SUFFIXES:
+        return read_step(path, units)
+    if suffix in MESH_SUFFIXES:
+        from weldcal.models.workpieces.mesh_files import read_mesh_shape
+
+        return read_mesh_shape(path, UNITS_M[units or "mm"])
+    kinds = ", ".join((*STEP_SUFFIXES, *MESH_SUFFIXES))
+    raise InputError(f"'{path.name}' is no part that can be read: give a file that ends in {kinds}.")
+
+
+def _bounded(path: Path, units: str | None) -> PartShape:
+    """Read a part in a process that ends after MOST_S of processor time.
+
+    Raises:
+        InputError: as read_shape; or it did not come to an end.
+    """
+    with TemporaryDirectory() as folder:
+        result = Path(folder) / "shape"
+        code = f"from weldcal.models.workpieces.reading import send; send({str(path)!r}, {units!r}, {str(result)!r})"
+        subprocess.run([sys.executable, "-c", code], check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        found = pickle.loads(result.read_bytes()) if result.is_file() else None
+    if isinstance(found, InputError):
+        raise found
+    if not isinstance(found, PartShape):
+        raise InputError(
+            f"'{path.name}' cannot be read within {MOST_S} s of processor time: it has too many faces, or damaged "
+            "ones. Export only the bodies that are welded, without threads, holes and purchased parts."
+        )
+    return found
+
+
+def send(path: str, units: str | None, result: str) -> None:
+    """Read a part within MOST_S, and write its shape, or the error, to a file."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (MOST_S, MOST_S + 1))
+    try:
+        found: PartShape | InputError = _parsed(Path(path), units)
+    except InputError as error:
+        found = error
+    Path(result).write_bytes(pickle.dumps(found))
 
 
 def _check_size(path: Path, shape: PartShape) -> None:

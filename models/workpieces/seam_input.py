@@ -41,8 +41,8 @@ class SeamSource:
             raise InputError("A seam needs either polyline: FILE.csv or edges: [NUMBER, ...], and not both.")
         if self.direction not in DIRECTIONS:
             raise InputError(f"A seam's direction must be forward or reverse, not '{self.direction}'.")
-        if min(self.start_m, self.end_m) < 0.0:
-            raise InputError("A seam's start_mm and end_mm are cut off its ends: give 0 or more.")
+        if self.start_m < 0.0:
+            raise InputError("A seam's start_mm is cut off its start: give 0 or more.")
 
 
 def seam_of(shape: PartShape, source: SeamSource, joint: str) -> DrawnSeam:
@@ -67,7 +67,12 @@ def seam_of(shape: PartShape, source: SeamSource, joint: str) -> DrawnSeam:
         drawn = draw_seam(shape.mesh, line, joint, normals, closed)
     if source.direction == "reverse":
         drawn = drawn.reversed()
-    if source.start_m + source.end_m > 0.0:
+    if source.end_m < 0.0 and not (drawn.closed and source.end_m >= -drawn.length_m):
+        raise InputError(
+            "A seam's end_mm is cut off its end: give 0 or more. Below 0, at most once around, a closed seam "
+            "goes on over its start."
+        )
+    if source.start_m or source.end_m:
         drawn = drawn.between(source.start_m, drawn.length_m - source.end_m)
     return drawn
 

@@ -100,25 +100,27 @@ class DrawnSeam:
         )
 
     def between(self, start_m: float, end_m: float) -> DrawnSeam:
-        """The stretch between two arc lengths, m.
+        """The stretch between two arc lengths, m; a closed seam goes on beyond its end, over its start.
 
         Raises:
             InputError: less than four points are left.
         """
-        s = self.arc_length_m
+        s, rows = self.arc_length_m, np.arange(len(self.points_P))
+        if self.closed and end_m > self.length_m:
+            s, rows = np.concatenate([s, s[-1] + s[1:]]), np.concatenate([rows, rows[1:]])
         keep = (s >= start_m - 1e-9) & (s <= end_m + 1e-9)
         if keep.sum() < 4:
             raise InputError(
                 f"Nothing is left of a seam of {1e3 * self.length_m:.1f} mm between {1e3 * start_m:.1f} and"
                 f" {1e3 * end_m:.1f} mm."
             )
-        whole = bool(keep.all())
+        whole, rows = bool(keep.all()), rows[keep]
         return replace(
             self,
-            points_P=self.points_P[keep],
-            up_P=self.up_P[keep],
-            wall_left_P=self.wall_left_P[keep],
-            wall_right_P=self.wall_right_P[keep],
+            points_P=self.points_P[rows],
+            up_P=self.up_P[rows],
+            wall_left_P=self.wall_left_P[rows],
+            wall_right_P=self.wall_right_P[rows],
             closed=self.closed and whole,
         )
 

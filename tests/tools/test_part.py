@@ -8,15 +8,23 @@ import re
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import proj3d
 from typer.testing import CliRunner
 
+from weldcal.models.errors import InputError
 from weldcal.models.tools.loading import WELDING, load_tool, tool_file
+from weldcal.models.workpieces.part import numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
+from weldcal.models.workpieces.seam_input import SeamSource, seam_of
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.workpiece import part_of
 from weldcal.tools.cli.app import app
+from weldcal.tools.commands.cell import new
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
 from weldcal.tools.commands.cell.part import edges_picture, with_plans
 from weldcal.tools.commands.cell.screen import Seam, ranked
@@ -110,13 +118,74 @@ def test_the_planner_refuses_in_part_what_it_refuses_in_new(tmp_path: Path) -> N
     write_step(assembly(box((0, 0, -10), (200, 100, 10)), box((8, 46, 0), (184, 8, 60)), *walls), tmp_path / "h.step")
     shape = read_shape(tmp_path / "h.step")
     inner = next(joint for joint in shape.joints if joint.length_m == pytest.approx(0.184))
-    asked = Seam(inner, None, "")
+    asked = Seam(joint=inner, radius_m=None, reason="")
     found = with_plans(shape, [asked], 1, tmp_path / "h.step", None, WELDING, lambda stage, share: None)[0]
     assert found.planned
     written, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "h.step", inner.edges), WELDING)
     assert written.name == "unfinished.yaml"
     assert found.verdict.startswith("no: ")
     assert found.reason in reason
+
+
+def test_a_seam_with_corners_is_taken_as_a_whole(tmp_path: Path) -> None:
+    """A rectangle around a low post is one seam with four corners, in `part` and in `new`."""
+    write_step(assembly(box((-150, -150, -10), (300, 300, 10)), box((-50, -35, 0), (100, 70, 40))), tmp_path / "p.step")
+    (joint,) = read_shape(tmp_path / "p.step").joints
+    assert joint.length_m == pytest.approx(0.34)
+    path, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "p.step"))
+    assert note == ""
+    seams = load_scenario(str(path)).workpiece.seams  # type: ignore[union-attr]
+    assert [seam.edges for seam in seams] == [list(joint.edges)]
+
+
+def test_where_the_whole_is_refused_a_piece_is_taken_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_step(assembly(box((-150, -150, -10), (300, 300, 10)), box((-50, -35, 0), (100, 70, 40))), tmp_path / "p.step")
+    (joint,) = read_shape(tmp_path / "p.step").joints
+
+    def only_alone(scenario: Scenario, *_: object) -> str:
+        return "Too near." if len(scenario.workpiece.seams[0].edges) > 1 else ""  # type: ignore[union-attr]
+
+    monkeypatch.setattr(new, "add_scan_poses", only_alone)
+    monkeypatch.setattr(new, "weldable_place", lambda scenario, advises: (scenario.workpiece.pose_guess, ""))
+    path, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "p.step"))
+    (seam,) = load_scenario(str(path)).workpiece.seams  # type: ignore[union-attr]
+    assert seam.edges[0] in joint.edges
+    assert note == f"Only edge {seam.edges[0]} of {', '.join(map(str, joint.edges))}. As a whole: Too near."
+    assert "# Only edge" in path.read_text()
+    # Of edges that a person gives nothing is left out.
+    path, reason = write_cell(tmp_path / "by_hand", "s_groove", OwnPart(tmp_path / "p.step", joint.edges))
+    assert (path.name, reason) == ("unfinished.yaml", "Too near.")
+
+
+def test_a_ring_that_the_arm_cannot_turn_around_is_halved(tmp_path: Path) -> None:
+    """Both halves together cover a circle of 100 mm and overlap by 5 mm at either end."""
+    pipe = less(cylinder((0, 0, 0), 100, 50), cylinder((0, 0, -1), 94, 60))
+    write_step(assembly(box((-220, -220, -10), (440, 440, 10)), pipe), tmp_path / "pipe.step")
+    path, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "pipe.step"))
+    assert note.startswith("The ring 14 in two halves that overlap by 5 mm. As a whole: ")
+    assert path.name == "cell.yaml"
+    part = part_of(load_scenario(str(path)).workpiece)  # type: ignore[arg-type]
+    assert seam_count(part) == 2
+    covered = np.zeros(3600, dtype=int)
+    for k in range(2):
+        p = 1e3 * numbered(part, k).seam_P
+        assert np.hypot(p[:, 0], p[:, 1]) == pytest.approx(100.0, abs=0.05)
+        turn = np.unwrap(np.arctan2(p[:, 1], p[:, 0]))
+        low, high = np.degrees([turn.min(), turn.max()])
+        covered[np.arange(math.ceil(10 * low), math.floor(10 * high) + 1) % 3600] += 1
+    assert covered.min() == 1
+    assert np.radians(0.1 * (covered == 2).sum()) * 100.0 == pytest.approx(10.0, abs=1.5)
+
+
+def test_an_end_below_zero_belongs_to_a_ring(tmp_path: Path) -> None:
+    write_pipe(tmp_path / "pipe.step", 80)
+    shape = read_shape(tmp_path / "pipe.step")
+    outside = max(shape.joints, key=lambda joint: joint.length_m)
+    ring = seam_of(shape, SeamSource(edges=outside.edges, start_m=0.25, end_m=-0.02), "fillet")
+    assert ring.length_m == pytest.approx(2.0 * math.pi * 0.08 - 0.23, abs=1e-3)
+    for edges, end in [(outside.edges, -0.6)]:
+        with pytest.raises(InputError, match="end_mm is cut off its end: give 0 or more"):
+            seam_of(shape, SeamSource(edges=edges, end_m=end), "fillet")
 
 
 def test_a_part_without_seams_says_so(tmp_path: Path) -> None:

@@ -168,9 +168,11 @@ class DemoResult:
         """The torch's distance from the true seam."""
         if self.weld is None or self.weld.error is None:
             return ExpectedError("torch off the seam", "not known", "the true seam is known in simulation only")
-        distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
+        distance = 1e3 * self.weld.error.distance_m
+        ends = 1e3 * np.max([error.ends_m()[:2] for error in self.weld.seams], axis=0)
         backing = (
-            f"95 % of the weld; mean {distance.mean():.3f}, at most {distance.max():.3f} mm; known in simulation only"
+            f"95 % of the weld; mean {distance.mean():.3f}, at most {distance.max():.3f} mm, "
+            f"in the first 5 mm {ends[0]:.3f}, in the last 5 mm {ends[1]:.3f} mm; known in simulation only"
         )
         return ExpectedError("torch off the seam", f"{np.percentile(distance, 95):.3f} mm", backing)
 
@@ -221,10 +223,11 @@ class DemoResult:
         found["n_scans"] = self.n_scans
         found["refused"] = [{"id": id, "reason": reason} for id, reason in self.status.refused]
         if self.weld is not None and self.weld.error is not None:
-            distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
-            found["torch_mean_mm"], found["torch_max_mm"] = float(distance.mean()), float(distance.max())
-            if len(self.weld.seams) > 1:
-                found["seams"] = [seam_document(error) for error in self.weld.seams]
+            seams = [seam_document(error) for error in self.weld.seams]
+            found["torch_mean_mm"] = 1e3 * float(self.weld.error.distance_m.mean())
+            found |= {key: float(np.nanmax([seam[key] for seam in seams])) for key in seams[0] if "max" in key}
+            if len(seams) > 1:
+                found["seams"] = seams
             found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
             found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
         if self.weld is not None and self.weld.speed is not None:
@@ -275,8 +278,11 @@ class DemoResult:
 
 def seam_document(error: PathError) -> dict[str, float]:
     """The torch's error on one seam, mm."""
-    distance = 1e3 * np.hypot(error.lateral, error.height)
-    return {"torch_mean_mm": float(distance.mean()), "torch_max_mm": float(distance.max())}
+    distance, ends = 1e3 * error.distance_m, 1e3 * np.array(error.ends_m())
+    found = {"torch_mean_mm": float(distance.mean()), "torch_max_mm": float(distance.max())}
+    return found | dict(
+        zip(("torch_first_max_mm", "torch_last_max_mm", "torch_middle_max_mm"), ends.tolist(), strict=True)
+    )
 
 
 def live_errors(values: np.ndarray) -> dict[str, float]:

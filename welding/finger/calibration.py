@@ -13,10 +13,10 @@ from weldcal.welding.numerics import Array
 
 FEWEST_PICTURES, FEWEST_CORNERS = 6, 8
 HELD_OUT = 4  # every fourth picture judges and is not used
-WORST_PX = 1.0
+WORST_PX = 1.0  # OpenCV's corners of a sharp picture are good to some tenths; above 1 px a corner is a wrong one
 LEAST_TILT_DEG = 8.0  # the board is turned by so much in some pictures: else focal length and distance are one number
 FEWEST_TOUCHES = 4
-LEAST_PRESS_M = 5e-4
+LEAST_PRESS_M = 5e-4  # a choice: about ten times the tag's own noise at the tip, a sixth of the weld's deflection
 FAR_OFF = 0.2  # of the nominal size: a tag that is further off is another tag
 AXES = ("x", "y", "z")
 

@@ -18,7 +18,7 @@ STRIPS, STRIP_AGREES = 8, math.radians(2.5)
 LEAST_TURN = math.sin(math.radians(8.0))  # between two normals that are to span a cylinder
 NORMALS_AGREE = math.cos(math.radians(9.0))
 STEEPEST = math.cos(math.radians(65.0))
-BAND_M = 0.003
+BAND_M = 0.003  # about a flat or bent face: above a scanner's noise and form error, below a plate's thickness
 
 
 @dataclass(frozen=True, eq=False)

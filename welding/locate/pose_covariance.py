@@ -20,7 +20,7 @@ EDGE_NOISES = 0.25  # error of an edge per noise of the face: flying points incr
 SLANT_PITCHES = 0.15  # error of an edge per tangent of the angle at which the face is seen
 INSET_PITCHES = 0.25  # common to all edges
 USUAL_SLANT_RAD = math.radians(8.0)
-HEIGHT_FLOOR_M = 2e-6
+HEIGHT_FLOOR_M = 2e-6  # a plane's mean of any number of points; keeps the matrix regular
 
 
 def outline_covariance(

@@ -10,6 +10,7 @@ from weldcal.models.errors import InputError
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 
+END_M = 0.005  # the first and the last stretch of a weld, where the motion starts and the tip has left the seam
 _BAND = 0.25  # a travel speed beyond +-25 % is commonly taken as another welding procedure
 
 
@@ -106,6 +107,18 @@ class PathError:
     def max_m(self) -> float:
         """Largest unsigned lateral error, m."""
         return float(np.max(np.abs(self.lateral)))
+
+    @property
+    def distance_m(self) -> Array:
+        """Distance (N,) from the true line in space, m."""
+        return np.hypot(self.lateral, self.height)
+
+    def ends_m(self, length_m: float = END_M) -> tuple[float, float, float]:
+        """Largest distance in space over the first and the last stretch, and between them, m; NaN without samples."""
+        first, last = self.s <= self.s[0] + length_m, self.s >= self.s[-1] - length_m
+        most = (np.max(self.distance_m, where=part, initial=-np.inf) for part in (first, last, ~(first | last)))
+        first_m, last_m, between_m = (float(v) if v >= 0.0 else math.nan for v in most)
+        return first_m, last_m, between_m
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,10 +5,9 @@ import numpy as np
 
 from weldcal.welding.record.weld_log import WeldRecord
 
+# A finger camera sends pictures far more often: a deflection that is constant for longer belongs to none of them.
 PICTURE_S = 0.1
-"""A finger camera sends a picture far more often: a deflection that stands still for longer belongs to none."""
-WORN = 0.25
-"""Four times the spread of the gain of a good tip (servo settings, gain_sigma)."""
+WORN = 0.25  # four times the spread of the gain of a good tip (servo settings, gain_sigma)
 
 
 def blind_s(record: WeldRecord) -> float:

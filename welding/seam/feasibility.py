@@ -12,7 +12,7 @@ from weldcal.models.tool import WeldingTool
 from weldcal.welding.seam.chord_map import ChordMap, chord_map
 from weldcal.welding.seam.curve import SeamCurve
 
-_SPACING_M = 1.0e-3
+_SPACING_M = 1.0e-3  # as the chord map of the weld itself
 
 
 class InfeasibleSeam(WeldcalError):

@@ -112,7 +112,7 @@ _EMPTY_ARC = np.zeros(0)
 _STEPS = 6  # frames over which the tip's own path is measured
 _SLOW = 0.5  # share of the progress below which the tip is held back
 _FRAME_M = 1.5e-3  # longer than one frame's progress (40 mm/s at 30 Hz): a longer step is a gap
-_LEAST_STEP_M = 0.01e-3
+_LEAST_STEP_M = 0.01e-3  # a few per cent of a frame's usual way: keeps a ratio finite while the tip stands
 _STICKING = 0.25  # path per progress below which the tip is almost at rest
 
 

@@ -16,16 +16,17 @@ from weldcal.models.tool import WeldingTool
 from weldcal.welding.numerics import Array, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 
+# A choice: above the errors of a registered part and of a calibrated arm, some tenths of a millimetre each.
 CLEARANCE_M = 0.001
 NEAR_TIP_M = 0.030  # finger and wire are in the joint by design: only what lies farther from the tip is checked
-AHEAD_STEP_M = 0.002
+AHEAD_STEP_M = 0.002  # below the radius of a tip: it does not pass a wall between two rays
 ACROSS_COS = 0.5  # a wall within 60 degrees of square to the way stops the tool
 ASIDE_M = 0.003  # what the leaning tip still yields sideways before its mechanical limit
 CLIMB_M = 0.010  # the wall of a groove, met at a slant, lifts the tip out over so much
 BESIDE_M = 1e-7 * np.array([3.7, 6.1, 7.1])  # keeps rays off the edges between triangles, which would count twice
 ASIDE_RAD = np.radians(np.arange(0.0, 181.0, 15.0))
 SAMPLES = 20_000
-STEP_M = 0.02
+STEP_M = 0.02  # along the seam; the tool, 20 mm and more wide, meets every place between
 SPHERES = 40  # that stand for one capsule of the tool where points far from it are left out
 # From the part's surface: above a scan's noise and the registration's error, below the height of a tack, 3 mm and more.
 OTHER_M = 0.0025

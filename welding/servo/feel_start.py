@@ -18,9 +18,9 @@ BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH handled here
 _STRAIGHT_RAD = math.radians(10.0)  # a bend turns by more than this
 _BESIDE_M = 4.0e-3  # the tip must not touch down within this distance of a bend
 _REACH_M = 0.030  # nor farther than this from the start
-_SETTLED_M = 0.15e-3
-_REENTRY_M = 12.0e-3
-_LEAST_STEP_M = 0.03e-3
+_SETTLED_M = 0.15e-3  # three times the tag's noise of 0.05 mm, small against the tip's radius
+_REENTRY_M = 12.0e-3  # a choice, two tip diameters and more: a groove that is not met by then does not begin here
+_LEAST_STEP_M = 0.03e-3  # a choice, below the tag's noise of 0.05 mm: nearer points give the curve no direction
 
 
 def with_touch_place(plan: SeamCurve, config: ServoConfig) -> ServoConfig:

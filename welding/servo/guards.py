@@ -67,8 +67,8 @@ class ArmGuardConfig:
 
 GUARD = ArmGuardConfig()
 """The thresholds of every guarded motion, and of the check of its path before it starts."""
+# Of the joints' speed limits, for guarded motions. A choice: a joint then stops in a quarter of its longest way (v^2).
 SPEED_SHARE = 0.5
-"""Share of the joints' speed limits that a guarded motion may use."""
 
 
 @dataclass(frozen=True)

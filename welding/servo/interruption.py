@@ -24,7 +24,7 @@ TRAIL_TICKS = 600  # 5 s: longer than the overlap takes at any speed but creepin
 EASE_S = 0.15  # from rest to the speed of the way back, and to rest again
 FEEDBACK_PER_S = 8.0  # as the FlangeMover
 BACK_AGAIN_M, BACK_AGAIN_RAD = 0.1e-3, 2e-3
-LONGEST_BACK_S = 8.0
+LONGEST_BACK_S = 8.0  # longer than the trail of 5 s that the way back follows: what takes longer is blocked
 MOVED_M = 1.0e-3  # a tool at rest that is found so far away has been moved
 
 

@@ -156,7 +156,9 @@ def _search(
         frames = frames + 1 if leaning and (pressed or not dropped) else 0
         t = replace(t, seated_frames=frames)
         state = changed(state, touch=t)
-    if dropped and frames >= _SEATED_FRAMES:
+    # Beside a guiding joint is no face: the ball that rests there leaning is in the root, also above the plan.
+    guided = touch.offset_m == 0.0 and frames >= _WALL_FRAMES and tip_height < 0.5 * touch.depth_m
+    if guided or (dropped and frames >= _SEATED_FRAMES):
         if not touch.calibrate_gain:
             return state, 0.0, depth_servo, None, True
         return _next(state, "press up", now, left), 0.0, 0.0, None, False

@@ -26,7 +26,7 @@ from weldcal.welding.servo.tool_axes import tool_path
 from weldcal.welding.servo.touch import touch_start_pose
 
 CHECKED_EVERY = 5  # places of the seam, against the surroundings: 20 mm
-CLEAR_OF_PART_M = 0.002
+CLEAR_OF_PART_M = 0.002  # twice the tool's own clearance: the arm's links are capsules, with errors of their own
 HIGHER = (1.0, 2.0, 4.0)  # of the clearance above the seam, until the moves are clear
 LEAN_STEP_DEG, LEAN_MOST_DEG = 2.0, 10.0
 MOVES_MM, TURNS_DEG = (25.0, 50.0, 100.0, 150.0, 200.0, 300.0), (15.0, 30.0, 45.0, 60.0, 90.0, 180.0)

@@ -11,7 +11,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection, expected_factors
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arrays import Array
@@ -68,7 +68,7 @@ def plan_root_anyhow(
     return dc.replace(found, root=found.root @ R.T, up=found.up @ R.T, X_BP=X_BP)
 
 
-OVERLAP_M = 5e-3
+OVERLAP_M = 5e-3  # a choice: the length of a usual weld pool, so that the ring's start is melted again
 RUN_UP_S = 2.0  # from where the tip comes down until the torch is on the seam
 UNFELT = "followed from the scan and the drawing; not felt"
 
@@ -264,9 +264,15 @@ def plan_seam(
         if isinstance(planning.workpiece, Part) and found.X_BP is not None:
             arc = planning.config.touch.arc_m if record.left_out else 0.0
             check_beside(*beside, seam, planning.tool, plan.lean_rad, planning.table_z_m, from_m=arc)
-        sigma_m, summary, felt = found.sigma_m, found.summary, is_felt(planning.workpiece, planning.tool)
+        felt = is_felt(planning.workpiece, planning.tool)
+        at, others = added_variance(planning, found, seam, plan, known[-1][1])
+        part_m = (
+            found.sigma_m if found.across_m is None else found.across_m
+        )  # a turn about a ring moves it along itself
+        sigma_m = math.sqrt(np.mean(np.square(part_m)) + np.mean(others))
+        summary = f"{found.summary}; with scanner and arm its sigma is {1e3 * sigma_m:.2f} mm"
         if not felt:
-            sigma_m, summary = unfelt_sigma(planning, found, seam, plan)
+            sigma_m, summary = unfelt_sigma(planning, found, at, others)
         return dc.replace(
             plan,
             felt=felt,
@@ -307,35 +313,48 @@ def interrupted(
     return planning, line, dc.replace(record, left_out=left_out), planning.piece + 1 < len(pieces)
 
 
-def unfelt_sigma(planning: SeamPlanning, found: RootPlan, seam: SeamCurve, plan: PlannedSeam) -> tuple[float, str]:
-    """The largest sigma of the torch across a seam that is not felt, m, and the plan's summary with it.
+def added_variance(
+    planning: SeamPlanning, found: RootPlan, seam: SeamCurve, plan: PlannedSeam, X_BC: RigidTransform
+) -> tuple[npt.NDArray[np.int_], Array]:
+    """Nine places of a root, and the variance m^2 across it there that scanner and arm add to the part's in the scan.
 
-    It is that of the root in the scan, with those of the scanner's pose and of the arm. Of a calibration by the same
-    arm the spread of its residuals counts for the arm; of a known pose its stated sigma, or else an arm as its maker
-    leaves it.
-
-    Raises:
-        UncertainSeam: it is over the tolerance.
+    Of a calibration by the same arm the spread of its residuals counts for the arm. Of a known pose it is the stated
+    sigma, or else that of a scanner that nobody has corrected and of an arm as its maker leaves it.
     """
-    assert found.across_m is not None
     left = np.cross(found.up, np.gradient(found.root, axis=0))
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     at, estimate = np.linspace(0, len(left) - 1, 9).astype(int), planning.estimate
     if estimate is not None:
         spread = [left[k] @ point_error_covariance(estimate, found.root[k]) @ left[k] for k in at]
-        others = np.array(spread) + estimate.sigma_position_m**2
-        advice = "calibrate with more scans or with calibration.refine: links"
-    else:
-        given, advice = planning.X_BC_sigma_m, "calibrate in the same job (job.calibrate), or state job.X_BC_sigma_mm"
-        assert plan.q_start is not None
-        arm = torch_sigma(planning.arm, planning.tool, seam, plan.q_start) if given is None else given
-        others = np.full(len(at), arm**2)
+        return at, np.array(spread) + estimate.sigma_position_m**2
+    if planning.X_BC_sigma_m is not None:
+        return at, np.full(len(at), planning.X_BC_sigma_m**2)
+    assert plan.q_start is not None
+    c = (found.root[at] - X_BC.translation()) @ X_BC.rotation().matrix()
+    factors = ScannerCorrection().terms(c) * expected_factors(TERMS[1], float(np.median(c[:, 2])))
+    scale = np.sum((left[at] @ X_BC.rotation().matrix()) * c, axis=1) * np.linalg.norm(factors, axis=1)
+    return at, scale**2 + torch_sigma(planning.arm, planning.tool, seam, plan.q_start) ** 2
+
+
+def unfelt_sigma(planning: SeamPlanning, found: RootPlan, at: npt.NDArray[np.int_], others: Array) -> tuple[float, str]:
+    """The largest sigma of the torch across a seam that is not felt, m, and the plan's summary with it.
+
+    It is that of the root in the scan, with the `added_variance` at its places.
+
+    Raises:
+        UncertainSeam: it is over the tolerance.
+    """
+    assert found.across_m is not None
     worst = int(np.argmax(found.across_m[at] ** 2 + others))
     part, other = float(found.across_m[at[worst]]), math.sqrt(others[worst])
     sigma = math.hypot(part, other)
     words = f"{1e3 * sigma:.2f} mm across it (part {1e3 * part:.2f} mm, scanner and arm {1e3 * other:.2f} mm)"
     if not sigma <= planning.tolerance_m:
-        advice = advice if other > part else "scan the part from nearer, or so that more of its sides are visible"
+        advice = "calibrate in the same job (job.calibrate), or state job.X_BC_sigma_mm"
+        if planning.estimate is not None:
+            advice = "calibrate with more scans or with calibration.refine: links"
+        if other <= part:
+            advice = "scan the part from nearer, or so that more of its sides are visible"
         raise UncertainSeam(
             f"The tip does not feel this seam, and its plan has a sigma of {words}, over welding.tolerance_mm "
             f"({1e3 * planning.tolerance_m:g} mm): {advice}."

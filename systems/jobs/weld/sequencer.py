@@ -13,7 +13,7 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
 from weldcal.systems.motion.clear_moves import stands_at
 from weldcal.systems.motion.drift_monitor import DriftStatus
 
-SCAN_TIMEOUT_S = 8.0
+SCAN_TIMEOUT_S = 8.0  # above a scanner driver's own limit of 6 s (scan_timeout_s), which names the device's fault first
 WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "home")
 """Phases in which the scanner streams, if it can: its calibration is done, and no scan is wanted."""
 WELDED = ("weld", "retract", "home")

@@ -27,7 +27,7 @@ from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolG
 from weldcal.welding.servo.tool_axes import tool_path
 
 EVERY = 10  # places of the tool's path: 10 mm of tip and torch together
-_UNPRESSED_M = 1e-9
+_UNPRESSED_M = 1e-9  # stands for a tip that is not pressed: zero has no direction
 _DIFFERENCE = 1e-2  # of the prior's standard deviation: micrometres
 
 

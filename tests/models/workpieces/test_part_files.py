@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +15,7 @@ import pytest
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude, merge
+from weldcal.models.workpieces import reading
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, chained, read_polyline, seam_of
 from weldcal.models.workpieces.step import referenced
@@ -287,8 +291,11 @@ def test_an_assembly_takes_its_bodies_from_the_files_beside_it(tmp_path: Path, m
     assert (found.bodies, len(found.joints)) == (2, len(known.joints))
     assert found.mesh.bounds == pytest.approx(known.mesh.bounds, abs=1e-9)
     assert found.joints[0].length_m == pytest.approx(known.joints[0].length_m, abs=1e-9)
-    cell, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(top))
-    assert (reason, sorted(file.name for file in referenced(cell.parent / "top.step"))) == ("", names)
+    cell, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(top))
+    assert (cell.name, sorted(file.name for file in referenced(cell.parent / "top.step"))) == ("cell.yaml", names)
+    assert re.match(
+        r"Without the short edges \d+, \d+\. As a whole: The seam is only 6 mm long", note
+    )  # the web's ends
     (top.parent / names[1]).unlink()
     with pytest.raises(InputError, match=f"takes a body from '{names[1]}': put that file beside it"):
         read_shape(top)
@@ -299,6 +306,40 @@ def test_the_frame_of_a_part_may_lie_out_of_the_arms_reach(tmp_path: Path) -> No
     write_step(assembly(plate, web), tmp_path / "t.step")
     path, reason = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "t.step"))
     assert (path.name, reason) == ("cell.yaml", "")
+
+
+@pytest.mark.parametrize("damage", [False, True])
+def test_a_large_file_is_read_in_a_process_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: bool
+) -> None:
+    """Its shape is the same; a reader that ends without one is a sentence."""
+    write_step(assembly(box((0, 0, -8), (100, 80, 8)), box((10, 37, 0), (80, 6, 40))), tmp_path / "t.step")
+    known = read_shape(tmp_path / "t.step")
+    monkeypatch.setattr(reading, "LARGE_BYTES", 0)
+    if damage:
+        monkeypatch.setattr(reading.sys, "executable", "/bin/false")
+    (tmp_path / "t.step").touch()
+    if damage:
+        with pytest.raises(InputError, match=r"'t.step' cannot be read within 60 s of processor time"):
+            read_shape(tmp_path / "t.step")
+        return
+    found = read_shape(tmp_path / "t.step")
+    assert found is not known
+    assert (found.bodies, len(found.edges)) == (known.bodies, len(known.edges))
+    assert [joint.edges for joint in found.joints] == [joint.edges for joint in known.joints]
+    assert found.mesh.vertices == pytest.approx(known.mesh.vertices)
+
+
+def test_a_reader_that_hangs_is_ended(tmp_path: Path) -> None:
+    """Also one that is busy and answers no signal."""
+    code = (
+        "import signal; from weldcal.models.workpieces import reading; reading.MOST_S = 1\n"
+        "def busy(*_):\n    signal.signal(signal.SIGTERM, signal.SIG_IGN)\n    while True: pass\n"
+        f"reading._parsed = busy; reading.send('t.step', None, {str(tmp_path / 'shape')!r})"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], check=False, timeout=60)
+    assert ended.returncode in (-signal.SIGXCPU, -signal.SIGKILL)
+    assert not (tmp_path / "shape").exists()
 
 
 def test_a_part_is_read_once_until_its_file_is_written_again(tmp_path: Path) -> None:

@@ -10,7 +10,16 @@ from pydrake.math import RollPitchYaw
 
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.welding.record.process import EFFICIENCY, ProcessLogError, WeldProcess, speed_along, torch_angles
+from weldcal.welding.record.process import (
+    EFFICIENCY,
+    PathError,
+    ProcessLogError,
+    WeldProcess,
+    path_error,
+    speed_along,
+    torch_angles,
+)
+from weldcal.welding.seam.curve import SeamCurve
 
 
 @pytest.mark.parametrize(("name", "k"), [("MAG", 0.8), ("TIG", 0.6), ("SAW", 1.0)])
@@ -90,3 +99,22 @@ def test_a_tool_that_leans_shows_it_in_the_angle_of_that_axis() -> None:
     work, travel = torch_angles(R, np.tile([0.0, 0.0, 1.0], (2, 1)), work_angle_rad=0.02)
     assert work == pytest.approx([0.10 - 0.02, -0.02])
     assert travel == pytest.approx([0.0, 0.20])
+
+
+def test_the_ends_of_a_weld_are_measured_apart_from_its_middle() -> None:
+    """A torch 0.04 mm beside a straight seam of 100 mm, but for four bumps whose places and heights are known."""
+    x = np.arange(3.0, 98.0, 0.25)
+    y, z = np.full(len(x), 0.04), np.zeros(len(x))
+    for place, aside, up in ((7.75, 0.3, 0.4), (8.25, 0.0, 0.2), (92.75, -0.25, 0.0), (93.0, 0.05, 0.12)):
+        y[x == place], z[x == place] = aside, up
+    seam = SeamCurve.from_points(np.outer(np.linspace(0.0, 0.1, 11), [1.0, 0.0, 0.0]))
+    found = path_error(1e-3 * np.column_stack([x, y, z]), seam)
+    # The weld is from 3.0 to 97.75 mm: its ends reach to 8.0 and from 92.75 on.
+    assert 1e3 * np.array(found.ends_m()) == pytest.approx([0.5, 0.25, 0.2], abs=1e-6)
+    assert 1e3 * found.distance_m.max() == pytest.approx(0.5, abs=1e-6)
+
+
+def test_a_weld_shorter_than_its_two_ends_has_no_middle() -> None:
+    found = PathError(np.array([0.0, 4e-3, 8e-3]), np.array([1e-4, 3e-4, 2e-4]), np.zeros(3)).ends_m()
+    assert found[:2] == pytest.approx((3e-4, 3e-4))
+    assert math.isnan(found[2])

@@ -40,7 +40,7 @@ from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.commands.cell.dataset_forms import FORMS, rewrite
 from weldcal.tools.commands.cell.scan_poses import add_scan_poses
 from weldcal.tools.commands.cell.schema import SchemaKey, json_schema, keys_of, yaml_of
-from weldcal.tools.commands.cell.screen import least_pipe, ranked, unit_hint
+from weldcal.tools.commands.cell.screen import MOST_TRIED, joint_of, least_pipe, to_try, unit_hint, ways
 from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.weld import write_scans
 from weldcal.tools.report.run import RunOptions
@@ -93,10 +93,6 @@ HEAD = """# yaml-language-server: $schema={schema}
 #   weldcal check-cell {path}
 """
 TOOL = "tool.yaml"
-NARROW_RAD = np.deg2rad(75.0)  # a V is narrower than this, a fillet wider
-FLUSH_RAD = np.deg2rad(179.0)  # a joint as open as this needs a gap for the tip to feel
-MOST_TRIED = 4  # seams for which a place is looked for
-OPEN_ABOVE = 0.3  # z of the joint's bisector
 TURNS_DEG = (90.0, -90.0, 0.0, 180.0)
 TABLE_M = (0.7, 0.7)  # half the size of the table in the scan that is tried
 OFF_MM, OFF_DEG = 6.0, 1.5  # of the simulated part from its guess: the scan has to find it
@@ -144,22 +140,22 @@ def new(
         raise typer.BadParameter("--format is for --dataset")
     if dataset:
         written = write_example(folder, call.seed, call.progress, form)
-        following = f"weldcal calibrate {written}"
+        following, note = f"weldcal calibrate {written}", {}
     else:
         numbers = tuple(edge_numbers(edges))
         own = None if part is None else OwnPart(part, numbers, joint, units)
         written, reason = write_cell(folder, base, own, tool_file(tool_of or WELDING) if tool or tool_of else None)
         following = f"weldcal demo --scenario {written}"
-        if reason:
-            assert part is not None
+        if part is not None and written.name == UNFINISHED:
             problem = (
                 f"The arm cannot weld {part.name} in any of the poses that were tried: {reason} "
                 f"Choose other edges from weldcal part {part} and give --edges, or change {written}."
             )
             summary = {"state": "unfinished", "reason": problem, "written": str(written)}
             return Outcome(summary, values={"written": str(written)}, problem=problem)
-    summary = {"state": "done", "written": str(written), "next": following}
-    return Outcome(summary, values={"written": str(written), "next": following})
+        note = {"note": reason} if reason else {}
+    values = {"written": str(written), **note, "next": following}
+    return Outcome({"state": "done", **values}, values=values)
 
 
 def edge_numbers(text: str) -> list[int]:
@@ -210,8 +206,9 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     """Write cell.yaml and its JSON schema into a folder, with a part and a tool of one's own.
 
     Returns:
-        The path of cell.yaml, and "". Where the arm can weld the part's seam in no pose that was tried: the path of
-        unfinished.yaml, and the reason in the pose that came nearest.
+        The path of cell.yaml, and ""; where the arm can weld a seam only in pieces, which, and why. Where the arm can
+        weld the part's seam in no pose that was tried: the path of unfinished.yaml, and the reason in the pose that
+        came nearest.
 
     Raises:
         InputError: there is one already, `base` is no scenario, or the part cannot be used.
@@ -229,51 +226,68 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
         add_tool(scenario, folder, tool)
     write_atomic(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
     unfinished = folder / UNFINISHED
+    note = ""
     if part is not None:
         assert scenario.workpiece is not None
         standing, nearest = scenario.workpiece.pose_guess, ""
-        for seam, joint in candidates:  # the reason is that of the first one
-            reason = _refused(unfinished, scenario, seam, joint, standing, not nearest)
+        for seams, joint, pieces in candidates:
+            reason, note = _refused(unfinished, scenario, seams, joint, standing, False), pieces
             nearest = nearest or reason
             if not reason:
                 break
         if reason:
-            several = f"None of {len(candidates)} seams can be welded; the nearest one: " if len(candidates) > 1 else ""
-            reason = _with_advice(read_shape(part.file, part.units), candidates[0][0], fits, several + nearest)
-            seam, joint = candidates[0]
-            scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
-            words = "\n# ".join(textwrap.wrap(reason, WIDTH - 2))
-            _write(unfinished, scenario, CANNOT_WELD.format(reason=words, path=unfinished))
+            nearest = _refused(unfinished, scenario, *candidates[0][:2], standing, True) or nearest
+            whole = sum(not note for *_, note in candidates)
+            several = f"None of {whole} seams can be welded; the nearest one: " if whole > 1 else ""
+            (seams, joint, _), shape = candidates[0], read_shape(part.file, part.units)
+            reason = _with_advice(shape, seams[0], fits, several + nearest)
+            scenario.workpiece = dc.replace(scenario.workpiece, seams=seams, joint=joint, pose_guess=standing)
+            _write(unfinished, scenario, CANNOT_WELD.format(reason=_comment(reason), path=unfinished))
             return unfinished, reason
-    _write(path, scenario, RUNS.format(path=path))
+        if note:
+            note = f"{note} As a whole: {nearest}"
+    _write(path, scenario, (RUNS + f"\n# {_comment(note)}" * bool(note)).format(path=path))
     unfinished.unlink(missing_ok=True)
-    return path, ""
+    return path, note
 
 
-def _refused(path: Path, scenario: Scenario, seam: SeamConfig, joint: str, standing: PoseConfig, advises: bool) -> str:
-    """Write a scenario with a seam, and place its part; why the arm can weld it in no pose, else ""."""
+def _comment(text: str) -> str:
+    return "\n# ".join(textwrap.wrap(text, WIDTH - 2)).replace("{", "{{").replace("}", "}}")
+
+
+def _refused(
+    path: Path, scenario: Scenario, seams: list[SeamConfig], joint: str, standing: PoseConfig, advises: bool
+) -> str:
+    """Write a scenario with seams, and place its part; why the arm can weld them in no pose, else ""."""
     assert scenario.workpiece is not None
-    scenario.workpiece = dc.replace(scenario.workpiece, seams=[seam], joint=joint, pose_guess=standing)
+    scenario.workpiece = dc.replace(scenario.workpiece, seams=seams, joint=joint, pose_guess=standing)
     _write(path, scenario, CANNOT_WELD.format(reason="Its place is not chosen yet.", path=path))
     scenario.workpiece.pose_guess, reason = weldable_place(load_scenario(str(path)), advises)
     return add_scan_poses(scenario, path, reason)
 
 
-def planned(part: OwnPart, seams: list[list[PartEdge]], tool: Path, progress: Progress) -> list[str]:
-    """Why a new cell's arm cannot weld each seam of a part, given by its edges, in any pose that is tried; "" where it
-    can."""
+def planned(part: OwnPart, seams: list[list[PartEdge]], tool: Path, progress: Progress) -> list[tuple[str, str]]:
+    """Why a new cell's arm cannot weld each seam of a part, given by its edges, in any pose that is tried, else "".
+
+    And in which pieces it can; "" where it can as a whole.
+    """
     found = []
     with TemporaryDirectory() as folder:
         scenario = load_scenario(BASE)
-        first = dc.replace(part, edges=tuple(edge.id for edge in seams[0]))
+        first, shape = dc.replace(part, edges=tuple(edge.id for edge in seams[0])), read_shape(part.file, part.units)
         add_part(scenario, Path(folder), first, load_tool(tool).tool)
         add_tool(scenario, Path(folder), tool)
         assert scenario.workpiece is not None
         standing = scenario.workpiece.pose_guess
         for k, edges in enumerate(seams):
             progress(f"plan seam {k + 1} of {len(seams)}", 0.3 + 0.6 * k / len(seams))
-            seam = SeamConfig(edges=[edge.id for edge in edges])
-            found.append(_refused(Path(folder) / CELL, scenario, seam, _joint(edges[0]), standing, False))
+            reason = ""
+            for tried, pieces in ways(shape, [edge.id for edge in edges])[:3]:
+                why = _refused(Path(folder) / CELL, scenario, tried, joint_of(edges[0]), standing, False)
+                reason, note = reason or why, pieces
+                if not why:
+                    break
+            found.append((reason if why else "", "" if why else note))
     return found
 
 
@@ -320,23 +334,32 @@ def _line(key: SchemaKey, value: Any, indent: str, written: bool = False) -> str
     return "".join(f"{indent}# {words}\n" for words in above) + text + "\n"
 
 
-def add_part(scenario: Scenario, folder: Path, part: OwnPart, tool: WeldingTool) -> list[tuple[SeamConfig, str]]:
+def add_part(
+    scenario: Scenario, folder: Path, part: OwnPart, tool: WeldingTool
+) -> list[tuple[list[SeamConfig], str, str]]:
     """Copy a part's file into the cell's folder, and make it the scenario's workpiece, standing on the table.
 
     Returns:
-        The seams to try, each with its joint, the best one first: without edges those that open upwards, by their
-            length.
+        What to try, each the seams, their joint and what of the part's seam they are, "" for the whole; the best first.
 
     Raises:
         InputError: the part cannot be read, has no such edge, or no joint.
     """
     shape = read_shape(part.file, part.units)
-    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else _candidates(shape, part.file, tool)
-    found = [(SeamConfig(edges=[edge.id for edge in edges]), part.joint or _joint(edges[0])) for edges in chosen]
+    chosen = [[shape.edge(id) for id in part.edges]] if part.edges else to_try(shape, part.file, tool)
+    found = [
+        (seams, part.joint or joint_of(edges[0]), note)
+        for edges in chosen
+        for seams, note in ways(shape, [e.id for e in edges])
+    ]
+    if part.edges:
+        found = [way for way in found if not way[2] or len(way[0]) > 1]  # only what welds all of it
+    whole, rest = [way for way in found if not way[2]], [way for way in found if way[2]]
+    found = [*whole, *sorted(rest, key=lambda way: len(way[0]) == 1)[:MOST_TRIED]]
     scenario.workpiece = WorkpieceConfig(
         file=part.file.name,
         units=part.units,
-        seams=[found[0][0]],
+        seams=found[0][0],
         joint=found[0][1],
         pose_guess=_standing(shape.mesh, TURNS_DEG[0], 0.5 * shape.mesh.bounds.sum(axis=0), scenario),
         located_by="scan",
@@ -376,14 +399,14 @@ def weldable_place(scenario: Scenario, advises: bool = True) -> tuple[PoseConfig
             )
         seams = [numbered(part, k) for k in range(seam_count(part))]
         line = np.concatenate([seam.seam_P for seam in seams])
-        for middle in (0.5 * part.mesh.bounds.sum(axis=0), 0.5 * (line.min(axis=0) + line.max(axis=0))):
-            for turn in TURNS_DEG:
-                guess = _standing(part.mesh, turn, middle, scenario)
-                welded, reason = _first_refusal(scenario, station, seams, guess)
-                if not reason:
-                    return guess, _unseen(scenario, station, seams[0], guess)
-                if welded > nearest[0]:
-                    nearest, nearest_pose = (welded, reason), guess
+        middles = [0.5 * part.mesh.bounds.sum(axis=0), 0.5 * (line.min(axis=0) + line.max(axis=0))]
+        middles = middles[: 1 + bool(np.ptp(middles, axis=0).max() > 0.005)]  # nearer they are one place
+        for guess in (_standing(part.mesh, turn, middle, scenario) for middle in middles for turn in TURNS_DEG):
+            welded, reason = _first_refusal(scenario, station, seams, guess)
+            if not reason:
+                return guess, _unseen(scenario, station, seams[0], guess)
+            if welded > nearest[0]:
+                nearest, nearest_pose = (welded, reason), guess
         if advises:
             nearest = _first_refusal(scenario, station, seams, nearest_pose, advises=True)
     finally:
@@ -450,39 +473,3 @@ def add_tool(scenario: Scenario, folder: Path, tool: Path) -> None:
     if ours:
         shutil.copyfile(tool, folder / TOOL)
     scenario.tool = ToolFile(TOOL if ours else str(tool.resolve()))
-
-
-def _candidates(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdge]]:
-    """The seams to try, at most MOST_TRIED, each by its edges, a seam with corners edge by edge.
-
-    Those that the tool fits come first, then those that it nearly fits; of these first what opens upwards.
-    """
-    found, order = [], []
-    for seam in ranked(shape, tool):
-        chain = [shape.edge(id) for id in seam.joint.edges]
-        if not seam.felt or seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
-            for edges in pieces(chain):
-                found.append(edges)
-                above = edges[0].up_P is not None and edges[0].up_P[2] > OPEN_ABOVE
-                order.append((bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above))
-    found = [found[k] for k in sorted(range(len(found)), key=lambda k: order[k])]
-    if not shape.joints:  # of a mesh of other surfaces
-        concave = [edge for edge in shape.edges if edge.kind == "concave"]
-        found = [[edge] for edge in sorted(concave, key=lambda edge: -edge.length_m)]
-    if not found:
-        raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
-    return found[:MOST_TRIED]
-
-
-def pieces(chain: list[PartEdge]) -> list[list[PartEdge]]:
-    """The seams along the edges of a joint, the longest first: one along a bent line, one for each edge between
-    corners."""
-    if all(len(edge.points_P) > 2 for edge in chain):
-        return [chain]
-    return [[edge] for edge in sorted(chain, key=lambda edge: -edge.length_m)]
-
-
-def _joint(edge: PartEdge) -> str:
-    if edge.kind == "flush":
-        return "butt"
-    return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"

@@ -22,7 +22,7 @@ from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.shape import PartEdge, PartShape
 from weldcal.systems.runner import Progress
 from weldcal.tools.cli.options import RESULT, Call, Outcome, command, option
-from weldcal.tools.commands.cell.new import OwnPart, pieces, planned
+from weldcal.tools.commands.cell.new import OwnPart, planned
 from weldcal.tools.commands.cell.screen import Seam, ranked, unit_hint
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import fixed, render, write_atomic
@@ -71,9 +71,13 @@ def with_plans(
     asked = [seam for seam in seams if not seam.reason][:most]
     if not asked:
         return seams
-    lines = [pieces([shape.edge(id) for id in seam.joint.edges])[0] for seam in asked]
-    reasons = planned(OwnPart(file, units=units), lines, tool, progress)
-    found = [replace(seam, reason=reason, planned=True) for seam, reason in zip(asked, reasons, strict=True)]
+    lines = [[shape.edge(id) for id in seam.joint.edges] for seam in asked]
+    found = [
+        replace(seam, reason=reason, pieces=pieces, planned=True)
+        for seam, (reason, pieces) in zip(
+            asked, planned(OwnPart(file, units=units), lines, tool, progress), strict=True
+        )
+    ]
     return sorted([*found, *(seam for seam in seams if seam not in asked)], key=lambda seam: bool(seam.reason))
 
 

@@ -1,6 +1,7 @@
 """Which joints of a part a tool fits, and why not the others; the arm is not asked."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,14 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
-from weldcal.models.errors import WeldcalError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import load_tool, tool_file
 from weldcal.models.workpieces.part import UNFELT_GAP_M, feels
+from weldcal.models.workpieces.seam_input import chained
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
-from weldcal.models.workpieces.shape import UNITS_M, PartJoint, PartShape
+from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
+from weldcal.systems.scenario.schema import SeamConfig
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam
 from weldcal.welding.seam.room import NoRoom, check_room
@@ -22,15 +25,24 @@ from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
 
 PIPE_TOOL = "pipe"
 SMALL_M = 0.012  # a part this small may be drawn in inches
+FLUSH_RAD = math.radians(179.0)  # a joint as open as this needs a gap for the tip to feel
+MOST_TRIED = 4  # seams for which a place is looked for, and after these so many of their pieces
+OPEN_ABOVE = 0.3  # z of the joint's bisector
+LAP_MM = 5.0  # by which the pieces of a ring overlap
+CORNER_COS = math.cos(math.radians(35.0))  # between two steps of a seam's line: a sharper turn is a corner
+SHORT_M = 0.02  # the end of a sheet is such an edge: too short for the tip to come down and for the torch to follow
+NARROW_RAD = math.radians(75.0)  # a V is narrower than this, a fillet wider
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Seam:
     """A joint of a part, its smallest radius in m (None where it is straight), and why a tool cannot weld it ("": it
     can).
 
-    short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball. felt:
-    by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was asked, too.
+    short_m: by how much the tool's clearance is too small; infinite where the joint itself is none for its ball.
+    felt: by the tip; else it is followed from the scan and the drawing. planned: whether a new cell's arm was
+    asked, too.
+    pieces: in which pieces that arm welds it; "" for one.
     """
 
     joint: PartJoint
@@ -39,6 +51,7 @@ class Seam:
     short_m: float = 0.0
     felt: bool = True
     planned: bool = False
+    pieces: str = ""
 
     @property
     def verdict(self) -> str:
@@ -46,6 +59,7 @@ class Seam:
         if self.reason:
             return f"no: {self.reason}"
         yes = "yes" if self.planned else "fits the tool, not planned"
+        yes = f"{yes}. {self.pieces}".removesuffix(". ")
         return yes if self.felt else f"{yes}; by the scan, not felt (its sigma comes with the scan)"
 
     def as_row(self) -> dict[str, Any]:
@@ -63,6 +77,7 @@ class Seam:
             "weldable": not self.reason,
             "reason": self.reason,
             "planned": self.planned,
+            "pieces": self.pieces,
             "felt": self.felt,
         }
 
@@ -76,7 +91,9 @@ def ranked(shape: PartShape, tool: WeldingTool) -> list[Seam]:
     found = []
     for joint in shape.joints:
         radii = [r for id in joint.edges if (r := shape.edge(id).radius_m) is not None]
-        found.append(Seam(joint, min(radii, default=None), *_obstacle(shape, joint, tool)))
+        reason, short_m, felt = _obstacle(shape, joint, tool)
+        radius = min(radii, default=None)
+        found.append(Seam(joint=joint, radius_m=radius, reason=reason, short_m=short_m, felt=felt))
     return sorted(found, key=lambda seam: (bool(seam.reason), not seam.felt, seam.short_m, -seam.joint.length_m))
 
 
@@ -143,3 +160,61 @@ def unit_hint(shape: PartShape) -> str:
     if max(size) >= SMALL_M or shape.unit_m != UNITS_M["mm"]:
         return ""
     return "The part is only {:.1f} x {:.1f} x {:.1f} mm: its unit may be inch; check the file.".format(*(1e3 * size))
+
+
+def ways(shape: PartShape, ids: Sequence[int]) -> list[tuple[list[SeamConfig], str]]:
+    """A seam along edges as a whole, and what it may be welded in: a ring in pieces that overlap, another edge by edge.
+
+    Each with a note of the pieces, "" for the whole.
+    """
+    found, named = [([SeamConfig(edges=list(ids))], "")], ", ".join(map(str, ids))
+    line, closed = chained(shape, ids)
+    steps = np.diff(line[np.linalg.norm(np.diff(line, axis=0, prepend=np.nan), axis=1) != 0.0], axis=0)
+    t = steps / np.linalg.norm(steps, axis=1)[:, None]
+    if closed and (np.vecdot(t, np.roll(t, 1, axis=0)) > CORNER_COS).all():
+        whole = 1e3 * sum(shape.edge(id).length_m for id in ids)
+        ends = [round(share * whole, 1) for share in (0.25, 0.5)]
+        edges, rest = list(ids), round(whole - ends[0] - LAP_MM, 1)
+        # Both halves begin at one place: there the arm turns one way for the one and back for the other.
+        halves = [
+            SeamConfig(edges=edges, direction="reverse", start_mm=round(whole - ends[1] - LAP_MM, 1)),
+            SeamConfig(edges=edges, start_mm=ends[1], end_mm=-LAP_MM),
+        ]
+        found.append((halves, f"The ring {named} in two halves that overlap by {LAP_MM:g} mm."))
+        following = f"start_mm: {ends[0]:g}, end_mm: {round(rest - ends[0], 1):g}"
+        quarter = f"For the next, subtract 90 from the last of pose_guess.rpy_deg and write {following}; and so on."
+        found.append(([SeamConfig(edges=edges, end_mm=rest)], f"Only a quarter of the ring {named}. {quarter}"))
+        return found
+    by_length = sorted(ids, key=lambda id: -shape.edge(id).length_m) if len(ids) > 1 else []
+    long = [id for id in ids if shape.edge(id).length_m > SHORT_M]
+    if 1 < len(long) < len(ids):
+        without = f"Without the short edges {', '.join(str(id) for id in ids if id not in long)}."
+        found.append(([SeamConfig(edges=[id]) for id in long], without))
+    return found + [([SeamConfig(edges=[id])], f"Only edge {id} of {named}.") for id in by_length]
+
+
+def joint_of(edge: PartEdge) -> str:
+    """The kind of joint at an edge, by its angle."""
+    if edge.kind == "flush":
+        return "butt"
+    return "v_groove" if edge.angle_rad < NARROW_RAD else "fillet"
+
+
+def to_try(shape: PartShape, part: Path, tool: WeldingTool) -> list[list[PartEdge]]:
+    """The seams to try, at most MOST_TRIED, each by its edges.
+
+    Those that the tool fits come first, then those that it nearly fits; of these first what opens upwards.
+    """
+    found = []
+    for seam in ranked(shape, tool):
+        if not seam.felt or seam.joint.gap_m > 0.0 or seam.joint.angle_rad < FLUSH_RAD:
+            above = seam.joint.up_P[2] > OPEN_ABOVE
+            order = (bool(seam.reason), not seam.felt, round(seam.short_m, 3), not above)
+            found.append((order, [shape.edge(id) for id in seam.joint.edges]))
+    chains = [chain for _, chain in sorted(found, key=lambda pair: pair[0])]
+    if not shape.joints:  # of a mesh of other surfaces
+        concave = [edge for edge in shape.edges if edge.kind == "concave"]
+        chains = [[edge] for edge in sorted(concave, key=lambda edge: -edge.length_m)]
+    if not chains:
+        raise InputError(f"{part.name} has no concave edge: choose edges with weldcal part {part} and give --edges.")
+    return chains[:MOST_TRIED]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -27,6 +27,8 @@ COLUMNS = (
     "state",
     "torch_mean_mm",
     "torch_max_mm",
+    "torch_first_max_mm",
+    "torch_last_max_mm",
     "plan_mean_mm",
     "plan_max_mm",
     "welded_mm",
@@ -58,7 +60,7 @@ def run_part_welds(
         listed = f"choose from {', '.join(PARTS)}."
         raise InputError(f"There is no part '{unknown[0]}': {did_you_mean(unknown[0], PARTS, listed)}")
     trial = trial or PartTrial()
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
     runs = [(name, seed) for name in chosen for seed in seeds]
     for k, (name, seed) in enumerate(runs):
         part = PARTS[name]()
@@ -79,24 +81,23 @@ def run_part_welds(
     return _summed(rows)
 
 
-def _summed(rows: list[dict[str, object]]) -> dict[str, object]:
-    def of(row: Mapping[str, object], key: str) -> float:
-        value = row.get(key)
-        return float(value) if isinstance(value, int | float) else float("nan")
+def _summed(rows: list[dict[str, Any]]) -> dict[str, object]:
+    def worst(*keys: str) -> float | None:
+        return max((row[key] for row in rows for key in keys if row.get(key) is not None), default=None)
 
     good = [
         row["state"] == "done"
-        and of(row, "torch_mean_mm") <= MEAN_TARGET_MM
-        and of(row, "torch_max_mm") <= MAX_TARGET_MM
+        and row.get("torch_mean_mm", np.inf) <= MEAN_TARGET_MM
+        and row.get("torch_max_mm", np.inf) <= MAX_TARGET_MM
         for row in rows
     ]
-    means, most = ([of(row, key) for row in rows] for key in ("torch_mean_mm", "torch_max_mm"))
     return {
         "state": "done" if all(row["state"] == "done" for row in rows) else "held",
         "welds": len(rows),
         "within_targets": int(sum(good)),
-        "worst_torch_mean_mm": float(np.nanmax(means)) if np.isfinite(means).any() else None,
-        "worst_torch_max_mm": float(np.nanmax(most)) if np.isfinite(most).any() else None,
+        "worst_torch_mean_mm": worst("torch_mean_mm"),
+        "worst_torch_max_mm": worst("torch_max_mm"),
+        "worst_ends_mm": worst("torch_first_max_mm", "torch_last_max_mm"),
         "parts": [{key: row.get(key) for key in COLUMNS if key in row} for row in rows],
     }
 

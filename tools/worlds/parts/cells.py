@@ -36,7 +36,7 @@ workpiece:
   placement_error: {{translation_mm: {translation_mm}, rotation_deg: {rotation_deg}}}
   groove_error: {{translation_mm: {bow_mm}}}
 planning: {{search: {search}}}
-welding: {{seam_length_mm: {seam_mm}}}
+welding: {{posture: any, seam_length_mm: {seam_mm}}}
 home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
 """
 

@@ -21,7 +21,7 @@ from weldcal.welding.locate.planes import Floats, thinned
 from weldcal.welding.seam.curve import SeamCurve
 
 MOST_RADIUS_M = 1.0  # over 0.3 m a larger radius sags by 11 mm or less, and counts as flat
-MARGIN_M = 0.020
+MARGIN_M = 0.020  # beyond the face found: a choice, a groove's own width and more; wider only costs points
 GROUND_REACH_M = 0.030  # the ends of a bent plate are inclined: the ground beyond is that much further away, unrolled
 COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006  # for the search: a groove 2 mm wide is still three cells wide
 

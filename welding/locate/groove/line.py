@@ -14,11 +14,13 @@ from scipy.spatial import cKDTree
 from weldcal.welding.locate.groove.seam import Profile
 from weldcal.welding.locate.planes import Floats, Mask
 
+# About a scanner's pitch or less; the curve between two places of an R5 bend is then 6 um off its chord.
 STEP_M = 0.0005
 SIDE_M = 0.015  # length of a side that is extended
 LEAST_RADIUS_M = 0.0005  # a seam curve needs a radius: at a right angle its apex is then 0.2 mm off
 RADII_M = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0]) * 1e-3
 CROWD = 4.0  # number of points near a corner whose errors are correlated
+# A radius is not known better than the grid shows an apex: standard deviation of a uniform pitch, 1 / sqrt(12).
 LEAST_SPREAD_PITCHES = 0.3
 WIDE_M = 0.010  # a bend of a larger radius is not a corner: the cross-sections follow it
 

@@ -27,13 +27,15 @@ from weldcal.welding.seam.curve import SeamCurve
 MOST_POINTS = 400_000  # about one groove
 THINNED = 0.9  # a pitch smaller than this times that of the search means that the cloud was thinned for the search
 SIGMA_SCALE = 1.1  # on the slices' own sigmas, for errors common to neighbouring slices
+# Common to the whole line, in point pitches: a choice, judged by tests of coverage (tests/welding/locate).
 SIGMA_FLOOR_PITCHES = 0.04
-SIGMA_FLOOR_NOISE = 0.20
+SIGMA_FLOOR_NOISE = 0.20  # the same, in the scanner's noise
 HEIGHT_FLOOR_NOISE = 0.25  # of the root: flying points off the walls increase with the scanner's noise
+# The edge of a face lies up to half a pitch off: near the standard deviation of that, 1 / sqrt(12).
 ONE_SIDED_PITCHES = 0.2
 END_PITCHES, END_REACH_M = 0.12, 0.006
-CORNER_REACH_M = 0.004
-GAP_ENDS = 0.6
+CORNER_REACH_M = 0.004  # a corner's error fades over the width of the sections beside it: no less than a groove is wide
+GAP_ENDS = 0.6  # at a shadow's ends, of the lever in its middle: its few sections beside it are as uncertain
 
 
 def measure_groove(

@@ -20,10 +20,10 @@ ENOUGH = 3  # fewest points on a measured wall
 WIDE_M = 0.0015  # initial scale of the residuals in z, while the line is still off the groove
 SHOULDER_PITCHES = 1.5  # largest distance between the end of the face and the shoulder
 BAND_M = 0.006  # width of the face used beyond each shoulder
-STATION_M = 0.001
+STATION_M = 0.001  # between sections: some pitches of a scanner, and short against any bend
 FOLLOW = 3.0  # width relative to the last smoothing: repeated moves accumulate noise
 SLOPE_SIGMA = 0.06  # relative, of a slice about the common profile: 2 deg between the walls of a 45 deg groove
-DEPTH_SIGMA = 0.10
+DEPTH_SIGMA = 0.10  # relative, as SLOPE_SIGMA: a root face that is 10 % off its depth
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

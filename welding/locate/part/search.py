@@ -40,6 +40,7 @@ WIDE_CELLS = 3.0  # in config.cell_m: 12 mm, in which a web and the plate beside
 RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, and of a turn at its ends
 # Gates of a large part, in its radius: the second is half a turn and half a cell's diagonal, (0.5 * 1.8 + 0.71) / 40.
 LARGE_GATES = (0.053, 0.04)
+# A rough place is off by less than a cell of the search, 8 mm: a part whose middle is deeper lies in its ground.
 SUNK_M, LEAST_GROUND = 0.008, 30  # depth of a part's middle in its ground, and the coarse points that show this ground
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
 # A large part does not reach farther through its ground, in its radius; else a beam on end fits wherever a beam lies.
