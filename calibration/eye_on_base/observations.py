@@ -14,12 +14,11 @@ from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
-from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import nearest_rotation
-from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 

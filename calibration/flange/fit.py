@@ -477,3 +477,16 @@ def _along_rows(rays: Array) -> Array:
         value[:, 2] = np.where(step[at], near, value[:, 2])
         out[known[fill[at]] + k] = value
     return out.reshape(h, w, 3)
+
+
+def face_cloud(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Array:
+    """The points (N, 3) m of the fitted face and its chamfers, without what lies in front, behind or around."""
+    flat = np.asarray(points_C, dtype=float).reshape(-1, 3)
+    # most of a cloud is far from the face's plane; NaN is nowhere near
+    flat = flat[np.abs((flat - fit.center_C) @ fit.normal_C) < 2.0 * standard.chamfer_m + 0.002]
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    d = flat - fit.center_C
+    height = d @ fit.normal_C
+    reach = np.linalg.norm(d - height[:, None] * fit.normal_C, axis=1)
+    keep = (reach < 0.5 * standard.outer_m + 0.001) & (height < 0.001) & (height > -2.0 * standard.chamfer_m)
+    return np.asarray(flat[keep])

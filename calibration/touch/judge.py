@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
-from weldcal.calibration.eye_on_base.stated_error import (
+from weldcal.calibration.eye_on_base.estimate import (
     USUAL_FIELD_M,
     USUAL_TURN_RAD,
     feature_rotation,

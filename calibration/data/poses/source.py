@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from weldcal.calibration.data.checks import read_rows
 from weldcal.calibration.data.cloud_files.depth import IMAGES, is_camera_file, may_be_depth
 from weldcal.calibration.data.clouds import NO_NOTES, SUFFIXES, cloud_id, ending_of
 from weldcal.calibration.data.header import PoseForm
@@ -15,7 +16,6 @@ from weldcal.calibration.data.poses.lists import lists_of_file, read_lists
 from weldcal.calibration.data.poses.names import BASES, FLANGES, columns_of, natural, number_of, whose
 from weldcal.calibration.data.poses.readings import PoseReading, pick
 from weldcal.calibration.data.poses.trees import stacked
-from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.models.arrays import Array

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.tables import Row, read_rows
+from weldcal.calibration.data.checks import Row, read_rows
 from weldcal.calibration.errors import LandmarksNotFound, TabletDataError
 from weldcal.calibration.tablet.detection import Look, arrange, find_marks
 from weldcal.calibration.tablet.touches import check_page_match
