@@ -217,19 +217,24 @@ def _tested(
         *((frames.ids[k], "The robot's stream has no data at its capture.") for k in np.flatnonzero(~inside)),
     ]
     pivot = at.p[order].mean(axis=0)
-    rows = rows_of(
-        result.X_BC,
-        pivot,
-        clock.times[order],
-        at.p[order],
-        at.n[order],
-        at.v[order],
-        at.turn[order],
-        frames.p_C[order],
-        frames.n_C[order],
-        frames.covariance[order],
-        frames.normal_sigma[order],
-    )
+
+    def rows_with(p_C: Array, n_C: Array) -> Rows:
+        """The residuals with these centres and normals of the frames."""
+        return rows_of(
+            result.X_BC,
+            pivot,
+            clock.times[order],
+            at.p[order],
+            at.n[order],
+            at.v[order],
+            at.turn[order],
+            p_C[order],
+            n_C[order],
+            frames.covariance[order],
+            frames.normal_sigma[order],
+        )
+
+    rows = rows_with(frames.p_C, frames.n_C)
     usual = clock.jitter_s or (_DEVICE_JITTER_S if clock.clock.kind == DEVICE else _ARRIVAL_JITTER_S)
     noise = measured_noise(rows) or FrameNoise(jitter_s=usual)
     interval = float(np.median(np.diff(rows.times))) if len(rows) > 1 else 0.05
@@ -249,19 +254,7 @@ def _tested(
     X, covariance = test.current()
     moves = [e for e in events if e.kind != WARM_UP]
     p_C, n_C = _as_before(result.X_BC, moves, clock.times, frames)
-    held = rows_of(
-        result.X_BC,
-        pivot,
-        clock.times[order],
-        at.p[order],
-        at.n[order],
-        at.v[order],
-        at.turn[order],
-        p_C[order],
-        n_C[order],
-        frames.covariance[order],
-        frames.normal_sigma[order],
-    )
+    held = rows_with(p_C, n_C)
     late, gross = _lateness(held, noise)
     moved = late[:, None] * rows.derivatives[:, :, CLOCK]
     residuals, tilts = (rows.residuals - moved)[:, :3], (rows.residuals - moved)[:, 3:]
