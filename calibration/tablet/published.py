@@ -259,7 +259,7 @@ Minimiser = Callable[[Residuals, Array], DistanceMinimum]
 
 @dataclass(frozen=True)
 class StageResult:
-    """One stage: its parameters (mm and degrees, named in chain.py and two_stage.py), its fitness, its cost."""
+    """One stage: its parameters (mm and degrees, named above), its fitness, its cost."""
 
     parameters: Array
     fitness: Fitness

@@ -42,7 +42,7 @@ USUAL_TILT_RAD = float(np.sqrt((6.0 * _PRIOR.offset_rad**2 + 12.0 * _PRIOR.turn_
 each axis."""
 _DRAWS, _SEED = 4000, 1
 _FIELD_LENGTH_M = 0.2  # over which what an arm leaves at another orientation is alike
-_LEAST_FREE = 3.0  # as in stated_error.py
+_LEAST_FREE = 3.0  # as in eye_on_base/estimate.py
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -31,7 +31,7 @@ from weldcal.models.errors import InputError
 POINTS = 7  # of each profile
 ITERATIONS = 80
 KEPT = 3
-SAME_RAD = 0.02  # as in edge/start.py
+SAME_RAD = 0.02  # as in edge/joint.py
 WORSE = 3.0  # times the best one's mean distance: what explains the sphere so badly is not polished
 
 Model = Literal["rigid", "affine", "affine+joints"]
