@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
-from weldcal.calibration.eye_on_base.estimate import (
+from weldcal.calibration.eye_on_base.stated_error import (
     USUAL_FIELD_M,
     USUAL_TURN_RAD,
     feature_rotation,
@@ -42,7 +42,7 @@ USUAL_TILT_RAD = float(np.sqrt((6.0 * _PRIOR.offset_rad**2 + 12.0 * _PRIOR.turn_
 each axis."""
 _DRAWS, _SEED = 4000, 1
 _FIELD_LENGTH_M = 0.2  # over which what an arm leaves at another orientation is alike
-_LEAST_FREE = 3.0  # as in eye_on_base/estimate.py
+_LEAST_FREE = 3.0  # as in eye_on_base/stated_error.py
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

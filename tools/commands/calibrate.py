@@ -20,11 +20,12 @@ from weldcal.calibration.data.results import CalibrationResult, PoseRecord, expo
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, orientations_of
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
 from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig
+from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation

@@ -7,8 +7,8 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord
-from weldcal.calibration.eye_on_base.estimate import orientations_of
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
+from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
 from weldcal.calibration.touch.arm_prior import observed_document

@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 from tests.calibration.eye_on_base.test_solve import X_BC, make_observations
 from tests.calibration.eye_on_base.test_tcp import _pairs
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_ur_pose, load_result, save_result
-from weldcal.calibration.eye_on_base.estimate import (
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.stated_error import (
     FALSE_ALARM,
     orientations_of,
     scatter_elsewhere,
     stated_median_limit,
 )
-from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
