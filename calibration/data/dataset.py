@@ -296,7 +296,6 @@ def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str,
         hashes[path.name] = digest(path)
     for id, points in recorded.items():
         hashes[f"clouds/{id}"] = hashlib.sha256(np.ascontiguousarray(points).tobytes()).hexdigest()
-    note = f"{bag.name}: {len(X)} scans at rest, {found.read_as}."
     poses = {id: _rigid(pose) for id, pose in zip(found.ids, X, strict=True)}
     clouds = {id: bag / id for id in found.ids}
     return Dataset(
@@ -308,7 +307,7 @@ def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str,
         refused=found.refused,
         hashes=hashes,
         recorded=recorded,
-        notes=(note,),
+        notes=(f"{bag.name}: {len(X)} scans at rest, {found.read_as}.",),
     )
 
 

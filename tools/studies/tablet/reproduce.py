@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from weldcal.calibration.tablet.planar_fit import fit_plane_motion, hand_over
-from weldcal.calibration.tablet.published import Sign, StageResult
+from weldcal.calibration.tablet.published import PUBLISHED_EVALUATIONS, Sign, StageResult
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
@@ -17,7 +17,6 @@ from weldcal.tools.report.pictures import OURS, THEIRS, svg
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.harness import Figures, Row, Study, Table
 from weldcal.tools.studies.tablet.study import (
-    PUBLISHED_EVALUATIONS,
     Reproduced,
     compare_models,
     compare_signs,

@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 
 from weldcal.calibration.tablet.planar_fit import PlanarConfig, fit_linear, fit_planar, solve_closed_form, touched_rays
-from weldcal.calibration.tablet.published import tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.published import PUBLISHED_EVALUATIONS, tablet_stage1, tablet_stage2
 from weldcal.tools.cli.options import Call, command
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.tablet.study import PUBLISHED_EVALUATIONS, evaluation_seconds, median_seconds
+from weldcal.tools.studies.tablet.study import evaluation_seconds, median_seconds
 from weldcal.tools.worlds.tablet import published_touches, simulate_trial
 
 

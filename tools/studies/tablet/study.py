@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.planar_fit import PlanarConfig, fit_linear, fit_planar, fit_plane_motion, hand_over
 from weldcal.calibration.tablet.published import (
-    PUBLISHED_GENERATIONS,
     PUBLISHED_POPULATION,
     Fitness,
     Model,
@@ -27,7 +26,6 @@ from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array
 from weldcal.tools.worlds.tablet import STAGE_1, TabletTrial, simulate_trial
 
-PUBLISHED_EVALUATIONS = PUBLISHED_POPULATION * PUBLISHED_GENERATIONS
 MODELS: tuple[Model, ...] = ("htm", "dh")
 
 
