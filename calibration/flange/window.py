@@ -31,9 +31,8 @@ _PLANE_POINTS = 4000
 _FLAT_M = 3e-4  # rms of a face from its plane that a scanner's own distortion may leave
 _FLAT_NOISE = 2.5  # and in multiples of its noise: a ball bends more
 _BEFORE_M = 0.002  # what stands so far before the face hides it and says nothing of its edge
-_RING_SEEN = (
-    0.6  # share of the ring that counts at least, scanned or not: with _HOLLOW, 0.42 of it must be face; a choice
-)
+# share of the ring that counts at least, scanned or not: with _HOLLOW, 0.42 of it must be face; a choice
+_RING_SEEN = 0.6
 _LABELLED = 1.2  # pitches about an edge whose pixels place it; farther ones say nothing that nearer ones do not
 _LABEL_SECTORS = 24  # of a thinned scan's edge: each with points on both sides of it, or none of its points counts
 _BEYOND = 0.6  # share of the places beyond it that show something: with less, the outermost points place it better

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.jobs.job import job_of
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import MOTION, Call, Outcome, command, option
 from weldcal.tools.commands.motion_live import run_motion_live

@@ -11,9 +11,8 @@ from pydrake.common.yaml import yaml_dump_typed
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.motion.collector import posed_stream
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
-from weldcal.systems.jobs.motion.procedure import MotionRecord
+from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
 from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job

@@ -16,10 +16,9 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.recording.comparison import Comparison, Difference
 from weldcal.systems.recording.player import Playback
 from weldcal.systems.recording.port_recorder import LEFT, PERIOD_S
-from weldcal.systems.recording.reader import read_recording
+from weldcal.systems.recording.reader import Comparison, Difference, read_recording
 from weldcal.systems.recording.scenario_files import unpacked
 from weldcal.systems.recording.values import array, decode
 from weldcal.systems.runner import Progress, no_progress

@@ -22,7 +22,7 @@ from weldcal.models.robots import ROBOTS
 from weldcal.models.tool import ToolShape
 from weldcal.models.tools.enclosing import shape_mesh
 from weldcal.models.tools.loading import LoadedTool
-from weldcal.systems.drivers.simulated.tag_view import TagView
+from weldcal.systems.drivers.simulated.rendered_finger_camera import TagView
 from weldcal.tools.report.render import render
 from weldcal.welding.servo.tool_axes import least_pipe_m
 

@@ -34,9 +34,8 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.console import plain
-from weldcal.tools.farm.journal import Result
-from weldcal.tools.farm.run import Farm
-from weldcal.tools.farm.work import FAILED
+from weldcal.tools.farm.pools import FAILED
+from weldcal.tools.farm.run import Farm, Result
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.output import markdown_table, print_table

@@ -14,7 +14,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
-from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
+from weldcal.systems.drivers.simulated.ur import draw_true_arm
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.worlds.flange_frames import facing, sphere_frame
 

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from tests.systems.cells import EXACT_PLATE
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.systems.jobs.job import Phases
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.checks import check_scenario

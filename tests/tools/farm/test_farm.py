@@ -15,8 +15,7 @@ import pytest
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.models.errors import InputError
-from weldcal.tools.farm.journal import NAME
-from weldcal.tools.farm.run import Farm
+from weldcal.tools.farm.run import NAME, Farm
 from weldcal.tools.worlds.imperfect_cells import imperfect_cell, ratios
 
 TASKS: dict[str, Mapping[str, object]] = {f"cell {seed}": {"kind": "both", "seed": seed} for seed in range(2)}

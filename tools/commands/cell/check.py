@@ -32,10 +32,10 @@ from weldcal.systems.drivers.ur.faults import RobotUnreachable
 from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
-from weldcal.systems.host_timing import measure_host
 from weldcal.systems.jobs.weld.settings import feature_standard, plan_poses
-from weldcal.systems.scenario.arm import nominal_arm
+from weldcal.systems.pacing import measure_host
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command

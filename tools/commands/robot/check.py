@@ -13,12 +13,12 @@ import typer
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
-from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET
 from weldcal.systems.drivers.ur.rtde import UrRtde, chosen_transport
+from weldcal.systems.drivers.ur.wire.rtde_client import UPPER_OFFSET
 from weldcal.systems.drivers.ur.wire.transport import UR_RTDE
-from weldcal.systems.host_timing import measure_host
-from weldcal.systems.scenario.arm import nominal_arm
+from weldcal.systems.pacing import measure_host
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option
 from weldcal.tools.commands.run import robot_at
 

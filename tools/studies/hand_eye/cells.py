@@ -10,7 +10,7 @@ import numpy as np
 from weldcal.calibration.planning.mounting_estimate import expected_error, solve_mounting
 from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.jobs.job import job_of
 from weldcal.systems.scenario.loading import load_scenario, scenario_names
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
 from weldcal.tools.commands.mounting_live import recorded_report, run_mounting_live

@@ -23,11 +23,10 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.models.scanners import depth_to_points
 from weldcal.systems.background import OwnProcess
-from weldcal.systems.drivers.simulated.streaming.replay import FrameReplay
+from weldcal.systems.drivers.simulated.streaming_scanner import FrameReplay
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand
-from weldcal.systems.motion.frame_queue import FrameQueue
-from weldcal.systems.motion.pose_recorder import PoseRecorder
+from weldcal.systems.motion.buffers import FrameQueue, PoseRecorder
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import Call, Outcome, command, option

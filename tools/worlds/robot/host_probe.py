@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 
-from weldcal.systems.host_timing import TICK_S
+from weldcal.systems.pacing import TICK_S
 from weldcal.systems.wall_clock import Lateness
 
 ABOVE_ALL = 50  # of SCHED_FIFO; cell, worker and emulated controller have SCHED_RR 1 to 3

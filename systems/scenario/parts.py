@@ -1,4 +1,4 @@
-"""Makes a scenario's workpiece from its file: the part as drawn with its seam, and the part as it was made."""
+"""Make a scenario's arm, surroundings and workpiece from its keys and files."""
 
 import dataclasses as dc
 import math
@@ -7,17 +7,76 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings
+from weldcal.models.arms.kinematics import ArmModel, load_arm, mounted, with_link_transforms
 from weldcal.models.errors import InputError
+from weldcal.models.mesh import TriMesh, extrude
+from weldcal.models.workpieces.mesh_files import read_surface
 from weldcal.models.workpieces.part import Part, bowed
-from weldcal.models.workpieces.reading import read_shape
+from weldcal.models.workpieces.reading import MESH_SUFFIXES, read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.seams import JOINTS, DrawnSeam
 from weldcal.models.workpieces.shape import UNITS_M, PartShape
-from weldcal.systems.scenario.schema import SeamConfig, WorkpieceConfig
+from weldcal.systems.scenario.schema import ObstacleConfig, Scenario, SeamConfig, WorkpieceConfig
 
 OF_PLATES = ("bend_radius_mm", "hole_from_mm")
 CORNER_RAD = math.radians(15.0)  # by which the bisector turns at one of a seam's points
 ROUNDED_M = 0.002  # to each side of a corner the drawing is rounded
+
+
+def nominal_arm(scenario: Scenario) -> ArmModel:
+    """The arm of a scenario, with the scenario's kinematics file where it names one.
+
+    Raises:
+        InputError: the arm is not known, or its file is not one.
+    """
+    arm = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
+    return mounted(arm, scenario.base.pose())
+
+
+def corrected_arm(scenario: Scenario, arm: ArmModel) -> ArmModel:
+    """The arm as the scenario's corrected kinematics state it, else `arm`, by which its controller computes.
+
+    Raises:
+        InputError: the file cannot be read, or is of another robot.
+    """
+    if scenario.corrected_kinematics is None:
+        return arm
+    path = Path(scenario.corrected_kinematics)
+    read = load_arm(scenario.arm, path)
+    return with_link_transforms(arm, read.stack, read.calibration, f"corrected_kinematics: '{path.name}'")
+
+
+def surroundings_of(scenario: Scenario) -> Surroundings:
+    """What the arm of a scenario must not touch.
+
+    Raises:
+        InputError: an obstacle is neither a box nor a mesh, or its file cannot be read.
+    """
+    return Surroundings(tuple(_obstacle(k, config) for k, config in enumerate(scenario.surroundings)))
+
+
+def _obstacle(k: int, config: ObstacleConfig) -> Obstacle:
+    name = config.name or f"surroundings {k + 1}"
+    if (config.box_m is None) == (config.mesh is None):
+        raise InputError(f"surroundings[{k}] needs either box_m: [x, y, z] or mesh: FILE.")
+    mesh = _box(k, config.box_m) if config.mesh is None else _mesh(Path(config.mesh), config.unit)
+    return Obstacle(name, mesh.transformed(config.pose.pose()), config.margin_m)
+
+
+def _mesh(path: Path, unit: str) -> TriMesh:
+    """The surface of a file; a mesh may be open."""
+    if path.suffix.lower() in MESH_SUFFIXES and unit in UNITS_M:
+        return read_surface(path, UNITS_M[unit])
+    return read_shape(path, unit).mesh
+
+
+def _box(k: int, size_m: list[float] | None) -> TriMesh:
+    size = np.array(size_m, dtype=float)
+    if size.shape != (3,) or not (size > 0.0).all():
+        raise InputError(f"surroundings[{k}].box_m needs three positive lengths, not {size_m}.")
+    x, y, z = 0.5 * size
+    return extrude(np.array([[-x, -y], [x, -y], [x, y], [-x, y]]), -float(z), float(z))
 
 
 def check_workpiece(spec: WorkpieceConfig) -> None:

@@ -58,7 +58,7 @@ class Gas:
 
 OUTPUTS = (0, 1)
 VOLT, MILLIAMPERE = "V", "mA"
-FULL_V = 10.0
+FULL_V = 10.0  # of a UR's analog outputs: 0 V to 10 V (user manual, controller I/O)
 ZERO_A, FULL_A = 0.004, 0.020
 SETTLES_S = 0.05  # of the controller's time, from the set points at the outputs to the torch
 TOLERANCE = 0.02  # of the range
@@ -155,7 +155,7 @@ def apart(asked: float, shown: float) -> bool:
     return not abs(asked - shown) <= TOLERANCE  # also of NaN
 
 
-TIMEOUT_S = 2.0
+TIMEOUT_S = 2.0  # a choice, as LINE_LIMIT_S in wire/transport.py
 MASK, VALUE = "standard_digital_output_mask", "standard_digital_output"
 ANALOG = (
     "standard_analog_output_mask",

@@ -17,7 +17,7 @@ from weldcal.models.files import read_text
 from weldcal.systems.drivers.sensors.acquisition import Delivery, DeviceFault, DeviceLost, Garbage, Source
 from weldcal.systems.drivers.sensors.stamps import UnixClock, unix_now
 
-CONNECT_S = 2.0
+CONNECT_S = 2.0  # a choice: a host of the local network answers within ms, or after one lost packet in 1 s
 LONGEST_LINE = 4096
 
 
@@ -248,9 +248,9 @@ class NewFiles:
 
 
 Datum = TypeVar("Datum")
-POLL_S = 0.01
+POLL_S = 0.01  # a choice: adds 5 ms on average to a scan's wait; half of it doubles the listings of a folder
 LISTING_SHARE = 0.1  # of the time that a folder of many files may be listed
-LONGEST_POLL_S = 0.1
+LONGEST_POLL_S = 0.1  # a choice: a folder whose listing takes 10 ms or more is listed 10 times a second
 PATIENCE_S = 2.0  # for which a settled file that cannot be read may still become complete
 BEFORE_S = 0.005  # a stamp may be this much before its trigger: the resolution of file times
 SIDECAR = ".json"
