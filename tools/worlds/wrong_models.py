@@ -27,9 +27,9 @@ from weldcal.calibration.refinement.kinematics_fit import (
     KinematicsFit,
     arm_errors,
     fit_kinematics,
+    informative_poses,
     unsought,
 )
-from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import device_warp
