@@ -52,7 +52,7 @@ class FlangeObservations:
     """The dataset with its poses as the scans say that they are to be read; None for pairs."""
 
 
-def see_flanges(
+def fit_flanges(
     data: Dataset,
     standard: FlangeStandard,
     *,

@@ -177,7 +177,7 @@ def fit(
         else:
             lin, drift, far = taken(state, centre), np.zeros(len(change)), 0.0
         new = s.variances(lin, noise, floor)
-        settled = s.unsettled(new)
+        settled = s.unconverged(new)
         exact = new.translation <= floor and new.rotation <= TINY
         # steps shrink at least as fast as they just did, so that the next one bounds what is left
         leap = max(size, settled)

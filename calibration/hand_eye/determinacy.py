@@ -30,7 +30,7 @@ class Diversity:
     position_spread: tuple[float, float, float]
 
     def sentence(self) -> str:
-        """One line for a person."""
+        """One line for an operator."""
         a, b, c = self.turn_spread_deg
         return (
             f"{self.n} poses, {self.distinct} distinct; largest turn {self.turn_deg:.1f} deg; spread of the turns "

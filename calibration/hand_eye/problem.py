@@ -396,7 +396,7 @@ class Scaled:
                 break
         return replace(noise, rotation=rotation, translation=translation)
 
-    def unsettled(self, new: Noise) -> float:
+    def unconverged(self, new: Noise) -> float:
         """How much of the observations' variances would change, as a share of them, with other common ones."""
         change_w = abs(new.rotation / self.noise.rotation - 1.0) * float(np.mean(self.share_w))
         return change_w + abs(new.translation / self.noise.translation - 1.0) * float(np.mean(self.share_d))

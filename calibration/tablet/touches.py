@@ -145,7 +145,7 @@ def check_page_match(
     """Require that touches (n, 2) px lie at their landmarks (n, 2) px; sentences on single ones that do not.
 
     A touch belongs to the landmark that is nearest, so it may miss by half of the least distance of two landmarks: that
-    is 30 times the scatter of a person's aim on the usual page. Fit and report do not show a mistake here: touches
+    is 30 times the scatter of an operator's aim on the usual page. Fit and report do not show a mistake here: touches
     alone fit a page that is mirrored or shifted just as well, and the camera is then off by as much.
 
     Raises:

@@ -27,7 +27,7 @@ _FUSED = 60  # frames of which a model is made
 _MARGIN_M = 0.005
 
 
-def see_link(
+def track_link(
     data: MotionDataset,
     result: CalibrationResult,
     standard: FlangeStandard,

@@ -13,7 +13,7 @@ from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, load_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
-from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
+from weldcal.calibration.eye_on_base.observations import corrected_observation, fit_flanges
 from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
@@ -229,7 +229,7 @@ def verify_dataset(
     correction = correction_from_document(calibration.scanner_correction) if correct_scanner else None
     data = load_dataset(Path(dataset), robot=calibration.robot)
     standard = get_flange(flange or data.header.flange or calibration.flange)
-    seen = see_flanges(
+    seen = fit_flanges(
         data,
         standard,
         X_BC=calibration.X_BC if len(calibrations) == 1 else None,

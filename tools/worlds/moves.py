@@ -54,7 +54,7 @@ def cube_moves(
 
 
 def observed_frames(
-    moves: "Moves | SeenFromHand",
+    moves: "Moves | TargetInHand",
     X_BC: RigidTransform,
     duration_s: float,
     rng: np.random.Generator,
@@ -118,7 +118,7 @@ def _axes(n: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenFromHand:
+class TargetInHand:
     """A fixed target X_BT as it moves in the frame of a moving flange: what takes the place of Moves for a scanner on
     the flange."""
 

@@ -195,7 +195,7 @@ def build_world(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Furnishing:
+class WorldSetup:
     """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
 
     `contacts_read`: a device reads the plant's contact results.

@@ -105,7 +105,7 @@ class FlangeEstimator(BackgroundSystem):
         guess = streamed_guess(X_CR, newest, self._guess_radius_m, self._standard)
         base = dc.replace(base, center_expected_C=X_CR.translation())
         # only what may show the flange travels to the computing process: a whole frame takes longer to copy than to fit
-        points = seen_about(scan.points_C, guess.center_C, guess.radius_m)
+        points = points_about(scan.points_C, guess.center_C, guess.radius_m)
         return self.background.ask(estimate_streamed, base, points, guess, self._standard)
 
 
@@ -132,7 +132,7 @@ def streamed_guess(
     return FlangeGuess(expected, radius_m + 0.5 * standard.outer_m, X_CR.rotation().matrix()[:, 2])
 
 
-def seen_about(points_C: NDArray[np.float32], center_C: Array, radius_m: float) -> NDArray[np.float32]:
+def points_about(points_C: NDArray[np.float32], center_C: Array, radius_m: float) -> NDArray[np.float32]:
     """The rows and columns (h, w, 3) of a scan (H, W, 3) m that hold all its points within ``radius_m`` of a place, and
     some more; the whole scan where a coarse look finds none."""
     coarse = points_C[::_COARSE, ::_COARSE]

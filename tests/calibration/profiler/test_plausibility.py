@@ -1,4 +1,4 @@
-"""What a person may state or copy wrongly beside a sphere's scans: its radius, a file cut short; and why a model was
+"""What an operator may state or copy wrongly beside a sphere's scans: its radius, a file cut short; and why a model was
 taken."""
 
 from __future__ import annotations

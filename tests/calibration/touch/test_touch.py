@@ -1,4 +1,4 @@
-"""Touched points against what a calibration states, and the table that a person writes of them."""
+"""Touched points against what a calibration states, and the table that an operator writes of them."""
 
 from __future__ import annotations
 
