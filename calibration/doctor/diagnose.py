@@ -25,6 +25,7 @@ UNITS = (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1, 100.0, 0.01)
 _WITHIN = 0.5  # of the logarithm of a unit's factor: a TCP or a quaternion's order changes spreads, too
 _REACH_M = (0.02, 9.0)
 FEWEST = 5
+WORN = 0.25  # of a soft tip's gain: four times the spread of a good one (servo settings, gain_sigma)
 LOOKS_WRONG_M, LOOKS_WRONG_RAD = 3e-3, 0.03  # residuals of no arm and scanner that work
 _Order = Literal["xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ"]
 _ORDERS: tuple[_Order, ...] = ("xyz", "zyx", "XYZ", "ZYX", "zyz", "ZYZ", "yxz", "YXZ")

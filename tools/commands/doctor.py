@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.doctor.case import NAME, DoctorCase, read_case
-from weldcal.calibration.doctor.diagnose import Cause, Diagnosis, diagnose
+from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis, diagnose
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
 from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.flange.fit import fit_flange
@@ -29,7 +29,7 @@ from weldcal.tools.commands.replay import replay_recording
 from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.commands.weld import SCANS, SUMMARY, live_case
 from weldcal.tools.report.doctor import CALIBRATION, DoctorReport, worded
-from weldcal.welding.record.signs import PICTURE_S, WORN, blind_s, gain_off
+from weldcal.welding.record.signs import PICTURE_S, blind_s, gain_off
 from weldcal.welding.record.weld_log import CSV_NAME, WeldRecord, load_weld_log
 
 _LOOKED_AT = 3  # scans in which other flanges are tried

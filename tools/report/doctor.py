@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from weldcal.calibration.doctor.diagnose import Cause, Diagnosis
-from weldcal.welding.record.signs import WORN
+from weldcal.calibration.doctor.diagnose import WORN, Cause, Diagnosis
 
 CALIBRATION = "calibration.yaml"
 CHECKED = (

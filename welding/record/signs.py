@@ -7,7 +7,6 @@ from weldcal.welding.record.weld_log import WeldRecord
 
 # A finger camera sends pictures far more often: a deflection that is constant for longer belongs to none of them.
 PICTURE_S = 0.1
-WORN = 0.25  # four times the spread of the gain of a good tip (servo settings, gain_sigma)
 
 
 def blind_s(record: WeldRecord) -> float:
