@@ -37,7 +37,7 @@ FINE_PLACES, FINE_RIVALS, MIRRORED = 10, 5, 2
 LARGE_PLACES = 40  # of a large part: the true place of the tests' beam 7009 is the 32nd
 CLEAN = 0.98  # least share of the rays that meets a pose that ends the search; a beam turned by 180 deg has 0.97
 PASSED = 0.005  # largest share that passes through it; of the true pose flying points are 0.002, of a wrong one 0.012
-NEAR_HINT_DEG = 40.0
+NEAR_HINT_DEG = 40.0  # under half of the least turn in TURNS_DEG: at most one of equal poses is so near
 # The coarse score of the second of two equal parts is 0.92 to 1.00 of the best one: "two equal parts" of
 # tests/welding/locate/lying.py, seeds 7000 to 7004.
 EQUAL_PART = 0.75  # of the best coarse score: a start at another place that may be an equal part
