@@ -41,12 +41,13 @@ NEAR_HINT_DEG = 40.0  # under half of the least turn in TURNS_DEG: at most one o
 # The coarse score of the second of two equal parts is 0.92 to 1.00 of the best one: "two equal parts" of
 # tests/welding/locate/lying.py, seeds 7000 to 7004.
 EQUAL_PART = 0.75  # of the best coarse score: a start at another place that may be an equal part
-# Of right poses (the same module, --seed 1700) clamps hide at most 7 % of the rays, a fixture 18 %, a cover 41 to
-# 54 %: a cover is named.
+# Right poses: the same module, --seed 1700. Wrong poses: "absent", "8 % larger" and "mirror image", seeds from 7000.
+# Clamps hide at most 7 % of the rays of a right pose, a fixture 18 %, a cover 41 to 54 %; of wrong ones 0 to 9 % are
+# hidden. A cover is named.
 MUCH_HIDDEN = 0.4  # share of the rays that end before the part, which a refusal names as its cause
-# Right poses of that run meet 97 % or more where nothing stands before the part, and 1 % at most pass through. The
-# limits are three times as far off.
-POOR_MET, POOR_PASSED = 0.9, 0.04  # a pose that agrees less than this is not ambiguous: another part lies there
+# Where nothing stands before the part, 97 % of a right pose's rays meet and at most 1 % pass through. Of wrong ones 86
+# to 99 % meet, and 1 to 15 % pass through: these limits keep no wrong part out. They choose a refusal's sentence.
+POOR_MET, POOR_PASSED = 0.9, 0.04  # a pose that agrees less, and is as good as another, is refused as another part
 HIDDEN = 0.15  # share of the rays that end before the part, above which something hides it
 PLAIN_PLACES, COVERED_PLACES = 7, 6  # fitted finely before others: by all rays, and by those that nothing keeps from it
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
