@@ -98,7 +98,7 @@ def _beam(path: Path) -> None:
 
 
 def _bracket_scan(path: Path) -> None:
-    from weldcal.tools.worlds.parts.scenes import scan_scene, subject
+    from weldcal.tools.worlds.parts.scans import scan_scene, subject
 
     scene = scan_scene(subject("bracket").mesh, get_scanner("phoxi_m", width=412, height=308), 0)
     np.savez(path, points_B=scene.cloud_B, eye_B=scene.eye_B)

@@ -24,9 +24,8 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.systems.jobs.motion.collector import posed_stream
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
-from weldcal.systems.jobs.motion.procedure import MotionRecord
+from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
 from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_names

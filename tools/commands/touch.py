@@ -19,7 +19,7 @@ from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.report.touch import TouchReport, touch_page
+from weldcal.tools.report.verify import TouchReport, touch_page
 
 TABLE = "touches.csv"
 

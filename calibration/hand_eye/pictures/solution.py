@@ -76,7 +76,7 @@ def solve_pictures(
 
     Returns:
         The result, with X, Y and covariance of the adjustment; the pairs under the camera that was found; what the
-            pictures add.
+        pictures add.
 
     Raises:
         as ``solve``; DatasetError: too few pictures agree.

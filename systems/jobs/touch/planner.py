@@ -16,8 +16,7 @@ from weldcal.calibration.touch.table import around, fit_touched_plane
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.systems.background import Answer, Background
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice
 from weldcal.systems.jobs.weld.arm_way import CLEAR_OF_PART_M, SeamObstructed, SeamOutOfReach
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_root_anyhow

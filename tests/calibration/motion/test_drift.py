@@ -9,7 +9,7 @@ from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter, Field
 from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
 from weldcal.calibration.motion.drift.residuals import CLOCK, SIZE, Rows
 from weldcal.calibration.motion.drift.sequential import CREEP, MOVED, WARM_UP, DriftConfig, DriftTest
-from weldcal.tools.worlds.features import Change, FeatureWorld, WorldConfig, simulate
+from weldcal.tools.worlds.moves import Change, FeatureWorld, WorldConfig, simulate
 
 KNOCK_S = 22.3
 

@@ -19,7 +19,7 @@ from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.wrong_arm import WrongArmStation, judged, station, study_station
+from weldcal.tools.worlds.wrong_models import WrongArmStation, judged, station, study_station
 
 ARM = load_chain("ur10e")
 

@@ -29,12 +29,9 @@ def one_run(
 
     Returns:
         errors (7,) of X_BC's six and the clock's offset (rad, m, s), the same in sigmas, the NEES of X_BC over its six,
-            the
-        error of the offset against the mean delay of the recording's own frames (ms), the error of a point in the
-            middle of
-        the work (mm), the turn (deg). With device times also the errors in sigmas (7,) of a least-squares fit that
-            knows the
-        motion exactly: what the draws themselves are.
+        the error of the offset against the mean delay of the recording's own frames (ms), the error of a point in the
+        middle of the work (mm), the turn (deg). With device times also the errors in sigmas (7,) of a least-squares fit
+        that knows the motion exactly: what the draws themselves are.
     """
     device, linear = clock == "device", index % 2 == 1
     rng = np.random.default_rng([seed, index, int(device)])

@@ -19,7 +19,7 @@ from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.commands.monitor_body import see_link
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.targets import Target, all_met, print_targets
+from weldcal.tools.studies.harness import Target, all_met, print_targets
 from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
 
 LINK = "wrist_1_link"
