@@ -48,8 +48,8 @@ EQUAL_PART = 0.75  # of the best coarse score: a start at another place that may
 # hidden. A cover is named.
 MUCH_HIDDEN = 0.4  # share of the rays that end before the part, which a refusal names as its cause
 # Where nothing stands before the part, 97 % of a right pose's rays meet and at most 1 % pass through. Of wrong ones 54
-# to 99 % meet and 1 to 46 % pass through, of the other hand 96 and 99 %, 4 and 1 %: these limits keep no wrong part out.
-# They choose a refusal's sentence.
+# to 99 % meet and 1 to 46 % pass through. Of the other hand 96 and 99 % meet, 4 and 1 % pass through: these limits
+# keep no wrong part out. They choose a refusal's sentence.
 POOR_MET, POOR_PASSED = 0.9, 0.04  # a pose that agrees less, and is as good as another, is refused as another part
 HIDDEN = 0.15  # share of the rays that end before the part, above which something hides it
 PLAIN_PLACES, COVERED_PLACES = 7, 6  # fitted finely before others: by all rays, and by those that nothing keeps from it
