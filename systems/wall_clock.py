@@ -112,8 +112,8 @@ class WallClock:
     with the speed slider. A single delay of more than LATE_S is never made up for, because a robot executes commands
     when they arrive: the Diagram goes on from where it is. Lateness is in robot time: `late_s` is the maximum while the
     arm was commanded to move, `thinking_s` the maximum while it was at rest, where computing time is not limited.
-    `reanchored` counts the delays of more than LATE_S during motion, and `lost_s` is their sum. `held`: a person wants
-    the path to stand still.
+    `reanchored` counts the delays of more than LATE_S during motion, and `lost_s` is their sum. `held`: an operator
+    wants the path to stand still.
     """
 
     def __init__(

@@ -99,10 +99,10 @@ def tick() -> dict[str, dict[str, int]]:
 def _run(scenario: Any, stage: str, path: str) -> dict[str, dict[str, int]]:
     """The calls of a cell's process from a stage on (any, if it is empty), until a file has been called TICKS times."""
     from weldcal.systems.cell import build_cell
-    from weldcal.systems.person import Person
+    from weldcal.systems.operator import Operator
     from weldcal.systems.runner import run_cell
 
-    person, calls, done = Person(), Calls(), threading.Event()
+    operator, calls, done = Operator(), Calls(), threading.Event()
 
     def watch(at: str, _: float) -> None:
         if stage in at and sys.getprofile() is None:
@@ -111,10 +111,10 @@ def _run(scenario: Any, stage: str, path: str) -> dict[str, dict[str, int]]:
     def end() -> None:
         while sum(n for (file, _), n in list(calls.found.items()) if file == path) < TICKS and not done.wait(0.02):
             pass
-        person.end("enough was traced")
+        operator.end("enough was traced")
 
     threading.Thread(target=end, daemon=True).start()
-    run_cell(build_cell(scenario, 0, person=person), watch)
+    run_cell(build_cell(scenario, 0, operator=operator), watch)
     done.set()
     return calls.document()
 

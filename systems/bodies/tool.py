@@ -31,7 +31,7 @@ from pydrake.multibody.tree import (
     UnitInertia,
 )
 
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import Surroundings
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import ToolShape, WeldingTool

@@ -17,7 +17,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.discovery import plugins
-from weldcal.systems.drivers.simulated.world import Furnishing
+from weldcal.systems.drivers.simulated.world import WorldSetup
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.motion.spine import MOVE_ACCELERATION, MOVE_SPEED, JobPorts, Spine
 from weldcal.systems.scenario.schema import Scenario
@@ -54,7 +54,7 @@ class AddedJob(ABC):
         return np.array([1.30, -0.68, 0.78]), np.array([0.42, 0.0, 0.42])
 
     def can_stand(self, root: Context) -> bool:
-        """Whether the Diagram's time may stand still now: where a person holds a job that has motion of its own, it
+        """Whether the Diagram's time may stand still now: where an operator holds a job that has motion of its own, it
         rests first."""
         return True
 
@@ -76,11 +76,11 @@ class Job(ABC, Generic[PlanOf]):
     def check(self, scenario: Scenario) -> None:
         """Check this job's part of a scenario, present or not; raises InputError."""
 
-    def furnish(
+    def set_up_world(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
-    ) -> Furnishing:
+    ) -> WorldSetup:
         """The objects that the job adds to a simulated world, besides the true workpiece `part` at X_BP."""
-        return Furnishing()
+        return WorldSetup()
 
     def position_error(self, scenario: Scenario, arm: ArmModel, seed: int) -> LeafSystem | None:
         """A system between the simulated arm and the readers of its joints (see add_spine), or None."""

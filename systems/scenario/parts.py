@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings
 from weldcal.models.arms.kinematics import ArmModel, load_arm, mounted, with_link_transforms
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude

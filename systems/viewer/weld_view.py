@@ -99,7 +99,7 @@ class WeldView:
         self._pieces = piece + 1
 
     def _draw_way_back(self, servo: ServoReport, time: float) -> None:
-        """While a person holds the weld, and until it goes on: the torch's way back to where it goes on."""
+        """While an operator holds the weld, and until it goes on: the torch's way back to where it goes on."""
         way = servo.interruption.way_back
         if bool(way) == self._way_shown:
             return

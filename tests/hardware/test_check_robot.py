@@ -68,7 +68,7 @@ def robot(shared: Emulator) -> Iterator[Emulator]:
 
 
 def weldcal(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Runs the command as a person does."""
+    """Runs the command as an operator does."""
     command = [sys.executable, "-P", "-m", "weldcal.tools", "check-robot", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 

@@ -1,4 +1,4 @@
-"""Only regular files of bounded size are read, and whatever else a person hands in is refused in a sentence, at
+"""Only regular files of bounded size are read, and whatever else an operator hands in is refused in a sentence, at
 once."""
 
 from __future__ import annotations

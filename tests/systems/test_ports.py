@@ -39,7 +39,7 @@ from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
 from weldcal.systems.drivers.sensors.watch import DeviceWatch, OnTrigger
 from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanStream
-from weldcal.systems.drivers.simulated.picture_scene import KnockedStand, PicturePoses
+from weldcal.systems.drivers.simulated.picture_scene import DisplacedStand, PicturePoses
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
 from weldcal.systems.drivers.simulated.rendered_profiler import (
@@ -106,7 +106,7 @@ from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, Moni
 from weldcal.systems.motion.flange_mover import FlangeMover
 from weldcal.systems.motion.guarded_path import SingularityGuard
 from weldcal.systems.motion.spine import CommandArbiter, OperatorPanel, ProcessSwitch, SlewLimiter
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.recording.player import PortPlayer
 from weldcal.systems.recording.port_recorder import PortRecorder, PortSink
 from weldcal.systems.scenario.loading import load_scenario
@@ -194,7 +194,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SeamPlanner: lambda: SeamPlanner(seam_planning()),
     DrawnSeamPlanner: lambda: DrawnSeamPlanner(seam_planning()),
     PicturePoses: lambda: PicturePoses(plain_station().world.plant, plain_station().world.scanner_view.frames),
-    KnockedStand: lambda: KnockedStand(plain_station().world.scanner_view.scene_graph.world_frame_id(), 1.0, X),
+    DisplacedStand: lambda: DisplacedStand(plain_station().world.scanner_view.scene_graph.world_frame_id(), 1.0, X),
     ArucoDeformationEstimator: lambda: ArucoDeformationEstimator(the_arm(), TOOL, RenderedFingerCamera().camera()),
     WeldingVelocityServo: lambda: WeldingVelocityServo(the_arm(), TOOL, ServoConfig()),
     SingularityGuard: lambda: SingularityGuard(the_arm(), TOOL.X_FT),
@@ -210,7 +210,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ),
     PortRecorder: lambda: PortRecorder((6, 2), {}, {}, cast("PortSink", None)),
     PortPlayer: lambda: PortPlayer({}, {}),
-    OperatorPanel: lambda: OperatorPanel(Person(), Meshcat(MeshcatParams(host="localhost", port=0))),
+    OperatorPanel: lambda: OperatorPanel(Operator(), Meshcat(MeshcatParams(host="localhost", port=0))),
     CameraDirector: lambda: CameraDirector(
         Meshcat(MeshcatParams(host="localhost", port=0)), Views(), (np.ones(3), np.zeros(3)), {}, X
     ),
@@ -392,7 +392,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "planned_seam": PlannedSeam,
     },
     PicturePoses: {"body_poses": list, "frame_poses": FramePoseVector},
-    KnockedStand: {"frame_poses": FramePoseVector},
+    DisplacedStand: {"frame_poses": FramePoseVector},
     ArucoDeformationEstimator: {
         "image": Image,
         "history": PoseHistory,

@@ -22,14 +22,14 @@ from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
-from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig
 from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.stated_arm import require_joint_angles
+from weldcal.calibration.refinement.kinematics_choice import require_joint_angles
 from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
@@ -222,7 +222,7 @@ def calibrate_dataset(
     if poses is not None:
         data = data.between(poses)
     standard = get_flange(flange or data.header.flange)
-    seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
+    seen = fit_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
     start: ArmStart | None = None
     if len(seen.observations) < ENOUGH and seen.refused and not data.pairs and data.header.scanner_guess is None:
         tell("comparing the visible arm", 0.7)

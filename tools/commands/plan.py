@@ -11,14 +11,12 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.motion.expected import PredictedSigma, expected_of_motion
+from weldcal.calibration.motion.expected import PredictedSigma, closed_moves, expected_of_motion, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.calibration_poses import PlannedPose
-from weldcal.calibration.planning.moves import closed_moves, recorded_stream
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_choice import LEAST
-from weldcal.calibration.refinement.kinematics_fit import KINDS
-from weldcal.calibration.refinement.poses import informative_poses
+from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_poses
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

@@ -6,7 +6,7 @@ from pathlib import Path
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.touch.judge import judge_touches
-from weldcal.calibration.touch.table import read_touches, touches_text
+from weldcal.calibration.touch.touches import read_touches, touches_text
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.touch.planner import TouchConfig
 from weldcal.systems.runner import Progress

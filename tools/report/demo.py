@@ -68,7 +68,7 @@ class DemoResult:
 
     @property
     def setting(self) -> str:
-        """What was real, for a person."""
+        """What was real, for an operator."""
         scenario = self.run.cell.scenario
         if self.robot == "simulated":
             return "Simulation"

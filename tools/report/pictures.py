@@ -107,7 +107,7 @@ def subplots(width: float, height: float, *grid: int, **settings: Any) -> tuple[
 
 
 def millimetres(axes: Axes) -> None:
-    """Ticks of a logarithmic axis as a person writes lengths: 0.04, not 4 times ten to the minus two."""
+    """Ticks of a logarithmic axis as an operator writes lengths: 0.04, not 4 times ten to the minus two."""
     axes.yaxis.set_major_formatter("{x:g}")
     low, high = axes.get_ylim()
     digits = "123456789" if high < 2.5 * low else "235" if high < 30.0 * low else ""

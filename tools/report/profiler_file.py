@@ -211,7 +211,7 @@ def seam_report(seam: ProfilerSeam) -> str:
 
 
 def _rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The short values of a result, by the names of a person."""
+    """The short values of a result, by the names of an operator."""
     rows = []
     for key, (name, unit) in _NAMES.items():
         value = found.get(key)

@@ -30,7 +30,7 @@ from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.calibration.profiler.record import load_record
-from weldcal.calibration.tablet.planar.files import load_planar
+from weldcal.calibration.tablet.planar_files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
 from weldcal.calibration.tablet.wrist.files import load_visit
 from weldcal.models.arms.kinematics import load_arm

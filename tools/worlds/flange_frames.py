@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.flange.fit import FlangeFit, fit_flange
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
-from weldcal.calibration.touch.table import around, fit_touched_sphere
+from weldcal.calibration.touch.touches import around, fit_touched_sphere
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array

@@ -13,7 +13,7 @@ from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
-from weldcal.calibration.planning.mounting_estimate import SeenCircle
+from weldcal.calibration.planning.mounting_estimate import ObservedCircle
 from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.calibration.planning.mounting_scene import MountingScene
 from weldcal.models.arms.inverse import inverse_kinematics
@@ -180,7 +180,7 @@ class MountedWorld:
     scene: MountingScene
     true: MountingScene
     device: ScannerPreset
-    seen: tuple[SeenCircle, ...]
+    seen: tuple[ObservedCircle, ...]
 
     @property
     def truth(self) -> dict[str, RigidTransform]:
@@ -233,7 +233,7 @@ def mounted_world(name: str, seed: int, scans: int | None = None) -> MountedWorl
         X_CR = true.seen(q, stop(scenario.robot_2, scene.arm_2, pose.q_2))
         p, n = _seen(device, X_CR, radius, rng)
         C = np.diag([_NORMAL_RAD**2] * 3 + [_CENTRE_M**2] * 3)
-        seen.append(SeenCircle(f"pose{k + 1:02d}", pose, scene.observation(pose.q, pose.q_2, p, n, C), 1.0))
+        seen.append(ObservedCircle(f"pose{k + 1:02d}", pose, scene.observation(pose.q, pose.q_2, p, n, C), 1.0))
     return MountedWorld(scene, true, device, tuple(seen))
 
 

@@ -7,11 +7,10 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.geometry.se3 import difference, exp_rotation, inverse, rotation_vector, skew
+from weldcal.calibration.geometry.se3 import difference, exp_rotation, fit_rigid, inverse, rotation_vector, skew
 from weldcal.calibration.motion.drift.residuals import Rows, rows_of
+from weldcal.calibration.motion.expected import ROBOT, Moves, closed_moves
 from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.calibration.planning.moves import ROBOT, Moves, closed_moves
 from weldcal.models.arms.chain import chain_inverse, load_chain
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import load_arm
@@ -55,7 +54,7 @@ def cube_moves(
 
 
 def observed_frames(
-    moves: "Moves | SeenFromHand",
+    moves: "Moves | TargetInHand",
     X_BC: RigidTransform,
     duration_s: float,
     rng: np.random.Generator,
@@ -119,7 +118,7 @@ def _axes(n: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenFromHand:
+class TargetInHand:
     """A fixed target X_BT as it moves in the frame of a moving flange: what takes the place of Moves for a scanner on
     the flange."""
 

@@ -307,11 +307,11 @@ def sphere_trial(
         )
         m = len(points)
         at = np.column_stack([rng.uniform(-0.015, 0.015, m), np.zeros(m), rng.uniform(0.19, 0.225, m)])
-        tests = seen_and_touched(world, points, at, looking_down(rng, m, 12.0, 10.0), rng)
+        tests = measured_and_touched(world, points, at, looking_down(rng, m, 12.0, 10.0), rng)
     return SphereTrial(data, sign, np.arange(n) < translations, tests)
 
 
-def seen_and_touched(
+def measured_and_touched(
     world: SphereWorld, points: Floats, p_S: Floats, R_BS: Floats, rng: np.random.Generator
 ) -> SphereTests:
     """Points (n, 3) brought into the real scan plane at about p_S, measured, and touched with the real tip."""

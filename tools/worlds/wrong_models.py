@@ -27,9 +27,9 @@ from weldcal.calibration.refinement.kinematics_fit import (
     KinematicsFit,
     arm_errors,
     fit_kinematics,
+    informative_poses,
     unsought,
 )
-from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import device_warp
@@ -162,7 +162,7 @@ WRONG = ScannerCorrection(1.002, (0.006, -0.004))
 """What the simulated scanner needs: 0.2 % in scale, and up to 0.06 % per 100 mm across its image."""
 
 
-def seen_by_a_wrong_scanner(
+def measured_by_a_wrong_scanner(
     observations: list[Observation], rng: np.random.Generator
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
     """The same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""

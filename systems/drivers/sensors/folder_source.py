@@ -42,7 +42,7 @@ class Trigger(Protocol):
 
 
 class NoTrigger:
-    """A person, or the other program by itself, scans after the arm has come to rest."""
+    """An operator, or the other program by itself, scans after the arm has come to rest."""
 
     def open(self) -> None:
         """See Trigger."""

@@ -20,7 +20,7 @@ from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.flanges import flange_mesh
@@ -195,7 +195,7 @@ def build_world(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Furnishing:
+class WorldSetup:
     """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
 
     `contacts_read`: a device reads the plant's contact results.

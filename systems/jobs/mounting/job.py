@@ -14,7 +14,7 @@ from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.planning.mounting_estimate import (
     Circle,
     MountingResult,
-    SeenCircle,
+    ObservedCircle,
     expected_after,
     expected_error,
     fewest,
@@ -34,7 +34,7 @@ from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated.second_arm import place_second_arm
-from weldcal.systems.drivers.simulated.world import Furnishing
+from weldcal.systems.drivers.simulated.world import WorldSetup
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
 from weldcal.systems.jobs.mounting.procedure import (
@@ -154,7 +154,7 @@ def digest(
 
 
 def next_best(
-    belief: MountingScene, result: MountingResult, seen: Sequence[SeenCircle], plan: Sequence[MountingPose]
+    belief: MountingScene, result: MountingResult, seen: Sequence[ObservedCircle], plan: Sequence[MountingPose]
 ) -> NextBest | None:
     """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work
     point most; None where all were visited."""
@@ -223,9 +223,9 @@ class MountingCalibrationJob(Job[MountingPlanned]):
         if job is not None and job.second_arm is not None:
             check_home(job.second_arm.home_deg, job.second_arm.arm, "mounting.second_arm.home_deg")
 
-    def furnish(
+    def set_up_world(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
-    ) -> Furnishing:
+    ) -> WorldSetup:
         """See Job: the ring of the base mounting, and the second arm at its true pose."""
         job, second = scenario.part(MountingJob), None
         config = None if job is None else job.second_arm
@@ -234,7 +234,7 @@ class MountingCalibrationJob(Job[MountingPlanned]):
                 rng, 1e-3 * config.placement_translation_mm, np.deg2rad(config.placement_rotation_deg)
             )
             second = place_second_arm(config, off)
-        return Furnishing(second=second, foot=base_circle(scenario.arm), time_step_s=0.004)  # this job has no contact
+        return WorldSetup(second=second, foot=base_circle(scenario.arm), time_step_s=0.004)  # this job has no contact
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> MountingPlanned:
         """See Job."""

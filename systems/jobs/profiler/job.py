@@ -21,7 +21,7 @@ from weldcal.systems.drivers.simulated.profiler_world import (
 )
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
-from weldcal.systems.drivers.simulated.world import Furnishing
+from weldcal.systems.drivers.simulated.world import WorldSetup
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.profiler.config import ProfilerJob, check_profiler_job, pose_of
 from weldcal.systems.jobs.profiler.plan import PlanningContext
@@ -99,17 +99,17 @@ class Profiler(Job[PlanningContext]):
             tool=str(scenario.tool),
         )
 
-    def furnish(
+    def set_up_world(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
-    ) -> Furnishing:
+    ) -> WorldSetup:
         """See Job: the objects that the profiler scans and the torch touches."""
         p, job = scenario.profiler, scenario.part(ProfilerJob)
         if not isinstance(p, RenderedProfiler) or job is None:
-            return Furnishing()
+            return WorldSetup()
         error = 1e-3 * p.mounting_translation_mm, float(np.deg2rad(p.mounting_rotation_deg))
         table_z_m = scenario.calibration.table_z_m
         fixture = draw_fixture(drawn_pose(p), *error, job, rng, table_z_m, part, X_BP)
-        return Furnishing(
+        return WorldSetup(
             profiler=fixture, time_step_s=fixture.time_step_s, parts=(fixture, fixture.truth), contacts_read=True
         )
 

@@ -10,9 +10,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.planning.clearance import arm_bodies
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
-from weldcal.calibration.touch.table import around, fit_touched_plane
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings, arm_bodies
+from weldcal.calibration.touch.touches import around, fit_touched_plane
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError

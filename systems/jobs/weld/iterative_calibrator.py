@@ -20,9 +20,9 @@ from weldcal.calibration.published.algorithm1 import (
     Algorithm1State,
     algorithm1_start,
     algorithm1_step,
+    make_verification,
     named_cost,
 )
-from weldcal.calibration.published.icp import make_verification
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
 from weldcal.models.arrays import Array

@@ -121,7 +121,7 @@ def test_what_is_out_of_range_returns_nothing(fixture: ProfilerFixture) -> None:
 def test_a_profile_taken_in_motion_meets_the_pose_of_its_own_time() -> None:
     scenario = load_scenario("profiler_sphere")
     scenario.profiler = replace(CLEAN, samples=480)
-    station = make_station(scenario, 3, furnish=job_of(scenario).furnish)
+    station = make_station(scenario, 3, set_up_world=job_of(scenario).set_up_world)
     truth = station.truth.profiler
     assert truth is not None
     X_BS = over(above(truth.center, truth.radius_m), [100.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""What a person sees: Meshcat gets a board for every phase, each belief as it comes, and a recording that opens by
+"""What an operator sees: Meshcat gets a board for every phase, each belief as it comes, and a recording that opens by
 itself."""
 
 from __future__ import annotations

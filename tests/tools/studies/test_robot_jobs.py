@@ -1,4 +1,4 @@
-"""The study of whole jobs on a controller ends where a person ends one of its jobs."""
+"""The study of whole jobs on a controller ends where an operator ends one of its jobs."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.calibration.tablet.published.two_stage import Sign
+from weldcal.calibration.tablet.published import Sign
 from weldcal.tools.studies.harness import Target, all_met
 from weldcal.tools.studies.tablet.reproduce import compare_signs, dh_by_eq_20
 from weldcal.tools.worlds.tablet import published_touches

@@ -14,9 +14,16 @@ from weldcal.calibration.profiler.reading_choice import sphere_fit
 from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere import linear as published
 from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
-from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, choose_model, leave_one_out_m, sphere_joint
+from weldcal.calibration.profiler.sphere.joint import (
+    SCALE_SIGMAS,
+    Model,
+    SphereEstimate,
+    check_radius,
+    choose_model,
+    leave_one_out_m,
+    sphere_joint,
+)
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
-from weldcal.calibration.profiler.sphere.radius import SCALE_SIGMAS, check_radius
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools import console

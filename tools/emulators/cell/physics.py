@@ -96,7 +96,7 @@ def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
     if not isinstance(scenario.robot_2, NoDevice):
         raise InputError("The world has one arm: remove robot_2 from its scenario.")
     q_home = np.deg2rad(scenario.home_deg)
-    return make_station(scenario, seed, PreparedRobot(arm, q_home), job_of(scenario).furnish)
+    return make_station(scenario, seed, PreparedRobot(arm, q_home), job_of(scenario).set_up_world)
 
 
 def still(station: Station, q: Array) -> tuple[Simulator, Context]:

@@ -31,7 +31,7 @@ from weldcal.tools.worlds.wrong_models import (
     Found,
     as_measured,
     judged,
-    seen_by_a_wrong_scanner,
+    measured_by_a_wrong_scanner,
     simulated_observations,
     station,
     study_station,
@@ -101,7 +101,7 @@ def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = n
     def calibrate(k: int) -> Calibrated:
         rng = np.random.default_rng([seed, poses, k, 3])
         exact, X_BC = simulated_observations(poses, rng)
-        observations, patterns = seen_by_a_wrong_scanner(exact, rng)
+        observations, patterns = measured_by_a_wrong_scanner(exact, rng)
         rigid = estimate_eye_on_base(observations, SolveConfig(seed=seed, hypotheses=60, leave_one_out=False))
         found = from_motion(observations, patterns, usual=True, start=rigid.X_BC)
         assert found.X_BC is not None

@@ -18,7 +18,7 @@ from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
+from weldcal.calibration.eye_on_base.observations import corrected_observation, fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import mean_interval, position_errors, tilt_errors
 from weldcal.calibration.flange.fit import FlangeFit, fit_flange
@@ -139,7 +139,7 @@ def usable_scans(
     """
     data = load_dataset(folder)
     standard = get_flange(data.header.flange)
-    seen = see_flanges(data, standard, seed=seed, tell=lambda done: progress("fitting flanges", share * done))
+    seen = fit_flanges(data, standard, seed=seed, tell=lambda done: progress("fitting flanges", share * done))
     if len(seen.observations) < least:
         raise TooFewPoses(f"{refusal}, and there are {len(seen.observations)}.")
     config = SolveConfig(seed=seed, allow_coplanar=allow_coplanar, leave_one_out=False)

@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.corners import refine_with_corners
-from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
 from weldcal.calibration.hand_eye.mountings import MOUNTINGS
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out, opencv_solve
-from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise
+from weldcal.calibration.hand_eye.problem import Loss, Noise, Problem, Scaled, full_problem, linearise
 from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     as_transform,

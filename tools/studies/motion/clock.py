@@ -8,8 +8,8 @@ from scipy.stats import binom, chi2
 
 from weldcal.calibration.geometry.se3 import difference
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
+from weldcal.calibration.motion.expected import recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import recorded_stream
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
 from weldcal.tools.worlds.moves import DELAY_S, cube_moves, exact_errors, observed_frames

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
-from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
+from weldcal.calibration.flange.fit import FlangeFit, face_cloud
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, rotation_vector
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.published.icp import Verification, face_cloud, icp_error, make_verification, sight
+from weldcal.calibration.published.algorithm1 import Verification, icp_error, make_verification, sight
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch

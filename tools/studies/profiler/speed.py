@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.profiler.edge.joint import edge_starts
 from weldcal.calibration.profiler.edge.model import EdgeState
-from weldcal.calibration.profiler.edge.start import edge_starts
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option

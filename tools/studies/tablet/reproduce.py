@@ -8,19 +8,30 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_plane_motion, hand_over
-from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
-from weldcal.calibration.tablet.published.calibration import (
-    PUBLISHED_GENERATIONS,
+from weldcal.calibration.tablet.planar_fit import (
+    PlanarConfig,
+    fit_linear,
+    fit_planar,
+    fit_plane_motion,
+    hand_over,
+    solve_closed_form,
+    touched_rays,
+)
+from weldcal.calibration.tablet.published import (
+    PUBLISHED_EVALUATIONS,
     PUBLISHED_POPULATION,
+    Fitness,
+    Model,
+    Sign,
     StageResult,
     evolve,
+    fitness,
     hand_to_touch,
+    place_landmarks,
+    stage1_residuals,
     tablet_stage1,
     tablet_stage2,
 )
-from weldcal.calibration.tablet.published.chain import Model, place_landmarks
-from weldcal.calibration.tablet.published.two_stage import Fitness, Sign, fitness, stage1_residuals
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array
 from weldcal.tools.cli.options import Call, Outcome, command, option
@@ -39,7 +50,6 @@ from weldcal.tools.worlds.tablet import (
     simulate_trial,
 )
 
-PUBLISHED_EVALUATIONS = PUBLISHED_POPULATION * PUBLISHED_GENERATIONS
 MODELS: tuple[Model, ...] = ("htm", "dh")
 
 

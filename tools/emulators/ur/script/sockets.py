@@ -58,7 +58,7 @@ class Sockets(Forces):
     def popup(
         self, s: Any, title: str = "Popup", warning: bool = False, error: bool = False, blocking: bool = False
     ) -> Slices:
-        """One that blocks waits until a person closes it: the dashboard's `close popup`."""
+        """One that blocks waits until an operator closes it: the dashboard's `close popup`."""
         c = self._controller
         c.note(f"popup: {title}: {text_of(s)}")
         c.tell(Popup(text_of(s), text_of(title), warning, error, blocking))

@@ -21,7 +21,7 @@ def serial_number(arm: str) -> str:
 
 
 class DashboardServer(Server):
-    """Commands that a person or a client may give."""
+    """Commands that an operator or a client may give."""
 
     kind = "dashboard"
 

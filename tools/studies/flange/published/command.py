@@ -16,8 +16,7 @@ from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, skew
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import get_flange

@@ -1,4 +1,4 @@
-"""Reads planar touches from an npz file: one visit or many of one rig, with optional queries that no fit uses."""
+"""Read planar touches from an npz file: one visit or many of one rig, with optional queries that no fit uses."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.errors import EqualRotations, TabletDataError, TooFewLandmarks
-from weldcal.calibration.tablet.page_match import check_page_match
 from weldcal.calibration.tablet.plane_pose import tablet_pose
-from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches
+from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches, check_page_match
 from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError

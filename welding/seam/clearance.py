@@ -37,7 +37,7 @@ LEAST_PIECE_M = 0.010  # of a seam beyond the place where the tip comes down
 WIRE_M = 0.001  # radius of the wire with its play
 
 
-class NoRoom(WeldcalError):
+class NoClearance(WeldcalError):
     """The tool's body would touch the part while the tip is in the joint; `short_m`: by how much its clearance is too
     small."""
 
@@ -46,7 +46,7 @@ class NoRoom(WeldcalError):
         self.short_m = short_m
 
 
-def check_room(
+def check_clearance(
     mesh: TriMesh,
     X_BP: RigidTransform,
     seam: SeamCurve,
@@ -61,7 +61,7 @@ def check_room(
     it across the chord by `lean_rad`.
 
     Raises:
-        NoRoom: less than 1 mm, with the place.
+        NoClearance: less than 1 mm, with the place.
     """
     points, _ = mesh.sample(SAMPLES, np.random.default_rng(0))
     points_B = points @ X_BP.rotation().matrix().T + X_BP.translation()
@@ -73,7 +73,7 @@ def check_room(
         for a, b, radius in spans:
             near = float(_distances(points_T, a, b).min()) - radius
             if near < CLEARANCE_M:
-                raise NoRoom(
+                raise NoClearance(
                     f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body"
                     f" would come within {1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer"
                     " finger or weld the joint from elsewhere.",
@@ -100,7 +100,7 @@ def check_beside(
     added to it instead.
 
     Raises:
-        NoRoom: with the place.
+        NoClearance: with the place.
     """
     above = [span for capsule in tool.capsules() if (span := _above_tip(capsule, tool.X_FT)) is not None]
     spans = [(a, b, radius + CLEARANCE_M) for a, b, radius in above]
@@ -145,7 +145,9 @@ def check_beside(
                     what, change = f"The tool would touch the table {there}", "raise the part"
                 else:
                     what, change = f"The tool would touch something that is not in the drawing {there}", "remove it"
-                raise NoRoom(f"{what}: {change}, or cut the seam with start_mm or end_mm, and scan again.", CLEARANCE_M)
+                raise NoClearance(
+                    f"{what}: {change}, or cut the seam with start_mm or end_mm, and scan again.", CLEARANCE_M
+                )
 
 
 def clear_pieces(
@@ -177,7 +179,7 @@ def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: fl
     of the groove. Where it is too high for that, as a web that the seam follows on its hollow side, it stops the tip.
 
     Raises:
-        NoRoom: with how much of the seam to cut off.
+        NoClearance: with how much of the seam to cut off.
     """
     triangles = mesh.transformed(X_BP).vertices[mesh.triangles]
     needed = chord_m + tip_radius_m
@@ -190,7 +192,7 @@ def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: fl
             off = f"{1e3 * (needed - free) + 1.0:.0f} mm"
             by_length = name == "end" and seam.end is not None
             change = f"welding.seam_length_mm {off} smaller" if by_length else f"{name}_mm of the seam {off} larger"
-            raise NoRoom(
+            raise NoClearance(
                 f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs"
                 f" {1e3 * needed:.0f} mm there: set {change}, or weld it from elsewhere.",
                 needed - free,

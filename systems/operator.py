@@ -1,4 +1,4 @@
-"""What a person asks of a run: to hold, to go on, to end, to keep a pace; from the terminal, the dashboard or the 3D
+"""What an operator asks of a run: to hold, to go on, to end, to keep a pace; from the terminal, the dashboard or the 3D
 view."""
 
 import sys
@@ -13,8 +13,8 @@ SLOWEST, FASTEST = 0.0, 3.0
 """Real-time rates of a simulation that may be asked for; 0 is as fast as it goes."""
 
 
-class Person:
-    """The wishes of a person; thread-safe.
+class Operator:
+    """The wishes of an operator; thread-safe.
 
     The Diagram reads them in its OperatorPanel, which makes them an input of the run.
 
@@ -73,14 +73,14 @@ class Person:
 
 
 @contextmanager
-def person_at(terminal: TextIO | None = None) -> Iterator[Person]:
+def operator_at(terminal: TextIO | None = None) -> Iterator[Operator]:
     """Listen to a terminal (None: standard input, where it is one) for the duration of the block."""
-    person, stream = Person(), sys.stdin if terminal is None else terminal
+    operator, stream = Operator(), sys.stdin if terminal is None else terminal
     if terminal is not None or (stream is not None and stream.isatty()):
 
         def listen() -> None:
             for line in stream:
-                person.says(line)
+                operator.says(line)
 
         threading.Thread(target=listen, daemon=True, name="terminal").start()
-    yield person
+    yield operator
