@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
@@ -17,6 +18,7 @@ from OCP.GeomAPI import GeomAPI_IntCS, GeomAPI_IntSS, GeomAPI_ProjectPointOnCurv
 from OCP.gp import gp_Pnt, gp_Vec
 from OCP.TopAbs import TopAbs_ShapeEnum
 
+from weldcal.models.errors import InputError
 from weldcal.models.workpieces.brep import (
     BRIDGED_MM,
     EXACT_MM,
@@ -40,6 +42,7 @@ LEAST_MM = 0.5  # length of a piece
 FLUSH_MM = 0.2  # between two faces in one plane
 FREE_MM = 2.0  # the joint is open at least this far: a clearance is no joint
 GRAZING = 1e-3  # rad, between a line and a plane that crosses it
+MOST_S = 40.0  # of processor time for a part's joints, of the 60 s in which a large file is read
 NARROW_RAD = math.radians(80.0)  # a V or HV is narrower
 
 
@@ -80,7 +83,11 @@ def joints_between(bodies: Sequence[Solid]) -> list[list[Piece]]:
 
     Root lines are intersections of the faces' surfaces. Where a surface of another face crosses such a line, a piece
     may end; each stretch between two crossings is a joint or is none.
+
+    Raises:
+        InputError: they are not found within MOST_S.
     """
+    begin = time.process_time()
     found: list[list[Piece]] = []
     for i, j in combinations(range(len(bodies)), 2):
         a, b = bodies[i], bodies[j]
@@ -90,21 +97,32 @@ def joints_between(bodies: Sequence[Solid]) -> list[list[Piece]]:
         for f in a.faces:
             if _far(f, b):
                 continue
+            _check_time(begin, bodies)
             for g in b.faces:
                 if not _far(f, g):
                     pieces += _met(bodies, (i, j), f, g)
                     pieces += _flush(bodies, (i, j), f, g)
         found += chains(pieces)
     if not found:
-        found = [chain for k in range(len(bodies)) for chain in chains(_within(bodies, k))]
+        found = [chain for k in range(len(bodies)) for chain in chains(_within(bodies, k, begin))]
     return [_named(chain, found) for chain in found]
 
 
-def _within(bodies: Sequence[Solid], k: int) -> Iterable[Piece]:
+def _check_time(begin: float, bodies: Sequence[Solid]) -> None:
+    if time.process_time() - begin > MOST_S:
+        faces = sum(len(body.faces) for body in bodies)
+        raise InputError(
+            f"The joints between {faces} faces are not found within {MOST_S:.0f} s of processor time: export only"
+            " the bodies that are welded, without threads, holes and purchased parts."
+        )
+
+
+def _within(bodies: Sequence[Solid], k: int, begin: float) -> Iterable[Piece]:
     """The pieces along the concave edges of one body."""
     for edge, met in bodies[k].edges:
         if len(met) != 2:
             continue
+        _check_time(begin, bodies)
         f, g = met
         curve = BRepAdaptor_Curve(edge)
         line = sampled(curve, curve.FirstParameter(), curve.LastParameter())

@@ -148,8 +148,8 @@ def check_weldable(section: JointSection, radius_m: float) -> None:
     for side, extent in (("left", section.left_m), ("right", section.right_m)):
         if extent < needed:
             raise JointNotWeldable(
-                f"A tip of radius {mm * r:.3g} mm is too large for this joint: it touches"
-                f" {mm * (needed - MARGIN_M):.2g} mm from the root, and the {side} wall ends at {mm * extent:.2g} mm."
+                f"A tip of radius {mm * r:.3g} mm is too large for this joint: it needs walls of"
+                f" {mm * needed:.3g} mm, and the {side} wall ends {mm * extent:.3g} mm from the root."
             )
 
 

@@ -157,6 +157,23 @@ def test_where_the_whole_is_refused_a_piece_is_taken_and_named(tmp_path: Path, m
     assert (path.name, reason) == ("unfinished.yaml", "Too near.")
 
 
+def test_pieces_are_named_with_the_reason_of_their_own_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two webs the longer is tried first, and refused in any way."""
+    webs = box((-60, -90, 0), (120, 6, 40)), box((-40, 90, 0), (80, 6, 40))
+    write_step(assembly(box((-150, -150, -10), (300, 300, 10)), *webs), tmp_path / "p.step")
+    _, second = sorted(read_shape(tmp_path / "p.step").joints, key=lambda joint: -joint.length_m)
+
+    def only_the_second_in_pieces(scenario: Scenario, *_: object) -> str:
+        ids = scenario.workpiece.seams[0].edges  # type: ignore[union-attr]
+        return f"Whole {min(ids)}." if len(ids) > 1 else "" if ids[0] in second.edges else "A piece."
+
+    monkeypatch.setattr(new, "add_scan_poses", only_the_second_in_pieces)
+    monkeypatch.setattr(new, "weldable_place", lambda scenario, advises: (scenario.workpiece.pose_guess, ""))
+    _, note = write_cell(tmp_path / "cell", "s_groove", OwnPart(tmp_path / "p.step"))
+    assert note.startswith("Without the short edges")
+    assert note.endswith(f"As a whole: Whole {min(second.edges)}.")
+
+
 def test_a_ring_that_the_arm_cannot_turn_around_is_halved(tmp_path: Path) -> None:
     """Both halves together cover a circle of 100 mm and overlap by 5 mm at either end."""
     pipe = less(cylinder((0, 0, 0), 100, 50), cylinder((0, 0, -1), 94, 60))

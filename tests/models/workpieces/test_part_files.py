@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from OCP.BRepAdaptor import BRepAdaptor_Curve
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude, merge
-from weldcal.models.workpieces import reading
+from weldcal.models.workpieces import joints, reading
+from weldcal.models.workpieces.brep import MeshBody, MeshFace
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, chained, read_polyline, seam_of
 from weldcal.models.workpieces.step import referenced
@@ -340,6 +342,28 @@ def test_a_reader_that_hangs_is_ended(tmp_path: Path) -> None:
     ended = subprocess.run([sys.executable, "-c", code], check=False, timeout=60)
     assert ended.returncode in (-signal.SIGXCPU, -signal.SIGKILL)
     assert not (tmp_path / "shape").exists()
+
+
+def test_joints_that_take_too_long_are_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between bodies, and inside one body."""
+    write_step(assembly(box((0, 0, -8), (100, 80, 8)), box((10, 37, 0), (80, 6, 40))), tmp_path / "t.step")
+    write_stl(tmp_path / "t.stl", t_mesh())
+    monkeypatch.setattr(joints, "MOST_S", 0.0)
+    for name, faces in (("t.step", 12), ("t.stl", 10)):
+        with pytest.raises(
+            InputError, match=f"joints between {faces} faces are not found within 0 s .*export only the bodies"
+        ):
+            read_shape(tmp_path / name)
+
+
+def test_a_border_that_repeats_a_corner_is_one_edge() -> None:
+    """A sliver of two regions: there, twice within 1e-5 mm at the end, and back."""
+    p, q = np.zeros(3), np.array([30.0, 40.0, 0.0])
+    triangles = np.array([[p, q, np.array([30.0, 40.0, 5.0])]])
+    body = MeshBody(triangles, [MeshFace(triangles, None)], [(np.array([p, q, q + 1e-5, p]), [0])])
+    ((edge, _),) = body.edges
+    curve = BRepAdaptor_Curve(edge)
+    assert curve.LastParameter() - curve.FirstParameter() == pytest.approx(50.0)
 
 
 def test_a_part_is_read_once_until_its_file_is_written_again(tmp_path: Path) -> None:

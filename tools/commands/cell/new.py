@@ -229,23 +229,23 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     note = ""
     if part is not None:
         assert scenario.workpiece is not None
-        standing, nearest = scenario.workpiece.pose_guess, ""
+        standing, refusals = scenario.workpiece.pose_guess, dict[int, str]()  # by edge: why the seam along it is none
         for seams, joint, pieces in candidates:
             reason, note = _refused(unfinished, scenario, seams, joint, standing, False), pieces
-            nearest = nearest or reason
             if not reason:
                 break
+            refusals = dict.fromkeys(seams[0].edges, reason) | refusals
         if reason:
-            nearest = _refused(unfinished, scenario, *candidates[0][:2], standing, True) or nearest
+            (seams, joint, _), shape = candidates[0], read_shape(part.file, part.units)
+            nearest = _refused(unfinished, scenario, seams, joint, standing, True) or refusals[seams[0].edges[0]]
             whole = sum(not note for *_, note in candidates)
             several = f"None of {whole} seams can be welded; the nearest one: " if whole > 1 else ""
-            (seams, joint, _), shape = candidates[0], read_shape(part.file, part.units)
             reason = _with_advice(shape, seams[0], fits, several + nearest)
             scenario.workpiece = dc.replace(scenario.workpiece, seams=seams, joint=joint, pose_guess=standing)
             _write(unfinished, scenario, CANNOT_WELD.format(reason=_comment(reason), path=unfinished))
             return unfinished, reason
         if note:
-            note = f"{note} As a whole: {nearest}"
+            note = f"{note} As a whole: {refusals[seams[0].edges[0]]}"
     _write(path, scenario, (RUNS + f"\n# {_comment(note)}" * bool(note)).format(path=path))
     unfinished.unlink(missing_ok=True)
     return path, note

@@ -33,6 +33,7 @@ MOST_PLANNED = 10
 MOST_DRAWN, MOST_NUMBERED = 20_000, 150  # triangles of a picture; edges in it with a number, as far as there is space
 SHARES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9)  # of an edge's length, where its number may be
 DPI = 110
+BEHIND_NUMBER = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 0.8}
 SHOWN = ("length_mm", "angle_deg", "gap_mm", "throat_mm")
 VIEWS = ((32.0, -60.0), (32.0, 120.0))  # elevation, azimuth
 
@@ -238,18 +239,8 @@ def _number(axes: Axes3D, shape: PartShape) -> None:
             x, y, _ = proj3d.proj_transform(*p, projection)
             box = np.concatenate([axes.transData.transform((x, y)), half])
             if all((np.abs(box[:2] - other[:2]) > box[2:] + other[2:]).any() for other in placed):
-                style = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 0.8}
-                axes.text(
-                    *p,
-                    str(edge.id),
-                    color=COLOURS[edge.kind],
-                    fontsize=size,
-                    fontweight="bold",
-                    zorder=20,
-                    bbox=style,
-                    ha="center",
-                    va="center",
-                )
+                style = {"color": COLOURS[edge.kind], "fontsize": size, "fontweight": "bold", "zorder": 20}
+                axes.text(*p, str(edge.id), bbox=BEHIND_NUMBER, ha="center", va="center", **style)
                 placed.append(box)
                 break
 
@@ -271,13 +262,9 @@ def _draw(axes: Axes3D, shape: PartShape, eye: Array) -> None:
             Line3DCollection(lines, colors=colour, linewidths=2.6 if wide else 0.8, zorder=5 if wide else 3)
         )
     low, high = 1e3 * mesh.bounds
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_zlim(low[2], high[2])
+    limits = {f"{k}lim": (low[i], high[i]) for i, k in enumerate("xyz")}
+    axes.set(**limits, **{f"{k}label": f"{k}, mm" for k in "xyz"})
     axes.set_box_aspect(tuple(np.maximum(high - low, 0.05 * float((high - low).max()))))
-    axes.set_xlabel("x, mm")
-    axes.set_ylabel("y, mm")
-    axes.set_zlabel("z, mm")
 
 
 def _facing(mesh: TriMesh, eye: Array) -> NDArray[np.int64]:

@@ -18,10 +18,10 @@ Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 MOST_RAYS = 9000
-NOT_MEASURED_COS = 0.22
+NOT_MEASURED_COS = 0.22  # 77 deg: a scanner measures no face that it sees at a larger angle
 VISIBLE_SAMPLES = 2500
-BEYOND_M = 0.004
-SAME_FACE_COS = 0.95
+BEYOND_M = 0.004  # beyond an edge, four times TOLERANCE_M: a pose that is right does not put the face there
+SAME_FACE_COS = 0.95  # 18 deg: the same face, bent by its triangles
 NEAR_M = 0.02  # error of fusion that is looked for: a ray that ends farther from the part meets another thing
 THIN = 0.6  # of a sheet's thickness: a lower point is nearer to the table, one thickness below, than to the face
 LEAST_NEAR, LEAST_MET = 100, 0.5  # rays of a scan that judge its fusion, and the share that meets a part in its place

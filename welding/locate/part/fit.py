@@ -30,10 +30,9 @@ RIM_SIGMA = 0.40  # of one of them, in point distances
 RIM_GATE, STILL_M = 4.5, 2e-5  # in point distances; a step smaller than this is the last with one gate
 LEAST_OWN = 0.15  # share of the rims with something behind them, below which nothing lies behind the part
 BEHIND_M = 0.002  # a face ends where the scan shows something so far behind it: over ten times the noise of a scan
-BEHIND = (
-    0.55  # the same for a thinner sheet, in its thickness: nearer to its table, one thickness below, than to itself
-)
-SHARED_M = 0.08
+# The same for a thinner sheet, in its thickness: nearer to its table, one thickness below, than to itself.
+BEHIND = 0.55
+SHARED_M = 0.08  # the warp of the tests' scans is one error over such a length: 60 points of 1 mm, smoothed
 RIM_FLOOR = 0.15  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
 PATCHES = 14.0  # size of a patch whose points share their error, in point distances

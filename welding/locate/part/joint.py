@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 Rows = tuple[Floats, Floats, Floats]  # a point's place along the seam m, its coefficients (M,4), and its residual m
 
 MOST_M = 0.0025  # of the root's shift: what is farther off is something else
-KNOT_M = 0.004
+KNOT_M = 0.004  # between two knots: four points of a scan with 1 mm between them
 REACH_M = 0.015  # of a wall from the root
 NEAR_ROOT_M = 0.0012  # points nearer to the root, and a point distance, may be of either wall
 ALONG_WALL_COS = math.cos(math.radians(25.0))
@@ -37,7 +37,7 @@ PRIOR_M, PRIOR_TILT_RAD, PRIOR_KNOTS = 0.0005, math.radians(1.0), 10  # shared b
 BEND_M, BEND_TILT_RAD = 2e-5, math.radians(0.1)  # second difference from knot to knot
 SHOWN_GAP = 1.5  # point distances: a narrower gap is not told from the distance of two points
 EDGE_SIGMA = 0.3  # of the middle between the outermost points of two edges, in point distances
-SIGMA_FLOOR_M = 3e-5
+SIGMA_FLOOR_M = 3e-5  # a third of a scan's noise of 0.1 mm, of which neighbours share a part
 WINDOW_M, STRIP_M = 0.010, 0.0009  # of the seam, for a place of the fit-up and for one end of a side's points
 CORRELATED = 6.0  # neighbouring points share their noise
 SLOPE_FLOOR = math.radians(0.1)

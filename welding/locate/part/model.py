@@ -17,7 +17,7 @@ Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 SAMPLES = 30_000
-EDGE_STEP_M = 0.003
+EDGE_STEP_M = 0.003  # between points of an edge: three points of a scan with 1 mm between them
 SHARP_COS = math.cos(math.radians(35.0))
 MOST_DIRECTIONS = 14
 BENEATH_M = 2e-5  # start of a ray into the part: a float32 rounds by 1e-6 m at 10 m, so the ray misses its own face

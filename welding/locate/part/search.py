@@ -25,17 +25,15 @@ Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 MOST_CELLS = 150  # along a side of the scene's map
-SAME_HEIGHT_M = 0.007
+SAME_HEIGHT_M = 0.007  # two heights in one cell: a face that leans by 60 deg rises by 7 mm over a cell of 4 mm
 RING_CELLS, RING_SHARE = 3, 0.5
 PEAKS, MOST_PLACES, MOST_UPS = 3, (24, 16, 4), 4
 LEAST_KNOWN = 0.3  # least share of a covered part that the scan shows
-LEAST_FILLED = (
-    0.4  # Plane.filled of a ground: 1 for a square, 0.79 for a disc; less where a plane cuts across several things
-)
+# Plane.filled of a ground: 1 for a square, 0.79 for a disc; less where a plane cuts across several things.
+LEAST_FILLED = 0.4
 LARGE_M = 0.4  # radius of a part that fills the field of one scan, 0.8 m across
-GROUND_SHARE = (
-    0.85  # extent of a large part's ground, in the scan's: no table is GROUND_EXTENT times as large in the scan
-)
+# Extent of a large part's ground, in the scan's: no table is GROUND_EXTENT times as large in the scan.
+GROUND_SHARE = 0.85
 WIDE_CELLS = 3.0  # in config.cell_m: 12 mm, in which a web and the plate beside it share a cell
 RADIUS_CELLS, TURN_CELLS = 40, 1.8  # of a large part: cells along its radius, and of a turn at its ends
 # Gates of a large part, in its radius: the second is half a turn and half a cell's diagonal, (0.5 * 1.8 + 0.71) / 40.
