@@ -13,18 +13,18 @@ from tests.places import ROOT
 
 # A figure that shrinks by much gets a lower bound. A change that raises one says why in its commit.
 BOUNDS = {
-    "modules": 655,  # files with code in the five folders
-    "code lines": 96_890,  # without blank lines, comments and docstrings
-    "lines of studies": 10_830,  # in tools/studies, all lines
+    "modules": 527,  # files with code in the five folders
+    "code lines": 96_170,  # without blank lines, comments and docstrings
+    "lines of studies": 10_640,  # in tools/studies, all lines
     "tests that import studies": 2,  # outside tests/tools/studies
     "positional calls": 0,  # constructor calls with more than LONGEST_CALL positional arguments
     "positional dataclasses": 0,  # with more than LONGEST_CALL fields and without kw_only
-    "import closure of calibrate": 113,  # modules with code that the command needs, directly or not
+    "import closure of calibrate": 90,  # modules with code that the command needs, directly or not
     "import cycles": 0,  # modules that import themselves through others, imports under TYPE_CHECKING included
     "full folders": 0,  # outside tools/, with more than FULLEST_FOLDER modules
     "long lines": 0,  # in the five folders, over LONGEST_LINE characters
     "layout by hand": 19,  # statements in the five folders that ruff does not format
-    "bare constants": 220,  # float constants of the mathematics and the systems without a comment
+    "bare constants": 0,  # float constants of the mathematics and the systems without a comment
     "shared class names": 0,  # public class names that occur in more than one module
 }
 LONGEST_CALL = 6
