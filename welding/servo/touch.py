@@ -15,6 +15,7 @@ from weldcal.welding.servo.state import GainFit, ServoSample, WeldingState
 _TAG_SIGMA_M = 0.05e-3  # sigma of a frame's deflection in the gain fit
 _SEATED_FRAMES = 3
 _WALL_FRAMES = 15
+_SLIDING_LEAN = 1.15
 _REST_M = 0.3e-3  # six sigma of the tag's noise: a ball whose height changes by more still slides down its wall
 
 
@@ -152,7 +153,8 @@ def _search(
     # Beside a guiding joint is no face: high above the plan the ball is in the root only where it does not slide.
     guiding = touch.offset_m == 0.0
     dropped = tip_height < (0.5 * half_drop if guiding else max(half_drop, t.face_height - half_drop))
-    leaning = state.delta_n > 0.9 * deflection.delta_d_m
+    # A ball that slides down its wall leans by a sixth more than wanted, at the least: friction 0.2, up to 120 deg.
+    leaning = 0.9 < state.delta_n / deflection.delta_d_m < (_SLIDING_LEAN if guiding else math.inf)
     frames = t.seated_frames
     if is_new:
         pressed = abs(state.delta_axial - deflection.axial_d_m) < 0.25 * deflection.axial_d_m
