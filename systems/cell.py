@@ -11,8 +11,7 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND
 from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.jobs.discovery import job_of
-from weldcal.systems.jobs.job import AddedJob, Job
+from weldcal.systems.jobs.job import AddedJob, Job, job_of
 from weldcal.systems.motion.clear_moves import check_way_home
 from weldcal.systems.motion.spine import add_spine
 from weldcal.systems.person import Person

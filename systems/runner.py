@@ -15,18 +15,24 @@ from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.drivers.simulated.second_arm import FIRST
-from weldcal.systems.host_timing import HostTiming, measure_host, require_timely_host
 from weldcal.systems.interrupts import SIGTERM, deferred
 from weldcal.systems.messages import JobCommand, Scan
-from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
+from weldcal.systems.pacing import (
+    HostTiming,
+    measure_host,
+    no_long_garbage_collections,
+    real_time_priority,
+    require_timely_host,
+    short_turns,
+)
 from weldcal.systems.person import KEYS
 from weldcal.systems.wall_clock import PictureWait, WallClock
 
 Progress = Callable[[str, float], None]
 LOOKS = {"job": 0.008, "progress": 1.0, "panel": 0.1}  # seconds between checks; shorter than the sequencer's period
-AT_REST_RAD_S = 1e-3
-COMMANDED_RAD_S = 1e-6
-PERSON_CHECK_S = 0.02
+AT_REST_RAD_S = 1e-3  # as flange_mover.SETTLED_RAD_S
+COMMANDED_RAD_S = 1e-6  # above rounding of a zero command, and 1000 times below the slowest motion, AT_REST_RAD_S
+PERSON_CHECK_S = 0.02  # a choice: 50 looks a second at a button; an operator notices no delay below 0.1 s
 STOPPED_BY_OPERATOR = "The operator stopped the run with Ctrl-C"
 COMES_TO_REST_S = 1.0  # longest time that a run continues after the end of its job until the arm is at rest
 OVERTIME_S = 5.0  # added to the time limit at which the job holds itself

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
@@ -21,21 +21,18 @@ from weldcal.models.workpieces.plate import make_workpiece, seeded_groove_error
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Background, Inline, OwnProcess
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
-from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
 from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND, PlacedArm
-from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
+from weldcal.systems.drivers.simulated.world import Furnishing, SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.config import TabletTruth
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 from weldcal.systems.recording.answers import RepeatedBackground
 from weldcal.systems.recording.player import Playback, add_player
-from weldcal.systems.scenario.arm import corrected_arm, nominal_arm
+from weldcal.systems.scenario.parts import corrected_arm, made, nominal_arm, part_of, surroundings_of
 from weldcal.systems.scenario.schema import Scenario, WorkpieceConfig
-from weldcal.systems.scenario.surroundings import surroundings_of
-from weldcal.systems.scenario.workpiece import made, part_of
 from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
 

@@ -15,8 +15,8 @@ from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, joint_angles
 from weldcal.calibration.errors import DatasetError, FlangeNotFound, InconsistentPoses
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
+from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeGuess
-from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.arms.chain import Chain, chain_capsules, chain_frames, known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution

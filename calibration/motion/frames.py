@@ -12,10 +12,8 @@ from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.motion_dataset import FrameTime, MotionDataset
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
-from weldcal.calibration.motion.clock import choose_clock
-from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.calibration.motion.start import search_start
-from weldcal.calibration.motion.start_in_hand import search_in_hand
+from weldcal.calibration.motion.observed import ObservedFrames, choose_clock
+from weldcal.calibration.motion.start import search_in_hand, search_start
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard

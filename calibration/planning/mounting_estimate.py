@@ -16,9 +16,8 @@ from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_fla
 from weldcal.calibration.geometry.robust import radius_95
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.hand_eye.determinacy import check_poses, determinacy, with_open_directions
-from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.mountings import TargetObservation
-from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, linearise
+from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, inverse_information, linearise
 from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     HandEyeHeldOut,

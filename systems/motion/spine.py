@@ -13,8 +13,8 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, UrStatus
+from weldcal.systems.motion.buffers import PoseRecorder
 from weldcal.systems.motion.flange_mover import FlangeMover
-from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.person import FASTEST, Person
 from weldcal.systems.viewer.kept import keep
 from weldcal.systems.wiring import Wiring
@@ -22,7 +22,7 @@ from weldcal.welding.servo.guards import SlewLimits, slew_limit
 
 HOLD_BUTTON = "Hold the job"
 PACE_SLIDER = "Pace (1 = real time, 0 = as fast as it goes)"
-PERIOD_S = 0.008
+PERIOD_S = 0.008  # two periods of the commands; an operator notices no delay below 0.1 s
 
 
 class OperatorPanel(LeafSystem):

@@ -13,8 +13,7 @@ from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import PlannedSeam
-from weldcal.systems.viewer.scene import CAD, DEFLECTION, DEFLECTION_SCALE, FELT, PLANNED, WAY_BACK, WELDED
-from weldcal.systems.viewer.shapes import coloured
+from weldcal.systems.viewer.scene import CAD, DEFLECTION, DEFLECTION_SCALE, FELT, PLANNED, WAY_BACK, WELDED, coloured
 
 Floats = npt.NDArray[np.float64]
 

@@ -22,8 +22,8 @@ from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
 from weldcal.calibration.errors import DatasetError, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.motion.estimate import estimate_in_motion
+from weldcal.calibration.motion.expected import ROBOT, Moves, closed_moves, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import ROBOT, Moves, closed_moves, recorded_stream
 from weldcal.models.arms.chain import chain_inverse, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

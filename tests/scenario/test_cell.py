@@ -33,7 +33,7 @@ from weldcal.tools.commands.run import JobRun
 from weldcal.tools.commands.weld import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import calibration_error, weld_outcome
-from weldcal.tools.worlds.weld.cell_run import figures
+from weldcal.tools.worlds.weld.case import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.

@@ -34,14 +34,12 @@ from weldcal.models.flanges import get_flange
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import BackgroundSystem
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
-from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
-from weldcal.systems.drivers.sensors.watch import DeviceWatch
+from weldcal.systems.drivers.sensors.watch import DeviceWatch, OnTrigger
 from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanStream
 from weldcal.systems.drivers.simulated.picture_scene import KnockedStand, PicturePoses
-from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
 from weldcal.systems.drivers.simulated.rendered_profiler import (
@@ -52,20 +50,25 @@ from weldcal.systems.drivers.simulated.rendered_profiler import (
 )
 from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
-from weldcal.systems.drivers.simulated.streaming.replay import FrameReplay
-from weldcal.systems.drivers.simulated.streaming.scanner import DepthStream, StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import DepthStream, FrameReplay, StreamingScanner
 from weldcal.systems.drivers.simulated.tablet_world import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
 from weldcal.systems.drivers.ur.touch_probe import ProbeInput, Touches, UrTouchProbeInput
-from weldcal.systems.jobs.motion.collector import MotionCalibrator, MotionCollector, MotionRecorder
-from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProcedure, MotionRecord, MotionState
-from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
-from weldcal.systems.jobs.mounting.job import mounting_scene
+from weldcal.systems.jobs.motion.procedure import (
+    MotionCalibration,
+    MotionCalibrator,
+    MotionCollector,
+    MotionProcedure,
+    MotionRecord,
+    MotionRecorder,
+    MotionState,
+)
+from weldcal.systems.jobs.mounting.job import MountingCalibrator, MountingFitConfig, mounting_scene
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.jobs.procedure import Procedure
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.job import RobotError
+from weldcal.systems.jobs.profiler.job import RobotError, draw_fixture
 from weldcal.systems.jobs.profiler.plan import PlanningContext
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
@@ -98,11 +101,10 @@ from weldcal.systems.messages import (
     TorchTouch,
     UrStatus,
 )
+from weldcal.systems.motion.buffers import FrameQueue, PoseHistory, PoseRecorder
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.flange_mover import FlangeMover
-from weldcal.systems.motion.frame_queue import FrameQueue
-from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
-from weldcal.systems.motion.singularity_guard import SingularityGuard
+from weldcal.systems.motion.guarded_path import SingularityGuard
 from weldcal.systems.motion.spine import CommandArbiter, OperatorPanel, ProcessSwitch, SlewLimiter
 from weldcal.systems.person import Person
 from weldcal.systems.recording.player import PortPlayer

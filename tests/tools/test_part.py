@@ -21,8 +21,8 @@ from weldcal.models.workpieces.part import numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import part_of
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.systems.scenario.workpiece import part_of
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell import new
 from weldcal.tools.commands.cell.new import OwnPart, write_cell

@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.doctor.case import DoctorCase
-from weldcal.calibration.doctor.diagnose import diagnose
-from weldcal.calibration.doctor.readings import FEWEST
-from weldcal.calibration.doctor.record import NAME, case_of, case_text
+from weldcal.calibration.doctor.case import NAME, DoctorCase, case_of, case_text
+from weldcal.calibration.doctor.diagnose import FEWEST, diagnose
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard

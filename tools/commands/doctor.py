@@ -13,9 +13,8 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.case import NAME, DoctorCase, read_case
 from weldcal.calibration.doctor.diagnose import Cause, Diagnosis, diagnose
-from weldcal.calibration.doctor.record import NAME, read_case
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
 from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.flange.fit import fit_flange

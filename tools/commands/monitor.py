@@ -16,17 +16,15 @@ from weldcal.calibration.data.checks import read_header
 from weldcal.calibration.data.motion_dataset import FrameTime, MotionDataset, load_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult, export_all, load_result, save_result, software_version
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.motion.drift.background import background_move
 from weldcal.calibration.motion.drift.sequential import MOVED, DriftConfig, DriftEvent
-from weldcal.calibration.motion.drift.watch import DriftHistory, watch
+from weldcal.calibration.motion.drift.watch import DriftHistory, background_move, watch
 from weldcal.calibration.motion.frames import observed_frames, see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.systems.jobs.motion.collector import posed_stream
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
-from weldcal.systems.jobs.motion.procedure import MotionRecord
+from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
 from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_names

@@ -27,7 +27,7 @@ from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.jobs.job import job_of
 from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.person import Person, person_at
 from weldcal.systems.recording.port_recorder import ENTERED, LEFT
@@ -36,8 +36,8 @@ from weldcal.systems.recording.tap import OpenSink, PortLayout
 from weldcal.systems.recording.values import encode
 from weldcal.systems.recording.writer import RecordingWriter
 from weldcal.systems.runner import Progress, Run, run_cell
-from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.viewer.kept import free_unused

@@ -19,8 +19,8 @@ from weldcal.calibration.eye_on_base.validation import position_errors, tilt_err
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.hand_eye.solve import as_transform
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.local_field import field_from_document
-from weldcal.calibration.refinement.stated_arm import shared_error
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

@@ -4,7 +4,7 @@ import dataclasses as dc
 from pathlib import Path
 
 from weldcal.calibration.data.clouds import NO_NOTES, read_cloud
-from weldcal.systems.drivers.sensors.files.source import FolderSource
+from weldcal.systems.drivers.sensors.folder_source import FolderSource
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud
 from weldcal.systems.drivers.station_build import StationBuild

@@ -13,9 +13,9 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import WeldPart
-from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated.tablet_world import tablet_fittings
+from weldcal.systems.drivers.simulated.world import Furnishing
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.tablet.config import TabletConfig, TabletTruth, WristPicture, check_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState

@@ -12,8 +12,7 @@ import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.planning.clearance import arm_bodies, path_clearance, self_distance
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings, arm_bodies, path_clearance, self_distance
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arrays import Array

@@ -9,17 +9,15 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.motion.frames import IN_MOTION
-from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-from weldcal.systems.background import Answer, Background
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan, StreamedScan
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 
 _CLOCKS_APART_S = 0.2  # a device's time that is further from the arrival's has jumped
 _COARSE = 8  # rows and columns of a scan between those that are looked at

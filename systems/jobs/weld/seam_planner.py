@@ -19,12 +19,11 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered
 from weldcal.models.workpieces.seat import Press
-from weldcal.systems.background import Answer, Background
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning, leans_with_room
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView, SeamRecord
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.welding.locate.part.joint import check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve, ringed

@@ -9,7 +9,7 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.tablet.detection import find_landmarks
-from weldcal.calibration.tablet.plane_depth import plane_depth
+from weldcal.calibration.tablet.plane_pose import plane_depth
 from weldcal.calibration.tablet.wrist.fit import WristFit, seen_point
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array

@@ -16,8 +16,15 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.algorithm1 import Algorithm1State, algorithm1_start, algorithm1_step
-from weldcal.calibration.published.icp import Verification, icp_error, make_verification, sight
+from weldcal.calibration.published.algorithm1 import (
+    Algorithm1State,
+    Verification,
+    algorithm1_start,
+    algorithm1_step,
+    icp_error,
+    make_verification,
+    sight,
+)
 from weldcal.calibration.published.pipeline import (
     Method,
     PublishedVerification,
