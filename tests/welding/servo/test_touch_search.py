@@ -10,11 +10,10 @@ import pytest
 
 from weldcal.systems.jobs.weld.arm_way import leaning
 from weldcal.tools.worlds.weld import plant
-from weldcal.tools.worlds.weld.budgets import NOMINAL
+from weldcal.tools.worlds.weld.budgets import NOMINAL, Unknowns
+from weldcal.tools.worlds.weld.case import RunMetrics, judge
 from weldcal.tools.worlds.weld.groove import TipPlace, Wedge
-from weldcal.tools.worlds.weld.metrics import RunMetrics, judge
 from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
-from weldcal.tools.worlds.weld.unknowns import Unknowns
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchOnConfig
