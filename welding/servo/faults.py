@@ -1,6 +1,7 @@
 """The faults of a weld: what is watched in each phase, and the sentence that ends it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,6 +10,11 @@ from weldcal.welding.servo.contact import beyond_limit
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase, ServoSample, WeldingState
 from weldcal.welding.servo.track import TorchTarget
+
+_FALL_M = 0.5e-3  # half of what the lowest tack lifts a tip that is seated above the plan
+_FOLLOW_M = (
+    0.02e-3  # a frame: at 8 mm/s a slope of 7 %, five times that of a plan by a scanner that nobody has corrected
+)
 
 
 def fault(state: WeldingState, reason: str) -> WeldingState:
@@ -65,6 +71,19 @@ def goes_on(state: WeldingState, config: ServoConfig) -> bool:
 def finish(state: WeldingState) -> WeldingState:
     """Enter FINISH: from here on the tip is not used, and holds its offset to the plan from the next tick."""
     return changed(state, phase=Phase.FINISH, steer=0.0, felt=0.0, hold=np.full(2, math.nan))
+
+
+def raised(state: WeldingState, config: ServoConfig) -> WeldingState:
+    """Check, until the arc is lit, that a tip that was seated above the plan does not fall: it was not in the root."""
+    t, fit, last = state.touch, state.plan_fit, state.measurement
+    if math.isnan(t.raised_m) or state.torch_on or fit is None or last is None:
+        return state
+    frame = fit.plan.frame(state.s_tip)
+    rise = dot(last.point - frame.position, frame.up) - t.raised_m
+    if rise < -_FALL_M:
+        text = "The tip was seated on something above the seam and fell off it; clear the joint, and scan again."
+        return fault(state, text)
+    return changed(state, touch=replace(t, raised_m=t.raised_m + clip(rise, -_FOLLOW_M, _FOLLOW_M)))
 
 
 def unlit(state: WeldingState, s_torch: float, past_start: float, error: float, config: ServoConfig) -> str | None:

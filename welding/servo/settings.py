@@ -129,7 +129,8 @@ class TouchOnConfig:
         height_m: start height of the free tip's centre above where the plan expects it to meet the face.
         slow_height_m: height below which it descends slowly.
         fast_m_s, slow_m_s, search_m_s: speeds of descent and lateral search.
-        range_m: lateral search; depth_m: how far below the expected face it may go.
+        range_m: lateral search; depth_m: how far below the expected face it may go; above_m: how far above the plan the
+            root of a guiding joint may lie.
         settle_s: pause on the face before the search.
         calibrate_gain: press to `press_ratio` times the wanted deflection and back, and fit the tag's gain.
         press_m_s: speed of that; gain_sigma: prior sigma of the gain about 1.
@@ -148,6 +149,7 @@ class TouchOnConfig:
     search_m_s: float = 4.0e-3
     range_m: float = 12.0e-3
     depth_m: float = 6.0e-3
+    above_m: float = 3.0e-3
     settle_s: float = 0.25
     calibrate_gain: bool = False
     press_ratio: float = 1.6

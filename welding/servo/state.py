@@ -116,7 +116,8 @@ class GainFit(NamedTuple):
 class TouchOnState:
     """State of the touch search: its step, the step's start, heights and lateral place; `free`: deflections of the free
     tip; `felt`: points measured on the way back to the start, each with how far ahead of its rest point friction held
-    the tip.
+    the tip; `rest_m`: height above the plan at which the ball has come to rest; `raised_m`: of a ball seated above the
+    plan, its height there, slowly followed.
     """
 
     step: str = "descend"
@@ -124,6 +125,8 @@ class TouchOnState:
     face_height: float = math.nan
     start_left: float = math.nan
     seated_frames: int = 0
+    rest_m: float = math.nan
+    raised_m: float = math.nan
     gain_fit: GainFit = field(default_factory=GainFit)
     free: tuple[Array, ...] = ()
     felt: tuple[PendingPoint, ...] = ()

@@ -19,7 +19,7 @@ from weldcal.welding.servo.contact import (
     with_point,
     with_progress,
 )
-from weldcal.welding.servo.faults import advance, angles, fault, finish, goes_on, unlit, watch
+from weldcal.welding.servo.faults import advance, angles, fault, finish, goes_on, raised, unlit, watch
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig, weave_at
@@ -204,7 +204,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
                 axial_paused=lost,
             )
         if not lost:
-            return with_point(state, config)
+            return with_point(raised(state, config), config)
         state = changed(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0, felt=0.0)
         if state.s_tip > state.s_end - end_window:
             assert before.measurement is not None

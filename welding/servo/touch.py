@@ -15,6 +15,8 @@ from weldcal.welding.servo.state import GainFit, ServoSample, WeldingState
 _TAG_SIGMA_M = 0.05e-3  # sigma of a frame's deflection in the gain fit
 _SEATED_FRAMES = 3
 _WALL_FRAMES = 15
+_SLIDING_LEAN = 1.15
+_REST_M = 0.3e-3  # six sigma of the tag's noise: a ball whose height changes by more still slides down its wall
 
 
 def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
@@ -148,17 +150,21 @@ def _search(
     deflection = config.deflection
     touch, t = config.touch, state.touch
     half_drop = 0.5 * config.tool.tip_drop_m
-    dropped = tip_height < t.face_height - half_drop or tip_height < half_drop
-    leaning = state.delta_n > 0.9 * deflection.delta_d_m
+    # Beside a guiding joint is no face: high above the plan the ball is in the root only where it does not slide.
+    guiding = touch.offset_m == 0.0
+    dropped = tip_height < (0.5 * half_drop if guiding else max(half_drop, t.face_height - half_drop))
+    # A ball that slides down its wall leans by a sixth more than wanted, at the least: friction 0.2, up to 120 deg.
+    leaning = 0.9 < state.delta_n / deflection.delta_d_m < (_SLIDING_LEAN if guiding else math.inf)
     frames = t.seated_frames
     if is_new:
         pressed = abs(state.delta_axial - deflection.axial_d_m) < 0.25 * deflection.axial_d_m
-        frames = frames + 1 if leaning and (pressed or not dropped) else 0
-        t = replace(t, seated_frames=frames)
+        slides = guiding and not dropped and not abs(tip_height - t.rest_m) < _REST_M
+        frames = frames + 1 if leaning and not slides and (pressed or not dropped) else 0
+        t = replace(t, seated_frames=frames, rest_m=tip_height if slides else t.rest_m)
         state = changed(state, touch=t)
-    # Beside a guiding joint is no face: the ball that rests there leaning is in the root, also above the plan.
-    guided = touch.offset_m == 0.0 and frames >= _WALL_FRAMES and tip_height < 0.5 * touch.depth_m
+    guided = guiding and frames >= _WALL_FRAMES and tip_height < touch.above_m
     if guided or (dropped and frames >= _SEATED_FRAMES):
+        state = changed(state, touch=replace(t, raised_m=math.nan if dropped else tip_height))
         if not touch.calibrate_gain:
             return state, 0.0, depth_servo, None, True
         return _next(state, "press up", now, left), 0.0, 0.0, None, False

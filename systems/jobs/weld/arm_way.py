@@ -84,8 +84,14 @@ class Welder:
     advises: bool = True
 
 
-def leaning(config: ServoConfig, lean_rad: float, touch_arc_m: float | None = None) -> ServoConfig:
-    """Settings of a servo that leans the tool, and whose tip comes down elsewhere."""
+def leaning(
+    config: ServoConfig, lean_rad: float, touch_arc_m: float | None = None, sigma_m: float = math.nan
+) -> ServoConfig:
+    """Settings of a servo that leans the tool, whose tip comes down elsewhere, and whose plan has a sigma."""
+    if math.isfinite(sigma_m):
+        # Two sigma above its plan is the root still likely; anything else that holds the ball there is refused.
+        above_m = min(max(2.0 * sigma_m, 0.5 * config.tool.tip_drop_m), config.touch.above_m)
+        config = dc.replace(config, touch=dc.replace(config.touch, above_m=above_m))
     if touch_arc_m is not None:
         config = dc.replace(config, touch=dc.replace(config.touch, arc_m=touch_arc_m))
     return dc.replace(config, torch=dc.replace(config.torch, work_angle_rad=lean_rad)) if lean_rad else config

@@ -117,7 +117,8 @@ class WeldingVelocityServo(LeafSystem):
         arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else WeldingState()
-        config = leaning(self._configs[min(job.seam, len(self._configs) - 1)], planned.lean_rad, planned.touch_arc_m)
+        config = self._configs[min(job.seam, len(self._configs) - 1)]
+        config = leaning(config, planned.lean_rad, planned.touch_arc_m, planned.sigma_m)
         holds = self._hold.HasValue(context) and bool(self._hold.Eval(context)[0] > 0.5)
         memory, held, command = interruptible_step(memory, old.interruption, sample, planned.seam, config, holds)
         report = ServoReport(
