@@ -12,9 +12,8 @@ from weldcal.welding.servo.state import Phase, ServoSample, WeldingState
 from weldcal.welding.servo.track import TorchTarget
 
 _FALL_M = 0.5e-3  # half of what the lowest tack lifts a tip that is seated above the plan
-_FOLLOW_M = (
-    0.02e-3  # a frame: at 8 mm/s a slope of 7 %, five times that of a plan by a scanner that nobody has corrected
-)
+# A frame: at 8 mm/s a slope of 7 %, five times that of a plan by a scanner that nobody has corrected.
+_FOLLOW_M = 0.02e-3
 
 
 def fault(state: WeldingState, reason: str) -> WeldingState:

@@ -15,6 +15,7 @@ from weldcal.welding.servo.state import GainFit, ServoSample, WeldingState
 _TAG_SIGMA_M = 0.05e-3  # sigma of a frame's deflection in the gain fit
 _SEATED_FRAMES = 3
 _WALL_FRAMES = 15
+# A choice: a ball at rest leans as the servo wants; one that leans by 15 % more still slides down its wall.
 _SLIDING_LEAN = 1.15
 _REST_M = 0.3e-3  # six sigma of the tag's noise: a ball whose height changes by more still slides down its wall
 
