@@ -22,9 +22,13 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.tcp import TcpOffset, find_tcp
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.refinement.kinematics_choice import choose_kinematics, kinematics_text, with_kinematics
+from weldcal.calibration.refinement.kinematics_choice import (
+    arm_document,
+    choose_kinematics,
+    kinematics_text,
+    with_kinematics,
+)
 from weldcal.calibration.refinement.local_field import LocalField, choose_local, with_field
-from weldcal.calibration.refinement.stated_arm import arm_document
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

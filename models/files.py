@@ -1,4 +1,4 @@
-"""Opens a file that a person hands in: a regular file of bounded size, text in UTF-8; anything else is refused by a
+"""Opens a file that an operator hands in: a regular file of bounded size, text in UTF-8; anything else is refused by a
 sentence."""
 
 import hashlib

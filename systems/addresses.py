@@ -1,4 +1,4 @@
-"""Checks the network addresses that a person gives, and names what is wrong with one."""
+"""Checks the network addresses that an operator gives, and names what is wrong with one."""
 
 import ipaddress
 import re

@@ -11,11 +11,10 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND
 from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.jobs.discovery import job_of
-from weldcal.systems.jobs.job import AddedJob, Job
+from weldcal.systems.jobs.job import AddedJob, Job, job_of
 from weldcal.systems.motion.clear_moves import check_way_home
 from weldcal.systems.motion.spine import add_spine
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.recording.answers import NotedBackground
 from weldcal.systems.recording.player import Playback
 from weldcal.systems.recording.tap import OpenSink, add_recorder
@@ -32,7 +31,7 @@ JobOf = TypeVar("JobOf", bound=AddedJob, covariant=True)
 
 @dataclass(frozen=True, eq=False)
 class Cell(Generic[JobOf]):
-    """The Diagram and its named parts; `person` may hold and end its run.
+    """The Diagram and its named parts; `operator` may hold and end its run.
 
     The caller that builds a cell must close its station.
 
@@ -44,7 +43,7 @@ class Cell(Generic[JobOf]):
     scenario: Scenario
     job: JobOf
     logs: dict[str, VectorLogSink]
-    person: Person = dc.field(default_factory=Person)
+    operator: Operator = dc.field(default_factory=Operator)
 
     @property
     def plant(self) -> MultibodyPlant | None:
@@ -64,7 +63,7 @@ def build_cell(
     robot: PreparedRobot | None = None,
     played: Playback | None = None,
     open_sink: OpenSink | None = None,
-    person: Person | None = None,
+    operator: Operator | None = None,
     live: LiveView | None = None,
 ) -> Cell[Any]:
     """Build the cell of a scenario. The caller must close its station.
@@ -77,30 +76,30 @@ def build_cell(
         meshcat: viewer of the cell, with the operator's controls; None: no viewer.
         robot, played: see make_station.
         open_sink: opens the sink that takes what enters and leaves the cell; None: nothing is recorded.
-        person: who may hold and end the run; None: a new one, the cell's `person`.
+        operator: who may hold and end the run; None: a new one, the cell's `operator`.
         live: takes what the dashboard shows; None: no dashboard.
 
     Raises:
         InputError, UnreachableScanner: the scenario cannot be run; nothing has been written or moved.
     """
     job = job_of(scenario)
-    station = make_station(scenario, seed, robot, job.furnish, played)
+    station = make_station(scenario, seed, robot, job.set_up_world, played)
     noted = NotedBackground(station.background)
     if open_sink is not None:
         station = dc.replace(station, background=noted)
     try:
         check_way_home(scenario, station)
-        person = person or Person()
+        operator = operator or Operator()
         wiring = Wiring(
             builder=DiagramBuilder(),
             station=station,
             scenario=scenario,
             seed=seed,
             meshcat=meshcat,
-            person=person if played is None else None,
+            operator=operator if played is None else None,
         )
         cell = _build(job, job.plan(scenario, station, seed), wiring, noted, open_sink, live)
-        return dc.replace(cell, person=person)
+        return dc.replace(cell, operator=operator)
     except BaseException:
         station.close()
         raise

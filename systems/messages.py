@@ -14,8 +14,7 @@ from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.algorithm1 import Algorithm1State
-from weldcal.calibration.published.icp import Verification
+from weldcal.calibration.published.algorithm1 import Algorithm1State, Verification
 from weldcal.calibration.refinement.local_field import LocalField
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.welding.locate.part.joint import FitUp

@@ -15,18 +15,24 @@ from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.drivers.simulated.second_arm import FIRST
-from weldcal.systems.host_timing import HostTiming, measure_host, require_timely_host
 from weldcal.systems.interrupts import SIGTERM, deferred
 from weldcal.systems.messages import JobCommand, Scan
-from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
-from weldcal.systems.person import KEYS
+from weldcal.systems.operator import KEYS
+from weldcal.systems.pacing import (
+    HostTiming,
+    measure_host,
+    no_long_garbage_collections,
+    real_time_priority,
+    require_timely_host,
+    short_turns,
+)
 from weldcal.systems.wall_clock import PictureWait, WallClock
 
 Progress = Callable[[str, float], None]
 LOOKS = {"job": 0.008, "progress": 1.0, "panel": 0.1}  # seconds between checks; shorter than the sequencer's period
-AT_REST_RAD_S = 1e-3
-COMMANDED_RAD_S = 1e-6
-PERSON_CHECK_S = 0.02
+AT_REST_RAD_S = 1e-3  # as flange_mover.SETTLED_RAD_S
+COMMANDED_RAD_S = 1e-6  # above rounding of a zero command, and 1000 times below the slowest motion, AT_REST_RAD_S
+OPERATOR_CHECK_S = 0.02  # a choice: 50 looks a second at a button; an operator notices no delay below 0.1 s
 STOPPED_BY_OPERATOR = "The operator stopped the run with Ctrl-C"
 COMES_TO_REST_S = 1.0  # longest time that a run continues after the end of its job until the arm is at rest
 OVERTIME_S = 5.0  # added to the time limit at which the job holds itself
@@ -41,9 +47,9 @@ class Run(Generic[JobOf]):
     """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase
     began.
 
-    `interrupted`: the reason where a person ended the run before its job. `clock`: the clock of a paced run, else None.
-    `held_by_person`: how often a person held the run and let it go on. `host`: the computer's timing before the first
-    motion. `share`: the completed share of the job, 0 to 1; a run that is held does not advance it.
+    `interrupted`: the reason where an operator ended the run before its job. `clock`: the clock of a paced run, else
+    None. `held_by_person`: how often an operator held the run and let it go on. `host`: the computer's timing before
+    the first motion. `share`: the completed share of the job, 0 to 1; a run that is held does not advance it.
     """
 
     cell: Cell[JobOf]
@@ -85,13 +91,13 @@ class Run(Generic[JobOf]):
     @property
     def ended_by_operator(self) -> bool:
         """Whether the operator ended the run: with Ctrl-C, on the dashboard or in the 3D view."""
-        return self.held and (self.cell.person.ends or (self.interrupted or "").startswith(STOPPED_BY_OPERATOR))
+        return self.held and (self.cell.operator.ends or (self.interrupted or "").startswith(STOPPED_BY_OPERATOR))
 
     def raise_if_interrupted(self) -> None:
-        """For a study of many runs, which a person ends with any one of them.
+        """For a study of many runs, which an operator ends with any one of them.
 
         Raises:
-            KeyboardInterrupt: a person ended this run.
+            KeyboardInterrupt: an operator ended this run.
         """
         if self.interrupted is not None:
             raise KeyboardInterrupt(self.interrupted)
@@ -142,9 +148,9 @@ def run_cell(
     always closed, also on Ctrl-C, which stops its arm. Before the first motion of a robot the computer's timing is
     measured.
 
-    The cell's `person` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so
-    that the job goes on along the same path when the person says so. During a weld the process is turned off first and
-    the servo brings the tool to rest; it goes on from a little before that place. `ended` is called before the
+    The cell's `operator` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so
+    that the job goes on along the same path when the operator says so. During a weld the process is turned off first
+    and the servo brings the tool to rest; it goes on from a little before that place. `ended` is called before the
     recording is shown.
 
     Raises:
@@ -154,11 +160,11 @@ def run_cell(
     run = Run(cell=cell, simulator=simulator, clock=station.robot.clock)
     if realtime and run.clock is None:
         simulator.set_target_realtime_rate(1.0)
-        cell.person.ask_pace(1.0)
+        cell.operator.ask_pace(1.0)
     start = time.perf_counter()
     if meshcat is not None:
         meshcat.StartRecording(frames_per_second=cell.scenario.visualization.recording_fps)
-    finished_at, has_panel, person = np.inf, cell.diagram.HasSubsystemNamed("operator_panel"), cell.person
+    finished_at, has_panel, operator = np.inf, cell.diagram.HasSubsystemNamed("operator_panel"), cell.operator
     next_at, pictures = dict.fromkeys(LOOKS, 0.0), PictureWait()
     precedence: Callable[[bool], None] = _no_precedence
 
@@ -170,7 +176,7 @@ def run_cell(
 
     def watch(root: Context) -> EventStatus:
         nonlocal finished_at
-        if person.holds and not person.ends and not _process_on(cell, root) and cell.job.can_stand(root):
+        if operator.holds and not operator.ends and not _process_on(cell, root) and cell.job.can_stand(root):
             if run.clock is None or run.clock.stands or not _commanded(cell, root):
                 _stand(run, progress)
             else:
@@ -241,18 +247,18 @@ def _tell(run: Run[JobOf], root: Context, progress: Progress) -> None:
 
 
 def _stand(run: Run[JobOf], progress: Progress) -> None:
-    """Keep the arm at rest and the Diagram's time where it is until the person lets the job go on, or ends it."""
-    person = run.cell.person
+    """Keep the arm at rest and the Diagram's time where it is until the operator lets the job go on, or ends it."""
+    operator = run.cell.operator
     phase, share = run.cell.job.stage(run.root, run.phases)
-    progress(f"held by a person ({phase}). {KEYS}", share)
+    progress(f"held by an operator ({phase}). {KEYS}", share)
     run.held_by_person += 1
-    person.stands = True
+    operator.stands = True
     try:
-        while person.holds and not person.ends:
+        while operator.holds and not operator.ends:
             run.cell.station.robot.rest()
-            time.sleep(PERSON_CHECK_S)
+            time.sleep(OPERATOR_CHECK_S)
     finally:
-        person.stands = False
+        operator.stands = False
     progress(phase, share)
     if run.clock is not None:
         run.clock.go_on()

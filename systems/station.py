@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource
 
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
@@ -21,21 +21,18 @@ from weldcal.models.workpieces.plate import make_workpiece, seeded_groove_error
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Background, Inline, OwnProcess
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
-from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
 from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND, PlacedArm
-from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
+from weldcal.systems.drivers.simulated.world import SimulatedWorld, WorldSetup, build_world
 from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.config import TabletTruth
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Message
 from weldcal.systems.recording.answers import RepeatedBackground
 from weldcal.systems.recording.player import Playback, add_player
-from weldcal.systems.scenario.arm import corrected_arm, nominal_arm
+from weldcal.systems.scenario.parts import corrected_arm, made, nominal_arm, part_of, surroundings_of
 from weldcal.systems.scenario.schema import Scenario, WorkpieceConfig
-from weldcal.systems.scenario.surroundings import surroundings_of
-from weldcal.systems.scenario.workpiece import made, part_of
 from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
 
@@ -153,12 +150,12 @@ class CheatPoses(LeafSystem):
         output.SetFromVector(self._poses.Eval(context)[self._flange] @ self._tool.X_FT @ self._tool.p_TW)
 
 
-class Furnish(Protocol):
-    """The signature of Job.furnish, which adds a job's objects to the simulated world."""
+class SetUpWorld(Protocol):
+    """The signature of Job.set_up_world, which adds a job's objects to the simulated world."""
 
     def __call__(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
-    ) -> Furnishing:
+    ) -> WorldSetup:
         """Draw the furnishing with the run's random numbers."""
 
 
@@ -166,14 +163,14 @@ def make_station(
     scenario: Scenario,
     seed: int,
     robot: PreparedRobot | None = None,
-    furnish: Furnish | None = None,
+    set_up_world: SetUpWorld | None = None,
     played: Playback | None = None,
 ) -> Station:
     """Build the station of a scenario; all random deviations of the simulated world follow from `seed`.
 
-    `robot` is an already prepared robot; None: the driver in the scenario prepares it. `furnish` is the job's method.
-    `played`: ports of a recording take the place of all devices.
-    A station without simulated devices has no simulated world: the arm is displayed at its measured joints.
+    `robot` is an already prepared robot; None: the driver in the scenario prepares it. `set_up_world` is the job's
+    method. `played`: ports of a recording take the place of all devices. A station without simulated devices has no
+    simulated world: the arm is displayed at its measured joints.
 
     Ports: in `arm.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `arm.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
@@ -192,7 +189,7 @@ def make_station(
         robot = prepare_robot(scenario.robot, nominal_arm(scenario), np.deg2rad(scenario.home_deg))
     opened: list[Closable] = []
     try:
-        return _make_station(scenario, seed, robot, furnish, opened, played)
+        return _make_station(scenario, seed, robot, set_up_world, opened, played)
     except BaseException:
         robot.close()
         for device in opened:
@@ -204,7 +201,7 @@ def _make_station(
     scenario: Scenario,
     seed: int,
     robot: PreparedRobot,
-    furnish: Furnish | None,
+    set_up_world: SetUpWorld | None,
     opened: list[Closable],
     played: Playback | None,
 ) -> Station:
@@ -219,11 +216,11 @@ def _make_station(
     build = StationBuild(
         builder=builder, arm=robot.arm, tool=tool, q_start=robot.q_start, rng=rng, robot=robot, closables=opened
     )
-    furnishing = Furnishing()
+    setup = WorldSetup()
     world, true_arm = None, controller
     if any(config.SIMULATED for config in devices.values()):
-        furnishing = Furnishing() if furnish is None else furnish(scenario, rng, real, X_BP)
-        true_arm, true_second = scenario.robot.true_arm(controller, robot.q_start, rng), furnishing.second
+        setup = WorldSetup() if set_up_world is None else set_up_world(scenario, rng, real, X_BP)
+        true_arm, true_second = scenario.robot.true_arm(controller, robot.q_start, rng), setup.second
         if true_second is not None:
             of_second = scenario.robot_2.true_arm(true_second.arm, true_second.q_start, rng)
             true_second = dc.replace(true_second, arm=of_second)
@@ -236,21 +233,21 @@ def _make_station(
             table=table_in_base(scenario),
             workpiece=real,
             X_BP=X_BP,
-            fittings=furnishing.fittings,
+            fittings=setup.fittings,
             second=true_second,
-            foot=furnishing.foot,
-            profiler=furnishing.profiler,
-            time_step_s=furnishing.time_step_s,
+            foot=setup.foot,
+            profiler=setup.profiler,
+            time_step_s=setup.time_step_s,
             surroundings=surroundings,
-            contacts_read=furnishing.contacts_read,
+            contacts_read=setup.contacts_read,
         )
-        build.parts = (world, *furnishing.parts)
+        build.parts = (world, *setup.parts)
     X_LC = None
     if played is not None:
         add_player(played, build)
     for name, config in devices.items():
-        if name == "robot_2" and furnishing.second is not None:
-            _apply_second_robot(config, furnishing.second, build)
+        if name == "robot_2" and setup.second is not None:
+            _apply_second_robot(config, setup.second, build)
             continue
         placed = apply_driver_config(config, build)
         if name == "scanner" and world is not None:  # only a simulation knows the truth
@@ -263,7 +260,7 @@ def _make_station(
         workpiece=real if world is not None else None,
         tablet=build.find(TabletTruth),
         X_LC=X_LC,
-        X_BD=None if furnishing.second is None else furnishing.second.X_BD,
+        X_BD=None if setup.second is None else setup.second.X_BD,
         profiler=build.find(ProfilerTruth),
         scanner=build.find(TrueScanner),
         arm=None if world is None else true_arm,
@@ -271,7 +268,7 @@ def _make_station(
     _export(build, world, truth, scenario, surroundings)
     diagram = builder.Build()
     diagram.set_name("station")
-    second = None if furnishing.second is None else furnishing.second.arm
+    second = None if setup.second is None else setup.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
     background: Background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
     if played is not None:

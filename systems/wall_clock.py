@@ -45,12 +45,12 @@ class LostTime:
 
 LATE_S = 0.020  # of robot time: a longer delay is not made up for
 LIMITS_MS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # upper limits of the histogram's bins; the last bin has none
-ON_TIME_MS = 4.0
+ON_TIME_MS = 4.0  # one period of the commands, and a limit of the histogram's bins
 # The path's rate falls from 1 at SLOW_FROM_S late by 1 per SLOW_SPAN_S, no faster than FALL_PER_S, and rises by
 # RISE_PER_S. A computer that manages half of the rate then settles 4 ms late, within one period of the commands.
 SLOW_FROM_S, SLOW_SPAN_S = 0.0015, 0.005
 FALL_PER_S, RISE_PER_S = 25.0, 2.0  # moves are at most 1 rad/s: a fall adds 25 rad/s^2 to them, and the link allows 40
-SLOWEST = 0.1
+SLOWEST = 0.1  # a choice: above zero, so that a late computer still ends its job, in at most ten times as long
 # The servo needs pictures and detections: where this computer makes them late the path is slowed too.
 PICTURE_LATE_S, PICTURE_SPAN_S = 0.025, 0.100
 # A robot that waits for its cell gives it time for a picture, too: each tick at most so long for one this old, and no
@@ -112,8 +112,8 @@ class WallClock:
     with the speed slider. A single delay of more than LATE_S is never made up for, because a robot executes commands
     when they arrive: the Diagram goes on from where it is. Lateness is in robot time: `late_s` is the maximum while the
     arm was commanded to move, `thinking_s` the maximum while it was at rest, where computing time is not limited.
-    `reanchored` counts the delays of more than LATE_S during motion, and `lost_s` is their sum. `held`: a person wants
-    the path to stand still.
+    `reanchored` counts the delays of more than LATE_S during motion, and `lost_s` is their sum. `held`: an operator
+    wants the path to stand still.
     """
 
     def __init__(

@@ -9,7 +9,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 
@@ -18,7 +18,7 @@ AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Wiring:
-    """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers; `person` may hold
+    """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers; `operator` may hold
     and end the run (None: a recording is played back).
 
     `read` and `driven` are the ports of the station that the cell reads, and the sources of those that it drives, by
@@ -30,7 +30,7 @@ class Wiring:
     scenario: Scenario
     seed: int = 0
     meshcat: Meshcat | None = None
-    person: Person | None = None
+    operator: Operator | None = None
     read: dict[str, OutputPort] = field(default_factory=dict)
     driven: dict[str, OutputPort] = field(default_factory=dict)
 

@@ -1,4 +1,4 @@
-"""A headless Chromium without a network: opens a page as a person would and tells what it saw."""
+"""A headless Chromium without a network: opens a page as an operator would and tells what it saw."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Browser:
         return self._driver.execute_cdp_cmd(command, parameters)
 
     def text(self) -> str:
-        """What a person can read on the page."""
+        """What an operator can read on the page."""
         return str(self.run("return document.body.innerText"))
 
     def console_messages(self, level: str = "SEVERE") -> list[str]:
@@ -119,7 +119,7 @@ class Browser:
         return [name for name in names if not name.startswith(("data:", "blob:"))]
 
     def dark(self, wanted: bool) -> None:
-        """Shows pages as a person with a dark (or light) desktop sees them."""
+        """Shows pages as an operator with a dark (or light) desktop sees them."""
         features = [{"name": "prefers-color-scheme", "value": "dark" if wanted else "light"}]
         self._driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
 

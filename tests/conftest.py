@@ -104,7 +104,7 @@ class FinishedRun:
 
 
 def run_weldcal(*arguments: str, folder: Path, timeout_s: float = 1200) -> FinishedRun:
-    """Runs a weldcal command with --json in a process of its own, as a person would."""
+    """Runs a weldcal command with --json in a process of its own, as an operator would."""
     command = [sys.executable, "-P", "-m", "weldcal.tools", *arguments, "--json"]
     finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=timeout_s)
     lines = finished.stdout.splitlines()

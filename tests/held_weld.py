@@ -1,4 +1,4 @@
-"""A short weld that a person holds in its middle for a moment, on any robot, and what came of it."""
+"""A short weld that an operator holds in its middle for a moment, on any robot, and what came of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.systems.cell import build_cell
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.recording.tap import OpenSink
 from weldcal.systems.runner import Run, run_cell
 from weldcal.systems.scenario.loading import load_scenario
@@ -51,17 +51,17 @@ class HeldWeld:
 
 def held_weld(scenario: Scenario, open_sink: OpenSink | None = None) -> HeldWeld:
     """Weld, hold once the torch has come to HELD_AT_M, and go on."""
-    person, live = Person(), LiveView()
-    cell = build_cell(scenario, 0, person=person, live=live, open_sink=open_sink)
+    operator, live = Operator(), LiveView()
+    cell = build_cell(scenario, 0, operator=operator, live=live, open_sink=open_sink)
 
     def beside() -> None:
         while not (live.weld and live.weld[-1].torch_on and live.weld[-1].s_torch > HELD_AT_M):
             time.sleep(0.002)
-        person.hold("a test")
-        while not person.stands:
+        operator.hold("a test")
+        while not operator.stands:
             time.sleep(0.002)
         time.sleep(HELD_S)
-        person.go_on()
+        operator.go_on()
 
     threading.Thread(target=beside, daemon=True).start()
     run = run_cell(cell)

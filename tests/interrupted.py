@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.models.result_files import UNFINISHED
-from weldcal.tools.worlds.fleet_cells import write_cell
+from weldcal.tools.worlds.doctor import write_cell
 
 STARTED = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]  # as tools/run does
 MARK = "WELDCAL_INTERRUPTED"

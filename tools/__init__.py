@@ -1,1 +1,1 @@
-"""What a person or CI runs: the command line, benchmarks, studies, reports."""
+"""What an operator or CI runs: the command line, benchmarks, studies, reports."""

@@ -66,7 +66,7 @@ def calibrate(
 
     Returns:
         `.result.X_BC` (pose of the camera in the robot's base, m), `.result.covariance` (6, 6), `.result.held_out_mm`,
-            and more.
+        and more.
 
     Raises:
         InputError, TooFewPoses: the data cannot be used; the message says what to change.
@@ -131,7 +131,7 @@ def read_calibration(file: str | Path) -> CalibrationResult:
 
     Returns:
         `.X_BC` (X_FC of a scanner on the flange has the same name), `.covariance` (6, 6); `.correct(points_C)` corrects
-            scanned points.
+        scanned points.
 
     Raises:
         InputError: there is no calibration, or it cannot be read.
@@ -169,8 +169,8 @@ def hand_eye(
 
     Returns:
         `.poses` by letter (X: the camera on what carries it, Y: the target), `.covariance`, `.held_out`,
-            `.unobservable`. `.warnings` name
-        another reading of the matrices than the usual one, and the rows that were left out.
+        `.unobservable`. `.warnings` name another reading of the matrices than the usual one, and the rows that were
+        left out.
 
     Raises:
         InputError: poses that cannot be used, contradict each other, or do not determine the answer.

@@ -70,7 +70,7 @@ def emit_summary(title: str, rows: Mapping[str, str]) -> None:
 
 MOST_NAME = 26
 WHOLE = ("p[", "weldcal ", "[[")
-"""Beginnings of lines that a person copies: they stay whole."""
+"""Beginnings of lines that an operator copies: they stay whole."""
 
 
 def summary_lines(name: str, text: str, column: int, wide: int) -> list[str]:
@@ -109,7 +109,7 @@ NAMES = {
     "fell_behind": "note",
     "slowed_to_percent": "slowest rate of the path (%)",
     "slowed_s": "time added by slowing (s)",
-    "held_by_person": "times held by a person",
+    "held_by_person": "times held by an operator",
 }
 """Printed names of the numbers of the JSON object whose keys are too short."""
 

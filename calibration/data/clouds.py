@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.cloud_files.body import CloudError, cloud_stream
+from weldcal.calibration.data.cloud_files.body import CloudError, CloudForm, cloud_stream, measured
 from weldcal.calibration.data.cloud_files.depth import (
     IMAGES,
     back_projected,
@@ -19,8 +19,6 @@ from weldcal.calibration.data.cloud_files.depth import (
     is_depth_array,
     read_depth_image,
 )
-from weldcal.calibration.data.cloud_files.form import CloudForm
-from weldcal.calibration.data.cloud_files.grid import measured
 from weldcal.calibration.data.cloud_files.pcd import read_pcd
 from weldcal.calibration.data.cloud_files.ply import read_ply
 from weldcal.models.array_files import read_npy, read_npz

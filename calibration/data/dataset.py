@@ -32,10 +32,17 @@ from weldcal.calibration.data.clouds import NO_NOTES, CloudError, cloud_id, endi
 from weldcal.calibration.data.header import DatasetHeader, PoseForm, Units, without_cloud_form
 from weldcal.calibration.data.poses.bag import ENDINGS as RECORDINGS
 from weldcal.calibration.data.poses.bag import find_bag, read_bag
-from weldcal.calibration.data.poses.form import PoseList
-from weldcal.calibration.data.poses.pairing import find_clouds, pair
 from weldcal.calibration.data.poses.readings import PoseReading
-from weldcal.calibration.data.poses.source import files_of_poses, find_poses, is_plain, metric_poses, read_poses
+from weldcal.calibration.data.poses.source import (
+    PoseList,
+    files_of_poses,
+    find_clouds,
+    find_poses,
+    is_plain,
+    metric_poses,
+    pair,
+    read_poses,
+)
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -289,7 +296,6 @@ def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str,
         hashes[path.name] = digest(path)
     for id, points in recorded.items():
         hashes[f"clouds/{id}"] = hashlib.sha256(np.ascontiguousarray(points).tobytes()).hexdigest()
-    note = f"{bag.name}: {len(X)} scans at rest, {found.read_as}."
     poses = {id: _rigid(pose) for id, pose in zip(found.ids, X, strict=True)}
     clouds = {id: bag / id for id in found.ids}
     return Dataset(
@@ -301,7 +307,7 @@ def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str,
         refused=found.refused,
         hashes=hashes,
         recorded=recorded,
-        notes=(note,),
+        notes=(f"{bag.name}: {len(X)} scans at rest, {found.read_as}.",),
     )
 
 

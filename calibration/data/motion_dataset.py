@@ -17,12 +17,12 @@ from weldcal.calibration.data.checks import (
     digest,
     metric_cloud,
     read_header,
+    read_rows,
     table_rows,
     unit_quaternion,
 )
 from weldcal.calibration.data.clouds import NO_NOTES, CloudError, cloud_id, ending_of, find_cloud, save_cloud
 from weldcal.calibration.data.header import DatasetHeader, Units, without_cloud_form
-from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import pose
 from weldcal.models.arms.chain import chain_poses, is_urdf

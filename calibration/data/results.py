@@ -106,7 +106,7 @@ class CalibrationResult:
 
         Returns:
             The corrected points (..., 3) m; the same points where the result has no `scanner_correction`. NaN stays
-                NaN.
+            NaN.
         """
         correction = correction_from_document(self.scanner_correction)
         points = np.asarray(points_C, dtype=float)

@@ -14,7 +14,7 @@ EXPONENTS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1,
 TERMS = {1: 3, 2: 6, 3: 10}
 """How many terms a correction of that order has."""
 
-LARGEST = 0.05
+LARGEST = 0.05  # a choice: 25 times the usual scale error; at half of it a poor scanner would be refused
 """A factor farther from 1 is no property of a scanner that measures."""
 LOOSE = np.array([0.03, 0.3, 0.3])
 """Standard deviations of scale and gradient that keep poses on one spot solvable, and a gradient that no circle

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from weldcal.calibration.doctor.case import DoctorCase
-from weldcal.calibration.geometry.rigid import drawn_triples, fit_rigid, fit_rigid_sets
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import drawn_triples, exp_rotation, fit_rigid, fit_rigid_sets, skew
 from weldcal.models.arrays import Array
 
-NU = 6.0
+NU = 6.0  # degrees of freedom of Student's t, a choice between heavy tails (3) and normal noise (30)
 FLOOR_M, FLOOR_RAD = 2e-5, 3e-4  # below any arm and scanner
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 2e-2])  # what scanners err: scale, and its gradients over x, y and z (1/m)
 _STEPS = 25

@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, joint_angles
 from weldcal.calibration.errors import DatasetError, FlangeNotFound, InconsistentPoses
-from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges
+from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeGuess
-from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.arms.chain import Chain, chain_capsules, chain_frames, known_chains, load_chain
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
@@ -124,7 +124,7 @@ def see_with_arm(
         except (CloudError, FlangeNotFound) as e:
             refused.append((id, e.reason))
     shown = replace(data, clouds={id: data.clouds[id] for id in guesses}, refused=tuple(refused))
-    again = see_flanges(shown, standard, guesses=guesses, seed=seed)
+    again = fit_flanges(shown, standard, guesses=guesses, seed=seed)
     return replace(again, data=replace(again.data or data, clouds=data.clouds, refused=data.refused)), start
 
 

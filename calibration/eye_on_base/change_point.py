@@ -17,17 +17,16 @@ from weldcal.models.errors import InputError
 FALSE_ALARM = 1e-4  # of recordings without a change in which one is named, by the F-test alone
 LEAST_PART = 4  # poses before and after
 _LEAST = 9  # poses in all: with fewer, 12 unknowns of two poses and 3 of the scanner leave nothing to test with
-_LARGER_THAN = (
-    3.0  # sigmas per axis of one pose: a smaller shift is arm and scanner, which repeat no better over a field
-)
+# sigmas per axis of one pose: a smaller shift is arm and scanner, which repeat no better over a field
+_LARGER_THAN = 3.0
 _LEAST_SHIFT_M = 1e-4  # a smaller one is within what arms repeat to, and no reason to refuse a recording
 _SCANNER_ORDERS = ((14, 2), (_LEAST, 1))  # from how many poses on the scanner's own error is left open to which order
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 0.02, 0.02, 0.02])  # what the factors of a scanner are off (1, 1/m, 1/m^2)
 _CANDIDATES = 60  # places looked at first
 _FINER = 10  # times finer are the places near the best
 _SAME_M, _SAME_RAD = 5e-3, 1e-2  # starts so near to each other lead to the same fit
-_HUBER = 2.0
-_FLOOR_M = 1e-6
+_HUBER = 2.0  # sigmas, as in the calibration (solve.py)
+_FLOOR_M = 1e-6  # as in solve.py: below any scanner or arm, keeps exact data from dividing by zero
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

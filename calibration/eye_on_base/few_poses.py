@@ -21,7 +21,8 @@ from weldcal.models.arrays import Array
 ENOUGH = 4
 """Poses from which on a calibration needs no such help."""
 
-_TURN_KNOWN_RAD = float(np.radians(0.1))  # as well as a calibration from many poses states it, and as a person would
+_TURN_KNOWN_RAD = float(np.radians(0.1))  # as well as a calibration from many poses states it, and as an operator would
+# radius of the hole circle of ISO 9409-1-50; on one of twice the size the sigma is stated twice too large
 _HOLE_CIRCLE_M = 0.025
 _TURN_STATED = (
     "The rotation about the flange's axis is as stated with --axis-turn: a degree of error there turns the scanner by a"

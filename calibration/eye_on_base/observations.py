@@ -14,16 +14,15 @@ from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.poses.readings import CHANGES, PoseReading
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound, InconsistentPoses
-from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import nearest_rotation
-from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
-CHANCE = 1e-6
+CHANCE = 1e-6  # a choice: a wrong refusal in a million; a factor of two moves the limit by less than 10 %
 """Chance that the right reading is rejected in favour of a wrong one."""
 FEWEST = 5
 _KEPT = 0.7  # share of the scans that must agree: the others may be outliers
@@ -53,7 +52,7 @@ class FlangeObservations:
     """The dataset with its poses as the scans say that they are to be read; None for pairs."""
 
 
-def see_flanges(
+def fit_flanges(
     data: Dataset,
     standard: FlangeStandard,
     *,

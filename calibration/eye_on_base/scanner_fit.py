@@ -18,8 +18,7 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.compiled_rotation import cross_rows, rotation_of
-from weldcal.calibration.geometry.robust import chi2_share
+from weldcal.calibration.geometry.robust import chi2_share, cross_rows, rotation_of
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
@@ -27,7 +26,7 @@ from weldcal.models.compiled import compiled
 LEAST_PATTERNS = 6
 STARTS = 30  # random starts of an estimate: these observations are cleared of gross outliers
 _MARGIN_M = 0.03  # a face reaches so far about its centre: there, too, a bend was seen
-_USUAL_SPREAD_M = 1e-4
+_USUAL_SPREAD_M = 1e-4  # a choice: between a good arm (0.05 mm) and the recorded ones (0.15 mm); it only weighs scans
 # how far a hole circle may differ from what motion shows: the maker's pitch circle is trusted to 25 micrometres on 50
 # mm, and a circle sees a distortion of higher order in one place, motion sees it over the whole field
 CIRCLE_OWN = np.array([5e-4, 3e-3, 3e-3])

@@ -14,10 +14,8 @@ from scipy.special import gammaincinv
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.compiled_rotation import cross_rows, rotation_of
-from weldcal.calibration.geometry.rigid import drawn_triples, fit_all_rigid_sets, fit_rigid_sets, fit_rotation
-from weldcal.calibration.geometry.robust import chi2_quantile, f_quantile
-from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.geometry.robust import chi2_quantile, cross_rows, f_quantile, rotation_of
+from weldcal.calibration.geometry.se3 import drawn_triples, fit_all_rigid_sets, fit_rigid_sets, fit_rotation, skew
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
@@ -28,13 +26,13 @@ Flags = NDArray[np.bool_]
 
 _GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion at the rim of its field reaches five
 _WIDEST_GATE = 10.0  # so many times wider at most, where three spare numbers or fewer set the scale
-_HUBER = 2.0
+_HUBER = 2.0  # sigmas per axis, a choice: 99 % of least squares' information on a normal axis; 1.0 keeps 90 %
 _START_POSES = 500  # at most: more do not make a start better
 _HELD_OUT_FITS = 100  # at most, so that the time grows with the number of poses and not with its square
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _WORST_TILT_RAD = 0.17  # of the normals' median: no arm, scanner or fit is ten degrees off
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
-_NORMAL_FLOOR_RAD = 1e-6
+_NORMAL_FLOOR_RAD = 1e-6  # below any scanner or arm, as _POSITION_FLOOR_M
 USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
 """What robot and scanner together are off, an axis, where too few scans show it: as on the recorded arms."""
 

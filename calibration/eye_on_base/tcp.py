@@ -9,29 +9,28 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.geometry.robust import f_tail
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, skew
 from weldcal.models.arrays import Array
 
 FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone
 _SHORTEST_M = 2e-3  # twice what arms are off: a joint's zero error looks like a TCP of a millimetre
-_ARM_M = 5e-4
+_ARM_M = 5e-4  # a choice: a maker's calibration usually leaves 0.4 mm; half would name joint errors as a TCP
 """What arms err systematically per coordinate (1 mm a point).
 
 However such errors are spread over the poses, they move the offset by no more than the norm of its row of the
 pseudo-inverse times theirs: a weak geometry makes much of little.
 """
 _UNKNOWN_M = 5e-3  # one sigma of an axis from which on it is not known
-_SURE_SIGMAS = 4.0
+_SURE_SIGMAS = 4.0  # a choice: 6 in 100,000 normal draws lie beyond; at 2 one in 22 does
 _LEAST_FREE = 5  # spare numbers of the test
 _SCANNER_ORDERS = ((12, 2), (7, 1), (0, 0))
 """From how many poses on the scanner's own error is left open to which power of x, y and z: a scale error looks like a
 TCP along z where every pose faces the scanner. Depth is among them: triangulation errs with its square, time of flight
 in waves over it."""
 _GATE = 6.5  # sigmas of a pose that takes no part, as in the calibration
-_USUAL_SPREAD_M = 1e-4
-_SINGULAR = 1e-6
+_USUAL_SPREAD_M = 1e-4  # as in scanner_fit.py
+_SINGULAR = 1e-6  # a choice between rounding (1e-15) and real motions, of columns of unit length
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,14 @@ from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import t_quantile
-from weldcal.calibration.published.algorithm1 import Cost, algorithm1_start, algorithm1_step, translation_cost
-from weldcal.calibration.published.icp import VerificationError, Verifier
+from weldcal.calibration.published.algorithm1 import (
+    Cost,
+    VerificationError,
+    Verifier,
+    algorithm1_start,
+    algorithm1_step,
+    translation_cost,
+)
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 

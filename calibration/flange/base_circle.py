@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import CircleFitError, FlangeNotFound, PlaneFitError
-from weldcal.calibration.flange.edge_labels import refine_circle
+from weldcal.calibration.flange.edge_labels import RayModel, refine_circle
+from weldcal.calibration.flange.face import coverage, plane_axes
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess
-from weldcal.calibration.flange.rays import RayModel
-from weldcal.calibration.flange.rim import coverage, plane_axes
 from weldcal.calibration.flange.search import window_about
 from weldcal.calibration.geometry.circle import CircleFit, fit_circle
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, local_planes
@@ -21,7 +20,7 @@ Mask = NDArray[np.bool_]
 _TILT_RAD = 0.2  # between the guessed normal and a plane that is tried
 _UPWARD_RAD = 0.4  # and the normal of a pixel's neighbourhood, which noise turns
 _NORMAL_PX = 2
-_FLAT_M = 8e-4
+_FLAT_M = 8e-4  # of a plane, a choice: a few times a scanner's noise at 2 m; half misses a noisy ring
 _PLANES = 6  # flat things about a robot's foot, its table among them
 _STEP_M = 0.004  # what lies so far below the ring is off it
 _SIDE_PX = 3  # pixels that a scanner may lose at the ring's edge

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import CircleFitError
+from weldcal.calibration.flange.face import plane_axes
 from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.flange.search import typical_pitches, window_about
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.models.arrays import Array

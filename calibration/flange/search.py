@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.flange.face import FaceRefusal, FlangeFace, FlangeFitConfig
-from weldcal.calibration.flange.rim import plane_axes
+from weldcal.calibration.flange.face import FaceRefusal, FlangeFace, FlangeFitConfig, plane_axes
 from weldcal.calibration.flange.window import measure_window
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import CircleFitError
-from weldcal.calibration.flange.edge_labels import refine_pair
+from weldcal.calibration.flange.edge_labels import pinhole_rays, pinhole_window, refine_pair
 from weldcal.calibration.flange.face import (
     FaceMeasurements,
     FaceRefusal,
@@ -16,10 +16,9 @@ from weldcal.calibration.flange.face import (
     clear_band,
     judge,
     lowered_by,
+    plane_axes,
     thickness,
 )
-from weldcal.calibration.flange.rays import pinhole_rays, pinhole_window
-from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, plane_steps, shared_noise
 from weldcal.calibration.geometry.robust import TUKEY
@@ -37,7 +36,7 @@ _BLOCK = 4  # pixels a side; what such a block's middle says of the ring and the
 _BEFORE_M = 0.002  # what stands so far before the face hides it and says nothing of its edge
 _LABELLED = 1.2  # pitches about an edge whose pixels place it
 _SHARED = 1.3  # variance of a labelled edge over the expected one, as in the window of a search
-_RING_SEEN = 0.6
+_RING_SEEN = 0.6  # as in window.py
 _FLAT_M = 3e-4  # rms of a face from its plane; a rougher one is for the careful way
 _EDGE_POINTS = 240  # crossings that place a circle well enough to look at the pixels about it
 _THREE = np.ones((3, 3), np.uint8)

@@ -9,7 +9,7 @@ from weldcal.models.flanges import get_flange
 
 _FLANGE = "iso9409-1-50-4-m6"
 _WIDTH, _DISTANCE_M = 220, 0.6
-_NOISE_M = 3e-5
+_NOISE_M = 3e-5  # a choice: any noise of a good scanner takes the paths of the fit that are to be compiled
 
 
 @cache

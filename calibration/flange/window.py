@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
-from weldcal.calibration.flange.edge_labels import refine_circle
+from weldcal.calibration.flange.edge_labels import RayModel, refine_circle
 from weldcal.calibration.flange.face import (
     FaceMeasurements,
     FaceRefusal,
@@ -17,10 +17,9 @@ from weldcal.calibration.flange.face import (
     clear_band,
     judge,
     lowered_by,
+    plane_axes,
     thickness,
 )
-from weldcal.calibration.flange.rays import RayModel
-from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
 from weldcal.models.arrays import Array
@@ -32,6 +31,7 @@ _PLANE_POINTS = 4000
 _FLAT_M = 3e-4  # rms of a face from its plane that a scanner's own distortion may leave
 _FLAT_NOISE = 2.5  # and in multiples of its noise: a ball bends more
 _BEFORE_M = 0.002  # what stands so far before the face hides it and says nothing of its edge
+# share of the ring that counts at least, scanned or not: with _HOLLOW, 0.42 of it must be face; a choice
 _RING_SEEN = 0.6
 _LABELLED = 1.2  # pitches about an edge whose pixels place it; farther ones say nothing that nearer ones do not
 _LABEL_SECTORS = 24  # of a thinned scan's edge: each with points on both sides of it, or none of its points counts

@@ -16,7 +16,7 @@ Single = NDArray[np.float32]
 
 _FEW = 1200  # points that find the plane, before all of them make it precise
 _FEW_COMPILED = 600  # the same in the compiled fit
-_ONE, _ZERO = np.float32(1.0), np.float32(0.0)
+_ONE = np.float32(1.0)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,9 @@
-"""Robust statistics for compiled loops: Tukey's and the MAD's constants, a median, a small Cholesky solution."""
+"""Robust statistics, and what compiled loops need besides: a median, a small Cholesky solution, rotations."""
+
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtr, chdtri, fdtrc, fdtri, gammaincinv, stdtrit
 
 from weldcal.models.arrays import Array
@@ -103,3 +106,25 @@ def radius_95(S: Array) -> float:
     mean, square = float(np.trace(S)), float(np.trace(S @ S))
     freedom = mean**2 / square if square > 0.0 else 3.0
     return float(np.sqrt(chi2_quantile(0.95, freedom) * mean / freedom))
+
+
+@compiled()
+def cross_rows(J: Array, v: NDArray[np.floating[Any]], weight: float) -> None:
+    """Set the first three columns of J (3, columns) to -skew(v), v (3,), times the weight: how v turns; the diagonal
+    stays."""
+    J[0, 1], J[0, 2], J[1, 2] = weight * v[2], -weight * v[1], weight * v[0]
+    J[1, 0], J[2, 0], J[2, 1] = -weight * v[2], weight * v[1], -weight * v[0]
+
+
+@compiled()
+def rotation_of(w: NDArray[np.floating[Any]]) -> Array:
+    """Rotation (3, 3) of a rotation vector (3,) rad (Rodrigues)."""
+    angle = np.sqrt(w @ w)
+    S = np.zeros((3, 3))
+    cross_rows(S, w, -1.0)
+    if angle < 1e-4:
+        first, second = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0
+    else:
+        first, second = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2
+    R: Array = np.eye(3) + first * S + second * (S @ S)
+    return R

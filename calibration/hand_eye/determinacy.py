@@ -7,11 +7,10 @@ from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import CoplanarPoses, PureTranslation, RepeatedPoses, TooFewPoses
 from weldcal.calibration.geometry.se3 import log_rotation, nearest_rotation
-from weldcal.calibration.hand_eye.linearisation import RANK
-from weldcal.calibration.hand_eye.problem import NAMES, Problem, State
+from weldcal.calibration.hand_eye.problem import NAMES, RANK, Problem, State
 from weldcal.models.arrays import Array
 
-SAME_TURN_RAD = 2e-3
+SAME_TURN_RAD = 2e-3  # 0.1 deg, a choice: above what arms repeat to (1e-4), below any turn taken on purpose
 SAME_PLACE_SHARE = 2e-3  # of the extent of the motion
 NO_TURN_RAD = float(np.radians(0.5))
 OPEN = 0.1  # predicted standard deviation, rad or share of the extent, at which a direction counts as open
@@ -31,7 +30,7 @@ class Diversity:
     position_spread: tuple[float, float, float]
 
     def sentence(self) -> str:
-        """One line for a person."""
+        """One line for an operator."""
         a, b, c = self.turn_spread_deg
         return (
             f"{self.n} poses, {self.distinct} distinct; largest turn {self.turn_deg:.1f} deg; spread of the turns "

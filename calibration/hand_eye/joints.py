@@ -10,11 +10,19 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import IDENTITY, flange_poses, inverse, log_rotation, mean_pose
-from weldcal.calibration.hand_eye.linearisation import TINY, inverse_information
 from weldcal.calibration.hand_eye.mountings import chain as mounted
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
-from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, full_problem, linearise, residuals
+from weldcal.calibration.hand_eye.problem import (
+    NAMES,
+    TINY,
+    Problem,
+    State,
+    full_problem,
+    inverse_information,
+    linearise,
+    residuals,
+)
 from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     HandEyeHeldOut,
@@ -30,7 +38,7 @@ from weldcal.models.errors import InputError, WeldcalError
 KINDS = ("joints", "links")
 _STEP = 1e-3  # of the prior's standard deviation, for the differences by the robot's errors
 _STEPS = 25
-_SETTLED = 1e-7
+_SETTLED = 1e-7  # of a sigma, and of a variance: a choice far below what is printed; it costs a step or two
 _SAME_M, _SAME_RAD = 5e-3, float(np.radians(0.5))  # a factory calibration moves the flange by no more
 _CHANCE = 2.6  # standard errors by which held-out errors must fall: 1 in 200 by chance
 _COLUMN_LOSS = 0.01  # how much worse one column may get while the other gets better

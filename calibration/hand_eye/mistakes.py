@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.poses.readings import PoseReading, apply_change
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
-from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.pairs.conventions import ReadingAgreement
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import LEAST_SCALE, SCALE_SIGMA, decided
-from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, residuals
+from weldcal.calibration.hand_eye.problem import Problem, full_problem, inverse_information, linearise, residuals
 from weldcal.calibration.hand_eye.repeats import one_per_pose
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.models.arrays import Array

@@ -12,9 +12,9 @@ from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 
-SAME_RAD = 5e-4
+SAME_RAD = 5e-4  # 0.03 deg, a choice: above what arms repeat to (1e-4), below any turn taken on purpose
 """Angle up to which two robot poses are one."""
-SAME_SHARE = 5e-4
+SAME_SHARE = 5e-4  # a choice: as the angle, at a lever of the extent
 """Distance up to which two robot poses are one, as a share of the extent of the motion."""
 _GROSS = 8.0  # sigma of a sample: a repeat beyond it is not averaged with the others
 

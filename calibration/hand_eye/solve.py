@@ -1,7 +1,7 @@
 """Solves AX = XB, AX = YB and AXB = YCZ, with covariance, held-out errors and unobservable directions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,7 @@ from weldcal.calibration.hand_eye.determinacy import (
     with_open_directions,
     without_drift,
 )
-from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, residuals
+from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, full_problem, residuals
 from weldcal.calibration.hand_eye.repeats import one_per_pose
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
@@ -140,7 +140,7 @@ def solve_ax_xb(A: ArrayLike, B: ArrayLike, config: HandEyeConfig | None = None)
     """
     a, b = as_poses(A, "A"), as_poses(B, "B")
     _same_length(a, b)
-    problem = _problem(a, inverse(b), None, None, (True, False, False), tied=True)
+    problem = full_problem(a, inverse(b), free=(True, False, False), tied=True)
     return solve_problem(problem, config=config, equation="AX = XB")
 
 
@@ -160,7 +160,7 @@ def solve_ax_yb(
     a, b = as_poses(A, "A"), as_poses(B, "B")
     _same_length(a, b)
     # inv(A) Y B = X: the measured pose stands where the residual is seen
-    problem = _problem(inverse(a), b, None, _covariances(covariance, len(a)), (True, True, False))
+    problem = full_problem(inverse(a), b, covariance=_covariances(covariance, len(a)))
     result = solve_problem(problem, config=config, equation="AX = YB", labels=labels)
     return _renamed(result, {"X": "Y", "Y": "X"})
 
@@ -182,7 +182,7 @@ def solve_axb_ycz(
     a, b, c = as_poses(A, "A"), as_poses(B, "B"), as_poses(C, "C")
     _same_length(a, b)
     _same_length(a, c)
-    problem = _problem(a, b, c, _covariances(covariance, len(a)), (True, True, True))
+    problem = full_problem(a, b, c, free=(True, True, True), covariance=_covariances(covariance, len(a)))
     given = tuple(
         (np.asarray(x.GetAsMatrix4()), np.asarray(y.GetAsMatrix4()), np.asarray(z.GetAsMatrix4())) for x, y, z in starts
     )
@@ -373,26 +373,7 @@ def _why_not_rigid(M: Array) -> str:
     return "the columns of its 3 x 3 part must have length 1 and be at right angles."
 
 
-def _problem(
-    F: Array, G: Array, H: Array | None, covariance: Array | None, free: tuple[bool, bool, bool], tied: bool = False
-) -> Problem:
-    n = len(F)
-    H = np.broadcast_to(IDENTITY, (n, 4, 4)) if H is None else H
-    return Problem(
-        F=F,
-        G=G,
-        H=H,
-        full=np.ones(n, dtype=bool),
-        normal=np.zeros(n, dtype=bool),
-        covariance=covariance,
-        free=free,
-        tied=tied,
-    )
-
-
 def _renamed(result: HandEyeResult, names: dict[str, str]) -> HandEyeResult:
-    from dataclasses import replace
-
     def swap(name: str) -> str:
         return names.get(name, name)
 

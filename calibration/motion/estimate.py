@@ -15,11 +15,9 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
 from weldcal.calibration.errors import InconsistentPoses, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.motion.clock import FrameClock, arrival_clock, choose_clock
 from weldcal.calibration.motion.clock_fit import DRIFT, EDGE, OFFSET, ROLLING, TARGET, ClockFit, fit_clock
-from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.calibration.motion.start import Start, search_start
-from weldcal.calibration.motion.start_in_hand import search_in_hand
+from weldcal.calibration.motion.observed import FrameClock, ObservedFrames, arrival_clock, choose_clock
+from weldcal.calibration.motion.start import Start, search_in_hand, search_start
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 

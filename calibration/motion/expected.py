@@ -1,20 +1,107 @@
-"""Predicts what a planned motion will tell of X_BC and of the scanner's clock."""
+"""Motions of a robot through waypoints, and what they will show of X_BC and of the scanner's clock."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform
+from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.motion.clock import arrival_clock
-from weldcal.calibration.motion.clock_fit import OFFSET, MotionProblem, linearised
-from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.data.motion_dataset import RobotStream
+from weldcal.calibration.geometry.se3 import pose, skew
+from weldcal.calibration.motion.clock_fit import OFFSET, MotionProblem, Variances, frame_weights, linearised
+from weldcal.calibration.motion.observed import ObservedFrames, arrival_clock
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.motion.variances import Variances, frame_weights
+from weldcal.models.arms.chain import chain_poses, load_chain
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+
+ROBOT = "ur10e"
+SPEED, ACCELERATION = 0.25, 1.2  # m/s, m/s^2
+PAUSE_S = 0.1  # a choice: a controller's settling between two moves
 
 _FEWEST = 6
 _LARGEST = 1e6  # sigmas beyond this are of directions that the motion does not show at all
+
+
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """Moves between waypoints ``q`` (n, J) rad, one after the other and round again: each trapezoidal in one path
+    parameter, straight in joints (moveJ) or in space (moveL); ``lengths`` (n,) m are those of the paths of the
+    flange."""
+
+    q: Array
+    poses: Array
+    lengths: Array
+    linear: bool
+    speed: float = SPEED
+
+    def at(self, t: Array) -> Array:
+        """Flange poses X_BF (..., 4, 4) at times (...) s, exact."""
+        k, s = self._progress(np.ravel(t))
+        j = (k + 1) % len(self.q)
+        if not self.linear:
+            X = chain_poses(load_chain(ROBOT), self.q[k] + s[:, None] * (self.q[j] - self.q[k]))
+        else:
+            R = Rotation.from_matrix(self.poses[:, :3, :3])
+            turn = (R[k].inv() * R[j]).as_rotvec()
+            p = self.poses[:, :3, 3]
+            X = pose((R[k] * Rotation.from_rotvec(s[:, None] * turn)).as_matrix(), p[k] + s[:, None] * (p[j] - p[k]))
+        return X.reshape(*np.shape(t), 4, 4)
+
+    def joints(self, t: Array) -> Array:
+        """Joint angles (N, J) rad of a moveJ at times (N,) s."""
+        k, s = self._progress(t)
+        return np.asarray(self.q[k] + s[:, None] * (self.q[(k + 1) % len(self.q)] - self.q[k]))
+
+    def _progress(self, t: Array) -> tuple[np.ndarray, Array]:
+        """Which move, and the share 0..1 of it done."""
+        ramp = self.speed / ACCELERATION
+        cruise = self.lengths / self.speed - ramp
+        duration = 2.0 * ramp + cruise + PAUSE_S
+        ends = np.cumsum(duration)
+        t = np.mod(t, ends[-1])
+        k = np.minimum(np.searchsorted(ends, t, side="right"), len(ends) - 1)
+        x = t - (ends - duration)[k]
+        c = cruise[k]
+        up = 0.5 * ACCELERATION * np.minimum(x, ramp) ** 2
+        steady = self.speed * np.clip(x - ramp, 0.0, c)
+        y = np.clip(x - ramp - c, 0.0, ramp)
+        return k, (up + steady + self.speed * y - 0.5 * ACCELERATION * y**2) / self.lengths[k]
+
+
+def closed_moves(way: Array, *, linear: bool) -> Moves:
+    """Moves through waypoints (n, J) rad and back to the first one."""
+    chain = load_chain(ROBOT)
+    poses = chain_poses(chain, way)
+    after = np.roll(np.arange(len(way)), -1)
+    steps = np.linspace(0.0, 1.0, 200)
+    lengths = np.linalg.norm(poses[after, :3, 3] - poses[:, :3, 3], axis=1)
+    if not linear:
+        for k in range(len(way)):
+            path = chain_poses(chain, way[k] + steps[:, None] * (way[after[k]] - way[k]))[:, :3, 3]
+            lengths[k] = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    return Moves(way, poses, lengths, linear)
+
+
+def recorded_stream(
+    moves: Moves,
+    duration_s: float,
+    rng: np.random.Generator,
+    *,
+    rate: float = 500.0,
+    jitter_s: float = 1e-4,
+    joints: bool = False,
+) -> RobotStream:
+    """The robot's stream: times late by an exponential law of mean ``jitter_s``, numbers rounded to six digits."""
+    t = np.arange(0.0, duration_s, 1.0 / rate)
+    told = np.round(t + jitter_s * rng.exponential(size=len(t)) - jitter_s, 6)
+    order = np.argsort(told, kind="stable")
+    if joints:
+        q = np.round(moves.joints(t), 6)
+        return RobotStream(told[order], chain_poses(load_chain(ROBOT), q)[order], q[order], ROBOT)
+    X = moves.at(t)
+    X[:, :3, 3] = np.round(X[:, :3, 3], 6)
+    return RobotStream(told[order], X[order], None, ROBOT)
 
 
 @dataclass(frozen=True)

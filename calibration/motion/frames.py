@@ -12,10 +12,8 @@ from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.motion_dataset import FrameTime, MotionDataset
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
-from weldcal.calibration.motion.clock import choose_clock
-from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.calibration.motion.start import search_start
-from weldcal.calibration.motion.start_in_hand import search_in_hand
+from weldcal.calibration.motion.observed import ObservedFrames, choose_clock
+from weldcal.calibration.motion.start import search_in_hand, search_start
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
@@ -35,7 +33,7 @@ _ROUGH_M, _SLANT = 3e-4, 1.0
 Tell = Callable[[float], None]
 
 
-class FramesSeen:
+class FittedFrames:
     """Fits of the frames of a recording: ``observed`` as arrays, ``fits`` by id, and (id, reason) of those
     ``refused``."""
 
@@ -89,7 +87,7 @@ def see_frames(
     X_BC: RigidTransform | None = None,
     seed: int = 0,
     tell: Tell = lambda fraction: None,
-) -> FramesSeen:
+) -> FittedFrames:
     """Fit the flange in every frame.
 
     Some frames, spread over the recording, are searched whole. They give a first X_BC and delay, and with them the
@@ -97,7 +95,7 @@ def see_frames(
     ``X_BC``: pose to begin with. An inverted ``motion`` is that of a fixed target before a scanner on the flange.
     Deterministic for ``seed``. Raises TooFewPoses where too few frames show the flange to begin.
     """
-    seen = FramesSeen(data)
+    seen = FittedFrames(data)
     finder = _Finder(data, standard, seed)
     X_start = None if motion.inverted else X_BC or data.X_BC_guess
     reach = _RADIUS * standard.outer_m
@@ -139,7 +137,7 @@ class _Finder:
     def __init__(self, data: MotionDataset, standard: FlangeStandard, seed: int) -> None:
         self.data, self.standard, self.config = data, standard, replace(IN_MOTION, seed=seed)
 
-    def fit(self, id: str, near: FlangeGuess | None, seen: FramesSeen, *, whole: bool) -> bool:
+    def fit(self, id: str, near: FlangeGuess | None, seen: FittedFrames, *, whole: bool) -> bool:
         """Fit one frame; the reason of a refusal is noted."""
         try:
             points = self.data.cloud(id)
@@ -160,7 +158,7 @@ class _Finder:
 class _Prediction:
     """Where the flange is in each frame, from a first X_BC and delay."""
 
-    def __init__(self, data: MotionDataset, motion: ContinuousMotion, seen: FramesSeen) -> None:
+    def __init__(self, data: MotionDataset, motion: ContinuousMotion, seen: FittedFrames) -> None:
         observed = seen.observed
         clock = choose_clock(observed)
         start = (
@@ -203,7 +201,7 @@ def _scattered(n: int) -> Array:
     return np.asarray(np.mod(np.arange(n) * 0.6180339887498949, 1.0))
 
 
-def _nothing(seen: FramesSeen, tried: int) -> str:
+def _nothing(seen: FittedFrames, tried: int) -> str:
     reasons = Counter(reason for _, reason in seen.refused)
     common = reasons.most_common(1)[0][0] if reasons else "there are too few frames"
     return (

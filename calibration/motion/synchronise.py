@@ -6,9 +6,8 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
-from weldcal.calibration.motion.clock import FrameClock, choose_clock
 from weldcal.calibration.motion.clock_fit import DRIFT, OFFSET, ClockFit, fit_clock
-from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.motion.observed import FrameClock, ObservedFrames, choose_clock
 from weldcal.calibration.motion.start import EARLIEST_S, LATEST_S
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
@@ -17,7 +16,7 @@ _STEP_S, _FINE_S = 0.01, 0.001
 _MOST_FRAMES = 150
 _FEWEST = 12
 _SHOWN = 4.0  # times its own least: a spread of residuals that rises so much over the delays shows the clock
-_LEAST_SHOWN_M = 2e-3
+_LEAST_SHOWN_M = 2e-3  # a choice: the scatter of arm and scanner at 0.15 mm, ten times over
 _WORST_S = 0.01  # a less certain offset is not used
 
 

@@ -9,8 +9,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
-from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, lowest_point, occludes, self_distance
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import (
+    LinkCapsule,
+    Surroundings,
+    arm_bodies,
+    lowest_point,
+    occludes,
+    self_distance,
+)
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
 from weldcal.models.arms.urdf import Capsule

@@ -16,9 +16,8 @@ from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_fla
 from weldcal.calibration.geometry.robust import radius_95
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.hand_eye.determinacy import check_poses, determinacy, with_open_directions
-from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.mountings import TargetObservation
-from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, linearise
+from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, inverse_information, linearise
 from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     HandEyeHeldOut,
@@ -59,7 +58,7 @@ class Circle:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenCircle:
+class ObservedCircle:
     """One scan with the circle: the arms' joints and expected view, the observation, and the visible share of the
     circle's edge."""
 
@@ -118,7 +117,7 @@ class _Fit:
 
 def see_circle(
     points_C: Array, belief: MountingScene, label: str, q: Array, q_2: Array | None, circle: Circle
-) -> SeenCircle:
+) -> ObservedCircle:
     """Find the circle in a cloud, (H, W, 3) or (N, 3) m, near its predicted place.
 
     Raises FlangeNotFound with the reason.
@@ -133,11 +132,11 @@ def see_circle(
     )
     own = block_diag(fit.normal_sigma**2 * np.eye(3), R.T @ fit.center_covariance @ R)  # for an arc it is not isotropic
     observation = belief.observation(q, q_2, fit.center_C, fit.normal_C, _FIT_SHARE**2 * own)
-    return SeenCircle(label, MountingPose(q, q_2, X_CR), observation, fit.coverage)
+    return ObservedCircle(label, MountingPose(q, q_2, X_CR), observation, fit.coverage)
 
 
 def off_prediction(
-    belief: MountingScene, seen: SeenCircle, correction: ScannerCorrection | None
+    belief: MountingScene, seen: ObservedCircle, correction: ScannerCorrection | None
 ) -> tuple[float, float]:
     """Distance (m) and angle (rad) of a seen circle from where a calibration expects it."""
     p, n = seen.observation.p_CM, seen.observation.n_CM
@@ -154,7 +153,7 @@ def fewest(scene: MountingScene) -> int:
     return 2 + 2 * (len(scene.mounting.unknowns) - len(scene.known))
 
 
-def solve_mounting(scene: MountingScene, seen: Sequence[SeenCircle], *, folds: int = 0) -> MountingResult:
+def solve_mounting(scene: MountingScene, seen: Sequence[ObservedCircle], *, folds: int = 0) -> MountingResult:
     """Solve for the unknown poses and the scanner's correction with all observations.
 
     Maximum a posteriori. Unknown poses have no prior. Factors of the correction are held to what scanners are usually
@@ -262,7 +261,7 @@ class _Data:
         )
 
 
-def _data(scene: MountingScene, seen: Sequence[SeenCircle]) -> _Data:
+def _data(scene: MountingScene, seen: Sequence[ObservedCircle]) -> _Data:
     p = np.array([s.observation.p_CM for s in seen])
     low, high = p.min(axis=0) - _FIELD_M - scene.radius_m, p.max(axis=0) + _FIELD_M + scene.radius_m
     poses = tuple(s.pose for s in seen)
@@ -323,7 +322,7 @@ def _fitted(data: _Data, state: State, scene: MountingScene | None) -> _Fit:
     return fit
 
 
-def _own(seen: SeenCircle) -> Array:
+def _own(seen: ObservedCircle) -> Array:
     """Covariance (5, 5) that the fit of a circle states: normal, centre."""
     C = seen.observation.covariance
     return np.zeros((5, 5)) if C is None else C[np.ix_([0, 1, 3, 4, 5], [0, 1, 3, 4, 5])]
@@ -387,12 +386,12 @@ def expected_error(scene: MountingScene, result: MountingResult) -> tuple[float,
 
 
 def expected_after(
-    scene: MountingScene, result: MountingResult, seen: Sequence[SeenCircle], left: Sequence[MountingPose]
+    scene: MountingScene, result: MountingResult, seen: Sequence[ObservedCircle], left: Sequence[MountingPose]
 ) -> Array:
     """Expected errors (k,) m, rms, of a point at the best distance after one more scan at each of k poses."""
     state, own = _state(result, scene.state), np.median([_own(s) for s in seen], axis=0)
     views = [scene.observation(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in left]
-    data = _data(scene, [SeenCircle("", pose, view, 1.0) for pose, view in zip(left, views, strict=True)])
+    data = _data(scene, [ObservedCircle("", pose, view, 1.0) for pose, view in zip(left, views, strict=True)])
     links, stops = _links(scene, left, state)
     J = _rows(data, state, result.correction)[1]
     W = np.linalg.inv(own + stops + np.diag(_REST**2) + links @ np.swapaxes(links, 1, 2))

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, skew
-from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
 from weldcal.calibration.hand_eye.mountings import Mounting
-from weldcal.calibration.hand_eye.problem import Problem, State, linearise
+from weldcal.calibration.hand_eye.problem import Loss, Noise, Problem, Scaled, State, linearise
 from weldcal.calibration.hand_eye.solve import HandEyeResult, as_transform
 from weldcal.models.arms.chain import Chain, chain_inverse
 from weldcal.models.arms.inverse import inverse_kinematics

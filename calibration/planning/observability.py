@@ -10,9 +10,9 @@ from weldcal.calibration.errors import CoplanarPoses, RepeatedPoses, TooFewPoses
 from weldcal.calibration.geometry.se3 import rotation_vector, skew
 from weldcal.models.arrays import Array
 
-SAME_PLACE_M = 0.002
-MIN_DEPTH_M = 0.002
-MIN_DEPTH_SHARE = 0.01
+SAME_PLACE_M = 0.002  # a choice: above what arms repeat to (0.1 mm), below any move on purpose
+MIN_DEPTH_M = 0.002  # a choice: as SAME_PLACE_M, ten times the usual spread of 0.15 mm
+MIN_DEPTH_SHARE = 0.01  # a choice: centres flatter than 1 : 100 fix what lies across them 100 times worse
 HIDDEN_BIAS_M = 0.0005  # a bias known this well is not worth a sentence
 SHIFT_LIKE_M = 0.005  # one known worse than this is as good as unknown
 

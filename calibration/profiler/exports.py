@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.columns import columns_of
 from weldcal.calibration.data.poses.listing import Listing
-from weldcal.calibration.data.poses.names import number_of
+from weldcal.calibration.data.poses.names import columns_of, number_of
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.text import table_lists
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.profiler.gocator import gocator_profiles, is_gocator
 from weldcal.calibration.profiler.motion import Floats
-from weldcal.calibration.profiler.text_blocks import NumberRows, blocks_of
+from weldcal.calibration.profiler.text_blocks import NumberRows, blocks_of, gocator_profiles, is_gocator
 from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_NUMBER, MOST_COLUMNS, read_text, require_short_numbers
 
@@ -40,7 +38,7 @@ _UNIT = re.compile(r"(.*?)[ _.]*(?<![a-zµμ])[\[(]?(m|mm|cm|µm|μm|um|inch)[\]
 _KEYS = re.compile(r"(?i)(scan_?line|profiles?|points?|line|xz|data)")
 _REPEATED = 5  # rows with one and the same pose that make a profile
 _RAW = 1e5  # integers beyond it are raw heights, in units of 0.01 micrometres
-_RAW_MM = 1e-5
+_RAW_MM = 1e-5  # 0.01 micrometres, see _RAW
 _EVEN = 0.02  # of the step: columns of x are evenly spaced
 _FEWEST_COLUMNS = 8  # of a grid of heights
 

@@ -12,7 +12,7 @@ from weldcal.models.errors import InputError
 
 Floats = NDArray[np.float64]
 
-ORTHONORMAL = 1e-6
+ORTHONORMAL = 1e-6  # a choice: six printed digits of a matrix leave half of it
 SAME_ROTATION_RAD = 1e-4  # orientations of a group differ by less: a robot holds one to a hundredth of this
 
 

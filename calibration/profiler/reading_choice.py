@@ -17,7 +17,7 @@ from weldcal.calibration.profiler.sphere.joint import sphere_optima
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import WeldcalError
 
-CHANCE = 1e-6
+CHANCE = 1e-6  # as for readings of a dataset (eye_on_base/observations.py)
 """Chance that the right reading is rejected in favour of a wrong one."""
 _KEPT = 0.7  # share of the scans that must agree: the others may be outliers
 _FLOOR_M = 2e-6  # printed digits

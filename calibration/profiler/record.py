@@ -31,8 +31,7 @@ class ProfilerRecord:
 
     Attributes:
         rotation (3, 3), translation (3,) m: X_FS; covariance (6, 6) [rotation in F; translation] or None (paper's
-            methods).
-        affine (3,), origin (2,) m: the sensor's correction; tip (3,) m in F or None.
+            methods). affine (3,), origin (2,) m: the sensor's correction; tip (3,) m in F or None.
         arm: its table as it was found where joints were corrected, with offsets (4,) rad of joints 2 to 5 and sag (2,)
             rad/m.
         figures: what the command reports of the fit; data_sha256: of the file it came from.

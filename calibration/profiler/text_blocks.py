@@ -1,7 +1,9 @@
-"""Split the text of a profile export into blocks of numbers, each with its header and the caption before it."""
+"""Split text exports of profilers into blocks of numbers with their headers, and read those of LMI Gocator."""
 
+import csv
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,6 +15,10 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _UNIT = re.compile(r"[\[(].{0,6}[\])]|mm|µm|um|m")
 _NOTHING = ("", "-", "--", "---", "invalid", "none", "null", "n/a", "na", "fffffff", "-fffffff")
 _SAMPLE = 200  # lines that decide the separator
+
+SECTIONS = ("RawProfile", "Profile", "Surface", "Part", "SurfaceSection")
+"""Sections that hold profiles, in the order in which they are used."""
+_START = re.compile(r"\A\ufeff?\s*Info\b[ ,]*\r?\n", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,3 +149,178 @@ def blocks_of(text: str, name: str) -> list[NumberRows]:
             caption = " ".join(cells)
     close()
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class GocatorProfiles:
+    """Profiles of one section: points [x, z] (m, 2) mm each, NaN where nothing was measured; names of the columns
+    before the points."""
+
+    section: str
+    points: tuple[Floats, ...]
+    ids: tuple[str, ...]
+    times: Floats | None
+    columns: tuple[str, ...]
+
+
+def is_gocator(text: str) -> bool:
+    """Whether a text begins as the export of a Gocator does."""
+    return _START.match(text[:200]) is not None
+
+
+def gocator_profiles(text: str, name: str) -> GocatorProfiles:
+    """The profiles of an export.
+
+    Raises:
+        InputError: no section with profiles, or one that is damaged; the sentence names the sections.
+    """
+    sections = _sections(text, name)
+    known = {re.sub(r"\s", "", key).lower(): key for key in sections}
+    for section in SECTIONS:
+        key = known.get(section.lower())
+        if key is not None:
+            rows = sections[key]
+            return _frames(rows, key, name) if "profile" in section.lower() else _surface(rows, key, name)
+    raise InputError(
+        f"'{name}' is a Gocator export with the sections {', '.join(list(sections)[:10])}, none of"
+        f" {', '.join(SECTIONS)}. Record in the mode Profile, and export the profiles as CSV."
+    )
+
+
+def _sections(text: str, name: str) -> dict[str, list[list[str]]]:
+    found: dict[str, list[list[str]]] = {}
+    rows: list[list[str]] | None = None
+    cells = 0
+    try:
+        for row in csv.reader(re.split(r"\r\n|\n|\r", text.lstrip("\ufeff"))):
+            row = [c.strip() for c in row]
+            if not any(row):
+                continue
+            if rows is None:
+                rows = found.setdefault(row[0], [])
+            elif row[0].lower() == "end" and not any(row[1:]):
+                rows = None
+            else:
+                rows.append(row)
+                cells += len(row)
+                if cells > MOST_CELLS:
+                    raise InputError(f"'{name}' has more than {MOST_CELLS} cells, the most that are read.")
+    except csv.Error as e:
+        raise InputError(f"'{name}' cannot be read as CSV ({e}).") from e
+    return found
+
+
+def _short(row: list[str]) -> list[str]:
+    """The row without empty cells at its end."""
+    return row[: max((k + 1 for k, c in enumerate(row) if c), default=0)]
+
+
+def _data(rows: list[list[str]], first: str) -> tuple[list[str], list[list[str]]]:
+    """The header that begins with a word, and the rows below it."""
+    for k, row in enumerate(rows):
+        if row[0].lower() == first and "axis" in (c.lower() for c in row):
+            return _short(row), rows[k + 1 :]
+    return [], []
+
+
+def _frames(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
+    header, data = _data(rows, "frame")
+    lower = [h.lower() for h in header]
+    if not header or not data:
+        raise InputError(
+            f"The section {section} of '{name}' has no table with the columns Frame and Axis; export it again."
+        )
+    axis = lower.index("axis")
+    last = len(header) - axis - 1
+    count = _column_count(rows)
+    if section.lower() == "profile" and count not in (None, last):
+        raise InputError(
+            f"The section {section} of '{name}' states {count} columns and names {last}: a decimal comma in its header,"
+            " or a lost column. Export it again with decimal points."
+        )
+    even = len({len(row) for row in data}) == 1  # rows that all end with a comma
+    place = {word: lower.index(word) for word in ("source", "time") if word in lower}
+    frames: dict[str, dict[str, list[str]]] = {}
+    order: list[str] = []
+    for row in data:
+        size = len(row)
+        row = _short(row)
+        if len(row) <= axis:
+            raise InputError(
+                f"A row of the section {section} of '{name}' ends before its column Axis: the file is cut off there."
+            )
+        if len(row) > len(header) or (size > len(header) and not even):
+            raise InputError(
+                f"A row of the section {section} of '{name}' has {size} cells, and its header {len(header)}; export it"
+                " again."
+            )
+        frame = row[0]
+        if frame not in frames:
+            frames[frame] = {}
+            order.append(frame)
+        mark = row[axis].upper()[:1]
+        if mark in frames[frame]:
+            sources = sorted({r[place["source"]] for r in data if len(r) > axis}) if "source" in place else []
+            if len(sources) > 1:
+                raise InputError(
+                    f"'{name}' holds the profiles of the sources {', '.join(sources[:6])}; export one of them."
+                )
+            raise InputError(f"Frame {frame[:20]} of '{name}' has two rows {mark}; keep one.")
+        frames[frame][mark] = row
+    shared = np.array([_number(c, name) for c in header[axis + 1 :]]) if section.lower() == "profile" else None
+    points, times = [], []
+    for frame in order:
+        rows_of = frames[frame]
+        z = rows_of.get("Z")
+        x = rows_of.get("X")
+        if z is None or (x is None and shared is None):
+            raise InputError(
+                f"Frame {frame[:20]} of '{name}' has the rows {', '.join(rows_of)}; a profile needs"
+                f" {'X and Z' if shared is None else 'Z'}."
+            )
+        at = _values(x, axis, last, name) if x is not None else np.zeros(last) if shared is None else shared
+        points.append(np.column_stack([at, _values(z, axis, last, name)]))
+        times.append(_number(z[place["time"]], name) if "time" in place else np.nan)
+    t = np.array(times)
+    return GocatorProfiles(
+        section, tuple(points), tuple(order), t if np.isfinite(t).all() else None, tuple(header[: axis + 1])
+    )
+
+
+def _column_count(rows: list[list[str]]) -> int | None:
+    """The number of columns that a section states."""
+    for head, values in pairwise(rows):
+        stated = dict(zip((c.lower() for c in head), values, strict=False)).get("column count")
+        if stated is not None:
+            return int(stated) if stated.isdecimal() else None
+    return None
+
+
+def _surface(rows: list[list[str]], section: str, name: str) -> GocatorProfiles:
+    """A surface of one frame: x in the first row, y in the first column, heights within."""
+    rows = [_short(row) for row in rows]
+    widest = max((len(r) for r in rows), default=0)
+    begin = next((k for k, r in enumerate(rows) if len(r) == widest and k > 1 and number_in(r[-1]) is not None), None)
+    if begin is None or widest < 6 or len(rows) < begin + 2:
+        raise InputError(f"The section {section} of '{name}' has no table of heights; export it again.")
+    x = np.array([_number(c, name) for c in rows[begin][1:]])
+    points = []
+    for row in rows[begin + 1 :]:
+        z = _values(row, 0, len(x), name)
+        points.append(np.column_stack([x, z]))
+    ids = tuple(row[0] for row in rows[begin + 1 :])
+    return GocatorProfiles(section, tuple(points), ids, None, tuple(rows[0][:9]))
+
+
+def _values(row: list[str], axis: int, count: int, name: str) -> Floats:
+    out = np.full(count, np.nan)
+    cells = row[axis + 1 : axis + 1 + count]
+    out[: len(cells)] = [_number(c, name) for c in cells]
+    return out
+
+
+def _number(cell: str, name: str) -> float:
+    value = number_in(cell)
+    if value is None:
+        raise InputError(f"'{name}' has a cell that is not a number: '{cell[:20]}'.")
+    return value

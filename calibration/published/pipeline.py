@@ -9,9 +9,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.calibration.published.icp import FAILED, VerificationError
+from weldcal.calibration.geometry.se3 import fit_rigid, rotation_vector
+from weldcal.calibration.published.algorithm1 import FAILED, VerificationError
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh

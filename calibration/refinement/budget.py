@@ -14,10 +14,10 @@ from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
 
 MEASURED, SHEET, ASSUMED = "measured", "data sheet", "assumed"
-USUAL_SCALE = 2e-3
+USUAL_SCALE = 2e-3  # what _USUAL of scanner_correction.py takes for a scale's sigma
 """Scale error of a scanner that is not corrected."""
 _USUAL_REPEAT_M = 5e-5  # of an arm without a data sheet
-_WARMING_K = 5.0
+_WARMING_K = 5.0  # a choice: a workshop's day; the row of the budget scales with it
 _EXPANSION = 2.3e-5  # 1/K, aluminium: the links of an arm
 _IT8 = 25.0  # tolerance units of grade 8 (ISO 286-1), which ISO 9409-1 asks of the outer diameter
 

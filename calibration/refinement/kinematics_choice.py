@@ -1,14 +1,20 @@
-"""Decides on errors of the arm by nested held-out errors, and writes the kinematics that follow from them."""
+"""Decide on errors of the arm by nested held-out errors, write its kinematics, and read what a result states."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RollPitchYaw, RotationMatrix
 
+from weldcal.calibration.data.dataset import Dataset, joint_angles
+from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.errors import DatasetError, TooFewPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
 from weldcal.calibration.eye_on_base.joint_fit import solve_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation
@@ -16,9 +22,11 @@ from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.se3 import flange_poses, log_rotation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.calibration.refinement.kinematics_fit import (
     KINDS,
+    ArmErrors,
     FactoryPrior,
     KinematicsFit,
     arm_errors,
@@ -26,23 +34,111 @@ from weldcal.calibration.refinement.kinematics_fit import (
     unsought,
 )
 from weldcal.calibration.refinement.local_field import GAIN
-from weldcal.models.arms.chain import Chain
+from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
+_SAME_M, _SAME_RAD = (
+    1e-4,
+    float(np.radians(0.01)),
+)  # what a controller rounds, and less than a factory calibration changes
+
 LEAST = 12
 """Poses from which on errors of an arm are sought."""
-LEAST_TURN_DEG = 20.0
+LEAST_TURN_DEG = 20.0  # a choice: at 20 deg a lever's error changes by a third of itself
 """Turn between poses from which on they show in more than one orientation."""
-WRONG_FILE = 8.0
+WRONG_FILE = 8.0  # a choice: nominal arms are off by some millimetres, factory files by some tenths
 """Times a factory's errors: the prior of an arm whose kinematics are those of another robot, or nominal."""
 _FOLDS = 10
-_MIXED = (
-    1.5  # growth of a standard deviation by the scanner's factors at which an error counts as not separable from them
-)
+# growth of a standard deviation by the scanner's factors at which an error counts as not separable
+_MIXED = 1.5
 _NAMED = 6  # errors in a sentence; the JSON object has all
 _SHOWN = 0.8  # of the prior: below it the poses have said something
+
+
+def require_joint_angles(data: Dataset, ids: Sequence[str], arm: Chain, stated: Array) -> Array:
+    """Joint angles (n, arm.n) rad that lead the arm to the stated flange poses (n, 4, 4).
+
+    Raises DatasetError without angles, InputError where they lead elsewhere: to another arm, or to one whose controller
+    has a factory calibration of its own.
+    """
+    q = joint_angles(data, ids, arm.n)
+    if q is None:
+        raise DatasetError(
+            f"poses.csv or pairs.csv in '{data.folder.name}' has no joint angles: add the columns q1 to q{arm.n}"
+            " (radians), or omit --refine."
+        )
+    reached = flange_poses(arm, q, np.zeros((arm.n, 6)))
+    off_m = float(np.linalg.norm(stated[:, :3, 3] - reached[:, :3, 3], axis=1).max())
+    turn = log_rotation(np.swapaxes(reached[:, :3, :3], 1, 2) @ stated[:, :3, :3])
+    if off_m > _SAME_M or float(np.linalg.norm(turn, axis=1).max()) > _SAME_RAD:
+        raise InputError(
+            f"The joint angles lead this {arm.name} up to {1e3 * off_m:.2f} mm from the stated poses. A real controller"
+            " computes with the factory calibration of its arm: give that file (--kinematics). Else check the robot's"
+            " name, radians, and that the TCP is zero."
+        )
+    return q
+
+
+def arm_document(fit: KinematicsFit) -> dict[str, Any]:
+    """The errors as plain types for calibration.yaml (rad, m), with the covariance of X_BC, scanner factors and errors
+    / prior."""
+    found = fit.errors
+    return {
+        "names": list(found.names),
+        "which": [int(i) for i in found.which],
+        "prior": [float(v) for v in found.scale],
+        "values": [float(v) for v in fit.values],
+        "sigma": [float(v) for v in fit.sigma],
+        "covariance": [[float(v) for v in row] for row in fit.covariance],
+    }
+
+
+def shared_error(
+    result: CalibrationResult,
+    kinematics: Path,
+    correction: ScannerCorrection | None,
+    observations: Sequence[Observation],
+    q: Array,
+) -> tuple[Array, Array] | None:
+    """Derivatives (n, 3, p) of positions of new scans by what the result estimated, and its covariance (p, p); None
+    where it states none.
+
+    ``observations`` (n) as seen, with the poses that the arm of ``kinematics`` reaches at q (n, joints).
+
+    Raises:
+        InputError: what the result states of its arm cannot be read.
+    """
+    if result.arm_errors is None:
+        return None
+    correction = correction or ScannerCorrection()
+    try:
+        which = np.array(result.arm_errors["which"], dtype=int)
+        scale = np.array(result.arm_errors["prior"], dtype=float)
+        covariance = np.array(result.arm_errors["covariance"], dtype=float)
+        size = 6 + len(correction.values) + len(which)
+        if covariance.shape != (size, size) or scale.shape != which.shape or not np.isfinite(covariance).all():
+            raise ValueError("sizes differ")
+        arm = load_chain(result.robot, kinematics)
+        if which.min() < 0 or which.max() >= 6 * arm.n:
+            raise ValueError("no joint of this arm")
+    except (KeyError, TypeError, ValueError) as problem:
+        raise InputError(
+            "The arm's errors (arm_errors) in the result cannot be read; run 'weldcal calibrate --refine' again."
+        ) from problem
+    errors = ArmErrors(arm, which, scale, tuple(str(i) for i in which))
+    fit = KinematicsFit(
+        X_BC=result.X_BC,
+        correction=correction,
+        u=np.zeros(len(which)),
+        covariance=covariance,
+        sigma_position_m=1.0,
+        sigma_normal_rad=1.0,
+        redundancy=1.0,
+        errors=errors,
+    )
+    return fit.sensitivity(observations, q)[:, :3], covariance
 
 
 @dataclass(frozen=True, eq=False)

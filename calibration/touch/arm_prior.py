@@ -21,7 +21,7 @@ from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-LEAST_OTHER = 0.05
+LEAST_OTHER = 0.05  # a choice: scanner and fit always add some noise; without it the arm's error would be certain
 """Share of the residuals' variance that is always taken as noise."""
 _USUAL_POSTURE = np.radians([-90.0, 110.0, -110.0, -90.0, 0.0])  # of the second joint and the others, over a table
 

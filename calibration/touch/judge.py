@@ -24,17 +24,17 @@ from weldcal.calibration.eye_on_base.stated_error import (
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.kinematics_fit import FactoryPrior
 from weldcal.calibration.refinement.local_field import field_from_document
-from weldcal.calibration.refinement.stated_arm import shared_error
 from weldcal.calibration.touch.arm_prior import arm_effect
 from weldcal.calibration.touch.touches import PLANE, POINT, SPHERE, Touch, require_touches
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-LEVEL = 0.95
-FALSE_ALARM = 0.01
+LEVEL = 0.95  # the usual level of a region, as everywhere in the reports
+FALSE_ALARM = 0.01  # the usual level of a test
 """Of verifications of a calibration as good as it states in which more touches lie outside than the limit allows."""
 _PRIOR = FactoryPrior()
 USUAL_TILT_RAD = float(np.sqrt((6.0 * _PRIOR.offset_rad**2 + 12.0 * _PRIOR.turn_rad**2) / 3.0))
@@ -42,7 +42,7 @@ USUAL_TILT_RAD = float(np.sqrt((6.0 * _PRIOR.offset_rad**2 + 12.0 * _PRIOR.turn_
 each axis."""
 _DRAWS, _SEED = 4000, 1
 _FIELD_LENGTH_M = 0.2  # over which what an arm leaves at another orientation is alike
-_LEAST_FREE = 3.0
+_LEAST_FREE = 3.0  # as in eye_on_base/stated_error.py
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,4 +1,4 @@
-"""Builds an arm's URDF for Drake, with masses, limits, actuators and a simple body, and the capsules around it.
+"""Build an arm's URDF for Drake, with masses, limits and actuators, and the capsules and meshes of its links.
 
 Shapes are drawn in the link frames from the nominal lengths and stop 6 mm short of the flange plane: the flange disc
 itself is a mesh of its own, because calibration measures it. They are visual only; the capsules serve planning.
@@ -9,10 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.models.mesh import TriMesh, revolve
 
 FLANGE_DISC_M = 0.006  # the last millimetres before the flange plane, left to the flange's own mesh
 WRIST_3_RADIUS_M = 0.045  # of the UR10e; see wrist_3_size
@@ -28,6 +30,8 @@ _COLOR_NAMES = {_BODY: "light_grey", _CAP: "blue_grey", _SEAL: "charcoal"}
 _BIG, _ELBOW, _WRIST = 0.076, 0.064, 0.0465
 _SEAL_LENGTH, _SEAL_INSET = 0.004, 0.001
 _DOME = 0.45  # height of a cap over its radius
+
+_SEGMENTS = 192
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,3 +285,40 @@ def _add_visual(link: ET.Element, solid: _Solid) -> None:
 
 def _text(values: ArrayLike) -> str:
     return " ".join(repr(float(v)) for v in np.asarray(values, dtype=np.float64))
+
+
+def link_index(arm: ArmModel, link: str) -> int:
+    """Index of a link of ``arm.link_names``, 0 the base. Raises InputError naming the links."""
+    if link not in arm.link_names:
+        raise InputError(f"The {arm.name} has no link '{link}': use one of {', '.join(arm.link_names[1:])}.")
+    return arm.link_names.index(link)
+
+
+def link_solids(arm: ArmModel, link: int) -> list[TriMesh]:
+    """The closed solids that a link consists of, in its frame, m; they overlap.
+
+    Cylinders and ellipsoids with the published radii and lengths: housings, tubes and caps, without screws and seams.
+    """
+    for element in ET.fromstring(arm_urdf(arm)).iter("link"):
+        if element.get("name") == arm.link_names[link]:
+            return [_placed(visual) for visual in element.iter("visual")]
+    return []
+
+
+def _placed(visual: ET.Element) -> TriMesh:
+    origin, geometry = visual.find("origin"), visual.find("geometry")
+    assert origin is not None
+    assert geometry is not None
+    xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
+    return _solid(geometry[0]).transformed(RigidTransform(RollPitchYaw(rpy), xyz))
+
+
+def _solid(shape: ET.Element) -> TriMesh:
+    if shape.tag == "cylinder":
+        r, half = float(shape.get("radius", "0")), 0.5 * float(shape.get("length", "0"))
+        return revolve(np.array([(0.0, -half), (r, -half), (r, half), (0.0, half)]), _SEGMENTS)
+    a, c = (float(shape.get(key, "0")) for key in "ac")
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)
+    profile = np.column_stack([a * np.cos(angle), c * np.sin(angle)])
+    profile[[0, -1], 0] = 0.0
+    return revolve(profile, _SEGMENTS)

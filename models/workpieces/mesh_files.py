@@ -264,8 +264,7 @@ def regions(mesh: TriMesh) -> tuple[Ints, list[tuple[Floats, Floats, float] | No
 
     Returns:
         The region (M,) of each triangle, and of each region a point, the normal or the axis, and 0 or the radius,
-            negative of a
-        hole; None of a region that is neither.
+        negative of a hole; None of a region that is neither.
     """
     corners, n, area = mesh.vertices[mesh.triangles], mesh.normals, np.linalg.norm(mesh.area_vectors, axis=1)
     pairs, sides = _shared(mesh)

@@ -31,12 +31,12 @@ from pydrake.multibody.tree import (
     UnitInertia,
 )
 
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import Surroundings
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import ToolShape, WeldingTool
 from weldcal.models.tools.enclosing import shape_mesh
-from weldcal.systems.bodies.textured_board import textured_board
+from weldcal.systems.viewer.scene import textured_board
 from weldcal.welding.finger.deformation import TagModel, tag_cells
 
 STEEL = (0.62, 0.64, 0.67, 1.0)

@@ -1,17 +1,23 @@
-"""Base classes of jobs: configuration, checks, planning, and the method that adds a job's systems to a cell."""
+"""Job: the base class of jobs, and the search for those of weldcal and of installed packages."""
 
+import importlib
+import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, OutputPort
 
+import weldcal.systems.jobs as rooms
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import WeldPart
-from weldcal.systems.drivers.simulated.furnishing import Furnishing
+from weldcal.systems.drivers.discovery import plugins
+from weldcal.systems.drivers.simulated.world import WorldSetup
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.motion.spine import MOVE_ACCELERATION, MOVE_SPEED, JobPorts, Spine
 from weldcal.systems.scenario.schema import Scenario
@@ -20,6 +26,7 @@ from weldcal.systems.wiring import Wiring
 
 PlanOf = TypeVar("PlanOf")
 Phases = Sequence[tuple[str, float, float]]
+MODULE = "job"  # jobs/<job>/job.py holds JOB
 
 
 class AddedJob(ABC):
@@ -47,7 +54,7 @@ class AddedJob(ABC):
         return np.array([1.30, -0.68, 0.78]), np.array([0.42, 0.0, 0.42])
 
     def can_stand(self, root: Context) -> bool:
-        """Whether the Diagram's time may stand still now: where a person holds a job that has motion of its own, it
+        """Whether the Diagram's time may stand still now: where an operator holds a job that has motion of its own, it
         rests first."""
         return True
 
@@ -69,11 +76,11 @@ class Job(ABC, Generic[PlanOf]):
     def check(self, scenario: Scenario) -> None:
         """Check this job's part of a scenario, present or not; raises InputError."""
 
-    def furnish(
+    def set_up_world(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
-    ) -> Furnishing:
+    ) -> WorldSetup:
         """The objects that the job adds to a simulated world, besides the true workpiece `part` at X_BP."""
-        return Furnishing()
+        return WorldSetup()
 
     def position_error(self, scenario: Scenario, arm: ArmModel, seed: int) -> LeafSystem | None:
         """A system between the simulated arm and the readers of its joints (see add_spine), or None."""
@@ -86,3 +93,25 @@ class Job(ABC, Generic[PlanOf]):
     @abstractmethod
     def add(self, wiring: Wiring, spine: Spine, plan: PlanOf) -> AddedJob:
         """Add the job's systems and connect them to the spine and the station."""
+
+
+@cache
+def jobs() -> tuple[Job[Any], ...]:
+    """All jobs, sorted by key; the job without a key is the last."""
+    names = [info.name for info in pkgutil.iter_modules(rooms.__path__, rooms.__name__ + ".") if info.ispkg]
+    modules = [importlib.import_module(f"{name}.{MODULE}") for name in names]
+    found = [module.JOB for module in (*modules, *plugins()) if hasattr(module, "JOB")]
+    return tuple(sorted(found, key=lambda job: (not job.key, job.key)))
+
+
+def job_of(scenario: Scenario) -> Job[Any]:
+    """The job of a scenario: the one whose part the scenario contains, else the job without a key.
+
+    Raises:
+        InputError: the scenario has the parts of two jobs.
+    """
+    asked = [job for job in jobs() if job.key and getattr(scenario, job.key, None) is not None]
+    if len(asked) > 1:
+        keys = " or ".join(job.key for job in asked)
+        raise InputError(f"A scenario has one job: move {keys} to another scenario.")
+    return asked[0] if asked else jobs()[-1]

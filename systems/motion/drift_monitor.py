@@ -20,7 +20,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, believed_arm
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 
 SEARCHED_S = 0.3  # by which a frame may come later or earlier than usual
 _APART_S = 0.5  # a frame that is this early is of a clock that was set anew; one this late may be late
@@ -28,7 +28,7 @@ _RELEARN_S = 3.0  # frames that stay so late for so long belong to a clock that 
 _NEVER_S = 5.0  # no frame is so late
 _STEP_S = 0.02  # of the fit's grid of shifts
 _FEWEST, _MOST = 12, 60  # frames
-_CERTAIN_S = 1e-3
+_CERTAIN_S = 1e-3  # half of _CONFIRMED_S: two sigma of a learnt shift are what the test lets a known clock be wrong
 _CONFIRMED_S = 2e-3  # as far as the drift test lets a known clock be wrong
 _REST_M = 1e-4  # by which the feature moves in SEARCHED_S at rest
 _ROUNDS = 8

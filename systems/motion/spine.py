@@ -13,20 +13,20 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import JobCommand, UrStatus
+from weldcal.systems.motion.buffers import PoseRecorder
 from weldcal.systems.motion.flange_mover import FlangeMover
-from weldcal.systems.motion.pose_recorder import PoseRecorder
-from weldcal.systems.person import FASTEST, Person
+from weldcal.systems.operator import FASTEST, Operator
 from weldcal.systems.viewer.kept import keep
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.servo.guards import SlewLimits, slew_limit
 
 HOLD_BUTTON = "Hold the job"
 PACE_SLIDER = "Pace (1 = real time, 0 = as fast as it goes)"
-PERIOD_S = 0.008
+PERIOD_S = 0.008  # two periods of the commands; an operator notices no delay below 0.1 s
 
 
 class OperatorPanel(LeafSystem):
-    """Reads the person's wishes and the controls of the viewer at 125 Hz.
+    """Reads the operator's wishes and the controls of the viewer at 125 Hz.
 
     .. pydrake_system::
 
@@ -36,15 +36,15 @@ class OperatorPanel(LeafSystem):
         - end
         - pace
 
-    `hold` (1) is 1.0 while a person holds the run. `end` (1) is 1.0 once a person has ended it, for good. `pace` (1) is
-    the requested real-time rate, 0 to 3; other values are ignored. A click of the viewer's button holds the run. Any
-    page of this computer's browsers can reach the viewer, so that nothing there may let it go on.
+    `hold` (1) is 1.0 while an operator holds the run. `end` (1) is 1.0 once an operator has ended it, for good. `pace`
+    (1) is the requested real-time rate, 0 to 3; other values are ignored. A click of the viewer's button holds the run.
+    Any page of this computer's browsers can reach the viewer, so that nothing there may let it go on.
     """
 
-    def __init__(self, person: Person, meshcat: Meshcat | None = None, period_s: float = PERIOD_S) -> None:
+    def __init__(self, operator: Operator, meshcat: Meshcat | None = None, period_s: float = PERIOD_S) -> None:
         super().__init__()
-        self._person, self._meshcat = person, None if meshcat is None else keep(meshcat)
-        pace = person.pace or 0.0
+        self._operator, self._meshcat = operator, None if meshcat is None else keep(meshcat)
+        pace = operator.pace or 0.0
         if meshcat is not None:
             meshcat.AddButton(HOLD_BUTTON, "Escape")
             meshcat.AddSlider(PACE_SLIDER, 0.0, FASTEST, 0.1, pace)
@@ -59,22 +59,22 @@ class OperatorPanel(LeafSystem):
     def _read(self, context: Context, discrete: DiscreteValues) -> None:
         clicks, before = discrete.value(self._seen)
         pace = float(discrete.value(self._pace)[0])
-        person = self._person
-        asked = before if person.pace is None else person.pace
+        operator = self._operator
+        asked = before if operator.pace is None else operator.pace
         if self._meshcat is not None:
             if asked != before:
                 self._meshcat.SetSliderValue(PACE_SLIDER, asked)
             slider = self._meshcat.GetSliderValue(PACE_SLIDER)
             pace = slider if 0.0 <= slider <= FASTEST else pace
             if (now := float(self._meshcat.GetButtonClicks(HOLD_BUTTON))) > clicks:
-                person.hold("the 3D view")
+                operator.hold("the 3D view")
             clicks = now
         elif asked != before:
             pace = asked
-        discrete.set_value(self._hold, [float(person.holds)])
+        discrete.set_value(self._hold, [float(operator.holds)])
         discrete.set_value(self._pace, [pace])
         discrete.set_value(self._seen, [clicks, asked])
-        if person.ends:  # for good
+        if operator.ends:  # for good
             discrete.set_value(self._end, [1.0])
 
 
@@ -98,7 +98,7 @@ class ProcessSwitch(LeafSystem):
     arm; `hold` (1) of the operator. `process_on` (1) follows all inputs without delay. The arm's command passes through
     the arbiter and the slew limiter, so the torch is off no later than the first tick in which the arm is commanded to
     stop. A burning torch that the robot's status or the guard turned off stays off for the rest of that weld; after a
-    person's hold the servo asks for it anew, when it is let go and has gone back. `arm_stopped` (1): the guard turned
+    operator's hold the servo asks for it anew, when it is let go and has gone back. `arm_stopped` (1): the guard turned
     it off; the JobSequencer then holds the job.
     """
 
@@ -250,7 +250,7 @@ class SpineArm:
 
 @dataclass(frozen=True, eq=False)
 class Spine:
-    """The shared systems: `hold` (1) is 1.0 while a person holds the run, `end` (1) once a person has ended it;
+    """The shared systems: `hold` (1) is 1.0 while an operator holds the run, `end` (1) once an operator has ended it;
     `switch` outputs `process_on` and `arm_stopped`."""
 
     wiring: Wiring
@@ -340,16 +340,16 @@ def add_spine(
                 error=own_error,
             )
         )
-    hold, end = _person(w)
+    hold, end = _operator(w)
     return Spine(w, tuple(made), hold, end, w.add("process_switch", ProcessSwitch()))
 
 
-def _person(w: Wiring) -> tuple[OutputPort, OutputPort]:
-    """What a person asks for, or asked for in a recording that is played back: to hold, to end."""
+def _operator(w: Wiring) -> tuple[OutputPort, OutputPort]:
+    """What an operator asks for, or asked for in a recording that is played back: to hold, to end."""
     if all(w.station.diagram.HasOutputPort(name) for name in (HOLD, END)):
         return w.out(HOLD), w.out(END)
-    if w.person is None:
+    if w.operator is None:
         return w.zeros("nobody_holds", 1), w.zeros("nobody_ends", 1)
-    panel = w.add("operator_panel", OperatorPanel(w.person, w.meshcat))
+    panel = w.add("operator_panel", OperatorPanel(w.operator, w.meshcat))
     w.read[HOLD], w.read[END] = panel.GetOutputPort("hold"), panel.GetOutputPort("end")
     return w.read[HOLD], w.read[END]

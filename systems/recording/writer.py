@@ -20,15 +20,14 @@ from pydrake.math import RigidTransform
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.messages import CalibrationStatus, Image, Scan
-from weldcal.systems.recording.cdr import IMAGE, POINT_CLOUD, SCHEMAS, write_cloud, write_image
 from weldcal.systems.recording.port_recorder import BEFORE, BOTH, ENTERED, LEFT, PERIOD_S, STAGES, UPDATED
-from weldcal.systems.recording.values import encode
+from weldcal.systems.recording.values import IMAGE, POINT_CLOUD, SCHEMAS, encode, write_cloud, write_image
 
 _Row = tuple[int, np.ndarray]  # key, values
 
 FORMAT: Final = 2
 JOINTS: Final = "arm.position_measured"
-TRANSFORM_PERIOD_S = 0.05
+TRANSFORM_PERIOD_S = 0.05  # a choice: 20 Hz is smooth to watch; only viewers read them, and 10 Hz would halve them
 ROWS_TICKS = 10  # 20 ms between messages of rows; each has the values of all its ticks, and by name those of the newest
 LISTED = 500  # numbers of an array of a result; of a larger one the digest is kept
 MAY_WAIT = 200_000  # messages that wait for the disk; more are a disk that cannot keep up

@@ -16,9 +16,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
 from weldcal.models.workpieces.reading import LARGEST_SIZE_M
 from weldcal.systems.drivers.config import NoDevice
-from weldcal.systems.jobs.discovery import job_of, jobs
+from weldcal.systems.jobs.job import job_of, jobs
+from weldcal.systems.scenario.parts import check_workpiece
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
-from weldcal.systems.scenario.workpiece import check_workpiece
 from weldcal.welding.servo.laws import get_law
 
 POSITIVE = {
@@ -83,7 +83,7 @@ LARGEST_OF_UNIT = {
     "_hz": 10_000,
 }
 """Largest size of any other key that names its unit; the longest unit counts."""
-LARGEST_AT_ALL = 1e9
+LARGEST_AT_ALL = 1e9  # a choice: beyond any quantity of a cell in any unit, and its cube is still finite
 """Largest size of any number."""
 
 
@@ -165,7 +165,7 @@ def check_home(home_deg: list[float], arm: str, key: str = "home_deg") -> None:
             )
 
 
-SLOWEST_FACTOR = 0.05
+SLOWEST_FACTOR = 0.05  # a choice: a job of 1 min takes 20 min at it; a smaller factor is more likely a typing error
 MASS_TOLERANCE_KG = 0.05  # as the pre-flight compares a payload
 BEYOND_REACH_M = 0.7  # torch and half a plate add less than this to an arm's reach
 

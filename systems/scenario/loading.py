@@ -16,7 +16,7 @@ from weldcal.models.files import LARGEST_DOCUMENT, read_text
 from weldcal.models.scanners import get_scanner, is_scanner_file
 from weldcal.systems.drivers.config import DEVICES
 from weldcal.systems.drivers.discovery import default_config, driver_configs
-from weldcal.systems.jobs.discovery import jobs
+from weldcal.systems.jobs.job import jobs
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
 

@@ -38,7 +38,7 @@ VIEW_OF_PHASE = {
 }
 """Which camera shows a phase; the others: the cell."""
 ZOOM = {CELL: 1.0, SCANNER: 1.7, SEAM: 1.0}
-PERIOD_S = 0.1
+PERIOD_S = 0.1  # a choice: 10 Hz is smooth where steps are STEP_M; 20 Hz doubles the messages to each browser
 MOVED_M, STEP_M = 0.01, 0.002
 """Farther than this from where it was put, the user has moved it; the seam's camera moves by such steps."""
 START_M = np.array([(0.0, -3.0, 1.0), (3.0, 0.0, 1.0), (0.0, 0.0, 0.0)])

@@ -20,8 +20,22 @@ from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, PlannedSeam, Scan
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.viewer.kept import keep
-from weldcal.systems.viewer.scene import CIRCLE, CLOUD, CONE, RESIDUAL_MM, UNCERTAINTY, WELDING_PHASES, uncertainty_at
-from weldcal.systems.viewer.shapes import R_SIGN, coloured, diverging, draw_ring, draw_sign, draw_triad, draw_view_cone
+from weldcal.systems.viewer.scene import (
+    CIRCLE,
+    CLOUD,
+    CONE,
+    R_SIGN,
+    RESIDUAL_MM,
+    UNCERTAINTY,
+    WELDING_PHASES,
+    coloured,
+    diverging,
+    draw_ring,
+    draw_sign,
+    draw_triad,
+    draw_view_cone,
+    uncertainty_at,
+)
 from weldcal.systems.viewer.weld_view import WeldView
 from weldcal.systems.wiring import Wiring
 

@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.tool import WeldingTool

@@ -13,8 +13,7 @@ from weldcal.systems.messages import FlangeEstimate
 from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.viewer.kept import keep
-from weldcal.systems.viewer.scene import CIRCLE
-from weldcal.systems.viewer.shapes import draw_ring, draw_triad
+from weldcal.systems.viewer.scene import CIRCLE, draw_ring, draw_triad
 
 ROOT = "/weldcal/drift"
 

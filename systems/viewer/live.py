@@ -19,7 +19,7 @@ from weldcal.systems.viewer.cameras import Views
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.servo.state import Phase
 
-PERIOD_S = 0.1
+PERIOD_S = 0.1  # a choice: values shown are at most this old; half of it doubles the load of the control loop
 ACTIVE = ("TRACK", "COAST", "FINISH", "HELD", "BACK")
 """Phases of the servo in which the torch has a place on the seam."""
 

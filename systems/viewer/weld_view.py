@@ -13,8 +13,7 @@ from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import PlannedSeam
-from weldcal.systems.viewer.scene import CAD, DEFLECTION, DEFLECTION_SCALE, FELT, PLANNED, WAY_BACK, WELDED
-from weldcal.systems.viewer.shapes import coloured
+from weldcal.systems.viewer.scene import CAD, DEFLECTION, DEFLECTION_SCALE, FELT, PLANNED, WAY_BACK, WELDED, coloured
 
 Floats = npt.NDArray[np.float64]
 
@@ -100,7 +99,7 @@ class WeldView:
         self._pieces = piece + 1
 
     def _draw_way_back(self, servo: ServoReport, time: float) -> None:
-        """While a person holds the weld, and until it goes on: the torch's way back to where it goes on."""
+        """While an operator holds the weld, and until it goes on: the torch's way back to where it goes on."""
         way = servo.interruption.way_back
         if bool(way) == self._way_shown:
             return

@@ -28,7 +28,7 @@ HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
 
 
 def weldcal(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Runs the command as a person does."""
+    """Runs the command as an operator does."""
     command = [sys.executable, "-P", "-m", "weldcal.tools", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, timeout=120)
 

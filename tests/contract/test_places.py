@@ -1,4 +1,4 @@
-"""Where measured data are absent a test is skipped on a person's computer, and fails in CI."""
+"""Where measured data are absent a test is skipped on an operator's computer, and fails in CI."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ class Page:
         return how
 
     def _emulated_robot(self, bare: bool) -> None:
-        """Start the emulated robot that takes the place of the real one, once for the page; a person has entered the
+        """Start the emulated robot that takes the place of the real one, once for the page; an operator has entered the
         payload."""
         if "robot" not in self.names:
             self.names["robot"] = EMULATED
@@ -120,7 +120,7 @@ class Page:
             time.sleep(1.0)
 
     def _serve(self, arguments: list[str]) -> None:
-        """Start a server, wait for what it says first, and end it with the page, as a person does."""
+        """Start a server, wait for what it says first, and end it with the page, as an operator does."""
         said = (self.folder / f"server{len(list(self.folder.glob('server*')))}.log").open("w+")
         server = subprocess.Popen(
             process(arguments), cwd=self.folder, env=self.environment, stdout=said, stderr=subprocess.STDOUT,

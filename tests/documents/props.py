@@ -20,7 +20,7 @@ from tests.places import ROOT, SHARED_DATA
 from tests.short_job import SHORT_JOB
 from weldcal.calibration.data.results import save_result
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.calibration.touch.table import touches_text
+from weldcal.calibration.touch.touches import touches_text
 from weldcal.models.arms import ur10e
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arms.urdf import arm_urdf
@@ -98,7 +98,7 @@ def _beam(path: Path) -> None:
 
 
 def _bracket_scan(path: Path) -> None:
-    from weldcal.tools.worlds.parts.scenes import scan_scene, subject
+    from weldcal.tools.worlds.parts.scans import scan_scene, subject
 
     scene = scan_scene(subject("bracket").mesh, get_scanner("phoxi_m", width=412, height=308), 0)
     np.savez(path, points_B=scene.cloud_B, eye_B=scene.eye_B)

@@ -29,13 +29,13 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import JointLimits, Ki
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.drivers.ur.wire.dashboard import ask, stop_program
+from weldcal.systems.drivers.ur.wire.line import ask, stop_program
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe, Value
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.robot.check import emit_table
-from weldcal.tools.emulators.ur.addresses import PORTS, free_address
+from weldcal.tools.commands.robots import emit_table
 from weldcal.tools.emulators.ur.main import HOME
+from weldcal.tools.emulators.ur.process import PORTS, free_address
 
 NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 MOVING = "def foreign():\n  movej([0.5, -1.57, 1.57, -1.57, -1.57, 0], a=1, v=0.05)\nend\n"
@@ -68,7 +68,7 @@ def robot(shared: Emulator) -> Iterator[Emulator]:
 
 
 def weldcal(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Runs the command as a person does."""
+    """Runs the command as an operator does."""
     command = [sys.executable, "-P", "-m", "weldcal.tools", "check-robot", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 

@@ -288,7 +288,7 @@ control.stopScript()
 
 
 def external_client(emulator: Emulator) -> subprocess.Popen[str]:
-    """A client for External Control whose script sender listens on a port of its own, and a person who presses play."""
+    """A client for External Control whose script sender listens on a port of its own, and an operator who presses play."""
     with socket.create_server(("", 0)) as free:
         port = free.getsockname()[1]
     client = start_client(emulator.host, EXTERNAL, str(port))
@@ -297,7 +297,7 @@ def external_client(emulator: Emulator) -> subprocess.Popen[str]:
 
 
 def press_play(emulator: Emulator, port: int) -> None:
-    """What a person does at the pendant, as soon as the client's script sender listens."""
+    """What an operator does at the pendant, as soon as the client's script sender listens."""
     until = time.monotonic() + 20.0
     while True:
         try:

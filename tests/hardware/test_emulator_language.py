@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.events import ScriptStopped
-from weldcal.tools.emulators.ur.controller.modes import SafetyMode
 from weldcal.tools.emulators.ur.controller.poses import matrix, pose_of, rotation_vector
+from weldcal.tools.emulators.ur.controller.registers import SafetyMode, ScriptStopped
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.script.builtins import script_functions
 from weldcal.tools.emulators.ur.script.program import Program

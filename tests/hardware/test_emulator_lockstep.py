@@ -19,7 +19,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import UrLink
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
-from weldcal.tools.emulators.ur.controller.modes import RuntimeState
+from weldcal.tools.emulators.ur.controller.registers import RuntimeState
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, STREAM_PACKAGES, Lockstep
 from weldcal.tools.emulators.ur.wire.net import LinkFaults
 from weldcal.tools.worlds.robot.bench import Bench, CommandThread

@@ -9,7 +9,7 @@ import pytest
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import SafetyMode
+from weldcal.tools.emulators.ur.controller.registers import SafetyMode
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer

@@ -13,7 +13,7 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.registers import RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.main import HOME, narrowed
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.emulators.ur.versions import parse_version

@@ -20,16 +20,15 @@ from weldcal.systems.drivers.ur.link import UrLink
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.run import chosen_robot
-from weldcal.tools.emulators.ur import addresses
-from weldcal.tools.emulators.ur.addresses import PORTS, first_taken, free_address, lock_path
-from weldcal.tools.emulators.ur.process import Emulator, emulator_process
+from weldcal.tools.emulators.ur import process
+from weldcal.tools.emulators.ur.process import PORTS, Emulator, emulator_process, first_taken, free_address, lock_path
 
 
 @pytest.fixture
 def mine(monkeypatch: pytest.MonkeyPatch) -> str:
     """The address that the next emulator of this process would take, away from those that other tests take."""
-    monkeypatch.setattr(addresses, "OWN", f"127.{128 + os.getpid() % 100}.{{}}.{{}}")
-    return addresses.OWN.format(0, 1)
+    monkeypatch.setattr(process, "OWN", f"127.{128 + os.getpid() % 100}.{{}}.{{}}")
+    return process.OWN.format(0, 1)
 
 
 @pytest.fixture(scope="module")

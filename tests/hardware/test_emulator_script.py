@@ -16,10 +16,10 @@ from pydrake.multibody.plant import MultibodyPlant
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.registers import RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.main import HOME
-from weldcal.tools.emulators.ur.script.dynamics import Dynamics, mass_matrix
-from weldcal.tools.emulators.ur.script.lexer import split_programs
+from weldcal.tools.emulators.ur.script.forces import Dynamics, mass_matrix
+from weldcal.tools.emulators.ur.script.parser import split_programs
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 from weldcal.tools.emulators.ur.versions import parse_version

@@ -17,7 +17,7 @@ from tests.hardware.emulator_process import Emulator, emulator_process
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.tools.emulators.ur.controller.dh import dh_parameters
+from weldcal.tools.emulators.ur.controller.poses import dh_parameters
 from weldcal.tools.emulators.ur.wire.rtde_fields import inputs, outputs
 
 

@@ -14,8 +14,7 @@ from weldcal.systems.drivers.ur.wire.transport import NATIVE, UR_RTDE
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, GO, REFUSE, RUNNING, STOP, FaultCase
-from weldcal.tools.worlds.robot.fault_run import recover, run_case
-from weldcal.tools.worlds.robot.sequences import run_sequence
+from weldcal.tools.worlds.robot.fault_run import recover, run_case, run_sequence
 
 CASES = [case for case in RUNNING + AT_START if case.short]
 

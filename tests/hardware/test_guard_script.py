@@ -11,9 +11,9 @@ import pytest
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.robot import guard_script, same_payload
-from weldcal.systems.drivers.ur.torch.set_points import Level
+from weldcal.systems.drivers.ur.set_points import Level
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.registers import RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.versions import parse_version
 

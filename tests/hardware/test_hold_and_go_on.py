@@ -1,4 +1,4 @@
-"""A person holds a move of the emulated arm: it comes to rest on its path, stays, and goes on along it."""
+"""An operator holds a move of the emulated arm: it comes to rest on its path, stays, and goes on along it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from tests.held_weld import held_weld, short_weld
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
@@ -45,24 +45,24 @@ def controller() -> Iterator[Emulator]:
 
 
 def test_the_arm_rests_on_its_path_while_it_is_held_and_then_ends_its_way(controller: Emulator) -> None:
-    described, person, seen = scenario(), Person(), {}
+    described, operator, seen = scenario(), Operator(), {}
     described.robot = UrRtde(host=controller.host, lockstep=True)
 
     def hold_for_a_while() -> None:
         time.sleep(MOVING_S)
-        person.hold()
+        operator.hold()
         time.sleep(0.5 * HELD_S)
         seen["first"] = controller.state()
         time.sleep(0.5 * HELD_S)
         seen["last"] = controller.state()
-        person.go_on()
+        operator.go_on()
 
     def watch(stage: str, _: float) -> None:
         if stage == phase_words("move_home") and not seen:
             seen["begun"] = {}
             threading.Thread(target=hold_for_a_while, daemon=True).start()
 
-    run = run_cell(build_cell(described, person=person), watch)
+    run = run_cell(build_cell(described, operator=operator), watch)
     assert run.reason is None
     assert run.held_by_person == 1
     assert [name for name, _, _ in run.phases] == ["start", "move_home", "park", "done"]

@@ -19,12 +19,12 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import Fault, RobotRefused
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
-from weldcal.systems.drivers.ur.torch.set_points import MASK, VALUE, Level
+from weldcal.systems.drivers.ur.set_points import MASK, VALUE, Level
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.station import make_station
 from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import RuntimeState
+from weldcal.tools.emulators.ur.controller.registers import RuntimeState
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.emulators.ur.versions import parse_version

@@ -17,9 +17,9 @@ from pydrake.systems.framework import Context, Diagram, EventStatus, InputPort, 
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenario
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
-from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY, LOOP_PRIORITY
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.messages import UrStatus
+from weldcal.systems.pacing import CELL_PRIORITY, LOOP_PRIORITY
 from weldcal.systems.station import make_station
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 

@@ -1,4 +1,4 @@
-"""Only regular files of bounded size are read, and whatever else a person hands in is refused in a sentence, at
+"""Only regular files of bounded size are read, and whatever else an operator hands in is refused in a sentence, at
 once."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from weldcal.models.array_files import read_grey_image, read_npy, read_npz
 from weldcal.models.documents import DocumentSection, parse_document, read_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_bytes, read_text, sha256
-from weldcal.tools.worlds.binary_damage import _bomb, _objects
+from weldcal.tools.worlds.damage import _npz_bomb, _objects
 
 READERS: dict[str, Callable[[Path], object]] = {
     "bytes": read_bytes,
@@ -130,7 +130,7 @@ LIAR = npy(np.zeros((4, 3))).replace(b"(4, 3)", b"(9, 3)")
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        (_bomb("points.npy"), "would expand to 2400 MB"),
+        (_npz_bomb("points.npy"), "would expand to 2400 MB"),
         (members(points=LIAR), "its header promises"),
         (members(points=_objects(np.zeros(3))), "object, not plain numbers"),
         (members(points=npy(np.zeros(3, dtype=[("a", "f8")]))), "not plain numbers"),

@@ -18,7 +18,7 @@ from weldcal.calibration.data.results import load_result
 from weldcal.models.errors import InputError
 from weldcal.models.result_files import UNFINISHED, require_whole, whole_result, write_atomic, write_npz
 from weldcal.tools.commands.doctor import examine
-from weldcal.tools.commands.view import find_pages
+from weldcal.tools.commands.replay import find_pages
 from weldcal.welding.record.weld_log import load_weld_log
 
 KILLS = 20

@@ -22,8 +22,8 @@ from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
 from weldcal.calibration.errors import DatasetError, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.motion.estimate import estimate_in_motion
+from weldcal.calibration.motion.expected import ROBOT, Moves, closed_moves, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import ROBOT, Moves, closed_moves, recorded_stream
 from weldcal.models.arms.chain import chain_inverse, load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -33,7 +33,7 @@ from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.mounting_live import calibrate_carried
 from weldcal.tools.worlds.flange_frames import flange_frame
-from weldcal.tools.worlds.moves import SeenFromHand, observed_frames
+from weldcal.tools.worlds.moves import TargetInHand, observed_frames
 
 SECONDS, EVERY = 12.0, 3
 TARGET = "iso9409-1-50-4-m6"
@@ -79,7 +79,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Truth:
     scanner = get_scanner("motioncam_3d_motion", 480)
     scanner = replace(scanner, noise=replace(scanner.noise, sigma_m=1e-4))
     moves, X_FC, X_BT = hand_moves(rng)
-    seen = SeenFromHand(moves, X_BT)
+    seen = TargetInHand(moves, X_BT)
     frames, capture = observed_frames(seen, X_FC, SECONDS, rng, device=True, epoch_s=100.0)
     picked = range(0, len(capture), EVERY)
 
@@ -132,7 +132,7 @@ def test_without_turns_the_pose_is_open() -> None:
     rng = np.random.default_rng(3)
     moves, X_FC, X_BT = hand_moves(rng, lean_deg=0.0, spread_m=0.1)
     shifted = closed_moves(moves.q, linear=True)
-    frames, _ = observed_frames(SeenFromHand(shifted, X_BT), X_FC, 12.0, rng, device=True)
+    frames, _ = observed_frames(TargetInHand(shifted, X_BT), X_FC, 12.0, rng, device=True)
     motion = ContinuousMotion(recorded_stream(shifted, 12.0, rng), inverted=True)
     with pytest.raises(UndeterminedPoses, match="target's"):
         estimate_in_motion(frames, motion, held_out=False)

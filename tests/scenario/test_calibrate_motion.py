@@ -17,7 +17,7 @@ from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.errors import DatasetError, TooFewPoses
-from weldcal.calibration.planning.moves import recorded_stream
+from weldcal.calibration.motion.expected import recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange

@@ -22,7 +22,7 @@ from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.jobs.weld.settings import job_plan
 from weldcal.systems.motion.clear_moves import clear_poses
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
@@ -33,7 +33,7 @@ from weldcal.tools.commands.run import JobRun
 from weldcal.tools.commands.weld import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.report.run import RunOptions
 from weldcal.tools.report.weld import calibration_error, weld_outcome
-from weldcal.tools.worlds.weld.cell_run import figures
+from weldcal.tools.worlds.weld.case import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.
@@ -371,9 +371,9 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
 
 
 def test_a_held_run_keeps_the_share_that_it_had_reached() -> None:
-    person, shares = Person(), []
-    person.end()
-    cell = build_cell(load_scenario("straight_groove", TOLD), person=person)
+    operator, shares = Operator(), []
+    operator.end()
+    cell = build_cell(load_scenario("straight_groove", TOLD), operator=operator)
     found = run_cell(cell, lambda stage, share: shares.append(share))
     assert found.held
     assert max(shares) < 0.5

@@ -1,4 +1,4 @@
-"""A person holds a weld in its middle: still in 0.1 s, finished over the join, and replayed from its recording bit for
+"""An operator holds a weld in its middle: still in 0.1 s, finished over the join, and replayed from its recording bit for
 bit."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The live view in Meshcat, seen by a browser and used by a person's click."""
+"""The live view in Meshcat, seen by a browser and used by an operator's click."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_click_asks_for_a_hold(live: tuple[Meshcat, Cell, Simulator], browser:
     )
     for _ in range(100):  # the click travels over a socket: give it simulated time until it has arrived
         simulator.AdvanceTo(simulator.get_context().get_time() + 0.02)
-        if cell.person.holds:
+        if cell.operator.holds:
             break
-    assert cell.person.holds
-    assert cell.person.held_by == "the 3D view"
+    assert cell.operator.holds
+    assert cell.operator.held_by == "the 3D view"

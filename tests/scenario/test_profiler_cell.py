@@ -21,7 +21,7 @@ from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.jobs.profiler.plan import PlanningContext, plan_touches
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.demo import RUNNERS, kind_of

@@ -25,7 +25,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import verify_dataset
-from weldcal.tools.worlds.wrong_arm import station
+from weldcal.tools.worlds.wrong_models import station
 
 
 @pytest.fixture(scope="module")

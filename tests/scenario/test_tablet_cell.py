@@ -19,7 +19,7 @@ from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
 from weldcal.systems.jobs.tablet.job import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.messages import UrStatus
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import Station
 from weldcal.tools.commands.demo import kind_of, run_procedure

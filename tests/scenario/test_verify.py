@@ -19,7 +19,7 @@ from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result, save_result
 from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
-from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
@@ -94,7 +94,7 @@ def test_scans_the_calibration_never_saw_are_hit_to_a_fifth_of_a_millimetre(veri
 
 def test_the_same_scans_give_the_same_calibration(halves: tuple[Path, Path]) -> None:
     data = load_dataset(halves[0].parent / "even")
-    seen = see_flanges(data, get_flange(data.header.flange))
+    seen = fit_flanges(data, get_flange(data.header.flange))
     again, _ = estimate_jointly(seen.observations, seen.patterns, config=SolveConfig(allow_coplanar=True))
     first = load_result(halves[0])
     assert again.correction is not None

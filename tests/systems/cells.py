@@ -16,7 +16,7 @@ from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
-from weldcal.tools.worlds.perfect_world import perfect
+from weldcal.tools.worlds.scaled_arms import perfect
 
 KNOWN_CAMERA = "X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"
 WELD_ONLY = f"job: {{calibrate: false, {KNOWN_CAMERA}}}"  # no pose planning: such a cell is built in a moment

@@ -1,4 +1,4 @@
-"""Every address that a person may mistype is one sentence; those that exist are taken as they are."""
+"""Every address that an operator may mistype is one sentence; those that exist are taken as they are."""
 
 from __future__ import annotations
 

@@ -19,8 +19,7 @@ from pydrake.systems.framework import Context
 from threadpoolctl import threadpool_info
 
 from weldcal.systems.addresses import AddressError, controller_address
-from weldcal.systems.background import Answer, Background, BackgroundFailed, Inline, OwnProcess
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import Answer, Background, BackgroundFailed, BackgroundSystem, Inline, OwnProcess
 from weldcal.systems.messages import Scan
 
 # functions of installed modules: the process of its own does not know this one

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from weldcal.systems.host_timing import MEASURED_S, TICK_S, HostTiming, HostTooLate, measure_host, require_timely_host
+from weldcal.systems.pacing import MEASURED_S, TICK_S, HostTiming, HostTooLate, measure_host, require_timely_host
 
 
 class Host:

@@ -19,7 +19,7 @@ from pydrake.systems.primitives import LogVectorOutput
 from weldcal.systems.cell import build_cell
 from weldcal.systems.leaf_system import DECLARATIONS, LeafSystem, without_owner
 from weldcal.systems.motion.spine import OperatorPanel
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.viewer.kept import free_unused
@@ -109,7 +109,7 @@ def test_a_cell_that_has_run_is_freed() -> None:
 def test_a_viewer_outlives_its_cell_until_its_own_thread_frees_it() -> None:
     """Drake ends the process where another thread frees a Meshcat."""
     meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
-    panel = OperatorPanel(Person(), meshcat)
+    panel = OperatorPanel(Operator(), meshcat)
     drawn, panels = weakref.ref(meshcat), weakref.ref(panel)
     free_unused()
     assert panels() is panel

@@ -34,14 +34,12 @@ from weldcal.models.flanges import get_flange
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import BackgroundSystem
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
-from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
-from weldcal.systems.drivers.sensors.watch import DeviceWatch
+from weldcal.systems.drivers.sensors.watch import DeviceWatch, OnTrigger
 from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanStream
-from weldcal.systems.drivers.simulated.picture_scene import KnockedStand, PicturePoses
-from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
+from weldcal.systems.drivers.simulated.picture_scene import DisplacedStand, PicturePoses
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
 from weldcal.systems.drivers.simulated.rendered_profiler import (
@@ -52,20 +50,25 @@ from weldcal.systems.drivers.simulated.rendered_profiler import (
 )
 from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
-from weldcal.systems.drivers.simulated.streaming.replay import FrameReplay
-from weldcal.systems.drivers.simulated.streaming.scanner import DepthStream, StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import DepthStream, FrameReplay, StreamingScanner
 from weldcal.systems.drivers.simulated.tablet_world import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
 from weldcal.systems.drivers.ur.touch_probe import ProbeInput, Touches, UrTouchProbeInput
-from weldcal.systems.jobs.motion.collector import MotionCalibrator, MotionCollector, MotionRecorder
-from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProcedure, MotionRecord, MotionState
-from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
-from weldcal.systems.jobs.mounting.job import mounting_scene
+from weldcal.systems.jobs.motion.procedure import (
+    MotionCalibration,
+    MotionCalibrator,
+    MotionCollector,
+    MotionProcedure,
+    MotionRecord,
+    MotionRecorder,
+    MotionState,
+)
+from weldcal.systems.jobs.mounting.job import MountingCalibrator, MountingFitConfig, mounting_scene
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure, MountingState, MountingStatus
 from weldcal.systems.jobs.procedure import Procedure
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.job import RobotError
+from weldcal.systems.jobs.profiler.job import RobotError, draw_fixture
 from weldcal.systems.jobs.profiler.plan import PlanningContext
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
@@ -98,13 +101,12 @@ from weldcal.systems.messages import (
     TorchTouch,
     UrStatus,
 )
+from weldcal.systems.motion.buffers import FrameQueue, PoseHistory, PoseRecorder
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.flange_mover import FlangeMover
-from weldcal.systems.motion.frame_queue import FrameQueue
-from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
-from weldcal.systems.motion.singularity_guard import SingularityGuard
+from weldcal.systems.motion.guarded_path import SingularityGuard
 from weldcal.systems.motion.spine import CommandArbiter, OperatorPanel, ProcessSwitch, SlewLimiter
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.recording.player import PortPlayer
 from weldcal.systems.recording.port_recorder import PortRecorder, PortSink
 from weldcal.systems.scenario.loading import load_scenario
@@ -192,7 +194,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SeamPlanner: lambda: SeamPlanner(seam_planning()),
     DrawnSeamPlanner: lambda: DrawnSeamPlanner(seam_planning()),
     PicturePoses: lambda: PicturePoses(plain_station().world.plant, plain_station().world.scanner_view.frames),
-    KnockedStand: lambda: KnockedStand(plain_station().world.scanner_view.scene_graph.world_frame_id(), 1.0, X),
+    DisplacedStand: lambda: DisplacedStand(plain_station().world.scanner_view.scene_graph.world_frame_id(), 1.0, X),
     ArucoDeformationEstimator: lambda: ArucoDeformationEstimator(the_arm(), TOOL, RenderedFingerCamera().camera()),
     WeldingVelocityServo: lambda: WeldingVelocityServo(the_arm(), TOOL, ServoConfig()),
     SingularityGuard: lambda: SingularityGuard(the_arm(), TOOL.X_FT),
@@ -208,7 +210,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ),
     PortRecorder: lambda: PortRecorder((6, 2), {}, {}, cast("PortSink", None)),
     PortPlayer: lambda: PortPlayer({}, {}),
-    OperatorPanel: lambda: OperatorPanel(Person(), Meshcat(MeshcatParams(host="localhost", port=0))),
+    OperatorPanel: lambda: OperatorPanel(Operator(), Meshcat(MeshcatParams(host="localhost", port=0))),
     CameraDirector: lambda: CameraDirector(
         Meshcat(MeshcatParams(host="localhost", port=0)), Views(), (np.ones(3), np.zeros(3)), {}, X
     ),
@@ -390,7 +392,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "planned_seam": PlannedSeam,
     },
     PicturePoses: {"body_poses": list, "frame_poses": FramePoseVector},
-    KnockedStand: {"frame_poses": FramePoseVector},
+    DisplacedStand: {"frame_poses": FramePoseVector},
     ArucoDeformationEstimator: {
         "image": Image,
         "history": PoseHistory,

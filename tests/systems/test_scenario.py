@@ -18,8 +18,8 @@ from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.scenario.checks import check_numbers, check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_class, scenario_names
+from weldcal.systems.scenario.parts import surroundings_of
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
-from weldcal.systems.scenario.surroundings import surroundings_of
 
 ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.

@@ -14,8 +14,8 @@ from weldcal.models.workpieces.part import Part, numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.systems.jobs.weld.settings import job_plan, seated_tip, servo_config
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import part_of
 from weldcal.systems.scenario.schema import ErrorConfig, Scenario, SeamConfig, WorkpieceConfig
-from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
 from weldcal.tools.worlds.parts.cells import PartTrial, write_cell
 from weldcal.tools.worlds.parts.step_parts import PARTS, assembly, box, less, write_step

@@ -129,7 +129,7 @@ def test_a_held_path_slows_to_rest_and_goes_on_without_a_jerk_and_without_being_
         wall.now += 1e-4
         clock.wait_for(TICK_S * k, moving=True)
     assert wall.now - 100.0 < 0.2
-    wall.now += 30.0  # a person looks at the arm
+    wall.now += 30.0  # an operator looks at the arm
     clock.go_on()
     rates = [clock.rate]
     while clock.rate < 1.0:

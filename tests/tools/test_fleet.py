@@ -15,8 +15,8 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.fleet import find_cells, judge_cell
 from weldcal.tools.report.fleet import FINE, LOOK, VISIT, Checked, sparkline
-from weldcal.tools.worlds import fleet_cells
-from weldcal.tools.worlds.fleet_cells import write_cell
+from weldcal.tools.worlds import doctor
+from weldcal.tools.worlds.doctor import write_cell
 
 
 def calibrated(mm: float = 0.2, **given: Any) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def history(*errors_mm: float, refuted: int = 0, newest: dict[str, Any] | None =
 def test_a_moved_cell_and_one_without_enough_scans_need_a_visit_and_a_good_one_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fleet_cells, "SCANS", 8)
+    monkeypatch.setattr(doctor, "SCANS", 8)
     for name, fault in (("good", "none"), ("hall/moved", "moved"), ("broken", "broken")):
         write_cell(tmp_path / "cells" / name, fault, 2, np.random.default_rng(5))
     call = ["fleet", str(tmp_path / "cells"), "--out", str(tmp_path / "out"), "--workers", "1", "--json"]

@@ -17,7 +17,7 @@ import typer
 from tests.interrupted import KNOWN, QUICK, commands, end_after
 from weldcal.models.result_files import UNFINISHED, whole_result, write_atomic
 from weldcal.tools import console
-from weldcal.tools.worlds.fleet_cells import write_cell
+from weldcal.tools.worlds.doctor import write_cell
 
 RNG = random.Random(7)
 MOMENTS = [

@@ -12,7 +12,7 @@ from tests.tools.test_monitor import FLANGE, FOCAL, HEIGHT, WIDTH, feature, rend
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream, save_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult, save_result
-from weldcal.calibration.motion.drift.background import BASE, SCANNER
+from weldcal.calibration.motion.drift.watch import BASE, SCANNER
 from weldcal.models.arrays import Array
 from weldcal.tools.cli.app import app
 

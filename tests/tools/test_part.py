@@ -21,8 +21,8 @@ from weldcal.models.workpieces.part import numbered, seam_count
 from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import part_of
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.systems.scenario.workpiece import part_of
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell import new
 from weldcal.tools.commands.cell.new import OwnPart, write_cell
@@ -152,7 +152,7 @@ def test_where_the_whole_is_refused_a_piece_is_taken_and_named(tmp_path: Path, m
     assert seam.edges[0] in joint.edges
     assert note == f"Only edge {seam.edges[0]} of {', '.join(map(str, joint.edges))}. As a whole: Too near."
     assert "# Only edge" in path.read_text()
-    # Of edges that a person gives nothing is left out.
+    # Of edges that an operator gives nothing is left out.
     path, reason = write_cell(tmp_path / "by_hand", "s_groove", OwnPart(tmp_path / "p.step", joint.edges))
     assert (path.name, reason) == ("unfinished.yaml", "Too near.")
 

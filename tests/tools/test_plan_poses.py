@@ -16,7 +16,7 @@ from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.plan_poses import plan_refining_poses
+from weldcal.tools.commands.plan import plan_refining_poses
 
 
 def test_the_table_holds_poses_and_the_joint_angles_that_lead_there(tmp_path: Path) -> None:

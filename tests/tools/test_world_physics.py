@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.tools.emulators.cell.arc import Arc
+from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.tools.emulators.cell.physics import STEP_S, STILL_FRAMES, Physics
 from weldcal.tools.emulators.cell.process import WORLD
+from weldcal.tools.emulators.cell.wires import Arc
 
 TURN_RAD = 0.05
 

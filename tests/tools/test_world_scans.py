@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import pytest
 
-from weldcal.tools.emulators.cell import scans
-from weldcal.tools.emulators.cell.scans import DONE, FRAME_WAITS_S, POSE, SCAN_S, Scans
+from weldcal.tools.emulators.cell import scanner_process
+from weldcal.tools.emulators.cell.scanner_process import DONE, FRAME_WAITS_S, POSE, SCAN_S, Scans
 
 
 class Scanner:
@@ -64,7 +64,7 @@ def test_the_world_waits_in_each_frame_once_a_scan_is_late_and_no_more_when_it_i
 
 def test_a_scanner_that_says_nothing_is_waited_for_up_to_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     it, scanner = exposed(0.0)
-    monkeypatch.setattr(scans, "LIMIT_S", -1.0)
+    monkeypatch.setattr(scanner_process, "LIMIT_S", -1.0)
     it.step(2.0 * SCAN_S)
     assert scanner.waits == []
 

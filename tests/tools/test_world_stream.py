@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.tools.emulators.cell.physics import STEP_S
-from weldcal.tools.emulators.cell.stream_process import Exposure
-from weldcal.tools.emulators.cell.streamer import IDLE_S, Streamer
-from weldcal.tools.emulators.cell.waiter import LIMIT_S, Waiter
+from weldcal.tools.emulators.cell.streamer import IDLE_S, LIMIT_S, Exposure, Streamer, Waiter
 
 
 class Pipe:

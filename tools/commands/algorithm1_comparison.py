@@ -10,7 +10,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors, run_algorithm1
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.icp import (
+from weldcal.calibration.published.algorithm1 import (
     CentreVerification,
     Sight,
     Verification,

@@ -16,21 +16,20 @@ from weldcal.calibration.calibrate import calibrate as calibrate_observations
 from weldcal.calibration.calibrate import refine as refine_calibration
 from weldcal.calibration.data.checks import is_carried, is_motion
 from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
-from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.data.results import CalibrationResult, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.arm_start import ArmStart, see_with_arm
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
-from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig
 from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.stated_arm import require_joint_angles
+from weldcal.calibration.refinement.kinematics_choice import require_joint_angles
 from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
@@ -52,7 +51,13 @@ from weldcal.tools.cli.options import (
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
 from weldcal.tools.console import Progress
-from weldcal.tools.report.calibration import CalibrationReport, calibration_report, error_summary
+from weldcal.tools.report.calibration import (
+    CalibrationReport,
+    calibration_report,
+    error_summary,
+    pose_records,
+    tilt_summary,
+)
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import check_limit
 from weldcal.tools.report.render import write_atomic
@@ -217,7 +222,7 @@ def calibrate_dataset(
     if poses is not None:
         data = data.between(poses)
     standard = get_flange(flange or data.header.flange)
-    seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
+    seen = fit_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
     start: ArmStart | None = None
     if len(seen.observations) < ENOUGH and seen.refused and not data.pairs and data.header.scanner_guess is None:
         tell("comparing the visible arm", 0.7)
@@ -294,12 +299,18 @@ def calibrate_dataset(
     if correct_scanner and not confirmed and not few:
         warnings += _unconfirmed(inliers, seed)
     correction = None if found.correction is None else found.correction.document()
+    values = {
+        "residual_mm": 1e3 * estimate.position_residuals_m,
+        "held_out_mm": 1e3 * estimate.held_out.position_m,
+        "tilt_deg": np.degrees(estimate.tilt_residuals_rad),
+        "held_out_tilt_deg": np.degrees(estimate.held_out.tilt_rad),
+    }
     result = CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
         held_out_mm=error_summary(1e3 * estimate.held_out.position_m[estimate.inliers]),
-        tilt_deg=_tilts(estimate),
-        poses=_pose_records(observations, estimate, refused),
+        tilt_deg=tilt_summary(estimate.held_out.tilt_rad[estimate.inliers]),
+        poses=pose_records([o.id for o in observations], estimate.inliers, values, refused),
         icp=icp,
         unobservable=estimate.unobservable,
         warnings=tuple(warnings),
@@ -437,36 +448,6 @@ def _axis_turn(
         return None
     turn, spread = axis_turn(seen, patterns, X_BC)
     return float(np.degrees(turn)), float(np.degrees(spread))
-
-
-def _tilts(estimate: CalibrationEstimate) -> dict[str, float | None]:
-    s = error_summary(np.degrees(estimate.held_out.tilt_rad[estimate.inliers]))
-    return {k: s[k] if np.isfinite(s[k]) else None for k in ("median", "p95")}
-
-
-def _pose_records(
-    observations: list[Observation], estimate: CalibrationEstimate, refused: list[tuple[str, str]]
-) -> tuple[PoseRecord, ...]:
-    reasons = dict(refused)
-    records = []
-    for k, o in enumerate(observations):
-        tilt, held_tilt = (float(np.degrees(t[k])) for t in (estimate.tilt_residuals_rad, estimate.held_out.tilt_rad))
-        records.append(
-            PoseRecord(
-                id=o.id,
-                used=bool(estimate.inliers[k]),
-                reason=reasons.pop(o.id, ""),
-                residual_mm=float(1e3 * estimate.position_residuals_m[k]),
-                held_out_mm=(
-                    float(1e3 * estimate.held_out.position_m[k])
-                    if np.isfinite(estimate.held_out.position_m[k])
-                    else None
-                ),
-                tilt_deg=tilt if np.isfinite(tilt) else None,
-                held_out_tilt_deg=held_tilt if np.isfinite(held_tilt) else None,
-            )
-        )
-    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 
 
 def _centres_csv(observations: list[Observation]) -> str:

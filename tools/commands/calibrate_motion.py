@@ -11,7 +11,7 @@ import typer
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import load_motion_dataset
-from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.data.results import export_all, save_result
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames
@@ -22,10 +22,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.options import Call, FlangeOption, LimitOption, Outcome, command, option, switch
 from weldcal.tools.console import Progress
-from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.motion_calibration import MotionReport, motion_report
+from weldcal.tools.report.motion_calibration import MotionReport, motion_report, motion_result
 from weldcal.tools.report.render import write_atomic
 
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
@@ -103,25 +102,16 @@ def calibrate_motion(
             "The orientation hardly changes, so the motion cannot show a TCP that is set at the robot: it would shift"
             " X_BC by its own length. Check that the TCP is zero, or tilt the flange on the way."
         )
-    used = estimate.inliers
-    result = CalibrationResult(
-        X_BC=estimate.X_BC,
-        covariance=estimate.covariance,
-        held_out_mm=error_summary(1e3 * estimate.held_out_m[used]),
-        tilt_deg=_tilts(estimate),
-        poses=_records(frames, estimate, refused),
-        unobservable=estimate.unobservable,
+    result = motion_result(
+        estimate,
+        frames.ids,
+        refused,
         warnings=tuple(warnings),
         robot=robot or data.header.robot,
         flange=standard.designation,
         scanner=data.header.scanner,
-        sigma_position_mm=1e3 * estimate.sigma_position_m,
-        sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
         seed=seed,
         data_hashes=data.hashes,
-        software=software_version(),
-        clock=estimate.clock,
-        clock_covariance=estimate.joint,
         configuration=data.header.configuration,
         target=_target(estimate) if data.in_hand else None,
     )
@@ -168,28 +158,6 @@ def _reasons(frames: ObservedFrames, estimate: MotionEstimate) -> list[tuple[str
         for id, keep, r in zip(frames.ids, estimate.inliers, estimate.residual_m, strict=True)
         if not keep
     ]
-
-
-def _tilts(estimate: MotionEstimate) -> dict[str, float | None]:
-    s = error_summary(np.degrees(estimate.held_out_tilt_rad[estimate.inliers]))
-    return {k: s[k] if np.isfinite(s[k]) else None for k in ("median", "p95")}
-
-
-def _records(
-    frames: ObservedFrames, estimate: MotionEstimate, refused: list[tuple[str, str]]
-) -> tuple[PoseRecord, ...]:
-    reasons = dict(refused)
-    records = []
-    for k, id in enumerate(frames.ids):
-        values = {
-            "residual_mm": 1e3 * estimate.residual_m[k],
-            "held_out_mm": 1e3 * estimate.held_out_m[k],
-            "tilt_deg": np.degrees(estimate.tilt_rad[k]),
-            "held_out_tilt_deg": np.degrees(estimate.held_out_tilt_rad[k]),
-        }
-        numbers = {key: float(v) if np.isfinite(v) else None for key, v in values.items()}
-        records.append(PoseRecord(id=id, used=bool(estimate.inliers[k]), reason=reasons.pop(id, ""), **numbers))
-    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 
 
 def _centres_csv(frames: ObservedFrames, estimate: MotionEstimate) -> str:

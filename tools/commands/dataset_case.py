@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.doctor.case import DoctorCase
-from weldcal.calibration.doctor.diagnose import diagnose
-from weldcal.calibration.doctor.readings import FEWEST
-from weldcal.calibration.doctor.record import NAME, case_of, case_text
-from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
+from weldcal.calibration.doctor.case import NAME, DoctorCase, case_of, case_text
+from weldcal.calibration.doctor.diagnose import FEWEST, diagnose
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, fit_flanges
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.result_files import write_apart
@@ -67,7 +65,7 @@ def examined_where_refused(
     except WeldcalError as problem:
         if len(seen.observations) < FEWEST and data.header.scanner_guess is not None:
             anywhere = replace(data, header=replace(data.header, scanner_guess=None))
-            seen = see_flanges(anywhere, standard, holes=False, seed=seed)
+            seen = fit_flanges(anywhere, standard, holes=False, seed=seed)
         if len(seen.observations) >= FEWEST:
             case = dataset_case(data, seen, standard, standard)
             write_case(out, case)

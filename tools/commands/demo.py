@@ -1,25 +1,50 @@
-"""weldcal demo: runs the job of any scenario with the command that is made for it."""
+"""weldcal demo and calibrate --scenario: run the job of a scenario with the command that is made for it."""
 
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Annotated, Protocol
 
-from weldcal.systems.jobs.discovery import job_of
+import typer
+
+from weldcal.systems.jobs.job import job_of
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.cli.options import Call, Outcome, ScenarioArgument, ScenarioOption, command
+from weldcal.tools.cli.options import MOTION, Call, Outcome, ScenarioArgument, ScenarioOption, command, option
 from weldcal.tools.commands.motion_live import run_motion_live
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.commands.run import RECORDED, JobRun, named_once, run_job, run_options
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.commands.touch import run_touches
-from weldcal.tools.commands.weld import run_scenario
+from weldcal.tools.commands.weld import run_calibration_live, run_scenario
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
+
+
+@command(
+    "calibrate-live", hidden=True, options=(*MOTION, "record"), short_help="Calibrate a scanner live in a scenario."
+)
+def calibrate_live(
+    call: Call,
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A scenario, by name or path.")],
+    robot: Annotated[str | None, option("--robot", "NAME", "simulated, emulated or a controller's address.")] = None,
+) -> Outcome:
+    """Calibrate a scanner live in a scenario, as `weldcal calibrate --scenario` does."""
+    options = run_options(call, "calibrate", scenario, robot=robot)
+    loaded = load_scenario(scenario)
+    kind = job_of(loaded).key
+    if kind == "mounting":
+        mounted = run_mounting_live(loaded, options, call.progress)
+        return Outcome(mounted.summary(), first=mounted.first)
+    if kind == "motion":
+        moved = run_motion_live(loaded, options, call.progress)
+        return Outcome(moved.summary(), first=moved.first)
+    calibrated = run_calibration_live(options, call.progress)
+    return Outcome(calibrated.calibration_summary(), first=calibrated.first)
+
 
 DEMO_SCENARIO = "s_groove"
 

@@ -13,11 +13,10 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.doctor.case import DoctorCase
+from weldcal.calibration.doctor.case import NAME, DoctorCase, read_case
 from weldcal.calibration.doctor.diagnose import Cause, Diagnosis, diagnose
-from weldcal.calibration.doctor.record import NAME, read_case
 from weldcal.calibration.errors import DatasetError, FlangeNotFound
-from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import STANDARDS, FlangeStandard, get_flange
@@ -100,7 +99,7 @@ def diagnose_dataset(folder: Path, flange: str | None, seed: int, progress: Prog
     standard = get_flange(flange or data.header.flange)
     found = standard if data.pairs else _other_flange(data, standard)
     anywhere = replace(data, header=replace(data.header, scanner_guess=None))  # a wrong pose leads the search astray
-    seen = see_flanges(anywhere, found, holes=False, seed=seed, tell=lambda share: progress("fit flanges", 0.9 * share))
+    seen = fit_flanges(anywhere, found, holes=False, seed=seed, tell=lambda share: progress("fit flanges", 0.9 * share))
     return diagnose(dataset_case(data, seen, standard, found))
 
 

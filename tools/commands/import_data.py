@@ -18,7 +18,7 @@ from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.header import Units
 from weldcal.calibration.data.poses.lists import folder_lists, read_lists, two_lists
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.observations import fit_flanges
 from weldcal.calibration.hand_eye.pairs.files import PosePairs, pairs_of_lists, read_pairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.models.arrays import Array
@@ -213,7 +213,7 @@ def import_scans(source: Path, out: Path, *, flange: str | None = None, mounting
                 "The poses can be read in several ways, and the scans choose. Name the flange: --flange"
                 " iso9409-1-50-4-m6."
             )
-        data = see_flanges(data, get_flange(name), holes=False).data or data
+        data = fit_flanges(data, get_flange(name), holes=False).data or data
     header = replace(
         data.header, schema=1, flange=name, poses=None, units=Units(clouds=data.header.units.clouds, poses="m")
     )

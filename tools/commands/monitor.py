@@ -16,23 +16,21 @@ from weldcal.calibration.data.checks import read_header
 from weldcal.calibration.data.motion_dataset import FrameTime, MotionDataset, load_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult, export_all, load_result, save_result, software_version
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.motion.drift.background import background_move
 from weldcal.calibration.motion.drift.sequential import MOVED, DriftConfig, DriftEvent
-from weldcal.calibration.motion.drift.watch import DriftHistory, watch
+from weldcal.calibration.motion.drift.watch import DriftHistory, background_move, watch
 from weldcal.calibration.motion.frames import observed_frames, see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.systems.jobs.motion.collector import posed_stream
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
-from weldcal.systems.jobs.motion.procedure import MotionRecord
+from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
 from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_names
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import LIVE, Call, FlangeOption, Outcome, command, option, switch
-from weldcal.tools.commands.monitor_body import see_link
+from weldcal.tools.commands.monitor_body import track_link
 from weldcal.tools.commands.run import JobRun, run_job, run_options
 from weldcal.tools.console import Progress
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next
@@ -183,7 +181,7 @@ def monitor_recording(
         )
         frames, refused = seen.observed, seen.refused
     else:
-        frames, motion, X_FR, refused = see_link(
+        frames, motion, X_FR, refused = track_link(
             data,
             result,
             standard,
@@ -195,7 +193,7 @@ def monitor_recording(
     tell("testing for drift", 0.85)
     config = DriftConfig(false_alarms_per_hour=false_alarms_per_hour)
     watched = watch(result, frames, motion, X_FR=X_FR, dropped=refused, config=config)
-    watched = replace(watched, events=tuple(told_apart(e, watched, data, result) for e in watched.events))
+    watched = replace(watched, events=tuple(classified(e, watched, data, result) for e in watched.events))
     recalibrated = (
         recalibrated_result(result, watched, data.hashes, standard.designation, seed) if recalibrate else None
     )
@@ -252,7 +250,7 @@ def recalibrated_result(
     )
 
 
-def told_apart(e: DriftEvent, watched: DriftHistory, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
+def classified(e: DriftEvent, watched: DriftHistory, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
     """The event with its cause, where what stands still in the scans before and after it tells."""
     if e.kind != MOVED or e.since_start:
         return e
@@ -431,7 +429,7 @@ def monitor_live(
     if collected.seen:
         watched = watched_record(result, collected, finished, DriftConfig(false_alarms_per_hour=false_alarms_per_hour))
         if data is not None:
-            events = tuple(told_apart(e, watched, data, result) for e in watched.events)
+            events = tuple(classified(e, watched, data, result) for e in watched.events)
             watched = replace(watched, events=events)
         feature = feature_standard(scenario).designation
         again = recalibrated_result(result, watched, {}, feature, options.seed) if recalibrate else None

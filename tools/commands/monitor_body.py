@@ -11,15 +11,13 @@ from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.motion_dataset import MotionDataset
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import ARRIVAL
-from weldcal.calibration.motion.body.model import BodyModel, fused_model, model_from_solids
-from weldcal.calibration.motion.body.tracking import link_motion, see_body
+from weldcal.calibration.motion.body import BodyModel, fused_model, link_motion, model_from_solids, see_body
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import synchronise
 from weldcal.models.arms.kinematics import ArmModel, known_arms, load_arm
-from weldcal.models.arms.link_mesh import link_index, link_solids
-from weldcal.models.arms.urdf import link_capsules
+from weldcal.models.arms.urdf import link_capsules, link_index, link_solids
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
@@ -29,7 +27,7 @@ _FUSED = 60  # frames of which a model is made
 _MARGIN_M = 0.005
 
 
-def see_link(
+def track_link(
     data: MotionDataset,
     result: CalibrationResult,
     standard: FlangeStandard,

@@ -8,19 +8,18 @@ from pathlib import Path
 import numpy as np
 from pydrake.common.yaml import yaml_dump_typed
 
-from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.data.results import CalibrationResult, export_all, save_result
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.motion.collector import posed_stream
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob
-from weldcal.systems.jobs.motion.procedure import MotionRecord
+from weldcal.systems.jobs.motion.procedure import MotionRecord, posed_stream
 from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.console import rows as console_rows
 from weldcal.tools.report.calibration import error_summary
 from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, after_hold
-from weldcal.tools.report.motion_calibration import motion_screen
+from weldcal.tools.report.motion_calibration import motion_result, motion_screen
 from weldcal.tools.report.render import render, write_atomic
 from weldcal.tools.report.run import RunOptions, robot_timing
 
@@ -194,40 +193,16 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
 
 def calibration_result(outcome: MotionOutcome, e: MotionEstimate) -> CalibrationResult:
     """The estimate as a result folder holds it."""
-    scenario, used = outcome.run.cell.scenario, e.inliers
+    scenario = outcome.run.cell.scenario
     scanner = scenario.scanner_config()
-    tilt = error_summary(np.degrees(e.held_out_tilt_rad[used]))
-    values: dict[str, Array] = {
-        "residual_mm": 1e3 * e.residual_m,
-        "held_out_mm": 1e3 * e.held_out_m,
-        "tilt_deg": np.degrees(e.tilt_rad),
-        "held_out_tilt_deg": np.degrees(e.held_out_tilt_rad),
-    }
-    poses = [
-        PoseRecord(
-            id=f.id,
-            used=bool(used[k]),
-            reason="",
-            **{key: float(v[k]) if np.isfinite(v[k]) else None for key, v in values.items()},
-        )
-        for k, (f, _) in enumerate(outcome.record.seen)
-    ]
-    return CalibrationResult(
-        X_BC=e.X_BC,
-        covariance=e.covariance,
-        held_out_mm=error_summary(1e3 * e.held_out_m[used]),
-        tilt_deg={k: tilt[k] if np.isfinite(tilt[k]) else None for k in ("median", "p95")},
-        poses=(*poses, *(PoseRecord(id=id, used=False, reason=text) for id, text in outcome.record.refused)),
-        unobservable=e.unobservable,
+    return motion_result(
+        e,
+        [f.id for f, _ in outcome.record.seen],
+        outcome.record.refused,
         warnings=e.warnings,
         robot=scenario.arm,
         flange=scenario.flange_name(),
         scanner="" if scanner is None else scanner.scanner().name,
-        sigma_position_mm=1e3 * e.sigma_position_m,
-        sigma_normal_deg=float(np.degrees(e.sigma_normal_rad)),
         seed=outcome.options.seed,
         data_hashes={},
-        software=software_version(),
-        clock=e.clock,
-        clock_covariance=e.joint,
     )

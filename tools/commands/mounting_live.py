@@ -22,7 +22,7 @@ from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.planning.mounting_estimate import (
     Circle,
-    SeenCircle,
+    ObservedCircle,
     expected_error,
     fewest,
     off_prediction,
@@ -183,7 +183,7 @@ def calibrate_carried(
     data = data if poses is None else data.between(poses)
     scene, circle = recorded_scene(data, robot or data.header.robot, flange or data.header.flange)
     joints = recorded_joints(data, scene)
-    seen: list[SeenCircle] = []
+    seen: list[ObservedCircle] = []
     refused = dict(data.refused)
     result, left = None, list(data.clouds)
     for again in (False, True):  # what is not found about the guess may be found about the result
@@ -246,7 +246,7 @@ def _too_few(
 
 def recorded_report(
     scene: MountingScene,
-    seen: Sequence[SeenCircle],
+    seen: Sequence[ObservedCircle],
     refused: tuple[tuple[str, str], ...] = (),
     *,
     limit_mm: float | None = None,

@@ -1,7 +1,8 @@
-"""weldcal replay: runs today's algorithms on what a recorded cell measured, and compares what they did bit for bit."""
+"""weldcal replay and view: repeat a recorded run bit for bit, and show the pages of a finished one."""
 
 import json
 import tempfile
+import webbrowser
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -14,16 +15,17 @@ from pydrake.systems.framework import Context, EventStatus
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import require_whole
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.recording.comparison import Comparison, Difference
 from weldcal.systems.recording.player import Playback
 from weldcal.systems.recording.port_recorder import LEFT, PERIOD_S
-from weldcal.systems.recording.reader import read_recording
+from weldcal.systems.recording.reader import Comparison, Difference, read_recording
 from weldcal.systems.recording.scenario_files import unpacked
 from weldcal.systems.recording.values import array, decode
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.cli.options import LOOK, Call, Outcome, command
+from weldcal.tools import console
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command, switch
 from weldcal.tools.commands.run import RECORDING
 from weldcal.tools.report.first_screen import pose_rows
 
@@ -159,3 +161,46 @@ def _run(
     estimate = None if status is None else status(root).estimate
     X_BC = None if estimate is None else estimate.X_BC.GetAsMatrix4().tolist()
     return str(cell.job.command(root).phase), X_BC
+
+
+PAGES = ("report.html", "recording.html")
+
+
+@command("view", common=LOOK, short_help="Show the report and the 3D recording of a finished run.")
+def view(
+    call: Call,
+    result: Annotated[Path, typer.Argument(help="A result folder, or one recording.html or report.html.")],
+    browser: Annotated[
+        bool, switch("--browser/--no-browser", "Open the pages, or only print their paths.", show_default="browser")
+    ] = True,
+) -> Outcome:
+    """Show a finished run again: its 3D recording and its report."""
+    pages = find_pages(result)
+    opened = browser and open_pages(pages)
+    if browser and not opened:
+        console.emit_warning("No web browser could be opened. Open these files on a machine that has one.")
+    return Outcome({"state": "done", "pages": pages, "opened": opened}, text="\n".join(map(str, pages)))
+
+
+def find_pages(result: Path) -> list[Path]:
+    """The absolute paths of the pages in a result folder (report first), or the one page that was given.
+
+    Raises:
+        InputError: if there is no such folder or file, or it holds no page.
+    """
+    if not result.exists():
+        raise InputError(f"There is no {result}. Give the result folder of a weldcal command.")
+    require_whole(result)
+    candidates = [result] if result.is_file() else [result / name for name in PAGES]
+    pages = [page.resolve() for page in candidates if page.is_file() and page.suffix == ".html"]
+    if not pages:
+        raise InputError(
+            f"{result} holds neither report.html nor recording.html. Give the result folder of a finished run."
+        )
+    return pages
+
+
+def open_pages(pages: list[Path]) -> bool:
+    """Opens each page in the web browser; false where there is none."""
+    opened = [webbrowser.open(page.as_uri()) for page in pages]
+    return all(opened)

@@ -27,17 +27,17 @@ from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.jobs.job import job_of
+from weldcal.systems.operator import Operator, operator_at
 from weldcal.systems.pacing import draw_in_this_thread
-from weldcal.systems.person import Person, person_at
 from weldcal.systems.recording.port_recorder import ENTERED, LEFT
 from weldcal.systems.recording.scenario_files import packed
 from weldcal.systems.recording.tap import OpenSink, PortLayout
 from weldcal.systems.recording.values import encode
 from weldcal.systems.recording.writer import RecordingWriter
 from weldcal.systems.runner import Progress, Run, run_cell
-from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.viewer.kept import free_unused
@@ -133,7 +133,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
     with (
         _one_thread(),
         chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot,
-        person_at() as person,
+        operator_at() as operator,
     ):
         free_unused()
         if options.recording or options.browser:
@@ -143,7 +143,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
             guard(meshcat)
         recorder = RunRecorder(scenario, options, robot.title) if options.record else None
         open_sink = None if recorder is None else recorder.open_sink
-        with _dashboard(person, meshcat, options) as source:
+        with _dashboard(operator, meshcat, options) as source:
 
             def told(stage: str, share: float) -> None:
                 progress(stage, share)
@@ -157,7 +157,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
             told("build the cell", 0.0)
             live = None if meshcat is None else LiveView() if source is None else source.live
             cell = build_cell(
-                scenario, options.seed, meshcat, robot.prepared, open_sink=open_sink, person=person, live=live
+                scenario, options.seed, meshcat, robot.prepared, open_sink=open_sink, operator=operator, live=live
             )
             with closing(cell.station):
                 if meshcat is not None:
@@ -191,7 +191,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> Iterator[DashboardSource | None]:
+def _dashboard(operator: Operator, meshcat: Meshcat | None, options: RunOptions) -> Iterator[DashboardSource | None]:
     """Serve the run's page for the duration of the block, and open it in the browser; None where no viewer is
     wanted."""
     if meshcat is None or not options.browser:
@@ -199,7 +199,7 @@ def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> 
         return
     from weldcal.tools.dashboard.server import Dashboard  # Flask takes a moment to load
 
-    source = DashboardSource(LiveView(), person)
+    source = DashboardSource(LiveView(), operator)
     with ExitStack() as stack:
         dashboard = stack.enter_context(closing(Dashboard(source, meshcat.web_url(), options.share)))
         console.emit_address("dashboard", dashboard.url)

@@ -6,7 +6,7 @@ from pathlib import Path
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.touch.judge import judge_touches
-from weldcal.calibration.touch.table import read_touches, touches_text
+from weldcal.calibration.touch.touches import read_touches, touches_text
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.touch.planner import TouchConfig
 from weldcal.systems.runner import Progress
@@ -19,7 +19,7 @@ from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.first_screen import DO_NOT
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.report.touch import TouchReport, touch_page
+from weldcal.tools.report.verify import TouchReport, touch_page
 
 TABLE = "touches.csv"
 

@@ -13,14 +13,14 @@ from weldcal.calibration.data.dataset import Dataset, joint_angles, load_dataset
 from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, load_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.data.stated_pose import HAND_EYE_FILE, read_stated_pose
-from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
+from weldcal.calibration.eye_on_base.observations import corrected_observation, fit_flanges
 from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.hand_eye.solve import as_transform
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.kinematics_choice import shared_error
 from weldcal.calibration.refinement.local_field import field_from_document
-from weldcal.calibration.refinement.stated_arm import shared_error
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -229,7 +229,7 @@ def verify_dataset(
     correction = correction_from_document(calibration.scanner_correction) if correct_scanner else None
     data = load_dataset(Path(dataset), robot=calibration.robot)
     standard = get_flange(flange or data.header.flange or calibration.flange)
-    seen = see_flanges(
+    seen = fit_flanges(
         data,
         standard,
         X_BC=calibration.X_BC if len(calibrations) == 1 else None,

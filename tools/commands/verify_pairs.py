@@ -9,7 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.clouds import NO_NOTES
 from weldcal.calibration.data.poses.bag import find_bag
-from weldcal.calibration.data.poses.pairing import FOLDERS
+from weldcal.calibration.data.poses.source import FOLDERS
 from weldcal.calibration.data.stated_pose import StatedPose, read_stated_pose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.hand_eye.mountings import get_mounting

@@ -10,8 +10,7 @@ from weldcal.calibration.calibrate import KINEMATICS_FILE
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
-from weldcal.calibration.doctor.case import DoctorCase
-from weldcal.calibration.doctor.record import case_of
+from weldcal.calibration.doctor.case import DoctorCase, case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.touch.arm_prior import observed_document

@@ -1,4 +1,4 @@
-"""DashboardSource: what the page is told of a run, and what its buttons ask of the person's wishes; used by the
+"""DashboardSource: what the page is told of a run, and what its buttons ask of the operator's wishes; used by the
 server's threads."""
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.viewer.live import LiveView, Moment
 from weldcal.tools.dashboard.facts import Facts
@@ -40,13 +40,13 @@ PACE_OVER_S = 2.0
 
 
 class DashboardSource:
-    """Reads the run's live view and the person's wishes.
+    """Reads the run's live view and the operator's wishes.
 
     It never waits for the Diagram, and the Diagram never for it.
     """
 
-    def __init__(self, live: LiveView, person: Person, facts: Facts | None = None) -> None:
-        self.live, self.person = live, person
+    def __init__(self, live: LiveView, operator: Operator, facts: Facts | None = None) -> None:
+        self.live, self.operator = live, operator
         self.facts = Facts() if facts is None else facts
         self._stage, self._share = "", 0.0
         self._ended: tuple[str, str | None] | None = None
@@ -63,7 +63,7 @@ class DashboardSource:
     def end(self, held: bool, reason: str | None, replays: bool) -> None:
         """Take how the run ended, and whether the 3D view repeats it from now on."""
         self.replays = replays
-        self._ended = (HELD if held and not self.person.ends else ENDED if held else DONE, reason)
+        self._ended = (HELD if held and not self.operator.ends else ENDED if held else DONE, reason)
 
     def conclude(self, first: FirstScreen | None, folder: Path | None) -> None:
         """Take the result: the first screen and the folder that holds report.html and recording.html; None: there is
@@ -88,19 +88,19 @@ class DashboardSource:
     def act(self, what: str, value: float | None = None) -> bool:
         """Do what a button asks: "hold", "go_on", "end", "pace" or "camera-NAME"; False where there is no such button
         now."""
-        person = self.person
+        operator = self.operator
         if self.ended:
             return False
         if what == "hold":
-            person.hold(BY)
-        elif what == "go_on" and person.holds and not person.ends:
-            person.go_on()
+            operator.hold(BY)
+        elif what == "go_on" and operator.holds and not operator.ends:
+            operator.go_on()
         elif what == "end":
-            person.end(BY)
+            operator.end(BY)
         elif what.startswith("camera-"):
             return self.live.views.pick(what.removeprefix("camera-"))
         elif what == "pace" and value is not None and self.facts.settable_pace:
-            person.ask_pace(value)
+            operator.ask_pace(value)
         else:
             return False
         return True
@@ -111,7 +111,7 @@ class DashboardSource:
 
     def values(self) -> dict[str, Any]:
         """All present values of the page."""
-        moment, facts, person = self.live.moment, self.facts, self.person
+        moment, facts, operator = self.live.moment, self.facts, self.operator
         state, line = self._state()
         weld = weld_values(facts, moment, self.live.weld)
         running = not self.ended
@@ -123,16 +123,16 @@ class DashboardSource:
             "title": facts.title,
             "robot": facts.robot,
             "can": {
-                "hold": running and not person.holds and not person.ends,
-                "go_on": running and person.holds and not person.ends,
-                "end": running and not person.ends,
+                "hold": running and not operator.holds and not operator.ends,
+                "go_on": running and operator.holds and not operator.ends,
+                "end": running and not operator.ends,
                 "pace": running and facts.settable_pace,
             },
             "steps": steps(facts, "done" if state == DONE else stage_of(moment)),
             "share": round(self._share, 3) if running else 1.0,
             "left_s": self._left_s(moment) if running else None,
             "time_s": round(moment.time, 1),
-            "pace": {"asked": person.pace or 0.0, "now": self._pace(moment.time)},
+            "pace": {"asked": operator.pace or 0.0, "now": self._pace(moment.time)},
             "weld": weld,
             "calibration": scan_values(facts, moment),
             "panel": panel(facts, moment),
@@ -148,21 +148,21 @@ class DashboardSource:
     def _left_s(self, moment: Moment) -> float | None:
         """Seconds of the wall clock that are left, about, at the pace that was asked for."""
         left = left_s(self.facts, moment, self._share)
-        return left if left is None or not self.person.pace else round(left / self.person.pace)
+        return left if left is None or not self.operator.pace else round(left / self.operator.pace)
 
     def _state(self) -> tuple[str, str]:
         """The state in large letters, and the line under it: by whom and why, or what the arm does."""
-        moment, person = self.live.moment, self.person
+        moment, operator = self.live.moment, self.operator
         doing = self._doing()
         if self._ended is not None:
             state, reason = self._ended
             return state, reason or "The job is complete."
-        if person.ends:
-            return STOPPING, f"ended by {person.ended_by}; the process goes off and the arm comes to rest"
-        if person.stands:
-            return HELD, f"by {person.held_by}, during: {doing}. {self._go_on_line()}"
-        if person.holds:
-            return STOPPING, f"held by {person.held_by}; the process goes off and the arm comes to rest"
+        if operator.ends:
+            return STOPPING, f"ended by {operator.ended_by}; the process goes off and the arm comes to rest"
+        if operator.stands:
+            return HELD, f"by {operator.held_by}, during: {doing}. {self._go_on_line()}"
+        if operator.holds:
+            return STOPPING, f"held by {operator.held_by}; the process goes off and the arm comes to rest"
         report = moment.shown.get("servo_report")
         if getattr(report, "phase", "") == "BACK":
             return RUNNING, "on the way back along the seam; the torch is off"

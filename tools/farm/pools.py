@@ -1,4 +1,4 @@
-"""Where tasks run: processes of this computer, or the workers of a Dask cluster."""
+"""Where tasks run: processes of this computer or a Dask cluster's workers, each with one thread for numerics."""
 
 import importlib
 import multiprocessing
@@ -10,13 +10,38 @@ from contextlib import contextmanager
 from typing import Any
 
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.farm.work import run_task
+from weldcal.tools.console import plain
 
+FAILED = "failed"
 Tasks = Mapping[str, tuple[str, Mapping[str, Any]]]
 """By key: the function ("package.module:name") and its keyword arguments."""
 
 MEMORY_GIB = 1.5  # of one process that holds Drake, Open3D and a rendered cell
 REACH_S = 10.0
+
+
+def run_task(function: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Call ``function`` ("package.module:name") with keyword arguments; its result in JSON's own types.
+
+    A WeldcalError becomes {"state": "failed", "reason": ...}: one task that cannot be done does not end a study.
+    """
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    module, name = function.split(":")
+    call = getattr(importlib.import_module(module), name)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(1):
+            found = plain(call(**arguments))
+    except WeldcalError as error:
+        return {"state": FAILED, "reason": str(error)}
+    finally:
+        cv2.setNumThreads(threads)
+    if not isinstance(found, dict):
+        raise TypeError(f"{function} returns a {type(found).__name__}. A task returns a mapping.")
+    return found
 
 
 class WorkerLost(WeldcalError):

@@ -1,6 +1,6 @@
 """The result of `weldcal calibrate` and its page, with its plots and tables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -10,8 +10,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from weldcal.calibration.data.results import RESULT_FILE, CalibrationResult, correction_note, export_ros2, matrix4
+from weldcal.calibration.data.results import (
+    RESULT_FILE,
+    CalibrationResult,
+    PoseRecord,
+    correction_note,
+    export_ros2,
+    matrix4,
+)
 from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
 from weldcal.calibration.eye_on_base.joint_fit import ScannerVerdict
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
@@ -33,12 +41,13 @@ from weldcal.tools.report.first_screen import (
     ShownPose,
     Tolerance,
     WorkPoint,
+    limit_tolerance,
     refused_note,
     work_point_error,
     work_point_expected,
 )
-from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, svg
-from weldcal.tools.report.render import fixed, fixed_row, render
+from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, subplots, svg
+from weldcal.tools.report.render import fixed, known, render, sigma_rows
 
 
 def error_summary(values: Array) -> dict[str, float]:
@@ -53,6 +62,24 @@ def error_summary(values: Array) -> dict[str, float]:
         "p95": float(np.percentile(v, 95)),
         "max": float(v.max()),
     }
+
+
+def tilt_summary(tilts_rad: Array) -> dict[str, float | None]:
+    """Median and 95th percentile of tilts (n,) in degrees; None where there are none."""
+    s = error_summary(np.degrees(tilts_rad))
+    return {k: known(s[k]) for k in ("median", "p95")}
+
+
+def pose_records(
+    ids: Sequence[str], used: NDArray[np.bool_], values: Mapping[str, Array], refused: Iterable[tuple[str, str]]
+) -> tuple[PoseRecord, ...]:
+    """The records of poses with their ``values`` (n,) by the record's field, then of those that were refused before."""
+    reasons = dict(refused)
+    records = []
+    for k, id in enumerate(ids):
+        numbers = {name: known(v[k]) for name, v in values.items()}
+        records.append(PoseRecord(id=id, used=bool(used[k]), reason=reasons.pop(id, ""), **numbers))
+    return (*records, *(PoseRecord(id=i, used=False, reason=t) for i, t in reasons.items()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,9 +147,7 @@ class CalibrationReport:
         # what is not observable and matters to X_BC is among the warnings
         concerns = [text for text in r.warnings if text not in said]
         expected, figure = work_point_expected(work)
-        tolerance = None
-        if self.limit_mm is not None:
-            tolerance = Tolerance("the error at the work point, 95 %,", figure, self.limit_mm, "--limit-mm")
+        tolerance = limit_tolerance("error at the work point, 95 %", figure, self.limit_mm)
         corrected = correction_note(r, self.out / RESULT_FILE)
         notes = [*filter(None, (corrected,)), *refused_note(self.refused, len(r.poses)), *self._refined]
         found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
@@ -293,7 +318,6 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
     p_B = np.array([o.p_BR for o in kept])
     middle, held_out = p_B.mean(axis=0), 1e3 * report.estimate.held_out.position_m
     work_sigma = 1e3 * float(np.sqrt(np.trace(point_error_covariance(report.estimate, middle))))
-    sigma = np.sqrt(np.diag(r.covariance))
     budget = report.budget
     return render(
         "calibration.html.j2",
@@ -311,8 +335,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         refused=report.refused,
         first=report.first,
         pose_facts=[
-            ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
-            ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
+            *sigma_rows(r.covariance),
             ("noise per axis, one sigma", f"{r.sigma_position_mm:.3f} mm"),
             *_axis_turn(r.axis_turn_deg),
             ("ROS 2", export_ros2(r.X_BC).strip()),
@@ -381,13 +404,11 @@ def _scanner_rows(report: CalibrationReport) -> list[tuple[str, ...]]:
 
 def _convergence(report: CalibrationReport) -> bytes:
     c = report.convergence
-    figure = Figure(figsize=(8.2, 3.9), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.9)
     _band(axes, c.counts, 1e3 * c.held_out, OURS, "this calibration, on unused scans")
     _band(axes, c.counts, 1e3 * c.figure_true, TRUTH, "Algorithm 1, on unused scans")
     _band(axes, c.counts, 1e3 * c.figure, THEIRS, "figure reported by Algorithm 1")
-    axes.set_xlabel("number of scans")
-    axes.set_ylabel("error at the flange, mm")
+    axes.set(xlabel="number of scans", ylabel="error at the flange, mm")
     axes.set_ylim(bottom=0.0)
     if axes.lines:
         axes.legend(frameon=False, fontsize=9)
@@ -448,8 +469,7 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
             markersize=15,
             label="best next pose",
         )
-        axes.set_xlabel(f"base {'xyz'[i]}, mm")
-        axes.set_ylabel(f"base {'xyz'[j]}, mm")
+        axes.set(xlabel=f"base {'xyz'[i]}, mm", ylabel=f"base {'xyz'[j]}, mm")
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_aspect("equal")
     assert drawn is not None

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import RESULT_FILE, correction_hint, export_ros2
 from weldcal.models.arrays import Array
@@ -28,13 +27,14 @@ from weldcal.tools.report.first_screen import (
     Tolerance,
     after_hold,
     refused_note,
+    upper,
     work_point_error,
     work_point_expected,
 )
 from weldcal.tools.report.monitor import drift_document
-from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, svg
+from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, millimetres, plain, subplots, svg
 from weldcal.tools.report.plots_weld import WeldTrace
-from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.render import fixed, render, sigma_rows
 from weldcal.tools.report.run import RunOptions, robot_timing
 from weldcal.tools.report.weld import CalibrationError, WeldOutcome, felt_seams, fit_up_document, heat_input_kJ_mm
 from weldcal.welding.record.process import PathError, path_error, speed_along, torch_angles
@@ -68,7 +68,7 @@ class DemoResult:
 
     @property
     def setting(self) -> str:
-        """What was real, for a person."""
+        """What was real, for an operator."""
         scenario = self.run.cell.scenario
         if self.robot == "simulated":
             return "Simulation"
@@ -315,12 +315,7 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
     estimate = status.estimate
     pose = []
     if estimate is not None:
-        sigma = np.sqrt(np.diag(estimate.covariance))
-        pose = [
-            ("one sigma of the position, mm", "  ".join(fixed(1e3 * float(v), 3) for v in sigma[3:])),
-            ("one sigma of the rotation, deg", "  ".join(fixed(float(np.degrees(v)), 4) for v in sigma[:3])),
-            ("ROS 2", export_ros2(estimate.X_BC).strip()),
-        ]
+        pose = [*sigma_rows(estimate.covariance), ("ROS 2", export_ros2(estimate.X_BC).strip())]
     return render(
         "demo.html.j2",
         result=result,
@@ -367,7 +362,7 @@ def _planned(result: DemoResult) -> list[tuple[str, str]]:
     plan = result.run.cell.job.planned_seam(result.run.root)
     if plan.seam is None:
         return []
-    rows = [("planned", plan.summary[:1].upper() + plan.summary[1:])] if plan.summary else []
+    rows = [("planned", upper(plan.summary))] if plan.summary else []
     if np.isfinite(plan.sigma_m):
         rows.append(
             ("sigma of the planned root, sideways", f"{fixed(1e3 * plan.sigma_m, 3)} mm, as the planner states it")
@@ -431,8 +426,7 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
     """Expected and held-out error of the estimate in use and Algorithm 1's own figure, against the scans taken (Fig.
     11)."""
     n, expected, held_out, figure = (np.array(c, dtype=float) for c in zip(*status.history, strict=True))
-    picture = Figure(figsize=(7.2, 3.4), layout="constrained")
-    axes = picture.subplots()
+    picture, axes = subplots(7.2, 3.4)
     axes.semilogy(n, 1e3 * expected, "o-", color=OURS, label="expected at the work point (one sigma, 3-D)")
     axes.semilogy(n, 1e3 * held_out, "s--", color=ROBOT, label="held out, at the ring (median)")
     if np.isfinite(figure).any():

@@ -1,7 +1,7 @@
 """Writes what the doctor finds: each cause with its evidence and the next step, and the report of `weldcal doctor`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from weldcal.calibration.doctor.diagnose import Cause, Diagnosis
 from weldcal.welding.record.signs import WORN
@@ -27,10 +27,6 @@ class NamedCause:
     evidence: str
     next: str
 
-    def document(self) -> dict[str, object]:
-        """The JSON object."""
-        return {"name": self.name, "confidence": self.confidence, "evidence": self.evidence, "next": self.next}
-
 
 _CENTRES_SAY = 1.5
 """How much better the centres fit with a cause before they are its evidence; else the normals are."""
@@ -52,7 +48,7 @@ class DoctorReport:
             "state": "done",
             "source": self.source,
             "scans": self.n,
-            "causes": [c.document() for c in self.causes],
+            "causes": [asdict(c) for c in self.causes],
             "spread_mm": self.spread_mm,
             "checked": list(CHECKED),
         }

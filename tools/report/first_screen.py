@@ -117,6 +117,11 @@ class Tolerance:
         return f"{value:.3f} {self.unit}".strip()
 
 
+def limit_tolerance(what: str, figure: float, limit_mm: float | None) -> Tolerance | None:
+    """The figure named ``what`` (mm) against the limit that --limit-mm states; None where it states none."""
+    return None if limit_mm is None else Tolerance(f"the {what},", figure, limit_mm, "--limit-mm")
+
+
 @dataclass(frozen=True)
 class ExpectedError:
     """The error to expect: `what` is measured, the figure with its unit, and what backs it, in words."""
@@ -208,7 +213,7 @@ def decide(found: Findings) -> tuple[str, str]:
         return found.settled
     if found.against:
         return DO_NOT, found.against[0]
-    said = found.no_tolerance if found.tolerance is None else _upper(found.tolerance.sentence)
+    said = found.no_tolerance if found.tolerance is None else upper(found.tolerance.sentence)
     if found.tolerance is not None and not found.tolerance.met:
         return DO_NOT, said
     if found.unseen is not None and found.unseen < ENOUGH_UNSEEN:
@@ -381,5 +386,6 @@ def _first_few(texts: Iterable[str]) -> tuple[str, ...]:
     return (*kept, f"{len(every) - len(kept)} more are listed in the report.")
 
 
-def _upper(text: str) -> str:
+def upper(text: str) -> str:
+    """The text with a capital first letter."""
     return text[:1].upper() + text[1:]

@@ -15,7 +15,7 @@ from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.motion.pose_streams import ClockOffset
 from weldcal.calibration.planning.next_pose import NextPose
 from weldcal.models.arrays import Array
-from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, ShownPose, Tolerance
+from weldcal.tools.report.first_screen import ExpectedError, Findings, FirstScreen, Next, ShownPose, limit_tolerance
 from weldcal.tools.report.pictures import error_bars
 from weldcal.tools.report.render import fixed, render
 
@@ -57,9 +57,7 @@ class HandEyeReport:
         """The first screen. Pose pairs have no work point: the held-out error at the target stands in its place."""
         r = self.result
         expected, p95, n = held_out_error(r)
-        tolerance = None
-        if self.limit_mm is not None:
-            tolerance = Tolerance(f"the {expected.what},", p95, self.limit_mm, "--limit-mm")
+        tolerance = limit_tolerance(expected.what, p95, self.limit_mm)
         outliers = int((~r.inliers).sum())
         notes = (
             [f"{outliers} of {len(r.inliers)} poses disagree with the others and were not used."] if outliers else []

@@ -8,14 +8,22 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftEvent
 from weldcal.calibration.motion.drift.watch import DriftHistory
 from weldcal.models.arrays import Array
-from weldcal.tools.report.first_screen import SCANNER, ExpectedError, Findings, FirstScreen, Next, ShownPose, Tolerance
-from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, svg
+from weldcal.tools.report.first_screen import (
+    SCANNER,
+    ExpectedError,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    Tolerance,
+    upper,
+)
+from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, subplots, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
 CALM, DRIFTED, WARMED = "no drift found", "the scanner has moved", "the scanner warms up"
@@ -43,7 +51,7 @@ class MonitorReport:
         w = self.watched
         largest = float(np.nanmax(w.statistic)) if len(w.statistic) else float("nan")
         source = f"--false-alarms {self.false_alarms_per_hour:g} per hour"
-        against = [f"{self.verdict[:1].upper()}{self.verdict[1:]}: {self.change}"] if self.moves else []
+        against = [f"{upper(self.verdict)}: {self.change}"] if self.moves else []
         concerns = [*self.warnings]
         if self.verdict == WARMED:
             concerns = [f"The scanner warms up: {self.change}", *concerns]
@@ -95,7 +103,7 @@ class MonitorReport:
             return f"from {e.time_s:.1f} s on its scale changed by {1e6 * e.scale:.0f} ppm; the pose is unchanged."
         return (
             f"at {e.time_s:.2f} s (robot clock) by {d['translation_mm']:.3f} mm and {d['rotation_deg']:.4f} degrees, "
-            f"found {max(e.found_s - e.time_s, 0.0):.1f} s later. {self.cause[:1].upper()}{self.cause[1:]}".rstrip(". ")
+            f"found {max(e.found_s - e.time_s, 0.0):.1f} s later. {upper(self.cause)}".rstrip(". ")
             + "."
         )
 
@@ -224,8 +232,7 @@ def _errors(
     t: Array, e: Array, label: str, events: tuple[DriftEvent, ...], *, scale: float = 1e3, names: tuple[str, ...] = ()
 ) -> bytes:
     """Components of an error (N, k) against time (N,) s."""
-    figure = Figure(figsize=(8.2, 2.7), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 2.7)
     for k in range(e.shape[1]):
         name, color = _AXES[k]
         axes.plot(t - t[0], scale * e[:, k], ".", color=color, markersize=2.5, label=names[k] if names else name)
@@ -242,8 +249,7 @@ def _errors(
 def _offset(report: MonitorReport) -> bytes:
     """By how much frames were later than their clock says, as their own residual tells it."""
     w = report.watched
-    figure = Figure(figsize=(8.2, 2.5), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 2.5)
     t = w.rows.times
     axes.plot(t - t[0], 1e3 * w.offsets, ".", color=GREY, markersize=2.5)
     axes.plot(t - t[0], 1e3 * _running(w.offsets[:, None])[:, 0], color=OURS, linewidth=1.2)
@@ -255,8 +261,7 @@ def _drift(report: MonitorReport) -> bytes:
     """Running median of the error, and the test's statistic against its threshold."""
     w = report.watched
     t = w.rows.times
-    figure = Figure(figsize=(8.2, 4.2), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
+    figure, (upper, lower) = subplots(8.2, 4.2, 2, 1, sharex=True)
     smooth = _running(w.residuals)
     for k, (name, color) in enumerate(_AXES):
         upper.plot(t - t[0], 1e3 * smooth[:, k], color=color, linewidth=1.2, label=name)

@@ -7,27 +7,52 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import CalibrationResult, export_ros2, matrix4, target_document
+from weldcal.calibration.data.results import CalibrationResult, export_ros2, matrix4, software_version, target_document
 from weldcal.calibration.data.scanner_clock import DEVICE
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.models.arrays import Array
-from weldcal.tools.report.calibration import scanner_pose
+from weldcal.tools.report.calibration import error_summary, pose_records, scanner_pose, tilt_summary
 from weldcal.tools.report.first_screen import (
     NO_TOLERANCE,
     Findings,
     FirstScreen,
     Next,
-    Tolerance,
     expected_error,
+    limit_tolerance,
     point_covariance,
     radius_95,
     refused_note,
 )
-from weldcal.tools.report.pictures import GREY, OURS, TRUTH, svg
-from weldcal.tools.report.render import fixed, fixed_row, render
+from weldcal.tools.report.pictures import GREY, OURS, TRUTH, subplots, svg
+from weldcal.tools.report.render import fixed, known, render, sigma_rows
+
+
+def motion_result(
+    e: MotionEstimate, ids: Sequence[str], refused: Sequence[tuple[str, str]], **more: Any
+) -> CalibrationResult:
+    """The estimate as a result folder holds it; ``more``: the names of robot, flange and scanner, and other fields."""
+    values = {
+        "residual_mm": 1e3 * e.residual_m,
+        "held_out_mm": 1e3 * e.held_out_m,
+        "tilt_deg": np.degrees(e.tilt_rad),
+        "held_out_tilt_deg": np.degrees(e.held_out_tilt_rad),
+    }
+    return CalibrationResult(
+        X_BC=e.X_BC,
+        covariance=e.covariance,
+        held_out_mm=error_summary(1e3 * e.held_out_m[e.inliers]),
+        tilt_deg=tilt_summary(e.held_out_tilt_rad[e.inliers]),
+        poses=pose_records(ids, e.inliers, values, refused),
+        unobservable=e.unobservable,
+        sigma_position_mm=1e3 * e.sigma_position_m,
+        sigma_normal_deg=float(np.degrees(e.sigma_normal_rad)),
+        software=software_version(),
+        clock=e.clock,
+        clock_covariance=e.joint,
+        **more,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,7 +96,7 @@ class MotionReport:
         """The JSON object of `calibrate` in motion: the keys of the calibration at rest, and those of the clock."""
         e, r = self.estimate, self.result
         clock = e.clock
-        before, after = (None if not np.isfinite(v) else v for v in self.along_rms_mm)
+        before, after = map(known, self.along_rms_mm)
         return {
             "state": "done",
             "mode": "motion",
@@ -92,7 +117,7 @@ class MotionReport:
             "rolling_ms": _ms(clock.rolling_s),
             "late": list(clock.late),
             "scanner_correction": None,
-            "held_out_mm": {k: _number(r.held_out_mm[k]) for k in ("median", "mean", "p95")},
+            "held_out_mm": {k: known(r.held_out_mm[k]) for k in ("median", "mean", "p95")},
             "held_out_interval_mm": None,
             "tilt_deg": r.tilt_deg,
             "rms_mm": self.rms_mm,
@@ -101,7 +126,7 @@ class MotionReport:
             "warnings": list(r.warnings),
             "unobservable": list(r.unobservable),
             "seconds": self.seconds,
-            "k_fold_mm": {k: _number(v) for k, v in r.held_out_mm.items()},
+            "k_fold_mm": {k: known(v) for k, v in r.held_out_mm.items()},
             "axis_turn_deg": None,
             "advice": [],
             "features": [],
@@ -111,10 +136,6 @@ class MotionReport:
 
 def _ms(seconds: float | None) -> float | None:
     return None if seconds is None else 1e3 * seconds
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def motion_screen(
@@ -136,9 +157,7 @@ def motion_screen(
     place = "in the middle of the frames" if r.symbol == "X_BC" else "at the target"
     what = f"error {place}, 95 %"
     expected, larger = expected_error(what, own, p95, len(held), "frames")
-    tolerance = None
-    if limit_mm is not None:
-        tolerance = Tolerance(f"the {what},", larger, limit_mm, "--limit-mm")
+    tolerance = limit_tolerance(what, larger, limit_mm)
     notes = refused_note(refused, len(p_C) + len(refused), "frames")
     concerns = (*r.warnings, *r.unobservable)
     found = Findings(
@@ -165,7 +184,6 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
     """The whole report as one self-contained HTML text."""
     r, e = report.result, report.estimate
     clock = e.clock
-    sigma = np.sqrt(np.diag(r.covariance))
     before, after = report.along_rms_mm
     facts = [
         ("clock used", f"{clock.kind}. {clock.reason}"),
@@ -195,11 +213,7 @@ def motion_report(report: MotionReport, *, dataset: str) -> str:
         offset_ms=None if clock.offset_s is None else 1e3 * clock.offset_s,
         offset_sigma_ms=None if clock.sigma_s is None else 1e3 * clock.sigma_s,
         first=report.first,
-        pose_facts=[
-            ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
-            ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
-            ("ROS 2", export_ros2(r.X_BC).strip()),
-        ],
+        pose_facts=[*sigma_rows(r.covariance), ("ROS 2", export_ros2(r.X_BC).strip())],
         clock_facts=facts,
         along=_along(report),
         cost=_cost(report),
@@ -216,8 +230,7 @@ def _ms_text(seconds: float | None) -> str:
 def _along(report: MotionReport) -> bytes:
     """Residual along the motion against time, before and after synchronisation."""
     e = report.estimate
-    figure = Figure(figsize=(8.2, 5.4), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
+    figure, (upper, lower) = subplots(8.2, 5.4, 2, 1, sharex=True)
     t = e.capture - e.capture[0]
     for axes, values, color, name in (
         (upper, e.before_m, TRUTH, "arrivals taken for captures"),
@@ -241,16 +254,15 @@ def _along(report: MotionReport) -> bytes:
 def _cost(report: MotionReport) -> bytes:
     """Rms of the rigid fit against the delay of the frames' times."""
     start, clock = report.estimate.start, report.estimate.clock
-    figure = Figure(figsize=(8.2, 3.4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.4)
     good = np.isfinite(start.rms_m)
     axes.plot(1e3 * start.delays[good], 1e3 * start.rms_m[good], color=OURS, linewidth=1.6)
     axes.axvline(1e3 * start.delay_s, color=TRUTH, linewidth=1, linestyle="--")
-    axes.set_xlabel(
-        "offset of the arrivals, ms"
+    axes.set(
+        xlabel="offset of the arrivals, ms"
         if clock.kind != DEVICE
-        else "device time behind the median arrival less capture, ms"
+        else "device time behind the median arrival less capture, ms",
+        ylabel="rms of the rigid fit, mm",
     )
-    axes.set_ylabel("rms of the rigid fit, mm")
     axes.set_ylim(bottom=0.0)
     return svg(figure, axes)

@@ -50,7 +50,7 @@ from weldcal.tools.report.hand_eye import (
     undetermined,
     unknown_tables,
 )
-from weldcal.tools.report.pictures import OURS, error_bars, millimetres, svg
+from weldcal.tools.report.pictures import OURS, error_bars, millimetres, subplots, svg
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.run import robot_timing
 
@@ -378,17 +378,14 @@ def _growth(report: MountingReport) -> bytes:
     """Expected error of a point at the work distance after every scan."""
     n, sigma = np.array(report.status.history).T
     required = report.tolerance[0]
-    figure = Figure(figsize=(8.2, 2.8), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 2.8)
     axes.plot(n, 1e3 * sigma, "o-", color=OURS, markersize=5)
     if required is not None:
         axes.axhline(required, color="#a8402f", linewidth=1, linestyle=":")
         axes.annotate(f"required {required:.2f}", (n[0], required), fontsize=9, va="bottom", color="#a8402f")
     axes.set_yscale("log")
     millimetres(axes)
-    axes.set_xticks(n)
-    axes.set_xlabel("scans")
-    axes.set_ylabel("expected error, mm")
+    axes.set(xticks=n, xlabel="scans", ylabel="expected error, mm")
     return svg(figure, axes)
 
 
@@ -481,8 +478,7 @@ def _annotated(image: NDArray[np.uint8], frames: dict[str, RigidTransform], X_WV
     placed: list[Array] = []
     for letter, X in frames.items():
         _draw_frame(axes, letter, X, X_WV, placed)
-    axes.set_xlim(0, WIDTH)
-    axes.set_ylim(HEIGHT, 0)
+    axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 
@@ -41,8 +41,7 @@ def error_bars(
     """One bar per pose (n,), grey where not ``keep``; the median of the others as a line (``median_of`` names them),
     and ``stated`` (a height and its name) as another. Gross outliers end at the top edge, with their value."""
     x = np.arange(len(error))
-    figure = Figure(figsize=(8.2, 3.2), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.2)
     keep = keep & np.isfinite(error)
     if not np.isfinite(error).any():
         axes.text(0.5, 0.5, "too few scans for cross-validation", transform=axes.transAxes, ha="center", color="#555")
@@ -85,8 +84,7 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
     seen = np.array([o.p_CR for o in observations])
     base = np.array([o.p_BR for o in observations])
     error = (seen @ R.T + X_BC.translation() - base) @ R
-    figure = Figure(figsize=(8.2, 3.7), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = subplots(8.2, 3.7, 1, 2)
     # a lone pose has no extent: its arrow is drawn against 50 mm
     extent = max(float(np.ptp(seen[:, :2], axis=0).max()), 0.05)
     scale = 0.12 * extent / max(float(np.median(np.linalg.norm(error, axis=1))), 1e-9)
@@ -94,8 +92,7 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
         at, e = 1e3 * seen[:, (i, j)].T, error[:, (i, j)].T
         axes.quiver(*at, *e, angles="xy", scale_units="xy", scale=1e-3 / scale, color=OURS, width=0.004)
         axes.plot(*at, ".", color="#555", markersize=4)
-        axes.set_xlabel(f"camera {names[0]}, mm")
-        axes.set_ylabel(f"camera {names[1]}, mm")
+        axes.set(xlabel=f"camera {names[0]}, mm", ylabel=f"camera {names[1]}, mm")
         axes.set_aspect("equal", adjustable="datalim")
         axes.invert_yaxis()
         axes.margins(0.15)
@@ -103,8 +100,14 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
     return svg(figure, left, right)
 
 
+def subplots(width: float, height: float, *grid: int, **settings: Any) -> tuple[Figure, Any]:
+    """An empty figure of that size in inches, and its axes: one, or a ``grid`` of rows and columns as in subplots."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(*grid, **settings)
+
+
 def millimetres(axes: Axes) -> None:
-    """Ticks of a logarithmic axis as a person writes lengths: 0.04, not 4 times ten to the minus two."""
+    """Ticks of a logarithmic axis as an operator writes lengths: 0.04, not 4 times ten to the minus two."""
     axes.yaxis.set_major_formatter("{x:g}")
     low, high = axes.get_ylim()
     digits = "123456789" if high < 2.5 * low else "235" if high < 30.0 * low else ""
@@ -117,8 +120,7 @@ def millimetres(axes: Axes) -> None:
 
 def plain(axes: Axes, x: str, y: str) -> None:
     """Axis labels, no box, a faint grid."""
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
+    axes.set(xlabel=x, ylabel=y)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
 

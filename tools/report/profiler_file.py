@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.profiler.record import ProfilerRecord
@@ -17,13 +16,13 @@ from weldcal.tools.report.first_screen import (
     FirstScreen,
     Next,
     ShownPose,
-    Tolerance,
     expected_error,
+    limit_tolerance,
     point_covariance,
     radius_95,
 )
-from weldcal.tools.report.pictures import OURS, error_bars, svg
-from weldcal.tools.report.render import fixed, fixed_row, render
+from weldcal.tools.report.pictures import OURS, error_bars, subplots, svg
+from weldcal.tools.report.render import fixed, render, sigma_rows
 
 _NAMES = {
     "scans": ("scans", ""),
@@ -94,9 +93,7 @@ class ProfilerFile:
         p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
         what = "error in the middle of the profiles, 95 %"
         expected, larger = expected_error(what, own, p95, len(held), "scans")
-        tolerance = None
-        if self.limit_mm is not None:
-            tolerance = Tolerance(f"the {what},", larger, self.limit_mm, "--limit-mm")
+        tolerance = limit_tolerance(what, larger, self.limit_mm)
         grave, notes = scan_notes(self.found)
         found = Findings(
             tolerance=tolerance, unseen=len(held), concerns=(*self.found.get("warnings", ()), *grave), notes=notes
@@ -148,9 +145,7 @@ class ProfilerSeam:
                 f"{own:.3f} mm",
                 f"of the profiler's calibration; {fit}; no point of the groove was measured otherwise",
             )
-        tolerance = None
-        if self.limit_mm is not None:
-            tolerance = Tolerance(f"the {what},", float("nan") if own is None else own, self.limit_mm, "--limit-mm")
+        tolerance = limit_tolerance(what, float("nan") if own is None else own, self.limit_mm)
         grave, notes = scan_notes(self.found)
         found = Findings(tolerance=tolerance, concerns=(*self.found.get("warnings", ()), *grave), notes=notes)
         after = Next("Touch some points of the groove with a pointer of known length, and compare them with seam.csv.")
@@ -177,7 +172,6 @@ def profiler_report(made: ProfilerFile) -> str:
     """The page of a calibration from a file, as one self-contained HTML text."""
     held = made.held_out_mm
     judged = bool(np.isfinite(held).any())
-    sigma = None if made.record.covariance is None else np.sqrt(np.diag(made.record.covariance))
     return render(
         "profiler_file.html.j2",
         first=made.first,
@@ -191,14 +185,7 @@ def profiler_report(made: ProfilerFile) -> str:
         seen=_seen(made.points),
         seam=None,
         rows=_rows(made.found),
-        sigma=(
-            []
-            if sigma is None
-            else [
-                ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
-                ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
-            ]
-        ),
+        sigma=[] if made.record.covariance is None else sigma_rows(made.record.covariance),
         warnings=list(made.found.get("warnings", ())),
         lists=_lists(made.found),
         digest=made.record.data_sha256,
@@ -224,7 +211,7 @@ def seam_report(seam: ProfilerSeam) -> str:
 
 
 def _rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The short values of a result, by the names of a person."""
+    """The short values of a result, by the names of an operator."""
     rows = []
     for key, (name, unit) in _NAMES.items():
         value = found.get(key)
@@ -242,12 +229,10 @@ def _lists(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _seen(points: Array) -> bytes:
     """Where in the scan plane the points (n, 2) m were measured: the calibration is good there."""
-    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.6)
     axes.plot(1e3 * points[:, 0], 1e3 * points[:, 1], ".", color=OURS, markersize=2.5)
     axes.plot(*(1e3 * points.mean(axis=0)), "+", color="#000000", markersize=12, markeredgewidth=1.6)
-    axes.set_xlabel("x in the scan plane, mm")
-    axes.set_ylabel("z, mm")
+    axes.set(xlabel="x in the scan plane, mm", ylabel="z, mm")
     axes.invert_yaxis()
     axes.set_aspect("equal", adjustable="datalim")
     return svg(figure, axes)
@@ -255,12 +240,10 @@ def _seen(points: Array) -> bytes:
 
 def _line(root_mm: Array) -> bytes:
     """The root (n, 3) mm of a groove in the base, from above and from the side."""
-    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
-    both = figure.subplots(1, 2)
+    figure, both = subplots(8.2, 3.6, 1, 2)
     for axes, (i, j), title in zip(both, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         axes.plot(root_mm[:, i], root_mm[:, j], ".", color=OURS, markersize=4)
-        axes.set_xlabel(f"base {'xyz'[i]}, mm")
-        axes.set_ylabel(f"base {'xyz'[j]}, mm")
+        axes.set(xlabel=f"base {'xyz'[i]}, mm", ylabel=f"base {'xyz'[j]}, mm")
         axes.set_title(title, fontsize=10, loc="left")
         axes.margins(0.1)
     return svg(figure, *both)

@@ -27,7 +27,7 @@ from weldcal.tools.report.first_screen import (
     point_covariance,
     radius_95,
 )
-from weldcal.tools.report.pictures import OURS, svg
+from weldcal.tools.report.pictures import OURS, subplots, svg
 from weldcal.tools.report.profiler_file import WORDS
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.report.run import RunOptions, robot_timing
@@ -398,8 +398,7 @@ def _shown(value: object) -> str:
 
 def sigmas_picture(poses: Mapping[str, Sequence[PoseOutcome]]) -> bytes:
     """Each of six parts of the error of X_FS in sigmas of its own prediction, a dot a run; the band is 3 sigma."""
-    figure = Figure(figsize=(8.2, 3.0), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.0)
     axes.axhspan(-3.0, 3.0, color="#e8eef2", zorder=0)
     axes.axhline(0.0, color="#444", linewidth=0.8)
     for k, (name, found) in enumerate(poses.items()):
@@ -410,16 +409,14 @@ def sigmas_picture(poses: Mapping[str, Sequence[PoseOutcome]]) -> bytes:
             axes.plot(at, pose.parts, "o", color=_COLOURS[name], markersize=size, label=name if j == 0 else None)
     axes.set_xticks(range(6), PARTS)
     largest = max(float(np.abs(p.parts).max()) for found in poses.values() for p in found)
-    axes.set_ylim(-max(4.0, 1.1 * largest), max(4.0, 1.1 * largest))
-    axes.set_ylabel("error / predicted sigma")
+    axes.set(ylim=(-max(4.0, 1.1 * largest), max(4.0, 1.1 * largest)), ylabel="error / predicted sigma")
     axes.legend(frameon=False, ncols=2, loc="upper right")
     return svg(figure, axes)
 
 
 def path_picture(paths: Mapping[str, PathOutcome], limit_mm: float) -> bytes:
     """Distance from the true line along it: raw points as dots, the seam and the torch as lines."""
-    figure = Figure(figsize=(8.2, 3.2), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.2)
     styles = {
         "points": (".", GREY, "each profile's root"),
         "curve": ("-", OURS, "seam as found"),
@@ -430,9 +427,7 @@ def path_picture(paths: Mapping[str, PathOutcome], limit_mm: float) -> bytes:
         axes.plot(1e3 * path.s, path.distance_mm, style, color=colour, label=label, markersize=3, linewidth=1.6)
     axes.axhline(limit_mm, color="#a8402f", linewidth=1, linestyle=":")
     axes.annotate(f"{limit_mm:g} mm", (axes.get_xlim()[0], limit_mm), fontsize=9, va="bottom", color="#a8402f")
-    axes.set_ylim(0.0, None)
-    axes.set_xlabel("along the seam, mm")
-    axes.set_ylabel("off the true line, mm")
+    axes.set(ylim=(0.0, None), xlabel="along the seam, mm", ylabel="off the true line, mm")
     axes.legend(frameon=False, ncols=3, loc="upper right")
     return svg(figure, axes)
 
@@ -458,16 +453,14 @@ def profiles_picture(profiles: Mapping[str, Array]) -> bytes:
 
 def torch_bars(seeds: Sequence[int], paths: Sequence[PathOutcome], limit_mm: float) -> bytes:
     """Mean and largest distance of the torch from the true line, a pair a seed."""
-    figure = Figure(figsize=(8.2, 3.0), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(8.2, 3.0)
     x = np.arange(len(paths))
     axes.bar(x, [p.distance_mm.max() for p in paths], color="#e3c3ae", width=0.7, label="largest")
     axes.bar(x, [p.distance_mm.mean() for p in paths], color=RUST, width=0.7, label="mean")
     axes.axhline(limit_mm, color="#a8402f", linewidth=1, linestyle=":")
     axes.annotate(f"{limit_mm:g} mm", (-0.35, limit_mm), fontsize=9, va="bottom", color="#a8402f")
     axes.set_xticks(x, [str(s) for s in seeds])
-    axes.set_xlabel("seed")
-    axes.set_ylabel("torch off the true line, mm")
+    axes.set(xlabel="seed", ylabel="torch off the true line, mm")
     axes.set_ylim(0.0, 1.3 * max(limit_mm, max(float(p.distance_mm.max()) for p in paths)))
     axes.legend(frameon=False, ncols=2, loc="upper right")
     return svg(figure, axes)

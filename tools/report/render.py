@@ -6,10 +6,12 @@ import math
 import re
 from collections.abc import Iterable
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
 from markupsafe import Markup, escape
 
 from weldcal.calibration.data.results import software_version
+from weldcal.models.arrays import Array
 from weldcal.models.result_files import write_atomic as write_atomic
 
 _MEDIA_TYPES = ((b"\x89PNG", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"<svg", "image/svg+xml"))
@@ -71,6 +73,20 @@ def fixed(value: float | None, digits: int = 2) -> str:
 def fixed_row(values: Iterable[float], digits: int = 2) -> str:
     """Numbers as ``fixed`` writes them, in one row."""
     return "  ".join(fixed(float(value), digits) for value in values)
+
+
+def known(value: float) -> float | None:
+    """The number for a JSON object; None where it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
+def sigma_rows(covariance: Array) -> list[tuple[str, str]]:
+    """The two rows of one sigma of a pose with covariance (6, 6) [rotation; translation], rad and m."""
+    sigma = np.sqrt(np.diag(covariance))
+    return [
+        ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
+        ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
+    ]
 
 
 def environment() -> Environment:

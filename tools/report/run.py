@@ -6,12 +6,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from weldcal.systems.runner import Run
 from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
 from weldcal.tools.report.first_screen import FirstScreen
-from weldcal.tools.report.pictures import GREY, OURS, THEIRS, plain, svg
+from weldcal.tools.report.pictures import GREY, OURS, THEIRS, plain, subplots, svg
 from weldcal.tools.report.render import fixed
 
 KeepPage = Callable[[Callable[[FirstScreen | None, Path | None], None], Callable[[], None]], None]
@@ -83,16 +81,14 @@ def histogram(late: Lateness) -> bytes:
     names += [f"{low:g} – {high:g}" for low, high in pairwise(LIMITS_MS)]
     names.append(f"≥ {LIMITS_MS[-1]:g}")
     on_time = LIMITS_MS.index(ON_TIME_MS) + 1
-    figure = Figure(figsize=(7.2, 2.6), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = subplots(7.2, 2.6)
     colours = [OURS if k < on_time else THEIRS for k in range(len(names))]
     axes.bar(range(len(names)), late.counts, color=colours, width=0.8)
     for k, count in enumerate(late.counts):
         axes.annotate(
             str(count), (k, max(count, 0.8)), ha="center", va="bottom", fontsize=8, color="black" if count else GREY
         )
-    axes.set_yscale("log")
-    axes.set_ylim(0.5, 5.0 * max(late.counts))
+    axes.set(yscale="log", ylim=(0.5, 5.0 * max(late.counts)))
     axes.set_xticks(range(len(names)), names)
     plain(axes, "late by, ms of robot time", "velocities")
     return svg(figure, axes)

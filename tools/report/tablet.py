@@ -23,9 +23,10 @@ from weldcal.tools.report.first_screen import (
     ShownPose,
     Tolerance,
     after_hold,
+    limit_tolerance,
 )
 from weldcal.tools.report.pictures import OURS, svg
-from weldcal.tools.report.render import fixed, fixed_row, render
+from weldcal.tools.report.render import fixed, fixed_row, render, sigma_rows
 from weldcal.tools.report.run import robot_timing
 
 Card = tuple[str, str, str, str, str]
@@ -102,7 +103,7 @@ def _touch(held_mm: Array, what: str, limit_mm: float | None) -> tuple[ExpectedE
     held = held_mm[np.isfinite(held_mm)]
     p95 = float(np.percentile(held, 95)) if len(held) else float("nan")
     name = "error of a touch, 95 %"
-    tolerance = None if limit_mm is None else Tolerance(f"the {name},", p95, limit_mm, "--limit-mm")
+    tolerance = limit_tolerance(name, p95, limit_mm)
     if not len(held):
         return ExpectedError(name, "not known", "no landmark could be left out"), tolerance
     return (
@@ -186,8 +187,7 @@ def miss_arrows(shown: Shown) -> bytes:
     axes.set_aspect("equal", adjustable="datalim")
     axes.invert_yaxis()
     axes.margins(0.2)
-    axes.set_xlabel("page x, mm")
-    axes.set_ylabel("page y, mm")
+    axes.set(xlabel="page x, mm", ylabel="page y, mm")
     axes.set_title(f"residuals, enlarged {times:g} times (largest {largest:.2f} mm)", fontsize=9, loc="left")
     return svg(figure, axes)
 
@@ -327,11 +327,9 @@ def _pose(result: TabletResult) -> list[tuple[str, str]]:
     if result.X_FC is None or result.p_FP_m is None or result.p_FP_covariance is None:
         scaled = {n: _UNITS.get(n, ("mm", 1e3)) for n in result.parameters}
         return [(n, f"{fixed(scaled[n][1] * v, 4)} {scaled[n][0]}".strip()) for n, v in result.parameters.items()]
-    sigma = np.sqrt(np.diag(np.array(result.X_FC_covariance)))
     pen = np.sqrt(np.diag(np.array(result.p_FP_covariance)))
     return [
-        ("one sigma of the position, mm", fixed_row(1e3 * sigma[3:], 3)),
-        ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
+        *sigma_rows(np.array(result.X_FC_covariance)),
         ("pen tip on the flange, mm", fixed_row(1e3 * np.array(result.p_FP_m), 3)),
         ("one sigma of the tip, mm", fixed_row(1e3 * pen, 3)),
         ("ROS 2", export_ros2(result.X_FC, "flange", "camera_optical_frame").strip()),

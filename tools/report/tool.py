@@ -9,7 +9,6 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.spatial import ConvexHull, QhullError
@@ -22,7 +21,8 @@ from weldcal.models.robots import ROBOTS
 from weldcal.models.tool import ToolShape
 from weldcal.models.tools.enclosing import shape_mesh
 from weldcal.models.tools.loading import LoadedTool
-from weldcal.systems.drivers.simulated.tag_view import TagView
+from weldcal.systems.drivers.simulated.rendered_finger_camera import TagView
+from weldcal.tools.report.pictures import subplots
 from weldcal.tools.report.render import render
 from weldcal.welding.servo.tool_axes import least_pipe_m
 
@@ -177,12 +177,10 @@ def tool_report(check: ToolCheck, picture: bytes) -> str:
 def tool_picture(loaded: LoadedTool) -> bytes:
     """PNG: the tool from the side (x, z), from behind (y, z) and along the flange's axis (x, y), mm in F; the camera's
     picture."""
-    figure = Figure(figsize=(13.0, 9.5), layout="constrained")
-    axes = figure.subplots(2, 2)
+    figure, axes = subplots(13.0, 9.5, 2, 2)
     for at, plane, names in ((axes[0, 0], (0, 2), "xz"), (axes[0, 1], (1, 2), "yz"), (axes[1, 0], (0, 1), "xy")):
         _view(at, loaded, plane)
-        at.set_xlabel(f"{names[0]} of the flange, mm")
-        at.set_ylabel(f"{names[1]} of the flange, mm")
+        at.set(xlabel=f"{names[0]} of the flange, mm", ylabel=f"{names[1]} of the flange, mm")
         at.set_aspect("equal", adjustable="datalim")
         at.grid(alpha=0.25)
         if names[1] == "z":

@@ -9,9 +9,19 @@ import numpy as np
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.pairs.judging import FALSE_ALARM, POWER, SHOWN_MM, SMALL, Judgement
 from weldcal.calibration.hand_eye.solve import as_transform
-from weldcal.tools.report.first_screen import CARE, DO_NOT, USE, ExpectedError, Findings, FirstScreen, Next, ShownPose
+from weldcal.tools.report.first_screen import (
+    CARE,
+    DO_NOT,
+    USE,
+    ExpectedError,
+    Findings,
+    FirstScreen,
+    Next,
+    ShownPose,
+    upper,
+)
 from weldcal.tools.report.pictures import error_bars
-from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.render import fixed, known, render
 from weldcal.tools.report.verify import NONE, Verdict
 
 CANNOT_TELL = "cannot tell"
@@ -85,7 +95,7 @@ class PairsReport:
             chance = f"By chance alone a right pose differs as much with a probability of {_small(j.chance)}."
             if j.other is not None:
                 return Verdict(
-                    DO_NOT, limit, f"{_upper(j.other[0])} fits: {j.other[1]:.1f} mm. As it is, {off}. {held}."
+                    DO_NOT, limit, f"{upper(j.other[0])} fits: {j.other[1]:.1f} mm. As it is, {off}. {held}."
                 )
             if limit is not None:
                 small, why = j.off_mm <= limit, f"The error is within the limit of {limit:g} mm."
@@ -157,11 +167,11 @@ class PairsReport:
             "read_as": self.read_as,
             "held_out_mm": j.held_out_mm,
             "held_out_deg": j.held_out_deg,
-            "off_mm": _known(j.off_mm),
-            "off_deg": _known(j.off_deg),
-            "off_uncertainty_mm": _known(j.uncertain_mm),
-            "shown_mm": _known(j.shown_mm),
-            "chance": _known(j.chance),
+            "off_mm": known(j.off_mm),
+            "off_deg": known(j.off_deg),
+            "off_uncertainty_mm": known(j.uncertain_mm),
+            "shown_mm": known(j.shown_mm),
+            "chance": known(j.chance),
             "false_alarm": FALSE_ALARM,
             "fits": None if j.other is None else {"form": j.other[0], "off_mm": j.other[1]},
             "new": (
@@ -169,8 +179,8 @@ class PairsReport:
                 if j.new is None
                 else {
                     "X": j.new.X,
-                    "held_out_mm": _known(j.new_held_out_mm),
-                    "held_out_deg": _known(j.new.held_out.rms_deg),
+                    "held_out_mm": known(j.new_held_out_mm),
+                    "held_out_deg": known(j.new.held_out.rms_deg),
                 }
             ),
             "per_pose": [
@@ -218,13 +228,5 @@ def verify_pairs_report(report: PairsReport) -> str:
     )
 
 
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def _small(chance: float) -> str:
     return f"{chance:.2g}" if chance >= 1e-6 else "less than 1e-6"
-
-
-def _upper(text: str) -> str:
-    return text[0].upper() + text[1:]

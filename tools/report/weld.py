@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
-from weldcal.calibration.geometry.rigid import fit_rigid
+from weldcal.calibration.geometry.se3 import fit_rigid
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array

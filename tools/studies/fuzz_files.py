@@ -12,8 +12,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.damaged_files import GOOD, READERS, Reader, damaged, lay_out
-from weldcal.tools.worlds.damaged_reading import Child
+from weldcal.tools.worlds.damaged_files import GOOD, READERS, Child, Reader, damaged, lay_out
 
 _KEPT = 20  # offending files of each reader and verdict
 

@@ -1,4 +1,4 @@
-"""Runs every study in one way: cases on workers, figures, targets, a table, and the files of its result.
+"""Runs every study in one way: cases on workers, figures, targets with verdicts, tables, and the files of its result.
 
 A study is one frozen description in its own module, and the command that runs it:
 
@@ -24,23 +24,109 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table as RichTable
 
 from weldcal.calibration.data.results import software_version
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome
 from weldcal.tools.console import plain
-from weldcal.tools.farm.journal import Result
-from weldcal.tools.farm.run import Farm
-from weldcal.tools.farm.work import FAILED
+from weldcal.tools.farm.pools import FAILED
+from weldcal.tools.farm.run import Farm, Result
 from weldcal.tools.report.files import csv_text, write_json
-from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import markdown_table, print_table
-from weldcal.tools.studies.targets import Target, all_met
+from weldcal.tools.report.render import fixed, write_atomic
+
+_STYLES = {"met": "[green]met[/]", "MISSED": "[bold red]MISSED[/]"}
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown, with a newline at its end."""
+    lines = [header, *rows]
+    text = [f"| {' | '.join(line)} |\n" for line in lines]
+    return "".join([text[0], f"|{'---|' * len(header)}\n", *text[1:]])
+
+
+def print_table(
+    title: str, header: Sequence[str], rows: Iterable[Sequence[str]], *, text: Sequence[int] = (0,)
+) -> None:
+    """Write a table on stdout; columns in `text` are text, the others are numbers, aligned right."""
+    table = RichTable(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0))
+    for k, name in enumerate(header):
+        table.add_column(name, justify="left" if k in text else "right")
+    for row in rows:
+        table.add_row(*(_STYLES.get(cell, cell) for cell in row))
+    console = Console()
+    console.print(table)
+    console.print()
+
+
+Bound = Literal["≤", "≥", "<", "±"]
+
+
+class Target(NamedTuple):
+    """A bound and, once measured, the figure that is held against it.
+
+    Attributes:
+        what: the figure's name; unit: of value and limit.
+        value: what was reached; NaN (not measured) misses every bound.
+        bound: how value compares with limit; with "±" it may differ from limit by tolerance.
+        over: the statistic over the runs, such as "worst" or "mean"; empty for a single figure.
+        decides: whether a miss fails the study. Wall-clock times are shown and do not decide.
+    """
+
+    what: str
+    unit: str
+    value: float
+    limit: float
+    bound: Bound = "≤"
+    tolerance: float = 0.0
+    over: str = ""
+    decides: bool = True
+
+    @property
+    def met(self) -> bool:
+        """Whether the figure is within its bound."""
+        match self.bound:
+            case "≤":
+                return bool(self.value <= self.limit)
+            case "<":
+                return bool(self.value < self.limit)
+            case "≥":
+                return bool(self.value >= self.limit)
+            case "±":
+                return bool(abs(self.value - self.limit) <= self.tolerance)
+
+    @property
+    def verdict(self) -> str:
+        """The word for the tables."""
+        return verdict(self.met)
+
+    @property
+    def wanted(self) -> str:
+        """The bound with its unit, such as "worst ≤ 0.3 mm"."""
+        limit = f"{self.limit:g} ± {self.tolerance:g}" if self.bound == "±" else f"{self.bound} {self.limit:g}"
+        return " ".join(part for part in (self.over, limit, self.unit) if part)
+
+
+def verdict(met: bool) -> str:
+    """The word for a target that is met or missed."""
+    return "met" if met else "MISSED"
+
+
+def all_met(targets: Iterable[Target]) -> bool:
+    """Whether every target that decides is met."""
+    return all(t.met for t in targets if t.decides)
+
+
+def print_targets(title: str, targets: Iterable[Target], digits: int = 3) -> None:
+    """Write the targets as a table on stdout."""
+    rows = [(t.what, t.wanted, fixed(t.value, digits), t.verdict) for t in targets]
+    print_table(title, ("figure", "target", "reached", ""), rows, text=(0, 1, 3))
+
 
 Cases = Mapping[str, Mapping[str, Any]]
 """Keyword arguments of the case function, by the case's name."""
@@ -64,7 +150,7 @@ class Study:
         what: one sentence for the page of all studies.
         case: a module's function; keyword arguments to a mapping of JSON values. None: the results are computed
             elsewhere.
-        figures: from the results of the cases, failed ones included, to the JSON object.
+        figures: from the results of the cases, failed ones included, to the JSON object; without cases see `found`.
         header: names of the table's columns.
         rows: the table's lines, from the figures.
         targets: the bounds that the figures are judged against, from the figures.
@@ -76,9 +162,9 @@ class Study:
 
     name: str
     what: str
-    figures: Callable[[Results], Figures]
     header: Row
     rows: Callable[[Figures], Iterable[Row]]
+    figures: Callable[[Results], Figures] = lambda results: results["all"]
     case: Callable[..., Mapping[str, object]] | None = None
     targets: Callable[[Figures], Sequence[Target]] = lambda figures: ()
     plots: Mapping[str, Callable[[Results], bytes]] = field(default_factory=dict)
@@ -115,6 +201,10 @@ class Study:
         if found and not done(found):
             raise InputError(str(next(iter(found.values()))["reason"]))
         return self.measured(found, farm.folder, cases)
+
+    def found(self, figures: Figures, folder: Path) -> Outcome:
+        """The outcome of a study that computes its figures without cases; the files of its result are written."""
+        return self.measured({"all": dict(figures)}, folder).outcome()
 
     def measured(self, results: Results, folder: Path | None = None, cases: Cases | None = None) -> "Measured":
         """The figures, the table and the verdicts of results; with a folder their files are written there."""

@@ -10,8 +10,7 @@ import typer
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import Call, Outcome, command
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.harness import TABLE
-from weldcal.tools.studies.output import markdown_table
+from weldcal.tools.studies.harness import TABLE, markdown_table
 
 PAGE = "BENCHMARK.md"
 HEAD = """# Measured figures

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.eye_on_base.arm_start import arm_shape, find_arm
 from weldcal.models.arms.chain import Chain, chain_frames, chain_inverse, load_chain
 from weldcal.models.arms.kinematics import known_arms, load_arm
-from weldcal.models.arms.link_mesh import link_solids
+from weldcal.models.arms.urdf import link_solids
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import flange_mesh, get_flange

@@ -1,10 +1,20 @@
-"""Damaged files for every reader of a file that a user can write: an example is built, damaged and read; a verdict says
-what was read."""
+"""Reads damaged files with every reader, in a child process that is started anew after it hung, died or grew.
 
+As a program of its own this module is the child: it reads "reader seed case" lines and answers each with a line of
+JSON.
+"""
+
+import json
 import os
 import pickle
+import resource
+import selectors
 import shutil
+import subprocess
+import sys
+import time
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -20,7 +30,7 @@ from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.hand_eye.pairs.files import read_pairs
 from weldcal.calibration.profiler.record import load_record
-from weldcal.calibration.tablet.planar.files import load_planar
+from weldcal.calibration.tablet.planar_files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
 from weldcal.calibration.tablet.wrist.files import load_visit
 from weldcal.models.arms.kinematics import load_arm
@@ -28,15 +38,15 @@ from weldcal.models.array_files import read_grey_image
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario.loading import load_scenario, scenario_class
 from weldcal.tools.commands.profiler.files import read_profiler_file
-from weldcal.tools.worlds import binary_damage, cloud_examples, pose_examples, text_damage
 from weldcal.tools.worlds import file_examples as examples
+from weldcal.tools.worlds import scan_examples
+from weldcal.tools.worlds.damage import GRAMMARS
 from weldcal.tools.worlds.file_examples import Files, Rng
 from weldcal.welding.record.weld_log import load_weld_log
 
 ACCEPTED, REFUSED, INTERNAL, WRONG = "accepted", "refused", "internal error", "silently wrong"
 HANG, MEMORY, CRASH, EXECUTED = "hang", "memory", "crash", "executed"
 GOOD = (ACCEPTED, REFUSED)
-GRAMMARS = text_damage.GRAMMARS | binary_damage.GRAMMARS
 _PLACES = ("a pipe", "a folder", "a device", "a loop of links", "nothing")
 _ODD_PLACE = 0.02  # share of the cases in which no regular file is there
 _MAY_BE_MISSING = (
@@ -167,21 +177,21 @@ READERS = (
     Reader("weld-table", "table", "weld.csv", examples.weld_log, _weld_log, finite=False),
     Reader("weld-header", "json", "weld.json", examples.weld_log, _weld_log, finite=False),
     Reader("image", "image", "a.png", examples.image, lambda f: [read_grey_image(f / "a.png")]),
-    Reader("hand-eye-program", "text", "set/robot.txt", pose_examples.program, _pairs("set")),
-    Reader("hand-eye-captions", "text", "poses.txt", pose_examples.captions, _pairs("poses.txt")),
-    Reader("hand-eye-documents", "text", "set/robot.yaml", pose_examples.documents, _pairs("set")),
-    Reader("hand-eye-nested", "json", "pairs.json", pose_examples.nested, _pairs("pairs.json")),
-    Reader("hand-eye-matlab", "matlab", "pairs.mat", pose_examples.matlab, _pairs("pairs.mat")),
-    Reader("hand-eye-folder", "json", "set/sample_3.json", pose_examples.folder, _pairs("set")),
-    Reader("ply-grid", "cloud", "a.ply", cloud_examples.ply_grid, _cloud("a.ply"), finite=False),
-    Reader("ply-lists", "cloud", "a.ply", cloud_examples.ply_lists, _cloud("a.ply"), finite=False),
-    Reader("ply-gz", "bytes", "a.ply.gz", cloud_examples.ply_gz, _cloud("a.ply.gz"), finite=False),
-    Reader("pcd-stored", "cloud", "a.pcd", cloud_examples.pcd_stored, _cloud("a.pcd"), finite=False),
-    Reader("pts", "table", "a.pts", cloud_examples.pts, _cloud("a.pts"), finite=False),
-    Reader("depth-png", "image", "clouds/s0.png", cloud_examples.depth_png, _dataset, finite=False),
-    Reader("depth-tiff", "bytes", "clouds/s0.tif", cloud_examples.depth_tiff, _dataset, finite=False),
-    Reader("depth-npy", "npy", "clouds/s0.npy", cloud_examples.depth_npy, _dataset, finite=False),
-    Reader("intrinsics", "yaml", "camera_info.yaml", cloud_examples.depth_npy, _dataset, finite=False),
+    Reader("hand-eye-program", "text", "set/robot.txt", scan_examples.program, _pairs("set")),
+    Reader("hand-eye-captions", "text", "poses.txt", scan_examples.captions, _pairs("poses.txt")),
+    Reader("hand-eye-documents", "text", "set/robot.yaml", scan_examples.documents, _pairs("set")),
+    Reader("hand-eye-nested", "json", "pairs.json", scan_examples.nested, _pairs("pairs.json")),
+    Reader("hand-eye-matlab", "matlab", "pairs.mat", scan_examples.matlab, _pairs("pairs.mat")),
+    Reader("hand-eye-folder", "json", "set/sample_3.json", scan_examples.folder, _pairs("set")),
+    Reader("ply-grid", "cloud", "a.ply", scan_examples.ply_grid, _cloud("a.ply"), finite=False),
+    Reader("ply-lists", "cloud", "a.ply", scan_examples.ply_lists, _cloud("a.ply"), finite=False),
+    Reader("ply-gz", "bytes", "a.ply.gz", scan_examples.ply_gz, _cloud("a.ply.gz"), finite=False),
+    Reader("pcd-stored", "cloud", "a.pcd", scan_examples.pcd_stored, _cloud("a.pcd"), finite=False),
+    Reader("pts", "table", "a.pts", scan_examples.pts, _cloud("a.pts"), finite=False),
+    Reader("depth-png", "image", "clouds/s0.png", scan_examples.depth_png, _dataset, finite=False),
+    Reader("depth-tiff", "bytes", "clouds/s0.tif", scan_examples.depth_tiff, _dataset, finite=False),
+    Reader("depth-npy", "npy", "clouds/s0.npy", scan_examples.depth_npy, _dataset, finite=False),
+    Reader("intrinsics", "yaml", "camera_info.yaml", scan_examples.depth_npy, _dataset, finite=False),
 )
 
 
@@ -293,3 +303,115 @@ def _read(reader: Reader, folder: Path) -> tuple[ReaderVerdict, Any]:
 def digest(values: Any) -> str:
     """A hash of what was read."""
     return sha256(pickle.dumps(values)).hexdigest()
+
+
+WATCHDOG_S = 10.0
+WORKER = ("-m", "weldcal.tools.worlds.damaged_files")
+_START_S = 120.0  # to import everything, on a slow computer
+FREE = 1024**3  # bytes above those of the idle process that any file may take
+TIMES = 10  # and as many times the size of the file
+
+
+class Child:
+    """A worker process, started anew after it hung, died or took too much memory."""
+
+    def __init__(self, place: Path) -> None:
+        self._place = place
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> "Child":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._end()
+
+    def ask(self, reader: Reader, seed: int, case: int) -> tuple[ReaderVerdict, float]:
+        """The verdict of a case, and how many seconds it took with making its files."""
+        limit = WATCHDOG_S if self._process is not None else WATCHDOG_S + _START_S
+        process = self._process or self._start()
+        assert process.stdin is not None
+        try:
+            process.stdin.write(f"{reader.name} {seed} {case}\n")
+            process.stdin.flush()
+        except BrokenPipeError:
+            self._end()
+            return ReaderVerdict(CRASH, "the worker ended before the case"), 0.0
+        answer = self._line(process, limit)
+        if answer is None:
+            hung = process.poll() is None
+            self._end()
+            if hung:
+                return ReaderVerdict(HANG, f"no answer within {WATCHDOG_S:g} s"), WATCHDOG_S
+            return ReaderVerdict(CRASH, f"exit {process.returncode}"), 0.0
+        said: dict[str, Any] = json.loads(answer)
+        if said["said"] == MEMORY:  # the next case begins with little
+            self._end()
+        return ReaderVerdict(said["said"], said["detail"]), said["seconds"]
+
+    def _start(self) -> subprocess.Popen[str]:
+        shutil.rmtree(self._place, ignore_errors=True)
+        self._place.mkdir()
+        command = [sys.executable, "-P", *WORKER, str(self._place)]
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+        )
+        return self._process
+
+    def _line(self, process: subprocess.Popen[str], limit: float) -> str | None:
+        """The next line of the worker; None where none comes in time, or the worker ends."""
+        assert process.stdout is not None
+        with selectors.DefaultSelector() as selector:
+            selector.register(process.stdout, selectors.EVENT_READ)
+            if not selector.select(limit):
+                return None
+        line = process.stdout.readline()
+        if not line:
+            process.wait()
+        return line or None
+
+    def _end(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+            self._process = None
+
+
+def main() -> None:
+    """Work in the folder that is the first argument until the input ends."""
+    folder = Path(sys.argv[1])
+    os.chdir(folder)
+    warnings.simplefilter("ignore")
+    readers = {reader.name: reader for reader in READERS}
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print must not come between the answers
+    idle = _peak()
+    for line in sys.stdin:
+        name, seed, case = line.split()
+        place = folder / "case"
+        begin = time.monotonic()
+        verdict = judge(readers[name], int(seed), int(case), place)
+        seconds = time.monotonic() - begin
+        size = sum(p.stat().st_size for p in place.rglob("*") if p.is_file() and not p.is_symlink())
+        if too_much(_peak() - idle, size):
+            verdict = ReaderVerdict(MEMORY, f"{(_peak() - idle) / 2**20:.0f} MiB for {size} bytes; {verdict.said}")
+        answers.write(json.dumps({"said": verdict.said, "detail": verdict.detail, "seconds": seconds}) + "\n")
+        answers.flush()
+
+
+def too_much(taken: int, size: int) -> bool:
+    """Whether a case took more bytes than files of so many bytes may."""
+    return taken > FREE + TIMES * size
+
+
+def _peak() -> int:
+    """The largest resident size so far, bytes."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+if __name__ == "__main__":
+    main()

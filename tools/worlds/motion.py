@@ -1,5 +1,4 @@
-"""An independent world for calibration in motion: an arm through a cube's corners, seen by a streaming scanner, as a
-dataset.
+"""A world for calibration in motion: an arm that moves or stops before a scanner, and what disturbs a watched cell.
 
 It shares no model with the estimators: the motion is the controller's exact trapezoid, frames are rendered pixel by
 pixel over their exposure, delays are skewed, stamps jitter, and all numbers in the files are rounded. The truth is a
@@ -16,6 +15,9 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream, save_motion_dataset
+from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
+from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import Depth
@@ -26,9 +28,136 @@ from weldcal.models.scanner_streams import ScannerStream, get_stream
 from weldcal.models.scanners import ScannerPreset, depth_to_points, get_scanner
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.worlds.disturbance import Disturbance
-from weldcal.tools.worlds.moving_scene import MovingScene, RigidBody, arm_bodies
-from weldcal.tools.worlds.robot_path import RobotPath, cube_poses, path_through, reachable_start
+from weldcal.tools.worlds.moving_arm import (
+    MovingScene,
+    RigidBody,
+    RobotPath,
+    arm_bodies,
+    cube_poses,
+    leaning,
+    path_through,
+    reachable_start,
+)
+
+Vector = tuple[float, float, float]
+_NO_MOTION: Vector = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbance:
+    """Times in s after the start, lengths in mm in axes of the base, angles (roll, pitch, yaw) in degrees; zeros:
+    nothing happens.
+
+    knock_s, knock_mm, knock_deg   the scanner's housing jumps: its own origin by knock_mm, its axes by knock_deg
+    creep_mm_per_min               the scanner moves steadily from creep_s on base_s, base_mm, base_deg      the robot's
+    base jumps: the scanner and everything that stands still move in its frame warm_up_s                      time
+    constant of the scanner's own warm-up; 0: it is warm warm_up_scale, warm_up_gradient_per_m  its relative error of
+    lengths, and that per metre of x, while cold; both die away
+    """
+
+    knock_s: float = 0.0
+    knock_mm: Vector = _NO_MOTION
+    knock_deg: Vector = _NO_MOTION
+    creep_s: float = 0.0
+    creep_mm_per_min: Vector = _NO_MOTION
+    base_s: float = 0.0
+    base_mm: Vector = _NO_MOTION
+    base_deg: Vector = _NO_MOTION
+    warm_up_s: float = 0.0
+    warm_up_scale: float = 0.0
+    warm_up_gradient_per_m: float = 0.0
+
+    def world_in_base(self, t: float) -> RigidTransform:
+        """Pose X_BW of what stands still, in the robot's base, at ``t`` s; the two are one before the base has
+        moved."""
+        if t < self.base_s or not any((*self.base_mm, *self.base_deg)):
+            return RigidTransform()
+        return _pose(self.base_mm, self.base_deg).inverse()
+
+    def scanner_pose(self, X_BC: RigidTransform, t: float) -> RigidTransform:
+        """The scanner's true pose in the robot's base at ``t`` s, ``X_BC`` where nothing has happened."""
+        p: Array = X_BC.translation()
+        R = X_BC.rotation()
+        if t >= self.knock_s:
+            p = p + 1e-3 * np.array(self.knock_mm)
+            R = RollPitchYaw(np.radians(self.knock_deg)).ToRotationMatrix() @ R
+        if t > self.creep_s:
+            p = p + 1e-3 * (t - self.creep_s) / 60.0 * np.array(self.creep_mm_per_min)
+        return self.world_in_base(t) @ RigidTransform(R, p)
+
+    def device(self, scanner: ScannerPreset, t: float) -> ScannerPreset:
+        """The scanner with its own errors at ``t`` s of its warm-up."""
+        if not self.warm_up_s:
+            return scanner
+        cold = float(np.exp(-max(t, 0.0) / self.warm_up_s))
+        noise = replace(
+            scanner.noise,
+            scale_error=scanner.noise.scale_error + cold * self.warm_up_scale,
+            gradient_per_m=(cold * self.warm_up_gradient_per_m, 0.0),
+        )
+        return replace(scanner, noise=noise)
+
+    def summary(self, start_s: float) -> dict[str, Any]:
+        """The truth file's entry, with times on the robot's clock."""
+        out: dict[str, Any] = {}
+        if any((*self.knock_mm, *self.knock_deg)):
+            out["knock"] = {"time_s": start_s + self.knock_s, "mm": self.knock_mm, "deg": self.knock_deg}
+        if any(self.creep_mm_per_min):
+            out["creep"] = {"time_s": start_s + self.creep_s, "mm_per_min": self.creep_mm_per_min}
+        if any((*self.base_mm, *self.base_deg)):
+            out["base"] = {"time_s": start_s + self.base_s, "mm": self.base_mm, "deg": self.base_deg}
+        if self.warm_up_s:
+            out["warm_up"] = {
+                "time_constant_s": self.warm_up_s,
+                "scale": self.warm_up_scale,
+                "gradient_per_m": self.warm_up_gradient_per_m,
+            }
+        return out
+
+
+def _pose(mm: Vector, deg: Vector) -> RigidTransform:
+    return RigidTransform(RollPitchYaw(np.radians(deg)), 1e-3 * np.array(mm))
+
+
+def disturbance_of(knock: str = "", creep: str = "", base: str = "", warm_up: str = "") -> Disturbance:
+    """What happens while the scanner streams, from the numbers of the command line; "" for nothing.
+
+    Raises:
+        InputError: a text is no such list of numbers.
+    """
+    knocked = _numbers(knock, "--knock", (4, 7))
+    creeping = _numbers(creep, "--creep", (4,))
+    based = _numbers(base, "--base", (4, 7))
+    warming = _numbers(warm_up, "--warm-up", (2, 3))
+    return Disturbance(
+        knock_s=knocked[0],
+        knock_mm=_vector(knocked[1:4]),
+        knock_deg=_vector(knocked[4:7]),
+        creep_s=creeping[0],
+        creep_mm_per_min=_vector(creeping[1:4]),
+        base_s=based[0],
+        base_mm=_vector(based[1:4]),
+        base_deg=_vector(based[4:7]),
+        warm_up_s=warming[0],
+        warm_up_scale=1e-6 * warming[1],
+        warm_up_gradient_per_m=1e-6 * warming[2],
+    )
+
+
+def _numbers(text: str, name: str, counts: tuple[int, ...]) -> tuple[float, ...]:
+    """Seven numbers, zeros behind those given."""
+    try:
+        given = tuple(float(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        given = (float("nan"),)
+    if text and (len(given) not in counts or not all(abs(v) < 1e6 for v in given)):
+        raise InputError(f"{name} takes {' or '.join(map(str, counts))} numbers with commas between, and is '{text}'.")
+    return given + (0.0,) * (7 - len(given))
+
+
+def _vector(values: tuple[float, ...]) -> Vector:
+    return values[0], values[1], values[2]
+
 
 _DEPTH_STEP_M = 1e-5  # of the stored depths: a tenth of the smallest noise
 _POSE_DIGITS, _JOINT_DIGITS = 6, 6  # decimals of the stream's numbers
@@ -281,3 +410,67 @@ def _mounted(X: RigidTransform, translation_m: float, rotation_rad: float, rng: 
     off = rng.uniform(-1.0, 1.0, 6)
     turn = RollPitchYaw(*(rotation_rad * off[:3])).ToRotationMatrix()
     return RigidTransform(X.rotation() @ turn, X.translation() + translation_m * off[3:])
+
+
+GRID, SIDE_M, HEIGHT_M, PERTURBED_M = 4, 0.2, 0.22, 0.02
+_SHARP = ScannerStream(exposure_s=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One scan with its fit: points (H, W, 3) m in the camera frame, and the robot's pose then."""
+
+    points_C: Array
+    X_BF: RigidTransform
+    fit: FlangeFit
+
+
+class StaticMode:
+    """The world's scanner in its static mode, at the same true pose."""
+
+    def __init__(self, world: MotionWorld, width: int | None = None) -> None:
+        self._world = world
+        self.scanner: ScannerPreset = get_scanner("motioncam_3d_static", width)
+        self._scene = MovingScene(world.arm, arm_bodies(world.arm, world.flange), self.scanner, _SHARP)
+
+    def look(self, q: Array, rng: np.random.Generator) -> Look:
+        """Scan with the arm at rest at ``q`` (6,) rad. Raises FlangeNotFound."""
+        w, s = self._world, self.scanner
+        depth = self._scene.frame(lambda _: q, w.X_BC, 0.0, rng, samples=1)
+        points = depth_to_points(depth, s.fx, s.fy, s.cx, s.cy)
+        X_BF = forward_kinematics(w.arm, q)
+        X_CF = w.X_BC_nominal.InvertAndCompose(X_BF)  # known with a tape measure
+        guess = FlangeGuess(X_CF.translation(), 0.08, X_CF.rotation().matrix()[:, 2])
+        return Look(points, X_BF, fit_flange(points, w.flange, guess=guess))
+
+    def grid(self, seed: int, progress: Progress) -> list[Look]:
+        """The scans of the grid, without those that do not show the flange."""
+        w, rng = self._world, np.random.default_rng([seed, 4])
+        found, q = [], w.path.waypoints[0]
+        steps = SIDE_M * (np.arange(GRID) / (GRID - 1) - 0.5)
+        for k, (x, y) in enumerate((x, y) for x in steps for y in steps):
+            progress("static mode", k / GRID**2)
+            p = np.array([w.centre[0] + x, w.centre[1] + y, HEIGHT_M + rng.uniform(-1.0, 1.0) * PERTURBED_M])
+            near = nearest_solution(w.arm, leaning(p, facing(p, w.X_BC_nominal), np.radians(12.0), rng), q)
+            if near is None:
+                continue
+            q = near
+            try:
+                found.append(self.look(q, rng))
+            except FlangeNotFound:
+                continue
+        return found
+
+
+def noise_of_face(points_C: Array, fit: FlangeFit, world: MotionWorld) -> tuple[float, float, int]:
+    """Rms of the points of the flat face about its plane (mm), rms of its outer edge about its circle (mm), and their
+    number."""
+    flat = points_C.reshape(-1, 3)
+    flat = flat[np.isfinite(flat[:, 2])]
+    d = flat - fit.center_C
+    height = d @ fit.normal_C
+    reach = np.linalg.norm(d - height[:, None] * fit.normal_C, axis=1)
+    f = world.flange
+    on = (np.abs(height) < 0.003) & (reach > f.face_inner_radius_m) & (reach < f.face_outer_radius_m)
+    spread = 1e3 * float(np.sqrt(np.mean(height[on] ** 2)))
+    return spread, 1e3 * fit.outer_rms_m, int(np.count_nonzero(on))

@@ -1,4 +1,6 @@
-"""Writes the demo's cell for another arm: part, scanner and home scaled to the arm's reach."""
+"""Variants of the demo's cell: scaled to another arm's reach, or without the scanner's and the arm's own errors."""
+
+from __future__ import annotations
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -8,6 +10,9 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
+from weldcal.systems.scenario.schema import Scenario
 
 ARMS = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "ur30")
 REFERENCE = "ur10e"
@@ -89,3 +94,17 @@ def arm_scenario(arm: str, seam_mm: float) -> str:
         seam=seam_mm,
         home=", ".join(f"{angle:.1f}" for angle in np.rad2deg(home_of(arm))),
     )
+
+
+def perfect(scenario: Scenario) -> Scenario:
+    """The scenario with an exact simulated arm, a scanner that has noise only, and a calibration that takes both so."""
+    scanner = scenario.scanner_config()
+    if isinstance(scenario.robot, SimulatedUr):
+        scenario.robot.repeatability_mm = scenario.robot.kinematic_error_mm = 0.0
+    if isinstance(scanner, RenderedScanner):
+        scanner.scale_error = scanner.warp_mm = 0.0
+        scanner.gradient_error_per_m = [0.0, 0.0]
+    scenario.calibration.correct_scanner = False
+    scenario.calibration.required_error_mm = 0.10
+    scenario.calibration.maximum_scans = min(scenario.calibration.maximum_scans, 10)
+    return scenario

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.calibration.tablet.published.chain import DH_NAMES, HTM_NAMES, Model
-from weldcal.calibration.tablet.published.two_stage import AFFINE_NAMES
+from weldcal.calibration.tablet.published import AFFINE_NAMES, DH_NAMES, HTM_NAMES, Model
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.models.arrays import Array
 

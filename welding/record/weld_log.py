@@ -50,10 +50,10 @@ COLUMNS: tuple[LogColumn, ...] = (
         "phase",
         "",
         "",
-        "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT; HELD while a person holds the weld, BACK on the way"
-        " back after that",
+        "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT; HELD while an operator holds the weld, BACK on the"
+        " way back after that",
     ),
-    LogColumn("torch_on", "", "", "process output, 1 or 0: servo, job, robot, guard and person all agree"),
+    LogColumn("torch_on", "", "", "process output, 1 or 0: servo, job, robot, guard and operator all agree"),
     LogColumn("s_tip_m", "m", "planned seam", "arc length beside the tip"),
     LogColumn("s_torch_m", "m", "planned seam", "arc length beside the torch; negative before the seam"),
     *_vector("p_BW", "xyz", "m", "B", "torch (wire) point, from the measured joints", "_m"),

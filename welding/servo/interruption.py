@@ -42,7 +42,7 @@ class TrailPoint(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Interruption:
-    """A person's hold of a weld; `Interruption()` is a weld that is not held.
+    """An operator's hold of a weld; `Interruption()` is a weld that is not held.
 
     Attributes:
         trail: the newest ticks with the arc on, oldest first.

@@ -16,7 +16,7 @@ from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam
 class Phase(StrEnum):
     """The phases of one weld, in order; FAULT is latched.
 
-    HELD and BACK: a person holds it, and the way back after that.
+    HELD and BACK: an operator holds it, and the way back after that.
     """
 
     TOUCH = "TOUCH"

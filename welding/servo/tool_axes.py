@@ -13,9 +13,9 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.seat import JointSection, press_for, seat
 from weldcal.welding.numerics import Array, clip, cross, dot, norm, pose, unit
 from weldcal.welding.seam.chord_map import chord_map
+from weldcal.welding.seam.clearance import check_clearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows, check_feasible
-from weldcal.welding.seam.room import check_room
 from weldcal.welding.servo.settings import TORCH_ABOVE_ROOT_M, DeflectionControl, ServoConfig, ToolGeometry
 
 TRAVEL_MARGIN_RAD = math.radians(3.0)  # the weld stops 5 deg beyond the window: 2 deg are left for the plan's error
@@ -161,7 +161,7 @@ def check_ring(
     follow.
 
     Raises:
-        NoRoom: its body would touch the part.
+        NoClearance: its body would touch the part.
         InfeasibleSeam: its torch cannot follow its tip, or leaves its windows.
     """
     press = press_for(section, tool, None, None)
@@ -176,7 +176,7 @@ def check_ring(
         windows=SeamWindows.of(tool),
     )
     seam = SeamCurve.from_points(line + above * up, up=up)
-    check_room(mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, tool.chord_m, lean_rad)
+    check_clearance(mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, tool.chord_m, lean_rad)
     check_feasible(seam, tool.chord_m, config.weld_speed_m_s, config.windows)
     check_travel(seam, config)
 

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.camera_file import find_camera
-from weldcal.calibration.data.cloud_files.body import CloudError
-from weldcal.calibration.data.cloud_files.form import CloudForm
+from weldcal.calibration.data.cloud_files.body import CloudError, CloudForm
 from weldcal.models.array_files import npy_shape, png_depth, read_raw_image
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

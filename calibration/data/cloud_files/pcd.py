@@ -12,12 +12,12 @@ from pydrake.math import RotationMatrix
 
 from weldcal.calibration.data.cloud_files.body import (
     CloudError,
+    CloudForm,
     check_points,
     cloud_stream,
     column_values,
     text_columns,
 )
-from weldcal.calibration.data.cloud_files.form import CloudForm
 from weldcal.models.arrays import Array
 from weldcal.models.files import expansion_limit
 

@@ -1,6 +1,7 @@
-"""Reads the names of mountings and sorts file names as people number them."""
+"""Understand the names that files use: of mountings, of numbered files, and of a table's columns."""
 
 import re
+from dataclasses import dataclass
 
 MOUNTINGS = {
     "eye_on_base": ("eye_to_hand", "eye_on_base", "eye_off_hand", "fixed", "static", "stationary"),
@@ -20,6 +21,78 @@ MOUNTINGS = {
 FLANGES = ("tool0", "flange", "tool0_controller", "wrist_3_link", "ee_link", "link_6", "panda_link8", "fr3_link8")
 """Frames that arms' descriptions call their flange, the likeliest first."""
 BASES = ("base", "base_link", "world")
+
+IDS = (
+    "id", "name", "pose", "scan", "file", "filename", "image", "cloud", "label", "index", "nr", "no", "sample",
+    "frame", "#", "point", "idx",
+)  # fmt: skip
+TIMES = (
+    "time",
+    "%time",
+    "timestamp",
+    "stamp",
+    "t",
+    "time_s",
+    "header.stamp",
+    "sec",
+    "secs",
+    "timestamp_s",
+    "time_ns",
+    "timestamp_ns",
+)
+_POSITION = {
+    "position",
+    "pos",
+    "translation",
+    "trans",
+    "t",
+    "p",
+    "tvec",
+    "xyz",
+    "location",
+    "origin",
+    "linear",
+    "coord",
+}
+_ROTATION = {"rotation", "rot", "orientation", "r", "angle", "euler", "ori", "deg", "rad"}
+_VECTOR = {"rvec", "rotvec", "rv", "axisangle", "aa", "rodrigues"}
+_QUATERNION = {"quat", "quaternion", "q"}
+_FILLERS = {"field", "pose", "transform", "transforms0", "vector", "tcp", "data", "actual", "x1"}
+_OWNERS = (
+    "robot",
+    "camera",
+    "cam",
+    "hand",
+    "eye",
+    "ee",
+    "base",
+    "flange",
+    "target",
+    "marker",
+    "board",
+    "gripper",
+    "tool",
+)
+_WHOLE = {
+    "qw", "qx", "qy", "qz", "q0", "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "a", "b", "c", "w", "p", "r", "o",
+}  # fmt: skip
+_EULER_WORDS = (
+    ("alpha", "beta", "gamma"),
+    ("phi", "theta", "psi"),
+    ("angle1", "angle2", "angle3"),
+    ("euler1", "euler2", "euler3"),
+)
+_UNIT = re.compile(r"[\[(]\s*([a-zA-Z°]*)\s*[\])]|[_\s](mm|cm|m|in|inch|deg|rad|degrees|radians|°)$")
+_UNITS = {
+    "degrees": "deg",
+    "radians": "rad",
+    "°": "deg",
+    "meter": "m",
+    "metres": "m",
+    "meters": "m",
+    "in": "inch",
+    "degree": "deg",
+}
 
 
 def mounting_name(word: str) -> str:
@@ -97,3 +170,135 @@ def _whose_part(plain: str) -> str | None:
     if robot and camera:
         return "camera" if re.search(r"(?i)(target|board|marker|object|chess|pattern|tag)", plain) else ""
     return "robot" if robot else "camera" if camera else None
+
+
+@dataclass(frozen=True)
+class PoseColumn:
+    """A column that is part of a pose: which list it belongs to, its role in a pose, its unit and its place in the
+    table."""
+
+    prefix: str
+    role: str
+    unit: str
+    index: int
+
+
+def columns_of(header: list[str]) -> tuple[list[PoseColumn], dict[str, int]]:
+    """The columns of poses of a header, and the places of its ids and times.
+
+    Roles are x, y, z; qw, qx, qy, qz; q0 to q4; rx, ry, rz (a rotation vector or angles), vx, vy, vz (a rotation vector
+    for sure); roll, pitch, yaw; a, b, c (KUKA), w, p, r (Fanuc), o, a, t (Kawasaki); e1, e2, e3 (other angles); m00 to
+    m33.
+    """
+    found: list[PoseColumn] = []
+    other: dict[str, int] = {}
+    plain = [_unit_of(h.strip().lower()) for h in header]
+    joints = any(name in ("q5", "q6") for name, _ in plain)  # then q1 to q4 are joint angles and no quaternion
+    for k, (name, unit) in enumerate(plain):
+        if joints and re.fullmatch(r"q[0-9]", name):
+            continue
+        if name in IDS and "id" not in other:
+            other["id"] = k
+            continue
+        if (name in TIMES or name.endswith("header.stamp")) and not _is_t_of_oat(name, [n for n, _ in plain]):
+            if "time" not in other or name.endswith("header.stamp"):
+                other["time"] = k
+            continue
+        for prefix, role in _roles(name):
+            found.append(PoseColumn(prefix, role, unit, k))
+            break
+    return _merged(_with_quaternions(_with_euler(found, plain), plain)), other
+
+
+def _is_t_of_oat(name: str, names: list[str]) -> bool:
+    return name == "t" and {"o", "a"} <= set(names) and "x" in names
+
+
+def _unit_of(name: str) -> tuple[str, str]:
+    found = _UNIT.search(name)
+    if found is None or not name[: found.start()]:
+        return name, ""
+    word = found[1] or found[2] or ""
+    return name[: found.start()].strip(" _"), _UNITS.get(word, word)
+
+
+def _roles(name: str) -> list[tuple[str, str]]:
+    """Prefix and role of a column's name; empty where it has none in a pose."""
+    if name in _WHOLE:
+        return [("", name)]
+    if grid := re.fullmatch(r"(?:(.*)[_.\s])?(?:m|r|t|h|matrix|transform)?[_\s]?([0-4])[_,\s]?([0-4])", name):
+        return [(grid[1] or "", f"m{grid[2]}{grid[3]}")]
+    if numbered := re.fullmatch(r"actual_tcp_pose_([0-5])", name):
+        return [("", ("x", "y", "z", "vx", "vy", "vz")[int(numbered[1])])]
+    tokens = [t for t in re.split(r"[._\s/\[\]()\-:]+", name) if t]
+    if not tokens:
+        return []
+    last, before = tokens[-1], tokens[:-1]
+    if last in ("a", "b", "c", "w", "p", "r", "o") and len(before) == 1 and before[0] in _OWNERS:
+        return [(before[0], last)]
+    if short := re.fullmatch(r"([tpqr]|pos|rot|quat|rvec|tvec|rv)([wxyz])", last):
+        before, last = [*before, short[1]], short[2]
+    if (short := re.fullmatch(r"(.+?)([xyz]|q[wxyz]|r[xyz])", last)) and short[1] in _OWNERS:
+        before, last = [*before, short[1]], short[2]
+    if last in ("roll", "pitch", "yaw") or re.fullmatch(r"q[0-4]", last):
+        return [(_prefix(before), last)]
+    if last not in ("w", "x", "y", "z"):
+        return []
+    if set(before) & _VECTOR or {"rotation", "vector"} <= set(before):
+        return [(_prefix(before), f"v{last}")] if last != "w" else []
+    for word in before:  # the first word that names a quantity decides: p_RS_R_x is a position
+        if word in _QUATERNION:
+            return [(_prefix(before), f"q{last}")]
+        if word in _POSITION and last != "w":
+            return [(_prefix(before), last)]
+        if word in _ROTATION:
+            return [(_prefix(before), f"r{last}")]
+    return [(_prefix(before), last)]
+
+
+def _prefix(words: list[str]) -> str:
+    skipped = _POSITION | _ROTATION | _VECTOR | _QUATERNION | _FILLERS
+    return "_".join(w for w in words if w not in skipped)
+
+
+def _with_quaternions(columns: list[PoseColumn], names: list[tuple[str, str]]) -> list[PoseColumn]:
+    """Rotation columns x, y, z, w of one list are a quaternion."""
+    four = {c.prefix for c in columns if c.role == "rw"}
+    return [
+        (
+            PoseColumn(c.prefix, f"q{c.role[1]}", c.unit, c.index)
+            if c.prefix in four and re.fullmatch("r[wxyz]", c.role)
+            else c
+        )
+        for c in columns
+    ]
+
+
+def _with_euler(columns: list[PoseColumn], names: list[tuple[str, str]]) -> list[PoseColumn]:
+    plain = [n for n, _ in names]
+    for words in _EULER_WORDS:
+        if set(words) <= set(plain):
+            columns += [
+                PoseColumn("", f"e{k + 1}", names[plain.index(w)][1], plain.index(w)) for k, w in enumerate(words)
+            ]
+    if {"o", "a", "t"} <= set(plain) and "x" in plain:
+        columns = [c for c in columns if c.role not in ("o", "a")]
+        columns += [PoseColumn("", w, names[plain.index(w)][1], plain.index(w)) for w in "oat"]
+    return columns
+
+
+def _merged(columns: list[PoseColumn]) -> list[PoseColumn]:
+    """Positions of one prefix and rotations of another are one list where there is one of each."""
+    have: dict[str, set[str]] = {}
+    for c in columns:
+        have.setdefault(c.prefix, set()).add("p" if c.role in "xyz" else "r")
+    positions = [p for p, kinds in have.items() if kinds == {"p"}]
+    rotations = [p for p, kinds in have.items() if kinds == {"r"}]
+    if len(have) == 2 and len(positions) == len(rotations) == 1:
+        return [PoseColumn("", c.role, c.unit, c.index) for c in columns]
+    whole = {
+        p
+        for p, kinds in have.items()
+        if kinds == {"p", "r"} or any(c.role.startswith("m") for c in columns if c.prefix == p)
+    }
+    return [c for c in columns if c.prefix in whole] if whole else columns

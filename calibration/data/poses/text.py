@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.columns import PoseColumn, columns_of
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array
-from weldcal.calibration.data.poses.names import whose
+from weldcal.calibration.data.poses.names import PoseColumn, columns_of, whose
 from weldcal.calibration.data.poses.programs import NUMBER, list_of_program
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array

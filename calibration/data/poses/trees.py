@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.poses.columns import columns_of
 from weldcal.calibration.data.poses.listing import Listing, listing_of, listing_of_array, looks_like_poses
-from weldcal.calibration.data.poses.names import natural
+from weldcal.calibration.data.poses.names import columns_of, natural
 from weldcal.calibration.data.poses.text import table_lists
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array

@@ -12,7 +12,7 @@ from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, nearest_rotation
 from weldcal.models.arrays import Array
 
-CHANCE = 1e-6
+CHANCE = 1e-6  # as for readings of a dataset (eye_on_base/observations.py)
 """Chance that the right reading is rejected in favour of a wrong one."""
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
 _PAIRS = 400  # relative motions that are compared
@@ -20,7 +20,7 @@ _KEPT = 0.7  # share of the poses that must agree: the others may be outliers
 _ROTATION_FLOOR = 2e-6  # rad: six printed digits
 _POSITION_FLOOR = 1e-6  # share of the positions: six printed digits
 _AGREE = 0.1  # of the motion: beyond it there is no agreement that deserves the name
-_SAME_SCALE = 0.02
+_SAME_SCALE = 0.02  # of the logarithm, a choice: readings with scales farther apart are two answers
 _NEAR_UNIT = 0.08  # of the logarithm of a factor: attenuation by noise of short motions
 # Pairs of notations that are solved: proper Euler angles of six orders each have relative rotations of the same size
 _MOST = 160

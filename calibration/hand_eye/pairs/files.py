@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from weldcal.calibration.data.checks import read_rows
 from weldcal.calibration.data.header import PoseForm
 from weldcal.calibration.data.poses.listing import Listing
 from weldcal.calibration.data.poses.lists import folder_lists, read_lists
 from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.poses.storage import read_tree
 from weldcal.calibration.data.poses.trees import lists_of_tree
-from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS

@@ -19,13 +19,13 @@ _FEWEST = 4  # with fewer pairs the data decide nothing
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 _DISTINCT = 1e-7  # of a rotation matrix, and of the extent of positions
 _MILLIMETRES_FROM, _METRES_TO = 80.0, 10.0  # median distances of a robot's poses from its base, in mm and m
-_NEAREST_M = 0.02
-FARTHEST_M = 20.0
+_NEAREST_M = 0.02  # a choice: no arm works 20 mm from its own axis
+FARTHEST_M = 20.0  # a choice: beyond any arm on a rail, below millimetres that are called metres
 """Median distance of a robot's poses from its base beyond which the unit is wrong."""
-SCALE_SIGMA = 4.0
+SCALE_SIGMA = 4.0  # a choice: 6 in 100,000 normal draws lie beyond
 """A ratio of lengths is known where this many of its standard deviations are below LEAST_SCALE."""
 _OTHER_UNIT = 0.1  # of the logarithm: how near a factor must be to that of another unit than the robot's
-LEAST_SCALE = 0.2
+LEAST_SCALE = 0.2  # a choice: 20 %, beyond a board's wrong scale, within a factor of unit
 """Of the logarithm of a factor on lengths: a factor that is nearer to a unit is a matter of the result, which names
 it."""
 

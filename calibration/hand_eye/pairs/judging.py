@@ -15,13 +15,13 @@ from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, fol
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 
-FALSE_ALARM = 0.01
+FALSE_ALARM = 0.01  # the usual level of a test
 """Chance that a right pose is called worse than a new solution."""
-POWER = 0.95
+POWER = 0.95  # the usual level of a region; at 0.8 the shown error is a fifth smaller
 """Chance that an error of the size ``shown_mm`` is found."""
-SHOWN_MM = 2.0
+SHOWN_MM = 2.0  # a choice; a limit that is stated takes its place
 """Error at the target that the pairs must be able to show, where no limit is stated."""
-SMALL = 0.5
+SMALL = 0.5  # sqrt(1 + 0.5^2) = 1.12
 """Share of one pose's held-out error below which an error of the camera's pose adds less than 12 % to it."""
 _PRINTED = 1e-5  # rad and m: a pose with five digits is not off by what it was rounded
 _ANGLE_OFF, _METRES_OFF = 0.09, 0.01  # within which another form of the pose fits

@@ -43,7 +43,7 @@ _CAMERA = re.compile(
 _CAMERA_ENDINGS = (".yaml", ".yml", ".xml", ".json", ".txt", ".npz")
 FEWEST = 4
 """Pictures with the board that are needed."""
-GROSS = 4.0
+GROSS = 4.0  # a choice: blur and wrong boards are worse; half would drop good pictures at the rim
 """Times the median error of a picture, beyond which it does not fit the camera."""
 _K3_LEVEL = 0.999  # at which a third radial coefficient is no chance
 _THUMBNAIL_PX = 240

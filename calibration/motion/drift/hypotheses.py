@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from weldcal.calibration.motion.drift.noise import FrameNoise
-from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, Rows
+from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, FrameNoise, Rows
 from weldcal.models.arrays import Array
 
 
@@ -75,7 +74,7 @@ class PoseField:
 
 
 STEP, RAMP = 0, 1
-RAMP_S = 60.0
+RAMP_S = 60.0  # a choice of unit only: the prior scales with it (FilterConfig)
 """A creep's unknowns are what it reaches in so many seconds."""
 
 _ROWS = 5
@@ -83,7 +82,7 @@ _STEPS, _RAMPS = 64, 12  # hypotheses kept of each kind
 _EVERY = {STEP: 2, RAMP: 40}  # frames between new ones
 _INFLUENCE = 25.0  # of chi-square with 5: a frame farther off counts as that far
 _NOVEL_OVER = 80.0  # frames over which those at new poses are counted
-_HOURS = 3600.0
+_HOURS = 3600.0  # seconds of an hour: the wander is stated per root of an hour
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,18 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.geometry.robust import chi2_threshold
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.motion.drift.hypotheses import RAMP, RAMP_S, STEP, DriftFilter, FilterConfig
-from weldcal.calibration.motion.drift.noise import FrameNoise, NoiseMemory, measured_noise
-from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, Rows, about, moved_about
+from weldcal.calibration.motion.drift.residuals import (
+    CLOCK,
+    MOVE,
+    SCALE,
+    SIZE,
+    FrameNoise,
+    NoiseMemory,
+    Rows,
+    about,
+    measured_noise,
+    moved_about,
+)
 from weldcal.models.arrays import Array
 
 MOVED, CREEP, WARM_UP = "moved", "creep", "warm-up"

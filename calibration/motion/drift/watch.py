@@ -1,6 +1,6 @@
-"""Watches a calibration over a recording in motion: synchronises its frames, tests for drift, recalibrates from what
-follows."""
+"""Watch a calibration over a recording: synchronise, test for drift, tell scanner from base, recalibrate."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -12,8 +12,7 @@ from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import DEVICE
 from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.motion.drift.hypotheses import FilterConfig
-from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
-from weldcal.calibration.motion.drift.residuals import CLOCK, Rows, rows_of
+from weldcal.calibration.motion.drift.residuals import CLOCK, FrameNoise, Rows, measured_noise, rows_of
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
@@ -21,11 +20,101 @@ from weldcal.calibration.motion.synchronise import Synchronised, synchronise
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
+Mask = NDArray[np.bool_]
+
+_STILL_M = 2e-3  # robust spread of a pixel's depth that shows the same thing in all frames
+_SEEN = 0.6  # of the frames that must measure a pixel
+_STEP_M = 0.004  # in depth between neighbours: an edge, whose normal says nothing
+_LEAST_PIXELS = 2000
+_SURE = 0.15  # sigma of the share from which on it decides
+_CORRELATED = 25.0  # pixels that share their noise
+_CLIP = 4.0  # robust deviations, a choice: 6 in 100,000 normal draws lie beyond
+
+SCANNER, BASE = "the scanner moved", "the robot's base moved, and the scanner did not"
+
 _GROSS = 60.0  # chi-square with 5 of a frame that shows something else
 _LARGE_M, _LARGE_RAD = 1e-3, 2e-3  # a move that may have disturbed the clock's fit
-_CLOCK_S = 2e-3
-_MOST_SPREAD_M = 5e-4
+_CLOCK_S = 2e-3  # a choice: one period of a robot's stream at 500 Hz
+_MOST_SPREAD_M = 5e-4  # a choice: three times the usual spread of solve.py; more would hide a move of a millimetre
 _ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show it
+
+
+@dataclass(frozen=True)
+class BackgroundMove:
+    """``share`` of the predicted move that the still background made in the camera, with its sigma, from so many
+    pixels: 1 where the scanner moved, 0 where the base did."""
+
+    share: float
+    sigma: float
+    pixels: int
+
+    @property
+    def cause(self) -> str | None:
+        """What moved, as a sentence without a full stop; None where the background does not decide."""
+        if self.sigma > _SURE:
+            return None
+        if abs(self.share - 1.0) < 0.35:
+            return SCANNER
+        return BASE if abs(self.share) < 0.35 else None
+
+
+def background_move(before: Sequence[Array], after: Sequence[Array], X_AB: RigidTransform) -> BackgroundMove | None:
+    """Compare organised clouds (H, W, 3) m of before and after a change, a still thing at p before being at X_AB p in
+    the camera after it if the scanner moved.
+
+    Each pixel's median over the frames shows what stands still; the arm passes through. Along the normal, a still
+    surface at p moves by n . (X_AB p - p) under its ray, and the share of it that shows is a weighted mean over all
+    pixels. What the scanner errs at a pixel is the same before and after. None where the clouds are not organised or
+    little stands still.
+    """
+    clouds = [*before, *after]
+    if not before or not after or any(c.ndim != 3 or c.shape != clouds[0].shape for c in clouds):
+        return None
+    first, still = _median(before)
+    second, also = _median(after)
+    normal, smooth = _normals(first)
+    use = still & also & smooth & (np.abs(second[..., 2] - first[..., 2]) < 10.0 * _STILL_M)
+    if int(use.sum()) < _LEAST_PIXELS:
+        return None
+    p, n = first[use], normal[use]
+    told = (n * (second[use] - p)).sum(axis=1)
+    moved = p @ X_AB.rotation().matrix().T + X_AB.translation() - p
+    expected = (n * moved).sum(axis=1)
+    weight = np.ones(len(p))
+    share = 0.0
+    for _ in range(6):
+        share = float((weight * told * expected).sum() / max(float((weight * expected**2).sum()), 1e-18))
+        e = told - share * expected
+        scale = 1.4826 * float(np.median(np.abs(e))) + 1e-7
+        weight = (np.abs(e) < _CLIP * scale).astype(float)
+    sigma = float(np.sqrt(_CORRELATED * scale**2 / max(float((weight * expected**2).sum()), 1e-18)))
+    return BackgroundMove(share, sigma, int(weight.sum()))
+
+
+def _median(clouds: Sequence[Array]) -> tuple[Array, Mask]:
+    """Median point of each pixel (H, W, 3), and whether it shows one thing that stands still."""
+    z = np.stack([c[..., 2] for c in clouds])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # pixels that no frame measured
+        middle = np.nanmedian(z, axis=0)
+        spread = 1.4826 * np.nanmedian(np.abs(z - middle), axis=0)
+        ray = np.nanmedian(np.stack([c[..., :2] / c[..., 2:] for c in clouds]), axis=0)
+    seen = np.isfinite(z).mean(axis=0) >= _SEEN
+    point = np.concatenate([ray * middle[..., None], middle[..., None]], axis=-1)
+    return point, np.asarray(seen & (spread < _STILL_M))
+
+
+def _normals(p: Array) -> tuple[Array, Mask]:
+    """Unit normals (H, W, 3) from differences over five pixels, and where they are those of one smooth surface."""
+    across, down = np.full_like(p, np.nan), np.full_like(p, np.nan)
+    across[:, 2:-2], down[2:-2] = p[:, 4:] - p[:, :-4], p[4:] - p[:-4]
+    n = np.cross(across, down)
+    size = np.linalg.norm(n, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        n = n / size[..., None]
+        steps = np.maximum(np.abs(across[..., 2]), np.abs(down[..., 2]))
+        smooth = np.isfinite(n).all(axis=-1) & (steps < 4.0 * _STEP_M)
+    return np.where(smooth[..., None], n, 0.0), np.asarray(smooth)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -128,19 +217,24 @@ def _tested(
         *((frames.ids[k], "The robot's stream has no data at its capture.") for k in np.flatnonzero(~inside)),
     ]
     pivot = at.p[order].mean(axis=0)
-    rows = rows_of(
-        result.X_BC,
-        pivot,
-        clock.times[order],
-        at.p[order],
-        at.n[order],
-        at.v[order],
-        at.turn[order],
-        frames.p_C[order],
-        frames.n_C[order],
-        frames.covariance[order],
-        frames.normal_sigma[order],
-    )
+
+    def rows_with(p_C: Array, n_C: Array) -> Rows:
+        """The residuals with these centres and normals of the frames."""
+        return rows_of(
+            result.X_BC,
+            pivot,
+            clock.times[order],
+            at.p[order],
+            at.n[order],
+            at.v[order],
+            at.turn[order],
+            p_C[order],
+            n_C[order],
+            frames.covariance[order],
+            frames.normal_sigma[order],
+        )
+
+    rows = rows_with(frames.p_C, frames.n_C)
     usual = clock.jitter_s or (_DEVICE_JITTER_S if clock.clock.kind == DEVICE else _ARRIVAL_JITTER_S)
     noise = measured_noise(rows) or FrameNoise(jitter_s=usual)
     interval = float(np.median(np.diff(rows.times))) if len(rows) > 1 else 0.05
@@ -160,19 +254,7 @@ def _tested(
     X, covariance = test.current()
     moves = [e for e in events if e.kind != WARM_UP]
     p_C, n_C = _as_before(result.X_BC, moves, clock.times, frames)
-    held = rows_of(
-        result.X_BC,
-        pivot,
-        clock.times[order],
-        at.p[order],
-        at.n[order],
-        at.v[order],
-        at.turn[order],
-        p_C[order],
-        n_C[order],
-        frames.covariance[order],
-        frames.normal_sigma[order],
-    )
+    held = rows_with(p_C, n_C)
     late, gross = _lateness(held, noise)
     moved = late[:, None] * rows.derivatives[:, :, CLOCK]
     residuals, tilts = (rows.residuals - moved)[:, :3], (rows.residuals - moved)[:, 3:]

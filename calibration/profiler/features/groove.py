@@ -17,10 +17,10 @@ from weldcal.models.errors import InputError
 
 MEDIAN = 9  # samples: takes out spikes for the start only
 OUTER = 0.12  # of the samples at each end lie on the plate
-MINIMUM_DEPTH_M = 1e-3
+MINIMUM_DEPTH_M = 1e-3  # a choice: below any groove to weld, above noise and scale of a plate
 MINIMUM_SAMPLES = 6  # of each of the four lines
 ROUNDS = 8
-TUKEY = 4.0
+TUKEY = 4.0  # as in frustum.py
 BENT = 2.5  # sigmas of its bend from which a wall is taken for curved, as beside a seam that turns
 MEETINGS = 12
 MARGIN_M = 0.5e-3  # beside an intersection nothing is taken for either line

@@ -1,9 +1,10 @@
-"""Estimates X_FS from raw profiles of a sphere in any poses, and from touches, in one least-squares problem.
+"""Estimate X_FS from raw profiles of a sphere in any poses, and from touches; check the sphere's stated radius.
 
 Every profile point lies on the sphere, and so does the tip at every touch. The sensor's scale and shear in its plane
 and, where the joint angles are given, the arm's offsets and sag may be estimated with it, each held by a prior.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -11,11 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import OptimizeResult
 
-from weldcal.calibration.errors import DegenerateMotion, InconsistentData, TooFewTranslations
-from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.errors import DegenerateMotion, InconsistentData, RadiusError, TooFewTranslations
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.profiler.arm_errors import DhArm, ProfilerArmErrors
-from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.edge.joint import cube_rotations
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, times_own, turned
 from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
+from weldcal.calibration.profiler.sphere.arc import fit_circle
 from weldcal.calibration.profiler.sphere.model import (
     ParameterLayout,
     SphereData,
@@ -23,16 +26,113 @@ from weldcal.calibration.profiler.sphere.model import (
     SphereSigmas,
     corrected,
 )
-from weldcal.calibration.profiler.sphere.start import sphere_starts
 from weldcal.models.errors import InputError
+
+POINTS = 7  # of each profile
+ITERATIONS = 80
+KEPT = 3
+SAME_RAD = 0.02  # as in edge/joint.py
+WORSE = 3.0  # times the best one's mean distance: what explains the sphere so badly is not polished
 
 Model = Literal["rigid", "affine", "affine+joints"]
 MINIMUM_POSES = 5
-SINGULAR = 1e-5
+SINGULAR = 1e-5  # a choice between rounding and poor motions, of columns of unit length
 WRONG_POSE = 5.0  # times the others' residual (its mean, or its rms) at which a scan is named
 MOST_WRONG = 0.25  # of the scans may be excluded as wrong
 RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more
 APART_RAD, OPEN_RAD = np.radians(1.0), np.radians(5.0)
+
+SCALE_SIGMAS = 3.0  # of the prior of the profiler's scale: what a sensor may be off, its radius may be
+NOISE_SIGMAS = 4.0  # a choice: 6 in 100,000 normal draws lie beyond
+KNOWN = 0.03  # one sigma of a radius, as a share of it, that is known at all
+BETTER = 0.4  # what another radius must leave of chi-square, and below which it must then be
+WORST_CHI2 = 100.0  # as sphere_joint has it: beyond it no sphere explains the profiles
+NAMED = 0.05  # of a ratio of radii that is called the diameter
+GOOD_CHI2 = 4.0  # of a fit whose sigmas are wrong by two at most
+ROUNDS, SETTLED = 12, 1e-3
+STARTS = (1.0, 0.5, 2.0)  # times the stated radius: as given, a diameter given, half of it given
+
+
+def sphere_starts(
+    poses: FlangePoses, profiles: Sequence[Floats], radius_m: float
+) -> list[tuple[Floats, Floats, Floats]]:
+    """The best different optima (R_FS, p_FS, centre in B), best first."""
+    some = [p[np.linspace(0, len(p) - 1, POINTS).astype(int)] for p in profiles]
+    p = np.vstack(some)
+    of = np.repeat(np.arange(len(some)), POINTS)
+    p_S = np.column_stack([p[:, 0], np.zeros(len(p)), p[:, 1]])
+    R_BF, p_BF = poses.rotation[of], poses.translation[of]
+    R = cube_rotations()
+    m = len(R)
+    t, c = _translations(poses, profiles, R, radius_m)
+    damping = np.full(m, 1e-2)
+    r, J = _linearised(R_BF, p_BF, R, t, c, p_S, radius_m)
+    cost = _cost(r)
+    for _ in range(ITERATIONS):
+        w = 1.0 / np.sqrt(1.0 + (r / _scale(r)[:, None]) ** 2)
+        Jw = np.swapaxes(w[:, :, None] * J, 1, 2)
+        H, g = Jw @ J, (Jw @ r[:, :, None])[:, :, 0]
+        unit = np.sqrt(np.einsum("mii->mi", H)) + 1e-12
+        A = H / (unit[:, :, None] * unit[:, None, :]) + damping[:, None, None] * np.eye(9)
+        step = -np.linalg.solve(A, (g / unit)[:, :, None])[:, :, 0] / unit
+        R_new, t_new, c_new = turned(R, step[:, :3]), t + step[:, 3:6], c + step[:, 6:]
+        r_new, J_new = _linearised(R_BF, p_BF, R_new, t_new, c_new, p_S, radius_m)
+        cost_new = _cost(r_new)
+        better = cost_new < cost
+        settled = np.abs(cost - cost_new) < 1e-10 * cost
+        R, t = np.where(better[:, None, None], R_new, R), np.where(better[:, None], t_new, t)
+        c, cost = np.where(better[:, None], c_new, c), np.where(better, cost_new, cost)
+        r, J = np.where(better[:, None], r_new, r), np.where(better[:, None, None], J_new, J)
+        damping = np.clip(np.where(better, 0.2 * damping, 10.0 * damping), 1e-12, 1e9)
+        if (settled | (damping > 1e8)).all():
+            break
+    chosen: list[int] = []
+    for k in np.argsort(cost):
+        if cost[k] > WORSE * cost.min() + 1e-9:
+            break
+        angles = [np.arccos(np.clip(0.5 * (np.trace(R[k].T @ R[j]) - 1.0), -1.0, 1.0)) for j in chosen]
+        if all(angle > SAME_RAD for angle in angles):
+            chosen.append(int(k))
+        if len(chosen) == KEPT:
+            break
+    return [(R[k], t[k], c[k]) for k in chosen]
+
+
+def _translations(poses: FlangePoses, profiles: Sequence[Floats], R: Floats, radius_m: float) -> tuple[Floats, Floats]:
+    """p_FS (m, 3) and the sphere's centre in B (m, 3) for rotations R_FS (m, 3, 3), by linear least squares.
+
+    The sphere's centre in S is taken as that of the profile's circle: its distance from the scan plane, unknown in
+    sign, is left out. From p_FS = 0 the search ended in another optimum in up to half of the sets of six scans.
+    """
+    circles = np.array([fit_circle(p)[0] for p in profiles])
+    means = np.array([p.mean(axis=0) for p in profiles])
+    x, z = np.where(circles[:, 2:] < 1.05 * radius_m, circles[:, :2], means).T
+    c_F = np.column_stack([x, np.zeros(len(x)), z]) @ np.swapaxes(R, 1, 2)
+    moved = times_own(c_F, np.swapaxes(poses.rotation, 1, 2)) + poses.translation
+    A = np.concatenate([poses.rotation, np.tile(-np.eye(3), (len(poses), 1, 1))], axis=2).reshape(-1, 6)
+    found = -moved.reshape(len(R), -1) @ np.linalg.pinv(A).T
+    return np.asarray(found[:, :3]), np.asarray(found[:, 3:])
+
+
+def _scale(r: Floats) -> Floats:
+    return np.asarray(np.maximum(3.0 * np.median(np.abs(r), axis=1), 1e-9))
+
+
+def _cost(r: Floats) -> Floats:
+    return np.asarray(np.abs(r).mean(axis=1))
+
+
+def _linearised(
+    R_BF: Floats, p_BF: Floats, R: Floats, t: Floats, c: Floats, p_S: Floats, radius_m: float
+) -> tuple[Floats, Floats]:
+    """Distances (m, n) to the sphere and their Jacobian (m, n, 9) by [turn in S; p_FS; centre]."""
+    p_F = p_S @ np.swapaxes(R, 1, 2) + t[:, None]
+    at = times_own(p_F, np.swapaxes(R_BF, 1, 2)) + p_BF - c[:, None]
+    length = np.maximum(np.linalg.norm(at, axis=2), 1e-9)
+    n_B = at / length[:, :, None]
+    n_F = times_own(n_B, R_BF)
+    turn = -times_own(n_F @ R, skew(p_S))
+    return np.asarray(length - radius_m), np.concatenate([turn, n_F, -n_B], axis=2)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -307,3 +407,73 @@ def last_step(J: Floats, r: Floats) -> tuple[float, float]:
     unit = np.linalg.norm(J, axis=0)
     C = np.linalg.pinv((J / unit).T @ (J / unit))
     return float(-(C @ ((J / unit).T @ r))[-1] / unit[-1]), float(np.sqrt(C[-1, -1]) / unit[-1])
+
+
+@dataclass(frozen=True)
+class FreeRadius:
+    """The radius that profiles show, its sigma, both in m, and the reduced chi-square of the fit with it."""
+
+    radius_m: float
+    sigma_m: float
+    reduced_chi2: float
+
+
+def free_radius(data: SphereData, start_m: float, sigmas: SphereSigmas) -> FreeRadius | None:
+    """The radius by the scans alone (rigid sensor, no touches), from a start; None where it does not settle.
+
+    Gauss-Newton in the radius, all other unknowns solved at each step.
+    """
+    scans, radius = SphereData(poses=data.poses, profiles=data.profiles, radius_m=start_m), start_m
+    layout = ParameterLayout(tip=False, affine=False, joints=False)
+    problem = SphereProblem(scans, layout, sigmas)
+    starts = sphere_starts(data.poses, problem.profiles, start_m)
+    if not starts:
+        return None
+    R, x = starts[0][0], np.concatenate([np.zeros(3), starts[0][1], starts[0][2]])
+    for _ in range(ROUNDS):
+        problem = SphereProblem(replace(scans, radius_m=radius), layout, sigmas)
+        _, found = problem.solved(R, np.zeros(3), x)
+        x = np.asarray(found.x)
+        r = problem.residual(x)
+        step, sigma = last_step(np.column_stack([problem.derivatives(x), problem.by_radius()]), r)
+        if abs(step) < SETTLED * radius:
+            chi2 = float(r @ r) / max(len(r) - len(x) - 1, 1)
+            return FreeRadius(radius + step, sigma * float(np.sqrt(max(1.0, chi2))), chi2)
+        radius = float(np.clip(radius + step, 0.6 * radius, 1.6 * radius))
+    return None
+
+
+def check_radius(data: SphereData, sigmas: SphereSigmas, stated: SphereEstimate | None) -> None:
+    """Refuse a stated radius that the profiles contradict; `stated`: the rigid fit with it, None where there is none.
+
+    A profiler's scale error shows as another radius: up to three sigmas of its prior is its error, more is another
+    sphere.
+
+    Raises:
+        RadiusError: the profiles determine the radius, and it is another one.
+    """
+    R = data.radius_m
+    allowed = SCALE_SIGMAS * sigmas.affine * R
+    # what a poor fit says of the radius, to first order, says nothing
+    near = stated is not None and abs(stated.radius_change_m) <= allowed + NOISE_SIGMAS * stated.radius_sigma_m
+    if stated is not None and near and stated.reduced_chi2 < GOOD_CHI2:
+        return
+    tried = [one for k in STARTS if (one := free_radius(data, k * R, sigmas)) is not None]
+    known = [one for one in tried if one.sigma_m < KNOWN * one.radius_m and one.reduced_chi2 < WORST_CHI2]
+    best = min(known, key=lambda one: one.reduced_chi2, default=None)
+    if best is None:
+        if stated is None or near:
+            return  # whatever the fit itself refuses for
+        raise RadiusError(
+            f"The profiles contradict a sphere of {1e3 * R:.2f} mm radius and show no other one. Check the radius, the"
+            " poses and that only the sphere is in the profiles."
+        )
+    worse = np.inf if stated is None else stated.reduced_chi2
+    if abs(best.radius_m - R) <= allowed + NOISE_SIGMAS * best.sigma_m or best.reduced_chi2 > BETTER * worse:
+        return
+    said = f"The profiles show a sphere of {1e3 * best.radius_m:.2f} mm radius, and {1e3 * R:.2f} mm is stated"
+    if abs(2.0 * best.radius_m / R - 1.0) < NAMED:
+        raise RadiusError(f"{said}: that is its diameter. Give the radius, {1e3 * R / 2:.5g} mm.")
+    if abs(best.radius_m / (2.0 * R) - 1.0) < NAMED:
+        raise RadiusError(f"{said}: that is half of it. Give the radius, {2e3 * R:.5g} mm.")
+    raise RadiusError(f"{said}. Check the radius and the unit.")

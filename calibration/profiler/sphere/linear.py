@@ -14,9 +14,9 @@ from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_axes_spread
 from weldcal.models.errors import InputError
 
-RADIUS_TOLERANCE_M = 0.2e-3
+RADIUS_TOLERANCE_M = 0.2e-3  # a choice: three times the radius error at the paper's noise (0.035 to 0.067 mm)
 PLANAR = 0.05  # second over first singular value of the translations
-ONE_AXIS = 0.02
+ONE_AXIS = 0.02  # ratio of singular values, a choice as PLANAR: below, the error along the axis is 50 times that across
 MINIMUM_TOUCHES = 4
 ONE_SPOT = 0.05  # of the radius: rms of the touches across the plane through them
 CLEARLY = 0.7  # of the spread that is left when a side is mirrored

@@ -15,7 +15,7 @@ _BAD_TOUCH_M, _BAD_PIXEL = 1.5e-3, 2.0  # residuals above these are no noise
 _GOOD_TOUCH_M = 3e-3  # what the others must come to where one landmark alone is to blame
 _LEAST_TO_DOUBT = 6  # landmarks
 _BETTER = 0.4  # what a change must leave of the residuals to be told
-_REFUSED_M = 3e-3
+_REFUSED_M = 3e-3  # derived below
 """Rms of the touches, or of the image on the page, beyond which nothing is written.
 
 A touch scatters by 0.3 mm an axis and an arm is 1 mm off over a page: 1.1 mm together, of which nine touches exceed 2.1

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.tables import Row, read_rows
+from weldcal.calibration.data.checks import Row, read_rows
 from weldcal.calibration.errors import LandmarksNotFound, TabletDataError
 from weldcal.calibration.tablet.detection import Look, arrange, find_marks
-from weldcal.calibration.tablet.page_match import check_page_match
+from weldcal.calibration.tablet.touches import check_page_match
 from weldcal.calibration.tablet.wrist.fit import WristTouches
 from weldcal.models.array_files import read_grey_image
 from weldcal.models.arrays import Array

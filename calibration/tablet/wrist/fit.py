@@ -16,7 +16,7 @@ from weldcal.calibration.tablet.touches import check_layout, check_turns
 from weldcal.models.arrays import Array
 
 _OPEN_PRIOR_M = 1.0  # of the pen's tip where nothing is known: far wider than any pen
-_KNOWN_PRIOR_M = 0.5e-3  # of a pen length that a person measured
+_KNOWN_PRIOR_M = 0.5e-3  # of a pen length that an operator measured
 _UNSURE_M = 5e-3  # a pen's tip worse than this is not known
 _LEAN = 3.0  # degrees of freedom that the scatter of all touches counts for
 _TOUCH_FLOOR_M, _PIXEL_FLOOR = 1e-6, 1e-3  # keep exact data from dividing by zero
@@ -127,7 +127,7 @@ def _touch_sigmas(touch_T: Array) -> Array:
     return np.maximum([along, along, across], _TOUCH_FLOOR_M)
 
 
-def seen_point(fit: WristFit, X_BF: RigidTransform, ray: Array) -> Array:
+def measured_point(fit: WristFit, X_BF: RigidTransform, ray: Array) -> Array:
     """Point (3,) m in the base where a ray (2,) of the camera, with the flange at ``X_BF``, meets the tablet's
     plane."""
     X_BC = X_BF @ fit.X_FC
@@ -142,7 +142,7 @@ def _missed(fit: WristFit, data: WristTouches, i: int) -> float:
     X_BF0, rays = data.views[0]
     R = fit.X_BT.rotation().matrix()
     beside = R[:, :2] @ (data.touched_m[i] - data.landmark_m[i])
-    off = data.X_BF[i].multiply(fit.p_FP) - (seen_point(fit, X_BF0, rays[i]) + beside)
+    off = data.X_BF[i].multiply(fit.p_FP) - (measured_point(fit, X_BF0, rays[i]) + beside)
     return float(np.linalg.norm(R[:, :2].T @ off))
 
 

@@ -13,13 +13,12 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
-from weldcal.systems.drivers.sensors.cell_time import CellTime, HostTime
-from weldcal.systems.drivers.sensors.stamps import DeviceClock, Stamp, UnixClock
+from weldcal.systems.drivers.sensors.stamps import CellTime, DeviceClock, HostTime, Stamp, UnixClock
 
 Datum = TypeVar("Datum")
 POLL_S = 0.02  # longest time that a source is waited for before requests are looked at
 RETRY_S = (0.1, 1.0)  # first and longest pause before a lost device is opened again
-CLOSE_S = 5.0
+CLOSE_S = 5.0  # a choice: a source that hangs in a read delays the end by this; half of it cuts off slow disconnects
 ATTEMPTS = 5  # to connect, or to read a frame, when a device is started
 
 

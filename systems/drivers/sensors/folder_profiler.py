@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.tables import read_rows
+from weldcal.calibration.data.checks import read_rows
 from weldcal.models.array_files import read_npy
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.sensors.files.source import FolderSource
+from weldcal.systems.drivers.sensors.folder_source import FolderSource
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_profiler import (
     Profile,

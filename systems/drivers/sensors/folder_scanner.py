@@ -4,7 +4,7 @@ import dataclasses as dc
 from pathlib import Path
 
 from weldcal.calibration.data.clouds import NO_NOTES, read_cloud
-from weldcal.systems.drivers.sensors.files.source import FolderSource
+from weldcal.systems.drivers.sensors.folder_source import FolderSource
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud
 from weldcal.systems.drivers.station_build import StationBuild
@@ -21,7 +21,9 @@ class FolderScanner(WiredScanner):
     """
 
     folder: str = ""
-    trigger: str = ""  # tcp://HOST:PORT or file:PATH: the line `scan N`; empty: a person or the program scans by itself
+    trigger: str = (
+        ""  # tcp://HOST:PORT or file:PATH: the line `scan N`; empty: an operator or the program scans by itself
+    )
     settle_s: float = 0.1  # a file is complete when it has not changed for so long
     remove_read: bool = False  # delete files that were read
 

@@ -15,7 +15,7 @@ from weldcal.systems.interrupts import deferred
 
 Datum = TypeVar("Datum")
 OPEN_S = 30.0  # the process imports its libraries first
-END_S = 1.0
+END_S = 1.0  # a choice: longer than a frame takes to be read; a process that hangs is killed after it
 
 
 class SourceProcess(Source[Datum]):

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, DeviceFault
 from weldcal.systems.drivers.ur.readiness.preflight import Check
 
-LOOK_S = 1.0
-START_S = 15.0
+LOOK_S = 1.0  # a choice: a camera of 10 Hz shows 10 pictures; half of it makes RATE_SHARE a matter of one picture
+START_S = 15.0  # a choice: ATTEMPTS of acquisition with their pauses; half of it fails a device that opens slowly
 RATE_SHARE = 0.8  # of the scenario's rate that a camera must reach
 
 

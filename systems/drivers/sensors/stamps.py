@@ -1,18 +1,24 @@
-"""Times of frames: the device's clock to the host's by the earliest arrivals, and the host's clock to the Diagram's."""
+"""Clocks of the sensors: from a device to the host and to the Diagram, and the clock that judges silent devices."""
 
+import math
+import threading
 import time
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
+
+from weldcal.systems.drivers.station_build import StationBuild
 
 KEPT = 4096  # pairs of host and Diagram time: 32 s at 125 Hz
+# a choice: 15 frames at 30 Hz, of which the earliest is rarely late; twice of it doubles the time to a drift
 BIN_S = 0.5
 BINS = 120
 DRIFT_LIMIT = 5e-4  # the drift of two quartz clocks is below 1e-4
 BINS_FOR_DRIFT = 8
 SET_S = 0.02  # by which the host's clock is set and not only disciplined, between two frames
-SET_KEPT_S = 10.0
+SET_KEPT_S = 10.0  # a choice: longer than a frame is under way; half of it suits frames that are at most 5 s late
 READINGS, QUICK_S = 5, 1e-4  # of two clocks one after the other, between which this process may have to wait
 RELEARN_S = 3.0  # frames that stay late for so long belong to another offset: the device's clock was set back
 
@@ -192,3 +198,66 @@ class DiagramTime:
             return self._diagram[-1]
         h0, h1, d0, d1 = self._host[k - 1], self._host[k], self._diagram[k - 1], self._diagram[k]
         return d0 + (d1 - d0) * (host_s - h0) / (h1 - h0)
+
+
+class CellTime(Protocol):
+    """A clock, s, of which any earlier time of the host (s, monotonic) can be asked."""
+
+    def now(self) -> float:
+        """Its time now."""
+
+    def at(self, host_s: float) -> float:
+        """Its time at a time of the host."""
+
+    def look(self) -> None:
+        """Note its time now; called often."""
+
+
+class HostTime:
+    """The host's own monotonic clock."""
+
+    def now(self) -> float:
+        """See CellTime."""
+        return time.monotonic()
+
+    def at(self, host_s: float) -> float:
+        """See CellTime."""
+        return host_s
+
+    def look(self) -> None:
+        """See CellTime."""
+
+
+class FollowedTime:
+    """The clock of a robot that the cell follows: its world may be slower than real time, and stands while it waits for
+    the cell.
+
+    The threads of the acquisition and of the Diagram both ask it.
+    """
+
+    def __init__(self, robot_time: Callable[[], float]) -> None:
+        self._robot_time = robot_time
+        self._times, self._lock = DiagramTime(), threading.Lock()
+        self._first = robot_time()
+
+    def now(self) -> float:
+        """See CellTime."""
+        return self._robot_time()
+
+    def at(self, host_s: float) -> float:
+        """See CellTime; the first noted time before it."""
+        with self._lock:
+            self._times.add(time.monotonic(), self._robot_time())
+            found = self._times.at(host_s)
+        return found if math.isfinite(found) else self._first
+
+    def look(self) -> None:
+        """See CellTime."""
+        with self._lock:
+            self._times.add(time.monotonic(), self._robot_time())
+
+
+def cell_time(build: StationBuild) -> CellTime:
+    """The clock of a station's devices."""
+    clock = None if build.robot is None else build.robot.clock
+    return FollowedTime(clock.now) if clock is not None and clock.follows else HostTime()

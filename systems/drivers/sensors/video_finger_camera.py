@@ -25,7 +25,7 @@ from weldcal.systems.drivers.sensors.wired_camera import (
 )
 from weldcal.systems.drivers.station_build import StationBuild
 
-CONNECT_S = 3.0
+CONNECT_S = 3.0  # a choice: cameras answer within 1 s; one that is off delays each attempt by this
 LARGEST_HEADER, LARGEST_PART = 16_384, 16 * 1024**2
 _BLOCK = 65_536
 _START, _END = b"\xff\xd8", b"\xff\xd9"

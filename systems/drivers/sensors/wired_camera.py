@@ -16,15 +16,14 @@ from weldcal.models.tool import FingerCamera
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.cell_time import cell_time
-from weldcal.systems.drivers.sensors.stamps import DiagramTime
+from weldcal.systems.drivers.sensors.stamps import DiagramTime, cell_time
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Image
 
 Picture = NDArray[np.uint8]
-PERIOD_S = 0.004
+PERIOD_S = 0.004  # the period of the robot's commands; a picture is delayed by at most this
 
 
 @dc.dataclass(kw_only=True)

@@ -7,16 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.cell_time import cell_time
-from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
-from weldcal.systems.drivers.sensors.watch import watch
+from weldcal.systems.drivers.sensors.stamps import cell_time
+from weldcal.systems.drivers.sensors.watch import OnTrigger, watch
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import ProfileScan
 
 Profile = NDArray[np.float64]
-PERIOD_S = 0.008
-FAR = 1.5
+PERIOD_S = 0.008  # two periods of the commands: a profile is delayed by at most this
+FAR = 1.5  # a choice: allows a mount that is half farther off than planned; a wrong unit is a factor of 10 or more
 FEWEST_POINTS = 10
 
 

@@ -14,10 +14,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig
 from weldcal.systems.drivers.sensors.acquisition import AcquiredFrame, Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.cell_time import cell_time
-from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
-from weldcal.systems.drivers.sensors.stamps import DiagramTime
-from weldcal.systems.drivers.sensors.watch import watch
+from weldcal.systems.drivers.sensors.stamps import DiagramTime, cell_time
+from weldcal.systems.drivers.sensors.watch import OnTrigger, watch
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import Scan, ScanStream, StreamedScan

@@ -107,12 +107,12 @@ def add_picture_scene(
     return PictureScene(scene, renderer, frames, poses)
 
 
-class KnockedStand(LeafSystem):
+class DisplacedStand(LeafSystem):
     """Computes the pose of a camera's stand, which jumps once.
 
     .. pydrake_system::
 
-        name: KnockedStand
+        name: DisplacedStand
         output_ports:
         - frame_poses
 
@@ -138,7 +138,7 @@ def add_stand(builder: DiagramBuilder, scene: PictureScene, time_s: float, displ
     graph = scene.scene_graph
     source = graph.RegisterSource("stand")
     frame = graph.RegisterFrame(source, GeometryFrame("stand"))
-    stand = builder.AddSystem(KnockedStand(frame, time_s, displacement))
+    stand = builder.AddSystem(DisplacedStand(frame, time_s, displacement))
     stand.set_name("knocked_stand")
     builder.Connect(stand.GetOutputPort("frame_poses"), graph.get_source_pose_port(source))
     return frame

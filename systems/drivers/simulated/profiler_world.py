@@ -14,9 +14,9 @@ from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.messages import Message
 
 TIP_RADIUS_M = 2e-5  # of the contact point: 0.01 mm is below the resolution of every reported figure
-POST_RADIUS_M = 0.006
+POST_RADIUS_M = 0.006  # a choice: thinner than the nominal sphere that it carries; no reported figure depends on it
 BEVEL_M = 0.007  # thickness of the straightedge, bevelled under 45 degrees so that its side is hidden from above
-MASS_KG = 0.9
+MASS_KG = 0.9  # a choice: a torch and a small profiler together; it only loads the simulated joint servos
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,6 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context, State
 
-from weldcal.systems.bodies.textured_board import textured_board
 from weldcal.systems.bodies.tool import DARK, STEEL
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
@@ -45,6 +44,7 @@ from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.tablet.config import TabletConfig, TabletTouch, TabletTruth
 from weldcal.systems.leaf_system import LeafSystem
+from weldcal.systems.viewer.scene import textured_board
 
 GLASS, NIB = "tablet_glass", "pen_nib"  # names of the two contact geometries
 
@@ -135,10 +135,11 @@ def ApplyDriverConfig(config: SimulatedTablet, build: StationBuild) -> None:
 
 
 _TEXELS_PER_MM = 8
+# a touch pen's: on its spring of 300 N/m it swings at 19 Hz, damped to 0.6; twice as much gives 14 Hz
 _PEN_MASS_KG = 0.02
 _PEN_DAMPING = 3.0  # N s / m
 _PEN_MODULUS_PA = 1e7  # of the soft nib
-_PEN_FRICTION = 0.1
+_PEN_FRICTION = 0.1  # a choice: the pen yields only along its axis, so that friction bends nothing, whatever it is
 _NIB_FACETS = 8.0  # edges of the contact model's nib per radius: the contact point is a centroid of its facets
 _HOLE = 0.62  # of a ring's radius, as drawn on the page
 _FRAME_M, _THICK_M = 0.010, 0.008  # width of the tablet's frame around the page, and its thickness

@@ -1,6 +1,7 @@
-"""Simulated UR arm: the controller's speedj on top of the MultibodyPlant's implicit joint servos."""
+"""Simulated UR arm: its true kinematics, and the controller's speedj on top of the plant's implicit joint servos."""
 
 import dataclasses as dc
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -8,13 +9,13 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues
 
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.arms.compiled_kinematics import tick_flange_pose
-from weldcal.models.arms.kinematics import ArmModel, jacobian
+from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig
-from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.leaf_system import LeafSystem
@@ -24,6 +25,8 @@ _LARGEST_MM = 1.0  # a larger error is a defect, not repeatability
 
 
 READY = UrStatus()
+_LENGTH_M = 0.5  # a link's length error is this times its angle error: machined parts of half a metre
+_LARGEST_LINK_MM = 5.0  # more is another arm
 
 
 @dc.dataclass
@@ -193,3 +196,32 @@ def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
     build.inputs["arm.velocity_command"] = servo.GetInputPort("velocity_command")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
         build.outputs[f"arm.{name}"] = servo.GetOutputPort(name)
+
+
+def draw_true_arm(arm: ArmModel, error_mm: float, q: Array, rng: np.random.Generator) -> ArmModel:
+    """The arm with random errors in each link transform: three angles and three lengths, normal and independent.
+
+    ``error_mm`` is the rms distance of the true flange from the reported one at ``q`` (6,) rad, over all draws. About a
+    quarter of it remains between poses after the best rigid fit; the rest looks like a shift of the robot's base.
+    Zero returns the arm as it is and draws nothing.
+
+    Raises:
+        InputError: the error is negative or larger than 5 mm.
+    """
+    if not 0.0 <= error_mm <= _LARGEST_LINK_MM:
+        raise InputError(f"robot.kinematic_error_mm must be from 0 to {_LARGEST_LINK_MM:g}, and it is {error_mm:g}.")
+    if error_mm == 0.0:
+        return arm
+    frames = link_frames(arm, q)
+    flange = frames[-1].translation()
+    levers = [float(np.sum((flange - X.translation()) ** 2)) for X in frames[:-1]]
+    # two of the three angles move the flange by the lever
+    gain = float(np.sqrt(sum(2.0 * square + 3.0 * _LENGTH_M**2 for square in levers)))
+    sigma = 1e-3 * error_mm / gain
+    stack = arm.stack.copy()
+    for k in range(len(stack)):
+        error = np.eye(4)
+        error[:3, :3] = exp_rotation(sigma * rng.standard_normal(3))
+        error[:3, 3] = _LENGTH_M * sigma * rng.standard_normal(3)
+        stack[k] = error @ stack[k]
+    return replace(arm, stack=stack)

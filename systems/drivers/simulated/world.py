@@ -1,5 +1,4 @@
-"""Builds the simulated world: arm, tool with its soft tip, table and workpiece in one MultibodyPlant and scene
-graph."""
+"""Build the simulated world: arm, tool, table, workpiece, and what a job adds, in one MultibodyPlant."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.flanges import flange_mesh
@@ -193,3 +192,19 @@ def build_world(
         second=second_arm,
         touch_pair=touch_pair,
     )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WorldSetup:
+    """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild).
+
+    `contacts_read`: a device reads the plant's contact results.
+    """
+
+    fittings: Sequence[Fittings] = ()
+    second: PlacedArm | None = None
+    foot: BaseCircle | None = None
+    profiler: ProfilerFixture | None = None
+    time_step_s: float = 0.002  # of the plant: as fine as what is touched asks for
+    parts: Sequence[object] = ()
+    contacts_read: bool = False

@@ -24,14 +24,14 @@ from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
-from weldcal.systems.drivers.ur.wire.dashboard import stop_program
+from weldcal.systems.drivers.ur.wire.line import stop_program
 from weldcal.systems.drivers.ur.worker import WorkerConfig, WorkerPhase
 from weldcal.systems.interrupts import started
 from weldcal.systems.messages import UrStatus
 
-START_LIMIT_S = 20.0
-CLOSE_LIMIT_S = 5.0
-HEARTBEAT_LIMIT_S = 0.15
+START_LIMIT_S = 20.0  # twice FIRST_LIMIT_S and START_LIMIT_S of robot.py: the rest is for the worker's imports
+CLOSE_LIMIT_S = 5.0  # twice what the worker takes at most, STOP_LIMIT_S and ENDS_S
+HEARTBEAT_LIMIT_S = 0.15  # when it has elapsed, the guard's 150 ms have too, and the arm brakes without the worker
 PLAYING, PAUSING, PAUSED = 2, 3, 4
 
 

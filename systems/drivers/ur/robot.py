@@ -11,11 +11,18 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.faults import Fault, RobotRefused, RobotUnreachable, reported_as
-from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, SET_POINTS, UPPER_OFFSET, register_names
+from weldcal.systems.drivers.ur.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
+from weldcal.systems.drivers.ur.set_points import ArcInputs, Level, apart
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
-from weldcal.systems.drivers.ur.torch.set_points import OUTPUTS as OUTPUTS_OF_SET_POINTS
-from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Level, apart
-from weldcal.systems.drivers.ur.wire.rtde_client import NotFinite, RtdeProbe, Value
+from weldcal.systems.drivers.ur.wire.rtde_client import (
+    DOUBLES,
+    SET_POINTS,
+    UPPER_OFFSET,
+    NotFinite,
+    RtdeProbe,
+    Value,
+    register_names,
+)
 from weldcal.systems.drivers.ur.wire.transport import (
     NATIVE,
     NO_COMMAND,
@@ -29,7 +36,7 @@ from weldcal.systems.drivers.ur.wire.transport import (
     Transport,
 )
 
-BIN_S = 0.5
+BIN_S = 0.5  # as in sensors/stamps.py, for packages at 500 Hz: the earliest of 250
 BINS = 60  # half a minute of bins
 BINS_FOR_DRIFT = 8
 DRIFT_LIMIT = 5e-4  # the drift of two quartz clocks is below 1e-4
@@ -93,14 +100,16 @@ class ClockMap:
 
 OUTPUTS = "actual_digital_output_bits"
 INPUTS = "actual_digital_input_bits"
-FIRST_LIMIT_S = 2.0
+FIRST_LIMIT_S = 2.0  # a choice: a controller sends 500 packages a second, and may take 1 s to begin
+# a choice: the guard answers in the next frame; a lost packet of TCP comes again after 0.2 s to 1 s
 ANSWER_LIMIT_S = 2.0
-START_LIMIT_S = 8.0
-EXCUSED_S = 0.5
+START_LIMIT_S = 8.0  # a choice: a script is compiled and started in seconds; half of it fails a slow control box
+EXCUSED_S = 0.5  # as Limits.lost_s: the arm is at rest by then, and a longer silence is a lost link whoever was silent
 ONLY_WITH_OUTPUT, ONLY_WITH_VALVE = "# only with an output", "# only with a gas valve"
 ONLY_WITH_ANALOG = "# only with analog output {}"
 ANALOG_TYPES = "analog_io_types"
 READ_BACK = ("tcp_offset", "payload", "payload_cog")
+# a choice: the controller applies a payload in some frames, and a connection takes a part of 1 s
 READ_BACK_LIMIT_S = 1.0
 SCALINGS = ("speed_scaling", "target_speed_fraction")
 ALWAYS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state", *SCALINGS)

@@ -23,15 +23,16 @@ from weldcal.systems.drivers.ur.faults import RobotRefused
 from weldcal.systems.drivers.ur.link import StartFailed, UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.set_points import SETTLES_S, AnalogSetPoint, levels_of
 from weldcal.systems.drivers.ur.supervisor import Limits
-from weldcal.systems.drivers.ur.torch.set_points import SETTLES_S, AnalogSetPoint, levels_of
-from weldcal.systems.drivers.ur.wire.dashboard import stop_program
+from weldcal.systems.drivers.ur.wire.line import stop_program
 from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose, installed, taken
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.wall_clock import WallClock
 
-FULL_PACE = 1.0
-STILL_RAD_S = 1e-9
+FULL_PACE = 1.0  # a controller's time is real time; only an emulated one has another pace
+STILL_RAD_S = 1e-9  # rounding of a zero command: in a frame of 2 ms a joint turns 2e-12 rad
+# one period of the commands: a later velocity is replaced by the next one before the robot uses it
 CATCHES_UP_S = 0.004
 N_OUTPUTS = 8
 

@@ -9,14 +9,14 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault, reported_as
-from weldcal.systems.drivers.ur.torch.set_points import apart
+from weldcal.systems.drivers.ur.set_points import apart
 
 NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
 SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7
 RUNNING = 7
 STOPPING, STOPPED, PLAYING, PAUSING, PAUSED = range(5)
 MODES = range(-1, 100)  # of robot, safety and program; PolyScope has some fifteen of each, from -1 on
-POSE_M = 5e-5
+POSE_M = 5e-5  # what the pre-flight demands at rest (docs/hardware.md, flange pose)
 # states that the guard script writes into its output register
 OBEYING, STALE_REGISTER = 1, 2
 MADE_UP_FOR_S = 0.03  # of the cell's time

@@ -12,8 +12,8 @@ from pydrake.systems.framework import Context, DiscreteValues
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig
-from weldcal.systems.drivers.sensors.cell_time import CellTime, cell_time
 from weldcal.systems.drivers.sensors.preflight import Sensed
+from weldcal.systems.drivers.sensors.stamps import CellTime, cell_time
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.drivers.ur.faults import Fault, reported_as, sentence
@@ -26,10 +26,10 @@ from weldcal.systems.messages import TorchTouch
 INPUTS = "actual_digital_input_bits"
 READ = ("timestamp", INPUTS, "actual_q", "actual_qd")
 N_INPUTS = 18  # 0 to 7 standard, 8 to 15 configurable, 16 and 17 of the tool connector
-FIRST_LIMIT_S = 2.0
+FIRST_LIMIT_S = 2.0  # as in ur/robot.py
 FIRST_LOOKS, LOOK_S = 5, 0.01
 SILENT_S = 0.2  # of the cell's time, without a new sample
-PERIOD_S = 0.004
+PERIOD_S = 0.004  # the period of the robot's commands; touches are timed by RTDE samples, and not by this
 # Of the controller's time. A touch is on for HELD_S, and its bounce leaves it off for less than BOUNCE_S; a contact
 # that opens has opened when it is off for RELEASED_S. A sound probe changes a few times when it closes and when it
 # opens.

@@ -18,8 +18,8 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur.precedence import take_priority
 from weldcal.systems.drivers.ur.robot import ControllerStream, Refused
+from weldcal.systems.drivers.ur.set_points import ArcInputs, Gas, Level, SetPoints, apart
 from weldcal.systems.drivers.ur.shared import Given, Memory, Published, TornRead
 from weldcal.systems.drivers.ur.supervisor import (
     PLAYING,
@@ -31,12 +31,12 @@ from weldcal.systems.drivers.ur.supervisor import (
     Supervisor,
     VelocityCommand,
 )
-from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas, Level, SetPoints, apart
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
+from weldcal.systems.pacing import take_priority
 
 FRESH_S = 0.012  # of robot time; three periods of the commands
-ZERO_S = 0.050
-RISE_PER_S = 10.0
+ZERO_S = 0.050  # as Limits.late_s: the arm is at rest before the silence is a fault
+RISE_PER_S = 10.0  # full speed again in 0.1 s: 10 rad/s^2 at 1 rad/s, a quarter of ACCELERATION
 
 
 class TimeScale:
@@ -60,9 +60,10 @@ class TimeScale:
 
 
 ACCELERATION = 40.0  # rad/s^2 of speedj: the cell ramps the stream, the controller only follows
+# a choice: five passes of 4 ms, half of Limits.stale_process_s; a shorter delay is an ordinary scheduler's
 LATE_PASS_S = 0.020
-REST_RAD_S = 1e-3
-STOP_LIMIT_S = 2.0
+REST_RAD_S = 1e-3  # as flange_mover.SETTLED_RAD_S
+STOP_LIMIT_S = 2.0  # ten times what Limits.braking needs from 1 rad/s: an arm that has not stopped by then will not
 ENDS_S = 0.5  # for which the program's end is waited for
 RESTS_S = 5.0  # for which an arm at rest waits for a cell that computes
 LEFT = 3  # exit code of a worker that exited because of the link

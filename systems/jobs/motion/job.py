@@ -15,14 +15,20 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
-from weldcal.systems.jobs.motion.collector import MotionCalibrator, MotionCollector, MotionRecorder
-from weldcal.systems.jobs.motion.procedure import MotionCalibration, MotionProcedure, MotionRecord
+from weldcal.systems.jobs.motion.procedure import (
+    MotionCalibration,
+    MotionCalibrator,
+    MotionCollector,
+    MotionProcedure,
+    MotionRecord,
+    MotionRecorder,
+)
 from weldcal.systems.jobs.weld.job import POLL_S, add_drift_view, add_stream
 from weldcal.systems.jobs.weld.settings import feature_on_flange
 from weldcal.systems.messages import CalibrationStatus
+from weldcal.systems.motion.buffers import FrameQueue
 from weldcal.systems.motion.clear_moves import clear_move, station_bodies
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
-from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario

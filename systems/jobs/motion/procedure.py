@@ -1,20 +1,32 @@
-"""MotionProcedure: moves the flange between the corners of a cube until enough frames are collected, then asks for the
-result."""
+"""Systems of the motion job: MotionProcedure, MotionCollector, MotionCalibrator and MotionRecorder."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, EventStatus, State
 
-from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream
+from weldcal.calibration.data.clouds import save_cloud
+from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.motion_dataset import FrameTime, RobotStream, save_motion_dataset
 from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.motion.estimate import MotionEstimate
+from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
+from weldcal.calibration.motion.frames import observed_frames
+from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
+from weldcal.models.errors import WeldcalError
+from weldcal.models.scanners import ScannerPreset
+from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
-from weldcal.systems.messages import JobCommand, Message
+from weldcal.systems.leaf_system import LeafSystem
+from weldcal.systems.messages import FlangeEstimate, JobCommand, Message, ScanStream
 
 _BLIND_S = 10.0  # without a single frame that shows the flange
+_BLOCK = 512  # samples that are joined to one array: copies of short tuples are cheap
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -144,3 +156,151 @@ class MotionProcedure(Procedure[MotionState, MotionInputs]):
         "home": _at_home,
         "calibrate": _calibrated,
     }
+
+
+class MotionCollector(LeafSystem):
+    """Adds each new estimate, and a sample of the joints per tick.
+
+    .. pydrake_system::
+
+        name: MotionCollector
+        input_ports:
+        - flange_estimate
+        - position_measured
+        - sample_time
+        - state
+        output_ports:
+        - record
+    """
+
+    def __init__(self, period_s: float = 0.008) -> None:
+        super().__init__()
+        self._estimate = self.DeclareAbstractInputPort("flange_estimate", AbstractValue.Make(FlangeEstimate()))
+        self._position = self.DeclareVectorInputPort("position_measured", 6)
+        self._time = self.DeclareVectorInputPort("sample_time", 1)
+        self._job = self.DeclareAbstractInputPort("state", AbstractValue.Make(MotionState()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(MotionRecord()))
+        self.DeclareStateOutputPort("record", self._state)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._collect)
+
+    def _collect(self, context: Context, state: State) -> None:
+        old: MotionRecord = context.get_abstract_state(self._state).get_value()
+        if self._job.Eval(context).phase not in ("approach", "collect", "home"):
+            return
+        row = np.append(self._time.Eval(context), self._position.Eval(context))
+        new = _sampled(old, row)
+        estimate: FlangeEstimate = self._estimate.Eval(context)
+        if estimate.sequence > old.sequence and np.isfinite(estimate.arrival_time):
+            new = _with_frame(new, estimate, context.get_time())
+        if new is not old:
+            state.get_mutable_abstract_state(self._state).set_value(new)
+
+
+def _sampled(record: MotionRecord, row: np.ndarray) -> MotionRecord:
+    """The record with one more sample; a repeated time is left out."""
+    last = record.newest[-1] if record.newest else (record.blocks[-1][-1] if record.blocks else None)
+    if last is not None and row[0] <= last[0]:
+        return record
+    newest = (*record.newest, row)
+    if len(newest) < _BLOCK:
+        return replace(record, newest=newest)
+    return replace(record, blocks=(*record.blocks, np.array(newest)), newest=())
+
+
+def _with_frame(record: MotionRecord, estimate: FlangeEstimate, now: float) -> MotionRecord:
+    """The record with one more frame."""
+    id = f"{estimate.sequence:05d}"
+    record = replace(record, sequence=estimate.sequence, waits_s=(*record.waits_s, now - estimate.arrival_time))
+    if estimate.fit is None:
+        return replace(record, refused=(*record.refused, (id, estimate.reason or "")))
+    frame = FrameTime(id, estimate.arrival_time, estimate.device_time)
+    return replace(record, seen=(*record.seen, (frame, estimate.fit)))
+
+
+class MotionCalibrator(BackgroundSystem):
+    """Calibrates when the procedure asks for it, beside the control loop.
+
+    .. pydrake_system::
+
+        name: MotionCalibrator
+        input_ports:
+        - record
+        - state
+        output_ports:
+        - calibration
+    """
+
+    def __init__(self, arm: ArmModel, background: Background | None = None, period_s: float = 0.02) -> None:
+        super().__init__("calibration", MotionCalibration(), background, period_s)
+        self._arm = arm
+        self._record = self.DeclareAbstractInputPort("record", AbstractValue.Make(MotionRecord()))
+        self._job = self.DeclareAbstractInputPort("state", AbstractValue.Make(MotionState()))
+
+    def ask(self, context: Context, newest: MotionCalibration) -> Answer[MotionCalibration] | None:
+        """Ask for the calibration once, when everything has been collected."""
+        if newest.asked or self._job.Eval(context).phase != "calibrate":
+            return None
+        return self.background.ask(calibrate_record, self._record.Eval(context), self._arm)
+
+
+def calibrate_record(record: MotionRecord, arm: ArmModel) -> MotionCalibration:
+    """Calibrate from a record; without a result, the reason is given and no exception is raised.
+
+    The robot's own kinematics are used, so that its factory calibration counts.
+    """
+    try:
+        frames = observed_frames([f for f, _ in record.seen], {f.id: fit for f, fit in record.seen})
+        return MotionCalibration(1, estimate_in_motion(frames, ContinuousMotion(posed_stream(record, arm))))
+    except WeldcalError as error:
+        return MotionCalibration(1, reason=str(error))
+
+
+def posed_stream(record: MotionRecord, arm: ArmModel) -> RobotStream:
+    """The robot's stream as flange poses by its own kinematics."""
+    stream = record.stream(arm.name)
+    assert stream.joints is not None
+    poses = np.array([forward_kinematics(arm, q).GetAsMatrix4() for q in stream.joints])
+    return RobotStream(stream.time, poses, None, arm.name)
+
+
+class MotionRecorder(LeafSystem):
+    """Writes clouds in publish events; `finish` writes the tables beside them.
+
+    .. pydrake_system::
+
+        name: MotionRecorder
+        input_ports:
+        - stream
+    """
+
+    def __init__(self, folder: Path, period_s: float = 0.02) -> None:
+        super().__init__()
+        self.folder = folder
+        self._frames: list[FrameTime] = []
+        self._newest = 0
+        self._stream = self.DeclareAbstractInputPort("stream", AbstractValue.Make(ScanStream()))
+        self.DeclarePeriodicPublishEvent(period_s, 0.0, self._write)
+
+    def _write(self, context: Context) -> EventStatus:
+        stream: ScanStream = self._stream.Eval(context)
+        for frame in stream.frames:
+            if frame.sequence <= self._newest:
+                continue
+            self._newest, id = frame.sequence, f"{frame.sequence:05d}"
+            (self.folder / "clouds").mkdir(parents=True, exist_ok=True)
+            points = np.asarray(frame.points_C, dtype=np.float64)
+            save_cloud(self.folder / "clouds" / f"{id}.npz", points)
+            self._frames.append(FrameTime(id, frame.arrival_time, frame.device_time))
+        return EventStatus.Succeeded()
+
+    def finish(self, stream: RobotStream, robot: str, flange: str, scanner: ScannerPreset) -> int:
+        """Write dataset.yaml, stream.csv and frames.csv; returns the number of frames."""
+        header = DatasetHeader(
+            robot=robot,
+            flange=flange,
+            scanner=scanner.name,
+            configuration="eye_on_base",
+            note="a run of the motion job",
+        )
+        save_motion_dataset(self.folder, header, stream, self._frames, ())
+        return len(self._frames)

@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.planning.mounting_estimate import MountingResult, SeenCircle
+from weldcal.calibration.planning.mounting_estimate import MountingResult, ObservedCircle
 from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
@@ -69,7 +69,7 @@ class MountingStatus(Message):
     """The calibration after its newest scan."""
 
     sequence: int = 0
-    seen: tuple[SeenCircle, ...] = ()
+    seen: tuple[ObservedCircle, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
     result: MountingResult | None = None
     sigma_work_m: float = np.inf  # expected error (3-D, rms) of a point at the scanner's best distance

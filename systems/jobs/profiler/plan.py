@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.interpolate import CubicSpline
 
-from weldcal.calibration.planning.clearance import LinkCapsule, arm_bodies, path_clearance
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.clearance import LinkCapsule, Surroundings, arm_bodies, path_clearance
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import (

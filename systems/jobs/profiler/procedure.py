@@ -33,7 +33,7 @@ from weldcal.systems.jobs.profiler.plan import (
     plan_touches,
 )
 from weldcal.systems.messages import JobCommand, ProfileScan, TorchTouch
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.welding.seam.curve import SeamCurve
 

@@ -13,9 +13,9 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import WeldPart
-from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated.tablet_world import tablet_fittings
+from weldcal.systems.drivers.simulated.world import WorldSetup
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.tablet.config import TabletConfig, TabletTruth, WristPicture, check_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
@@ -169,12 +169,12 @@ class Tablet(Job[TabletPlan]):
         """See Job."""
         check_tablet(scenario)
 
-    def furnish(
+    def set_up_world(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
-    ) -> Furnishing:
+    ) -> WorldSetup:
         """See Job: camera, pen and tablet at their true poses."""
         visit = tablet_fittings(tablet_of(scenario), scenario.wrist_camera, scenario.digitizer, rng)
-        return Furnishing(fittings=(visit,), parts=(visit.tablet, visit.truth), contacts_read=True)
+        return WorldSetup(fittings=(visit,), parts=(visit.tablet, visit.truth), contacts_read=True)
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> TabletPlan:
         """See Job."""

@@ -11,9 +11,9 @@ from weldcal.models.arrays import Array
 from weldcal.systems.jobs.procedure import Inputs, Procedure, ProcedureState
 from weldcal.systems.jobs.tablet.config import TabletTouch, WristPicture
 from weldcal.systems.messages import Message
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 
-PICTURE_TIMEOUT_S = 8.0
+PICTURE_TIMEOUT_S = 8.0  # a choice: a busy computer renders a picture in seconds; twice as much only delays the report
 # added to a descent's longest time, so that a touch at its end can still be reported
 LATE_TOUCH_S = 0.2
 

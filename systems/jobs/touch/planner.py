@@ -10,14 +10,12 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.planning.clearance import arm_bodies
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
-from weldcal.calibration.touch.table import around, fit_touched_plane
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings, arm_bodies
+from weldcal.calibration.touch.touches import around, fit_touched_plane
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.systems.background import Answer, Background
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.drivers.config import FingerCameraConfig, NoDevice
 from weldcal.systems.jobs.weld.arm_way import CLEAR_OF_PART_M, SeamObstructed, SeamOutOfReach
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_root_anyhow

@@ -15,10 +15,11 @@ from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.messages import JobCommand, Message
 
 DWELL_S = 0.3  # at rest before a scan and before frames count
+# a choice: scan and plan take seconds; twice as much only delays the report of a scanner that hangs
 SCAN_TIMEOUT_S = 30.0
 FRAMES = 10  # of the free tip, and of the pressed one
 FREE_M = 0.3e-3  # that a free tip may read
-_FRAMES_TIMEOUT_S = 4.0
+_FRAMES_TIMEOUT_S = 4.0  # a choice: FRAMES take 0.3 s at 30 Hz; ten times that is a tag out of sight
 _LONGEST_DESCENT_S = 120.0  # also on a computer that is late, which slows the arm
 _SLOWEST_FRAME_S = 0.3  # a descent without a newer frame stops
 _NO_TAG = "The finger camera does not see the tip's tag: check its light and focus."

@@ -12,16 +12,15 @@ import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.planning.clearance import arm_bodies, path_clearance, self_distance
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings, arm_bodies, path_clearance, self_distance
 from weldcal.models.arms.inverse import inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.motion.guarded_path import Followed, GuardedMotion, InfeasiblePath, check_path, straight
+from weldcal.welding.seam.clearance import NoClearance, check_clearance
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.room import NoRoom, check_room
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.tool_axes import tool_path
 from weldcal.welding.servo.touch import touch_start_pose
@@ -92,19 +91,19 @@ def leaning(config: ServoConfig, lean_rad: float, touch_arc_m: float | None = No
     return dc.replace(config, torch=dc.replace(config.torch, work_angle_rad=lean_rad)) if lean_rad else config
 
 
-def leans_with_room(welder: Welder, seam: SeamCurve, X_BP: RigidTransform) -> list[float]:
+def leans_with_clearance(welder: Welder, seam: SeamCurve, X_BP: RigidTransform) -> list[float]:
     """Leans, rad, that the job may use and with which the tool's body fits the part; the upright tool's only where that
     fits.
 
     Raises:
-        NoRoom: none fits, with the least lean that would.
+        NoClearance: none fits, with the least lean that would.
     """
     assert welder.workpiece is not None
     mesh, tool, refused, fits = welder.workpiece.mesh, welder.tool, None, []
     for lean in LEANS:
         try:
-            check_room(mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
-        except NoRoom as problem:
+            check_clearance(mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
+        except NoClearance as problem:
             refused = refused or problem
             continue
         if refused is None:
@@ -116,7 +115,7 @@ def leans_with_room(welder: Welder, seam: SeamCurve, X_BP: RigidTransform) -> li
     if not fits:
         raise refused
     advice = f"set welding.lean_deg: {abs(math.degrees(fits[0])):.0f}, with which the tool leans so far where it must"
-    raise NoRoom(f"{refused} Or {advice}.", refused.short_m)
+    raise NoClearance(f"{refused} Or {advice}.", refused.short_m)
 
 
 def find_way(
@@ -232,8 +231,8 @@ def way_on(welder: Welder, seam: SeamCurve, X_BP: RigidTransform | None, lean: f
     if lean and welder.workpiece is not None and X_BP is not None:
         tool = welder.tool
         try:
-            check_room(welder.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
-        except NoRoom as problem:
+            check_clearance(welder.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m, lean)
+        except NoClearance as problem:
             raise SeamObstructed(str(problem)) from problem
     return way
 

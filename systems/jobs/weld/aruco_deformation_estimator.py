@@ -14,7 +14,7 @@ from weldcal.models.tool import FingerCamera, WeldingTool
 from weldcal.systems.background import Answer, Background, Inline, import_module
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, Image, Message, believed_arm
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.welding.finger.deformation import TagModel, deflection_from_tag, detect_tag
 from weldcal.welding.servo.state import DeflectionSample
 

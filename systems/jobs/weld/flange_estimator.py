@@ -9,17 +9,15 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, face_cloud, fit_flange
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.motion.frames import IN_MOTION
-from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-from weldcal.systems.background import Answer, Background
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan, StreamedScan
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 
 _CLOCKS_APART_S = 0.2  # a device's time that is further from the arrival's has jumped
 _COARSE = 8  # rows and columns of a scan between those that are looked at
@@ -107,7 +105,7 @@ class FlangeEstimator(BackgroundSystem):
         guess = streamed_guess(X_CR, newest, self._guess_radius_m, self._standard)
         base = dc.replace(base, center_expected_C=X_CR.translation())
         # only what may show the flange travels to the computing process: a whole frame takes longer to copy than to fit
-        points = seen_about(scan.points_C, guess.center_C, guess.radius_m)
+        points = points_about(scan.points_C, guess.center_C, guess.radius_m)
         return self.background.ask(estimate_streamed, base, points, guess, self._standard)
 
 
@@ -134,7 +132,7 @@ def streamed_guess(
     return FlangeGuess(expected, radius_m + 0.5 * standard.outer_m, X_CR.rotation().matrix()[:, 2])
 
 
-def seen_about(points_C: NDArray[np.float32], center_C: Array, radius_m: float) -> NDArray[np.float32]:
+def points_about(points_C: NDArray[np.float32], center_C: Array, radius_m: float) -> NDArray[np.float32]:
     """The rows and columns (h, w, 3) of a scan (H, W, 3) m that hold all its points within ``radius_m`` of a place, and
     some more; the whole scan where a coarse look finds none."""
     coarse = points_C[::_COARSE, ::_COARSE]

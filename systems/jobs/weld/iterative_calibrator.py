@@ -20,19 +20,18 @@ from weldcal.calibration.published.algorithm1 import (
     Algorithm1State,
     algorithm1_start,
     algorithm1_step,
+    make_verification,
     named_cost,
 )
-from weldcal.calibration.published.icp import make_verification
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
-from weldcal.systems.background import Answer, Background
-from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.background import Answer, Background, BackgroundSystem
 from weldcal.systems.leaf_system import LeafSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, Refinement, VerificationResult
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 
 TIME_S = 120.0  # for which the job waits, at rest, for the folds beside a robot
 

@@ -13,7 +13,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import is_felt, numbered, seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
@@ -33,9 +33,9 @@ from weldcal.systems.jobs.weld.settings import (
 )
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
+from weldcal.systems.motion.buffers import FrameQueue
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
-from weldcal.systems.motion.frame_queue import FrameQueue
-from weldcal.systems.motion.singularity_guard import SingularityGuard
+from weldcal.systems.motion.guarded_path import SingularityGuard
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.phase_words import phase_words
 from weldcal.systems.scenario.schema import Scenario

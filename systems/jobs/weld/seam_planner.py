@@ -19,17 +19,16 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, WeldPart, is_felt, numbered
 from weldcal.models.workpieces.seat import Press
-from weldcal.systems.background import Answer, Background
-from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning, leans_with_room
+from weldcal.systems.background import Answer, Background, BackgroundSystem
+from weldcal.systems.jobs.weld.arm_way import ArmWay, Welder, find_way, leaning, leans_with_clearance
 from weldcal.systems.jobs.weld.tip_to_torch import TipToTorch, tip_to_torch, torch_sigma
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView, SeamRecord
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.welding.locate.part.joint import check_fit_up
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.seam.clearance import NoClearance, check_beside, check_ends, clear_pieces
 from weldcal.welding.seam.curve import SeamCurve, ringed
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.room import NoRoom, check_beside, check_ends, clear_pieces
 from weldcal.welding.servo.tool_axes import check_travel
 from weldcal.welding.servo.touch import check_length, touch_start_pose
 
@@ -134,7 +133,7 @@ class SeamPlanning(Welder):
         check_length(seam, self.config)
         leans = None
         if X_BP is not None:
-            tool, leans = self.tool, leans_with_room(self, seam, X_BP)
+            tool, leans = self.tool, leans_with_clearance(self, seam, X_BP)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s, self.config.windows)
         check_travel(seam, self.config)
@@ -296,12 +295,14 @@ def interrupted(
     follows.
 
     Raises:
-        NoRoom: nothing is left of the seam.
+        NoClearance: nothing is left of the seam.
     """
     chord = planning.tool.chord_m
     pieces = clear_pieces(seam, stops, chord, RUN_UP_S * planning.config.weld_speed_m_s)
     if planning.piece >= len(pieces):
-        raise NoRoom("Nothing of the seam is left beside what is in the tool's way: remove it and scan again.", 0.0)
+        raise NoClearance(
+            "Nothing of the seam is left beside what is in the tool's way: remove it and scan again.", 0.0
+        )
     start, end, down = pieces[planning.piece]
     ends = [0.0, *(s for a, b, _ in pieces for s in (a, b)), seam.length]
     left_out = tuple((a, b) for a, b in zip(ends[::2], ends[1::2], strict=True) if b - a > 1e-6)

@@ -10,9 +10,8 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.calibrate import PLAIN
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
-from weldcal.calibration.refinement.kinematics_fit import KINDS
-from weldcal.calibration.refinement.poses import informative_poses
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings
+from weldcal.calibration.refinement.kinematics_fit import KINDS, informative_poses
 from weldcal.models.arms.chain import chain_of
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError

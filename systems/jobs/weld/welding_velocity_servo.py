@@ -43,7 +43,7 @@ class ServoReport(Message):
     time: float = np.nan  # of the tick, on the robot's clock
     X_BT: RigidTransform | None = None  # measured at that tick
     plan: int = 0  # sequence of the plan that is followed
-    interruption: Interruption = dc.field(default_factory=Interruption)  # a person's hold
+    interruption: Interruption = dc.field(default_factory=Interruption)  # an operator's hold
 
     @property
     def way_back_m(self) -> float:

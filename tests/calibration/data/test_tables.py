@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from weldcal.calibration.data.tables import read_rows
+from weldcal.calibration.data.checks import read_rows
 from weldcal.models.errors import InputError
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from weldcal.calibration.doctor.case import case_text, read_case
 from weldcal.calibration.doctor.diagnose import diagnose
-from weldcal.calibration.doctor.record import case_text, read_case
 from weldcal.models.errors import InputError
 from weldcal.tools.report.doctor import CHECKED, worded
 from weldcal.tools.worlds.doctor import CAUSES, UNKNOWN, clean

@@ -10,8 +10,7 @@ from weldcal.calibration.errors import CoplanarPoses, InconsistentPoses, Repeate
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
+from weldcal.calibration.geometry.se3 import exp_rotation, fit_rigid, rotation_vector
 from weldcal.models.errors import InputError
 
 X_BC = RigidTransform(RollPitchYaw(np.pi - 0.1, 0.2, 0.7), [-0.6, -0.3, 1.1])

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from tests.calibration.flange.raycast import Camera, forms, random_flange, scan
-from weldcal.calibration.flange.fit import fit_flange
-from weldcal.calibration.flange.lattice import rebuild_grid
+from weldcal.calibration.flange.fit import fit_flange, rebuild_grid
 from weldcal.models.flanges import get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")

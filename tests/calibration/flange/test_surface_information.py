@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.calibration.flange.face import face_points
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.icp import (
+from weldcal.calibration.published.algorithm1 import (
     COMPONENTS,
     CentreVerification,
     icp_error,

@@ -13,7 +13,7 @@ from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
-from weldcal.tools.worlds.hand_eye_mistakes import MISTAKES, fuzz, judge, random_world
+from weldcal.tools.worlds.hand_eye import MISTAKES, fuzz, judge, random_world
 
 QUICK = HandEyeConfig(folds=0)
 

@@ -12,7 +12,7 @@ from weldcal.calibration.hand_eye.choice import solve
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.problem import full_problem, residuals
 from weldcal.calibration.hand_eye.solve import IDENTITY, HandEyeConfig, solve_problem
-from weldcal.tools.worlds.imperfect_cells import imperfect_cell, ratios
+from weldcal.tools.worlds.hand_eye import imperfect_cell, ratios
 
 KNOWN = (IDENTITY, IDENTITY, IDENTITY)
 

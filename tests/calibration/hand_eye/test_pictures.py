@@ -21,9 +21,9 @@ from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import StatedForms
 from weldcal.calibration.hand_eye.pictures import search as picture_search
 from weldcal.calibration.hand_eye.pictures.boards import Board, find_board, find_circles, parse_board, with_layout
-from weldcal.calibration.hand_eye.pictures.bundle import Corners, adjust
 from weldcal.calibration.hand_eye.pictures.search import picture_files
 from weldcal.calibration.hand_eye.pictures.sets import read_pictures
+from weldcal.calibration.hand_eye.pictures.solution import Corners, adjust
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.tools.cli.app import app

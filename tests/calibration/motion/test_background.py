@@ -5,7 +5,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.motion.drift.background import BASE, SCANNER, background_move
+from weldcal.calibration.motion.drift.watch import BASE, SCANNER, background_move
 from weldcal.models.arrays import Array
 
 WIDTH, HEIGHT, FOCAL, NOISE_M = 160, 120, 150.0, 4e-4

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from weldcal.calibration.motion.drift.hypotheses import STEP, DriftFilter, FieldConfig, FilterConfig, PoseField
-from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
-from weldcal.calibration.motion.drift.residuals import CLOCK, SIZE, Rows
+from weldcal.calibration.motion.drift.residuals import CLOCK, SIZE, FrameNoise, Rows, measured_noise
 from weldcal.calibration.motion.drift.sequential import CREEP, MOVED, WARM_UP, DriftConfig, DriftTest
-from weldcal.tools.worlds.features import Change, FeatureWorld, WorldConfig, simulate
+from weldcal.tools.worlds.moves import Change, FeatureWorld, WorldConfig, simulate
 
 KNOCK_S = 22.3
 

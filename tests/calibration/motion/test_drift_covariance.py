@@ -12,8 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from weldcal.calibration.motion.drift.noise import FrameNoise
-from weldcal.calibration.motion.drift.residuals import Rows, rows_of
+from weldcal.calibration.motion.drift.residuals import FrameNoise, Rows, rows_of
 from weldcal.calibration.motion.drift.sequential import MOVED, DriftConfig, DriftEvent, DriftTest
 
 Array = NDArray[np.float64]

@@ -11,11 +11,10 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.errors import UndeterminedPoses
-from weldcal.calibration.motion.clock import choose_clock
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
-from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.motion.expected import Moves, recorded_stream
+from weldcal.calibration.motion.observed import ObservedFrames, choose_clock
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.tools.worlds.moves import cube_moves, observed_frames
 

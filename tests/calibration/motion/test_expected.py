@@ -7,9 +7,8 @@ import pytest
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.motion.estimate import estimate_in_motion
-from weldcal.calibration.motion.expected import expected_of_motion
+from weldcal.calibration.motion.expected import Moves, expected_of_motion, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.errors import InputError
 from weldcal.tools.worlds.moves import cube_moves, observed_frames
 

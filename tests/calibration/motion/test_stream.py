@@ -8,8 +8,8 @@ import pytest
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.motion_dataset import RobotStream
+from weldcal.calibration.motion.expected import Moves, recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.tools.worlds.moves import cube_moves
 

@@ -8,10 +8,16 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.motion.body.model import BodyModel, fused_model, model_from_solids
-from weldcal.calibration.motion.body.tracking import BodyTracker, link_motion, observed_point
+from weldcal.calibration.motion.body import (
+    BodyModel,
+    BodyTracker,
+    fused_model,
+    link_motion,
+    model_from_solids,
+    observed_point,
+)
 from weldcal.models.arms.kinematics import link_frames, load_arm
-from weldcal.models.arms.link_mesh import link_index, link_solids
+from weldcal.models.arms.urdf import link_index, link_solids
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, merge, revolve

@@ -12,10 +12,10 @@ from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import ARRIVAL, ScannerClock
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.motion.drift.watch import watch
+from weldcal.calibration.motion.expected import recorded_stream
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import synchronise
-from weldcal.calibration.planning.moves import recorded_stream
 from weldcal.models.errors import InputError
 from weldcal.tools.worlds.moves import cube_moves, observed_frames
 

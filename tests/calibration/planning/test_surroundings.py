@@ -8,8 +8,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannerConfig, plan_calibration_poses
-from weldcal.calibration.planning.clearance import arm_bodies
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings, arm_bodies
 from weldcal.models.arms.kinematics import link_frames, load_arm
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.scanners import get_scanner

@@ -1,4 +1,4 @@
-"""What a person may state or copy wrongly beside a sphere's scans: its radius, a file cut short; and why a model was
+"""What an operator may state or copy wrongly beside a sphere's scans: its radius, a file cut short; and why a model was
 taken."""
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 from tests.calibration.profiler.test_cli import called, edge_csv, found
 from tests.calibration.profiler.test_sphere import DATA, MM, SIGMAS, clean, needs_data, poses
 from weldcal.calibration.errors import RadiusError
-from weldcal.calibration.profiler.sphere.joint import _clearly_less, choose_model
+from weldcal.calibration.profiler.sphere.joint import _clearly_less, check_radius, choose_model, free_radius
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
-from weldcal.calibration.profiler.sphere.radius import check_radius, free_radius
 from weldcal.tools.cli.app import app
 from weldcal.tools.worlds.profiler import CLEAN, RADIUS_M, SphereWorld, sphere_trial
 

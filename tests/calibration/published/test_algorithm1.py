@@ -12,7 +12,10 @@ from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold, position_errors, run_algorithm1
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import (
+    FAILED,
     POOL_SIZE,
+    CentreVerification,
+    VerificationError,
     algorithm1_start,
     algorithm1_step,
     axes_cost,
@@ -21,7 +24,6 @@ from weldcal.calibration.published.algorithm1 import (
     translation_cost,
     work_radius_cost,
 )
-from weldcal.calibration.published.icp import FAILED, CentreVerification, VerificationError
 from weldcal.models.errors import InputError
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])

@@ -10,12 +10,12 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from tests.calibration.flange.face import face_points
+from weldcal.calibration.flange.fit import face_cloud
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.published.icp import (
+from weldcal.calibration.published.algorithm1 import (
     CentreVerification,
     Verification,
-    face_cloud,
     icp_error,
     make_verification,
     sight,

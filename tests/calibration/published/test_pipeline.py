@@ -10,13 +10,13 @@ from tests.calibration.flange.face import face_points
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import (
+    VerificationError,
     algorithm1_start,
     algorithm1_step,
     axes_cost,
     translation_cost,
     work_radius_cost,
 )
-from weldcal.calibration.published.icp import VerificationError
 from weldcal.calibration.published.pipeline import (
     CircleParameters,
     PublishedParameters,

@@ -14,12 +14,17 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.hand_eye.joints import flange_poses
 from weldcal.calibration.refinement.kinematics_choice import KinematicsChoice, choose_kinematics, kinematics_text
-from weldcal.calibration.refinement.kinematics_fit import KinematicsFit, arm_errors, fit_kinematics, unsought
-from weldcal.calibration.refinement.poses import informative_poses
+from weldcal.calibration.refinement.kinematics_fit import (
+    KinematicsFit,
+    arm_errors,
+    fit_kinematics,
+    informative_poses,
+    unsought,
+)
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.tools.worlds.wrong_arm import WrongArmStation, judged, station, study_station
+from weldcal.tools.worlds.wrong_models import WrongArmStation, judged, station, study_station
 
 ARM = load_chain("ur10e")
 

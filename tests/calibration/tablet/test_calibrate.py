@@ -17,7 +17,7 @@ from pydrake.math import RigidTransform
 
 from tests.calibration.tablet.visit import MM_PER_PX, P_FP, X_FC, csv_options, rows_of, run, write, write_visit
 from weldcal.calibration.errors import TabletDataError
-from weldcal.calibration.tablet.planar.files import load_planar
+from weldcal.calibration.tablet.planar_files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
 from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit

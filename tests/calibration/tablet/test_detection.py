@@ -10,8 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from tests.calibration.tablet.image import grid, picture, project
 from weldcal.calibration.errors import LandmarksNotFound
 from weldcal.calibration.tablet.detection import find_landmarks
-from weldcal.calibration.tablet.plane_depth import plane_depth
-from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose
+from weldcal.calibration.tablet.plane_pose import plane_depth, tablet_points, tablet_pose
 
 K = np.array([[617.7, 0.0, 316.5], [0.0, 617.7, 242.3], [0.0, 0.0, 1.0]])
 PAGE = grid(3, 3, 0.06, 0.038)

@@ -11,8 +11,16 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.errors import CollinearLandmarks, EqualRotations, TooFewLandmarks
-from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_plane_motion, hand_over, refine_rounded
-from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
+from weldcal.calibration.tablet.planar_fit import (
+    PlanarConfig,
+    fit_linear,
+    fit_planar,
+    fit_plane_motion,
+    hand_over,
+    refine_rounded,
+    solve_closed_form,
+    touched_rays,
+)
 from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.worlds.tablet import TabletNoise, TabletTrial, published_touches, simulate_trial

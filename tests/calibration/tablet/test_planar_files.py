@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from weldcal.calibration.tablet.planar.files import load_planar
-from weldcal.calibration.tablet.published.two_stage import Sign
+from weldcal.calibration.tablet.planar_files import load_planar
+from weldcal.calibration.tablet.published import Sign
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.tablet.planar import VisitFits, best_model, fit_visit
 from weldcal.tools.worlds.tablet import TabletTrial, simulate_trial

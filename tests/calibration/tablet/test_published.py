@@ -12,14 +12,20 @@ from typer.testing import CliRunner
 
 from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
-from weldcal.calibration.tablet.published.calibration import evolve, hand_to_touch, tablet_stage1, tablet_stage2
-from weldcal.calibration.tablet.published.chain import DH_NAMES, HTM_NAMES, place_landmarks, search_range
-from weldcal.calibration.tablet.published.two_stage import (
+from weldcal.calibration.tablet.published import (
     AFFINE_NONE,
+    DH_NAMES,
+    HTM_NAMES,
     Sign,
+    evolve,
     fitness,
+    hand_to_touch,
+    place_landmarks,
+    search_range,
     stage1_residuals,
     stage2_residuals,
+    tablet_stage1,
+    tablet_stage2,
 )
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.cli.app import app

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.errors import EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.calibration.tablet.wrist.fit import WristTouches, fit_wrist, seen_point
+from weldcal.calibration.tablet.wrist.fit import WristTouches, fit_wrist, measured_point
 
 X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])
 P_FP = np.array([-0.002, -0.021, 0.163])
@@ -91,7 +91,7 @@ def test_a_seen_point_is_where_the_tablet_lies() -> None:
     fit = fit_wrist(data, leave_one_out=False)
     X_BF, rays = data.views[0]
     for p, ray in zip(GRID, rays, strict=True):
-        np.testing.assert_allclose(seen_point(fit, X_BF, ray), X_BT.multiply(np.r_[p, 0.0]), atol=1e-7)
+        np.testing.assert_allclose(measured_point(fit, X_BF, ray), X_BT.multiply(np.r_[p, 0.0]), atol=1e-7)
 
 
 def test_what_fixes_nothing_is_named() -> None:

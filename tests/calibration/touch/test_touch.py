@@ -1,4 +1,4 @@
-"""Touched points against what a calibration states, and the table that a person writes of them."""
+"""Touched points against what a calibration states, and the table that an operator writes of them."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from typer.testing import CliRunner
 from weldcal.calibration.data.results import save_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.touch.judge import judge_touches
-from weldcal.calibration.touch.table import (
+from weldcal.calibration.touch.touches import (
     CAMERA,
     DIRECTION,
+    POINT,
     POSE,
     REQUIRED,
     TIP,
+    Touch,
     fit_touched_plane,
     fit_touched_sphere,
     read_touches,
 )
-from weldcal.calibration.touch.touches import POINT, Touch
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.worlds.touch import TouchWorld, touch_world

@@ -16,15 +16,19 @@ from pydrake.systems.sensors import CameraInfo
 
 from tests.systems.cells import Q_HOME, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
-from weldcal.systems.drivers.simulated.tag_view import Pixels, TagView
+from weldcal.systems.drivers.simulated.rendered_finger_camera import (
+    Pixels,
+    RenderedFingerCamera,
+    StreamingCamera,
+    TagView,
+)
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import (
     ArucoDeformationEstimator,
     Deformation,
     measure_deformation,
 )
 from weldcal.systems.messages import Image
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.welding.finger.deformation import TagModel, tag_cells
 
 TAG = TagModel(dictionary=TOOL.tag_dictionary, id=TOOL.tag_id, size_m=TOOL.tag_size_m)

@@ -11,8 +11,8 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.depth_noise import DepthNoise
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import apply_noise, depth_to_points
-from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
+from weldcal.systems.drivers.simulated.ur import draw_true_arm
 
 Q = np.deg2rad([190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
 

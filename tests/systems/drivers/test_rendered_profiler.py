@@ -19,12 +19,11 @@ from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.rendered_profiler import RayFan, RenderedProfiler, drawn_pose, measured_profile
-from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.jobs.job import job_of
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.job import RobotError
+from weldcal.systems.jobs.profiler.job import RobotError, draw_fixture
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
@@ -122,7 +121,7 @@ def test_what_is_out_of_range_returns_nothing(fixture: ProfilerFixture) -> None:
 def test_a_profile_taken_in_motion_meets_the_pose_of_its_own_time() -> None:
     scenario = load_scenario("profiler_sphere")
     scenario.profiler = replace(CLEAN, samples=480)
-    station = make_station(scenario, 3, furnish=job_of(scenario).furnish)
+    station = make_station(scenario, 3, set_up_world=job_of(scenario).set_up_world)
     truth = station.truth.profiler
     assert truth is not None
     X_BS = over(above(truth.center, truth.radius_m), [100.0, 0.0, 0.0])

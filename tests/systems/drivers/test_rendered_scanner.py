@@ -39,7 +39,7 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.perfect_world import perfect
+from weldcal.tools.worlds.scaled_arms import perfect
 
 DISTANCE_M = 0.7
 HALF_M = np.array([0.10, 0.07])  # half the sides of the plate that is looked at

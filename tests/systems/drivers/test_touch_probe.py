@@ -22,7 +22,7 @@ from weldcal.systems.drivers.ur.touch_probe import (
     UrTouchProbeInput,
 )
 from weldcal.systems.messages import TorchTouch
-from weldcal.tools.emulators.cell.touch_probe import TouchProbe
+from weldcal.tools.emulators.cell.wires import TouchProbe
 
 STEP_S = 0.002
 SPEED_M_S = 0.006

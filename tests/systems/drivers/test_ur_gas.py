@@ -1,6 +1,6 @@
 """Gas flows before the torch and after it, by the controller's time."""
 
-from weldcal.systems.drivers.ur.torch.set_points import ArcInputs, Gas
+from weldcal.systems.drivers.ur.set_points import ArcInputs, Gas
 
 
 def run(gas: Gas, wanted: list[bool]) -> list[tuple[bool, bool]]:

@@ -11,7 +11,7 @@ import pytest
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
-from weldcal.systems.drivers.ur.torch.set_points import SETTLES_S, AnalogSetPoint, Gas, SetPoints, apart, levels_of
+from weldcal.systems.drivers.ur.set_points import SETTLES_S, AnalogSetPoint, Gas, SetPoints, apart, levels_of
 
 FEED = AnalogSetPoint(output=0, unit="V", at_zero=1.0, at_full=22.0, value=8.0)
 VOLTAGE = AnalogSetPoint(output=1, unit="mA", at_zero=10.0, at_full=40.0, value=25.0)

@@ -461,7 +461,7 @@ def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
 
 
 def test_an_arm_at_a_limit_may_leave_it_and_not_go_on() -> None:
-    """Within the margin of its limits, as a person may have left it."""
+    """Within the margin of its limits, as an operator may have left it."""
     for q, way in ((-5.99, 1.0), (5.99, -1.0)):
         for sign, fault in ((1.0, Fault.NONE), (-1.0, Fault.JOINT_LIMIT)):
             rig = Rig(velocity=sign * way * np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]))

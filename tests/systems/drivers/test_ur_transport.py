@@ -14,7 +14,7 @@ from weldcal.systems.drivers.ur import rtde
 from weldcal.systems.drivers.ur.link import StartFailed
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import UrRtde, chosen_transport
-from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
+from weldcal.systems.drivers.ur.set_points import AnalogSetPoint
 from weldcal.systems.drivers.ur.wire.transport import AUTO, NATIVE, UR_RTDE, Situation, choose
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.worlds.robot.bench import OUTPUT, Bench

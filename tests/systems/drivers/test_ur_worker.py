@@ -11,9 +11,9 @@ import pytest
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.set_points import Level
 from weldcal.systems.drivers.ur.shared import Given, Memory
 from weldcal.systems.drivers.ur.supervisor import OBEYING, PLAYING, RUNNING, Limits, RobotSample, VelocityCommand
-from weldcal.systems.drivers.ur.torch.set_points import Level
 from weldcal.systems.drivers.ur.worker import Worker, WorkerConfig
 
 ARM = load_arm()

@@ -21,7 +21,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import extrude, merge
 from weldcal.models.tools.loading import load_tool, tool_file
 from weldcal.models.workpieces.part import WeldPart
-from weldcal.systems.jobs.weld.arm_way import Welder, find_way, leans_with_room
+from weldcal.systems.jobs.weld.arm_way import Welder, find_way, leans_with_clearance
 from weldcal.systems.jobs.weld.job import seam_planning
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanning, plan_drawn_seam, seam_above
 from weldcal.systems.jobs.weld.settings import servo_config
@@ -31,8 +31,8 @@ from weldcal.tools.worlds.weld.budgets import PERFECT
 from weldcal.tools.worlds.weld.plant import groove_config, simulate
 from weldcal.tools.worlds.weld.seams import get_seam
 from weldcal.welding.locate.planning import RootPlan
+from weldcal.welding.seam.clearance import NoClearance
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.room import NoRoom
 from weldcal.welding.servo.settings import ServoConfig, ToolGeometry
 from weldcal.welding.servo.state import Phase
 from weldcal.welding.servo.tool_axes import tool_path
@@ -183,8 +183,8 @@ def test_a_tool_leans_off_the_bisector_where_it_has_no_room_upright(sense: float
     welder = Welder(
         arm=plain_station().arm, tool=tool, config=ServoConfig(), q_near=np.zeros(6), clearance_m=0.025, workpiece=part
     )
-    with pytest.raises(NoRoom, match=r"does not fit at .* Or set welding.lean_deg: 2, with which") as refused:
-        leans_with_room(welder, seam, RigidTransform())
+    with pytest.raises(NoClearance, match=r"does not fit at .* Or set welding.lean_deg: 2, with which") as refused:
+        leans_with_clearance(welder, seam, RigidTransform())
     assert 0.0 < refused.value.short_m < 0.01
-    leans = np.degrees(leans_with_room(replace(welder, lean_rad=np.radians(3.0)), seam, RigidTransform()))
+    leans = np.degrees(leans_with_clearance(replace(welder, lean_rad=np.radians(3.0)), seam, RigidTransform()))
     assert leans == pytest.approx([2.0 * sense])

@@ -28,7 +28,7 @@ from weldcal.systems.jobs.weld.iterative_calibrator import (
     verify_at,
 )
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 
 RING = get_flange("tool-ring-63")
 X_BC = RigidTransform(RollPitchYaw(np.pi, 0.0, -np.pi / 2), [0.65, 0.0, 0.95])

@@ -24,11 +24,11 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.weld.iterative_calibrator import refined_status
 from weldcal.systems.messages import CalibrationStatus
-from weldcal.systems.scenario.arm import corrected_arm
 from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.parts import corrected_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.worlds.wrong_arm import WrongArmStation, station
+from weldcal.tools.worlds.wrong_models import WrongArmStation, station
 
 
 def status_of(world: WrongArmStation) -> CalibrationStatus:

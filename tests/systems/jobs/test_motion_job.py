@@ -22,9 +22,9 @@ from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
-from weldcal.systems.jobs.motion.collector import MotionRecorder, posed_stream
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.systems.jobs.motion.job import AddedMotion, MotionJob, plan_corners
+from weldcal.systems.jobs.motion.procedure import MotionRecorder, posed_stream
 from weldcal.systems.jobs.weld.flange_estimator import believed_capture
 from weldcal.systems.messages import FlangeEstimate, ScanStream, StreamedScan
 from weldcal.systems.runner import Run, no_progress

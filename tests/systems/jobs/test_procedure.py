@@ -26,7 +26,7 @@ from weldcal.systems.jobs.touch.planner import PlannedTouches, TouchPlace
 from weldcal.systems.jobs.touch.procedure import TouchMotion, TouchProcedure, TouchState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.welding.servo.guards import SPEED_SHARE
 
 DOWN = np.array([0.0, 0.0, -1.0])

@@ -19,7 +19,7 @@ from weldcal.systems.jobs.weld.arm_way import SeamOutOfReach, arm_waypoints
 from weldcal.systems.jobs.weld.seam_planner import SeamPlanner, SeamPlanning, plan_drawn_seam, tip_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan, ScanView
-from weldcal.systems.motion.pose_recorder import PoseHistory
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig

@@ -12,10 +12,9 @@ from pydrake.math import RigidTransform
 from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.planning.clearance import arm_bodies
-from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
+from weldcal.calibration.planning.clearance import Obstacle, Surroundings, arm_bodies
 from weldcal.calibration.touch.judge import judge_touches
-from weldcal.calibration.touch.table import read_touches, touches_text
+from weldcal.calibration.touch.touches import read_touches, touches_text
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, link_frames
 from weldcal.models.errors import InputError

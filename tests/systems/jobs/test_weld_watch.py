@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from tests.systems.cells import EXACT_PLATE
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.systems.jobs.job import Phases
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.checks import check_scenario
@@ -20,7 +20,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.weld import measure
 from weldcal.tools.report.demo import DemoResult, demo_report
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.worlds.perfect_world import perfect
+from weldcal.tools.worlds.scaled_arms import perfect
 
 KNOCK_MM = [0.0, 1.2, 0.9]
 POSE = "X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"

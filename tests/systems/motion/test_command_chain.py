@@ -16,7 +16,7 @@ from weldcal.models.arms.kinematics import forward_kinematics, kinematics_and_ja
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.systems.messages import JobCommand, PlannedSeam, UrStatus
-from weldcal.systems.motion.singularity_guard import SingularityGuard
+from weldcal.systems.motion.guarded_path import SingularityGuard
 from weldcal.systems.motion.spine import CommandArbiter, SlewLimiter
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.guards import SlewLimits

@@ -13,8 +13,8 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arrays import Array
 from weldcal.systems.messages import FlangeEstimate
+from weldcal.systems.motion.buffers import PoseHistory
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
-from weldcal.systems.motion.pose_recorder import PoseHistory
 
 ARM = load_arm("ur10e")
 X_BC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [-0.6, -0.2, 1.1])

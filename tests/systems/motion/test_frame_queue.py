@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from weldcal.systems.messages import StreamedScan
-from weldcal.systems.motion.frame_queue import Queue, advance
+from weldcal.systems.motion.buffers import Queue, advance
 
 
 def frames(*numbers: int) -> tuple[StreamedScan, ...]:

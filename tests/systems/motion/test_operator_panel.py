@@ -1,4 +1,4 @@
-"""The panel brings a person's wishes and the viewer's controls into the Diagram; the viewer can hold and set the pace,
+"""The panel brings an operator's wishes and the viewer's controls into the Diagram; the viewer can hold and set the pace,
 no more."""
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
 from weldcal.systems.motion.spine import HOLD_BUTTON, PACE_SLIDER, OperatorPanel
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 
 
 class Panel:
     """The panel alone, with what it says at any time."""
 
     def __init__(self, pace: float | None = None, *, viewer: bool = True) -> None:
-        self.person = Person()
+        self.operator = Operator()
         if pace is not None:
-            self.person.ask_pace(pace)
+            self.operator.ask_pace(pace)
         self.meshcat = Meshcat(MeshcatParams(host="localhost", port=0)) if viewer else None
-        self.system = OperatorPanel(self.person, self.meshcat)
+        self.system = OperatorPanel(self.operator, self.meshcat)
         self.simulator = Simulator(self.system)
 
     def after(self, duration: float) -> tuple[float, float, float]:
@@ -55,12 +55,12 @@ def test_nobody_holds_by_default() -> None:
 def test_a_persons_wishes_are_in_the_diagram_within_ten_milliseconds_without_a_viewer() -> None:
     panel = Panel(viewer=False)
     panel.after(0.1)
-    panel.person.hold()
+    panel.operator.hold()
     assert panel.after(0.01) == (1.0, 0.0, 0.0)
-    panel.person.go_on()
-    panel.person.ask_pace(1.5)
+    panel.operator.go_on()
+    panel.operator.ask_pace(1.5)
     assert panel.after(0.01) == (0.0, 0.0, 1.5)
-    panel.person.end()
+    panel.operator.end()
     assert panel.after(0.01) == (0.0, 1.0, 1.5)
 
 
@@ -70,8 +70,8 @@ def test_a_click_of_the_viewer_holds_until_a_person_lets_it_go_on_and_another_cl
     for _ in range(2):
         panel.click()
         assert panel.after(0.1)[:2] == (1.0, 0.0)
-        assert panel.person.held_by == "the 3D view"
-        panel.person.go_on()
+        assert panel.operator.held_by == "the 3D view"
+        panel.operator.go_on()
         assert panel.after(0.1)[:2] == (0.0, 0.0)
 
 
@@ -86,7 +86,7 @@ def test_the_slider_begins_at_the_pace_that_was_asked_for_and_can_be_moved(pace:
 def test_a_pace_asked_for_elsewhere_moves_the_slider() -> None:
     panel = Panel(1.0)
     panel.after(0.1)
-    panel.person.ask_pace(2.5)
+    panel.operator.ask_pace(2.5)
     assert panel.after(0.1)[2] == 2.5
     assert panel.meshcat.GetSliderValue(PACE_SLIDER) == 2.5
 

@@ -12,7 +12,7 @@ from pydrake.systems.primitives import SymbolicVectorSystem
 
 from tests.systems.cells import Q_HOME, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
+from weldcal.systems.motion.buffers import PoseHistory, PoseRecorder
 
 STEP = np.array([0.02, -0.01, 0.03, 0.0, 0.01, -0.02])
 HISTORY = PoseHistory(np.array([1.0, 1.008, 1.016]), np.array([Q_HOME, Q_HOME + STEP, Q_HOME + 3.0 * STEP]))

@@ -84,7 +84,7 @@ CAUSES: dict[str, tuple[Callable[[Welding], None], bool]] = {
     "a fault of the servo": (lambda w: w.report(Phase.FAULT, torch_on=False), True),
     "a held job": (lambda w: w.job(dc.replace(WELDING, phase="held")), False),
     "a job that only takes back its consent": (lambda w: w.job(dc.replace(WELDING, process_on=False)), True),
-    "a person": (lambda w: w.person_holds(), True),
+    "an operator": (lambda w: w.person_holds(), True),
     "a protective stop of the robot": (lambda w: w.arm(Q_HOME, fault=1.0), False),
     "the guard of the arm's singularities": (lambda w: w.arm(stretched()), False),
 }

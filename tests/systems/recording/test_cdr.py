@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.systems.recording.cdr import read_cloud, read_image, write_cloud, write_image
+from weldcal.systems.recording.values import read_cloud, read_image, write_cloud, write_image
 
 CLOUD = np.arange(18, dtype=np.float32).reshape(2, 3, 3)
 

@@ -1,4 +1,4 @@
-"""What a person sees: Meshcat gets a board for every phase, each belief as it comes, and a recording that opens by
+"""What an operator sees: Meshcat gets a board for every phase, each belief as it comes, and a recording that opens by
 itself."""
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, PlannedS
 from weldcal.systems.phase_words import TEXT
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.viewer.cell_visualizer import ROOT, CellVisualizer, face_residuals
-from weldcal.systems.viewer.scene import uncertainty_at
-from weldcal.systems.viewer.shapes import diverging
+from weldcal.systems.viewer.scene import diverging, uncertainty_at
 from weldcal.systems.viewer.weld_view import outline
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Diagnostics, Measurement, Phase, WeldingCommand, WeldingState

@@ -24,7 +24,7 @@ from tests.browser import Browser, Pixels, colours
 from weldcal.systems.jobs.weld.iterative_calibrator import PoseRequest
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.viewer.live import LiveView, Moment, ScanRow, WeldRow
 from weldcal.tools.commands.run import JobRun, run_job
@@ -98,7 +98,7 @@ def welding(live: LiveView, sigma_min: float = 0.3) -> None:
 
 @pytest.fixture
 def source() -> DashboardSource:
-    return DashboardSource(LiveView(), Person(), FACTS)
+    return DashboardSource(LiveView(), Operator(), FACTS)
 
 
 @pytest.fixture(scope="module")
@@ -224,13 +224,13 @@ def test_end_asks_once_more_and_escape_holds(browser: Browser, page: Dashboard, 
     opened(browser, page.url, "RUNNING")
     click(browser, "end")
     assert "Really end?" in browser.text()
-    assert not source.person.ends
+    assert not source.operator.ends
     browser.run("document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
     browser.wait("document.getElementById('state').textContent === 'STOPPING'")
-    assert source.person.holds
+    assert source.operator.holds
     click(browser, "end")
     browser.wait("document.getElementById('line').textContent.startsWith('ended by the dashboard')")
-    assert source.person.ends
+    assert source.operator.ends
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -314,7 +314,7 @@ def test_the_page_keeps_result_report_and_replay_when_the_program_has_ended(
 def test_the_time_left_follows_the_pace_that_was_asked_for(source: DashboardSource) -> None:
     welding(source.live)
     assert source.values()["left_s"] == 12
-    source.person.ask_pace(0.1)
+    source.operator.ask_pace(0.1)
     assert source.values()["left_s"] == 120
 
 
@@ -332,7 +332,7 @@ def test_a_page_that_hears_nothing_says_so(browser: Browser, page: Dashboard, so
 
 def test_only_the_page_itself_can_act(page: Dashboard, source: DashboardSource) -> None:
     key = _key(page)
-    source.person.hold()
+    source.operator.hold()
     port = page.url.split(":")[2].strip("/")
     foreign = {
         "no key": {},
@@ -342,9 +342,9 @@ def test_only_the_page_itself_can_act(page: Dashboard, source: DashboardSource) 
     }
     for who, headers in foreign.items():
         assert ask(page.url, "go_on", **headers) == (403, None), who
-        assert source.person.holds, who
+        assert source.operator.holds, who
     assert ask(page.url, "go_on", **{"X-Weldcal-Key": key}) == (200, {"done": True})
-    assert not source.person.holds
+    assert not source.operator.holds
     assert ask(page.url, "go_on", **{"X-Weldcal-Key": key}) == (200, {"done": False}), "there is nothing to go on with"
     assert ask(page.url, "pace", **{"X-Weldcal-Key": key}) == (200, {"done": False}), "without a number"
     source.end(held=False, reason=None, replays=True)

@@ -23,7 +23,7 @@ from weldcal.systems.jobs.touch.planner import TouchPlace
 from weldcal.systems.jobs.touch.procedure import Felt, TouchState
 from weldcal.systems.messages import FlangeEstimate, JobCommand, Scan
 from weldcal.systems.motion.drift_monitor import DriftStatus
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.phase_words import (
     MOTION_STEPS,
     MOUNTING_STEPS,
@@ -128,7 +128,7 @@ def view() -> Meshcat:
 
 @pytest.fixture
 def source() -> DashboardSource:
-    return DashboardSource(LiveView(), Person())
+    return DashboardSource(LiveView(), Operator())
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_a_job_of_another_package_has_neither(source: DashboardSource) -> None:
 
 
 def test_a_scanner_that_moved_is_a_warning_and_a_step_of_its_curve(source: DashboardSource) -> None:
-    calm = DashboardSource(LiveView(), Person(), Facts(steps=WATCH_STEPS))
+    calm = DashboardSource(LiveView(), Operator(), Facts(steps=WATCH_STEPS))
     calm.live.moment = Moment(2.0, JobCommand(), {"state": MotionState(phase="collect"), "drift": drifted(False)})
     assert calm.values()["panel"]["warning"] == ""
     moved = told(source, "monitor")["panel"]

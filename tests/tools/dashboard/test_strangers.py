@@ -14,7 +14,7 @@ import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 
 from tests.strangers import Address, connect, hold_ms, key_of, status, strangers
-from weldcal.systems.person import Person
+from weldcal.systems.operator import Operator
 from weldcal.systems.viewer.live import LiveView
 from weldcal.tools.connections import CONNECTIONS, VIEWS, guard
 from weldcal.tools.dashboard.server import Dashboard
@@ -26,7 +26,7 @@ MANY = 400
 
 @pytest.fixture
 def source() -> DashboardSource:
-    return DashboardSource(LiveView(), Person())
+    return DashboardSource(LiveView(), Operator())
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_strangers_take_neither_hold_nor_descriptors(page: Dashboard, source: Da
         assert own <= descriptors + 2, "the pages' processes have them"
         assert threading.active_count() <= threads
         assert hold(local, key) < HOLD_MS
-        assert source.person.holds
+        assert source.operator.holds
         assert status(attacked, f"{path}values") == 200, "nobody is kept away by idle connections"
         assert status(attacked, f"{path}events", Origin="http://elsewhere.example") == 403
 
@@ -97,7 +97,7 @@ def test_a_page_for_the_network_cannot_act_whatever_it_asks(page: Dashboard, sou
         pipe.send(("act", "hold", None))
         assert pipe.recv() is False
     thread.join(5.0)
-    assert not source.person.holds
+    assert not source.operator.holds
 
 
 def test_values_that_cannot_be_shown_do_not_take_hold_away(page: Dashboard, source: DashboardSource) -> None:
@@ -106,7 +106,7 @@ def test_values_that_cannot_be_shown_do_not_take_hold_away(page: Dashboard, sour
     source.facts = None  # type: ignore[assignment]
     assert status(address, "/values") == 200
     assert hold_ms(address, key) < float("inf")
-    assert source.person.holds
+    assert source.operator.holds
 
 
 def ended(connection: socket.socket) -> bool:

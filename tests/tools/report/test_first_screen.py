@@ -121,7 +121,7 @@ def test_the_terminal_wraps_between_words_and_keeps_what_is_copied_whole(
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
     shown = screen(
-        Findings(tolerance=WITHIN, unseen=8, concerns=["The scanner was moved by a person. " * 4, "Second."])
+        Findings(tolerance=WITHIN, unseen=8, concerns=["The scanner was moved by an operator. " * 4, "Second."])
     )
     console.emit_summary("In short", shown.rows())
     said = capsys.readouterr().out

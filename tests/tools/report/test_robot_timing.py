@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
-from weldcal.systems.host_timing import HostTiming
+from weldcal.systems.pacing import HostTiming
 from weldcal.systems.runner import Run
 from weldcal.systems.wall_clock import LIMITS_MS, WallClock
 from weldcal.tools.report.run import robot_timing

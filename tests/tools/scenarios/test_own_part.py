@@ -17,8 +17,8 @@ from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import part_of
 from weldcal.systems.scenario.schema import Scenario, ToolFile
-from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.cell.new import OwnPart, edge_numbers, write_cell

@@ -11,8 +11,8 @@ import pytest
 
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.studies.cell.study import STUDY, TARGETS, cases, targets
-from weldcal.tools.worlds.weld.cell_run import CellRun, scatter
+from weldcal.tools.studies.cell.runs import STUDY, TARGETS, cases, targets
+from weldcal.tools.worlds.weld.case import CellRun, scatter
 
 GOOD = vars(
     CellRun(
@@ -77,7 +77,7 @@ def test_the_table_has_every_run_and_grows_with_them(tmp_path: Path, monkeypatch
         assert len((folder / "tasks.jsonl").read_text().splitlines()) == 1 + seed
         return {**GOOD, "scenario": name, "seed": seed, "torch_max_mm": 0.1 * (seed + 1)}
 
-    monkeypatch.setattr("weldcal.tools.studies.cell.study.weld_once", weld_once)
+    monkeypatch.setattr("weldcal.tools.studies.cell.runs.weld_once", weld_once)
     study = STUDY.run(Farm(folder, 0), cases(("l_groove",), range(2)))
     assert study.met
     assert [run["seed"] for run in study.figures["runs"]] == [0, 1]

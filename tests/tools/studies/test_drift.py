@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.motion.drift import DriftTrial, _watched, expected_late, found_by_angle, knock_trial
-from weldcal.tools.worlds.features import Change, WorldConfig
+from weldcal.tools.worlds.moves import Change, WorldConfig
 
 
 def test_the_short_form_meets_the_targets(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from weldcal.models.errors import InputError
 from weldcal.tools.studies import fuzz_files as fuzz
 from weldcal.tools.worlds import damaged_files as cases
-from weldcal.tools.worlds import damaged_reading
 from weldcal.tools.worlds.damaged_files import (
     ACCEPTED,
     CRASH,
@@ -23,10 +22,11 @@ from weldcal.tools.worlds.damaged_files import (
     READERS,
     REFUSED,
     WRONG,
+    Child,
     Reader,
     judge,
+    too_much,
 )
-from weldcal.tools.worlds.damaged_reading import Child, too_much
 
 SLOW = ("scenario",)  # a tenth of a second each
 
@@ -94,10 +94,10 @@ def test_the_child_is_watched_and_ended(tmp_path: Path, monkeypatch: pytest.Monk
         "    said = 'memory' if case == 3 else 'accepted'\n"
         "    print(json.dumps({'said': said, 'detail': '', 'seconds': 0.1}), flush=True)\n"
     )
-    monkeypatch.setattr(damaged_reading, "WORKER", ("-c", code))
+    monkeypatch.setattr(cases, "WORKER", ("-c", code))
     with Child(tmp_path / "place") as child:
         assert child.ask(READERS[0], 0, 0)[0].said == ACCEPTED
-        monkeypatch.setattr(damaged_reading, "WATCHDOG_S", 0.5)
+        monkeypatch.setattr(cases, "WATCHDOG_S", 0.5)
         begin = time.monotonic()
         assert child.ask(READERS[0], 0, 1)[0].said == HANG
         assert time.monotonic() - begin < 5.0

@@ -12,7 +12,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.tools.studies.flange.live import live_scenario
 from weldcal.tools.studies.flange.recorded import median_sigma, study_few_scans
-from weldcal.tools.worlds.redrawn import RedrawnStation, bound_covariance, joints_of, redraw
+from weldcal.tools.worlds.light_runs import RedrawnStation, bound_covariance, joints_of, redraw
 
 DATA = SHARED_DATA / "flange"
 Q_HOME = np.deg2rad([180.0, -70.0, 120.0, -50.0, 90.0, 0.0])

@@ -18,9 +18,8 @@ from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm1_step
-from weldcal.calibration.published.icp import COMPONENTS, VerificationError
+from weldcal.calibration.geometry.se3 import fit_rigid
+from weldcal.calibration.published.algorithm1 import COMPONENTS, VerificationError, algorithm1_start, algorithm1_step
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app

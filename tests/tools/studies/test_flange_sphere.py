@@ -8,8 +8,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.tools.studies.flange.published.sphere import false_segmentations, sphere_calibration
-from weldcal.tools.worlds.sphere_cell import P_FS, SphereScan, cell_scans
+from weldcal.tools.studies.flange.published.command import false_segmentations, sphere_calibration
+from weldcal.tools.worlds.flange_frames import P_FS, SphereScan, cell_scans
 
 X_BC = RigidTransform(RollPitchYaw(np.pi, 0.1, -1.5), [-0.65, 0.1, 1.25])
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from weldcal.calibration.data.poses.readings import readings
 from weldcal.tools.cli.app import app
-from weldcal.tools.worlds.written_poses import written_set
+from weldcal.tools.worlds.hand_eye import written_set
 
 
 @pytest.mark.parametrize("seed", range(8))

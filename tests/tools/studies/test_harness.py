@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.farm.run import Farm
-from weldcal.tools.studies.harness import MISSED, Study, statistics
-from weldcal.tools.studies.targets import Target
+from weldcal.tools.studies.harness import MISSED, Study, Target, statistics
 
 
 def half(n: int) -> Mapping[str, object]:

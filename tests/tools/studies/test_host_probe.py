@@ -7,9 +7,9 @@ import os
 import signal
 import time
 
-from weldcal.systems.host_timing import TICK_S
+from weldcal.systems.pacing import TICK_S
 from weldcal.systems.wall_clock import Lateness
-from weldcal.tools.worlds.robot.host_probe import watched_host
+from weldcal.tools.worlds.robot.timing import watched_host
 
 PAUSE_S = 0.1
 

@@ -18,8 +18,7 @@ from weldcal.models.depth_noise import DepthNoise
 from weldcal.models.errors import InputError
 from weldcal.models.scanner_streams import ScannerStream, get_stream
 from weldcal.models.scanners import depth_to_points, get_scanner
-from weldcal.tools.worlds.disturbance import Disturbance, disturbance_of
-from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
+from weldcal.tools.worlds.motion import Disturbance, MotionOptions, MotionWorld, disturbance_of, write_motion_dataset
 
 SMALL = MotionOptions(size=(534, 400), noise_mm=0.0, frames=4, surroundings=False)
 

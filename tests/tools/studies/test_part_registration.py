@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.studies.parts import registration
 from weldcal.tools.studies.parts.registration import NEES_BOUND, run_registration_study
-from weldcal.tools.worlds.parts.scenes import REFUSALS, scan_scene, subject
+from weldcal.tools.worlds.parts.scans import REFUSALS, scan_scene, subject
 from weldcal.welding.locate.part.result import PartRegistration
 
 pytest.importorskip("OCP")

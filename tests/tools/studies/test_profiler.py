@@ -12,13 +12,10 @@ from typer.testing import CliRunner
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.profiler import reproduce
-from weldcal.tools.studies.profiler.edge import edge_rows
-from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines
-from weldcal.tools.studies.profiler.reproduce import compute
-from weldcal.tools.studies.profiler.sphere import METHODS, measure
+from weldcal.tools.studies.profiler.papers import SPHERE_METHODS, edge_rows, measure
+from weldcal.tools.studies.profiler.reproduce import compute, figure_text, fixed_lines
 from weldcal.tools.worlds.edge_trials import made_edge_trials
-from weldcal.tools.worlds.profiler import SphereWorld, sphere_trial
-from weldcal.tools.worlds.profiler_parts import WorldData, groove_mesh, scan_groove
+from weldcal.tools.worlds.profiler import SphereWorld, WorldData, groove_mesh, scan_groove, sphere_trial
 
 
 def test_on_other_edges_the_joint_method_is_near_its_bound_and_the_papers_is_not() -> None:
@@ -34,11 +31,11 @@ def test_on_other_edges_the_joint_method_is_near_its_bound_and_the_papers_is_not
 def test_in_another_world_touches_help_the_paper_and_the_joint_method_needs_no_sides() -> None:
     world = SphereWorld.made(40)
     results = {r.method: r for r in measure(0, WorldData(sphere_trial(world, 40), scan_groove(world, 40)))}
-    points = [results[m].points_mm.mean() for m in METHODS]
+    points = [results[m].points_mm.mean() for m in SPHERE_METHODS]
     assert points[1] < 0.5 * points[0]
     assert points[2] < 0.5 * points[1]
     assert points[3] < 0.15
-    seam = results[METHODS[3]].seam_mm
+    seam = results[SPHERE_METHODS[3]].seam_mm
     assert seam is not None
     assert seam.max() < 0.3
 

@@ -1,4 +1,4 @@
-"""The study of whole jobs on a controller ends where a person ends one of its jobs."""
+"""The study of whole jobs on a controller ends where an operator ends one of its jobs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from weldcal.tools.studies.robot import jobs
+from weldcal.tools.studies.robot import stream
 
 
 def test_a_person_who_stops_a_job_stops_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,9 +29,9 @@ def test_a_person_who_stops_a_job_stops_the_study(tmp_path: Path, monkeypatch: p
     def host() -> object:
         yield None
 
-    monkeypatch.setattr(jobs, "run_scenario", stopped)
-    monkeypatch.setattr(jobs, "emulator_process", controller)
-    monkeypatch.setattr(jobs, "watched_host", host)
+    monkeypatch.setattr(stream, "run_scenario", stopped)
+    monkeypatch.setattr(stream, "emulator_process", controller)
+    monkeypatch.setattr(stream, "watched_host", host)
     with pytest.raises(KeyboardInterrupt, match="in the phase 'weld'"):
-        jobs.run_jobs("s_groove", tmp_path, 3)
+        stream.run_jobs("s_groove", tmp_path, 3)
     assert begun == [1]

@@ -12,7 +12,7 @@ import pytest
 
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S
 from weldcal.tools.studies.robot.stream import MISSED_S, RATE_HZ, STEP_S, StreamReport, run_robot_benchmark
-from weldcal.tools.worlds.robot.tap import Tap
+from weldcal.tools.worlds.robot.timing import Tap
 
 SECONDS = 6.0
 

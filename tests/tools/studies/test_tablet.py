@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.calibration.tablet.published.two_stage import Sign
-from weldcal.tools.studies.tablet.study import compare_signs, dh_by_eq_20
-from weldcal.tools.studies.targets import Target, all_met
+from weldcal.calibration.tablet.published import Sign
+from weldcal.tools.studies.harness import Target, all_met
+from weldcal.tools.studies.tablet.reproduce import compare_signs, dh_by_eq_20
 from weldcal.tools.worlds.tablet import published_touches
 
 GATE_MM = 0.0015  # half the last printed digit is 0.005

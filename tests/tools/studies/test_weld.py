@@ -15,13 +15,20 @@ from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.weld.rows import ROWS, CaseResult, MetricTarget, UnknownRow, get_rows, hold_against, run_turn
-from weldcal.tools.worlds.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, planned_seam, roughness
-from weldcal.tools.worlds.weld.case import WeldCase, run_case, study_config
+from weldcal.tools.worlds.weld.budgets import (
+    BUDGETS,
+    HARD,
+    NOMINAL,
+    PERFECT,
+    WeldUnknowns,
+    draw_world,
+    planned_seam,
+    roughness,
+)
+from weldcal.tools.worlds.weld.case import RunMetrics, WeldCase, run_case, study_config
 from weldcal.tools.worlds.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, TipPlace
-from weldcal.tools.worlds.weld.metrics import RunMetrics
 from weldcal.tools.worlds.weld.plant import Stamps, StudyRun, simulate
 from weldcal.tools.worlds.weld.seams import NAMES, UnknownSeam, get_seam
-from weldcal.tools.worlds.weld.unknowns import WeldUnknowns, draw_world
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import DeflectionSample

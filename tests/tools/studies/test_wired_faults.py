@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from weldcal.tools.emulators.cell.bridges import Bridge, PictureBridge, ScannerBridge
-from weldcal.tools.emulators.cell.input_wire import DELAY_S, InputWire
+from weldcal.tools.emulators.cell.wires import DELAY_S, InputWire
 from weldcal.tools.studies.robot.wired import FLAT_MB_H, grows, growth
 from weldcal.tools.worlds.robot.wired_job import DEVICES, FAULTS, PHASES, Happening
 

@@ -17,7 +17,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import cast, get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
-from weldcal.tools.worlds.parts.plates import Scene, box, looking_at, scan_part, sideways, table
+from weldcal.tools.worlds.parts.scans import Scene, box, looking_at, scan_part, sideways, table
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.groove.seam import GrooveNotFound, GrooveSeam, GrooveTooNarrow, SeveralGrooves
 

@@ -14,8 +14,7 @@ from weldcal.models.workpieces.drawing import draw_seam
 from weldcal.models.workpieces.part import Part
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.models.workpieces.shape import PartShape
-from weldcal.tools.worlds.parts.plates import box
-from weldcal.tools.worlds.parts.scenes import scan_scene
+from weldcal.tools.worlds.parts.scans import box, scan_scene
 from weldcal.welding.locate import planning
 from weldcal.welding.locate.planning import locate_part
 

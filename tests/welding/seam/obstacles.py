@@ -19,8 +19,8 @@ from tests.welding.locate.lying import FLOOR, TABLE, Box, Solid, Tube, box, look
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.tools.loading import WELDING, load_tool
+from weldcal.welding.seam.clearance import NoClearance, check_beside
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.room import NoRoom, check_beside
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ def scene(seed: int) -> Found:
     try:
         check_beside(points, TriMesh(*triangles(part)), X_BP, seam, TOOL)
         refusal = ""
-    except NoRoom as error:
+    except NoClearance as error:
         refusal = str(error)
     return Found(kind, np.inf if other is None else away(other, TOOL, root, half), refusal)
 

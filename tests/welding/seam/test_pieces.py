@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from weldcal.welding.seam.clearance import clear_pieces
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.room import clear_pieces
 
 SEAM = SeamCurve.from_points(np.outer(np.linspace(0.0, 0.5, 60), [1.0, 0.0, 0.0]))
 CHORD_M, RUN_UP_M, STEP_M = 0.06, 0.016, 0.005

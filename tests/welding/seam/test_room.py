@@ -8,8 +8,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.mesh import TriMesh, extrude, merge
 from weldcal.models.tool import WeldingTool
+from weldcal.welding.seam.clearance import NoClearance, check_clearance, check_ends
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.seam.room import NoRoom, check_ends, check_room
 
 TOOL = WeldingTool()
 X_BP = RigidTransform(RollPitchYaw(0.1, -0.2, 0.7), [0.6, 0.1, 0.05])
@@ -34,21 +34,21 @@ def seam(lean_deg: float = 45.0, low: float = -0.1, high: float = 0.1) -> SeamCu
 
 def test_a_tool_that_leans_between_the_walls_has_room() -> None:
     part = merge(PLATE, WEB)
-    check_room(part, X_BP, seam(), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+    check_clearance(part, X_BP, seam(), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
     check_ends(part, X_BP, seam(), TOOL.chord_m, TOOL.tip_radius_m)
 
 
 def test_a_body_that_would_touch_the_web_is_refused() -> None:
     high = merge(PLATE, block((-0.1, 0.0, 0.0), (0.1, 0.01, 0.15)))
-    check_room(high, X_BP, seam(), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
-    with pytest.raises(NoRoom, match="does not fit at 0 mm"):
-        check_room(high, X_BP, seam(20.0), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+    check_clearance(high, X_BP, seam(), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+    with pytest.raises(NoClearance, match="does not fit at 0 mm"):
+        check_clearance(high, X_BP, seam(20.0), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
 
 
 @pytest.mark.parametrize(("x", "says"), [(0.09, "beyond its end.*tip.*end_mm"), (-0.095, "beyond its start.*start_mm")])
 def test_a_wall_across_an_end_is_refused_with_what_to_cut(x: float, says: str) -> None:
     part = merge(PLATE, WEB, block((x, -0.05, 0.0), (x + 0.005, 0.0, 0.05)))
-    with pytest.raises(NoRoom, match=says):
+    with pytest.raises(NoClearance, match=says):
         check_ends(part, X_BP, seam(low=-0.08, high=0.08), TOOL.chord_m, TOOL.tip_radius_m)
     # 62.5 mm are needed, and 10 mm are free.
     check_ends(part, X_BP, seam(low=-0.026, high=0.026), TOOL.chord_m, TOOL.tip_radius_m)
@@ -76,7 +76,7 @@ def test_a_wall_met_at_a_slant_leads_the_tip_on_only_where_it_can_climb_it(heigh
     path = along_ring(0.2, -1.0, (-0.5, 0.15))
     if fits:
         return check_ends(web, RigidTransform(), path, TOOL.chord_m, TOOL.tip_radius_m)
-    with pytest.raises(NoRoom, match="beyond its end"):
+    with pytest.raises(NoClearance, match="beyond its end"):
         check_ends(web, RigidTransform(), path, TOOL.chord_m, TOOL.tip_radius_m)
     return None
 
@@ -98,16 +98,16 @@ def straight_cut(lean_deg: float, drawn_to: float, length: float) -> SeamCurve:
 
 def test_a_wall_past_what_is_drawn_is_measured_from_the_seams_end() -> None:
     part = merge(PLATE, WEB, block((0.07, -0.05, 0.0), (0.075, 0.0, 0.05)))
-    with pytest.raises(NoRoom, match=r"50 mm beyond its end.*set welding\.seam_length_mm 14 mm smaller"):
+    with pytest.raises(NoClearance, match=r"50 mm beyond its end.*set welding\.seam_length_mm 14 mm smaller"):
         check_ends(part, X_BP, straight_cut(45.0, 0.05, 0.12), TOOL.chord_m, TOOL.tip_radius_m)
     check_ends(part, X_BP, straight_cut(45.0, 0.05, 0.10), TOOL.chord_m, TOOL.tip_radius_m)
 
 
 def test_the_tool_has_room_for_its_tip_past_the_end_of_a_seam_cut_short() -> None:
     part = merge(PLATE, block((0.07, 0.0, 0.0), (0.1, 0.01, 0.15)))
-    check_room(part, X_BP, straight_cut(20.0, 0.1, 0.06), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
-    with pytest.raises(NoRoom, match=r"does not fit at 1\d\d mm"):
-        check_room(part, X_BP, straight_cut(20.0, 0.1, 0.09), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+    check_clearance(part, X_BP, straight_cut(20.0, 0.1, 0.06), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+    with pytest.raises(NoClearance, match=r"does not fit at 1\d\d mm"):
+        check_clearance(part, X_BP, straight_cut(20.0, 0.1, 0.09), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
 
 
 def test_a_wall_that_bends_away_is_no_obstacle() -> None:

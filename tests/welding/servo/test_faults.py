@@ -13,8 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.case import WeldCase, study_config
-from weldcal.tools.worlds.weld.metrics import judge
+from weldcal.tools.worlds.weld.case import WeldCase, judge, study_config
 from weldcal.tools.worlds.weld.plant import simulate
 from weldcal.tools.worlds.weld.seams import TrueSeam, arcs
 from weldcal.welding.seam.curve import SeamCurve, SeamError

@@ -1,4 +1,4 @@
-"""A weld that a person holds: the arc is off at once, the tool rests, goes back over its own path and welds the rest as
+"""A weld that an operator holds: the arc is off at once, the tool rests, goes back over its own path and welds the rest as
 well."""
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MM = 1e-3
 
 
 class Held:
-    """The servo with a person beside it, who holds it for a second once the torch has come to each of these places
+    """The servo with an operator beside it, who holds it for a second once the torch has come to each of these places
     (m)."""
 
     def __init__(self, *places: float, held_s: float = 1.0, moved: float = 0.0, phase: Phase | None = None) -> None:

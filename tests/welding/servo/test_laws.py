@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from weldcal.tools.worlds.weld.budgets import KINEMATIC, NOMINAL, Budget
-from weldcal.tools.worlds.weld.case import WeldCase, study_config
-from weldcal.tools.worlds.weld.metrics import RunMetrics, judge
+from weldcal.tools.worlds.weld.case import RunMetrics, WeldCase, judge, study_config
 from weldcal.tools.worlds.weld.plant import simulate
 from weldcal.tools.worlds.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.numerics import Array

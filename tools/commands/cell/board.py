@@ -203,7 +203,7 @@ def described_sheet(board: DescribedBoard, paper: str) -> Sheet:
         and height <= side.height - 2.0 * MARGIN_MM - FOOT_MM
     ):
         sheet = side
-    _require_room(sheet, width, height, paper)
+    _require_space(sheet, width, height, paper)
     x0 = 0.5 * (sheet.width - width) - low[0]
     y0 = 0.5 * (sheet.height + FOOT_MM + height) + low[1]  # of the board's origin, y up
     sheet.origin = (x0, y0)
@@ -247,7 +247,7 @@ def tag_sheet(tags: Iterable[TagModel], paper: str) -> Sheet:
     cell = side * (1.0 + 2.0 * QUIET)
     per_row = int((sheet.width - 2.0 * MARGIN_MM) // (cell + 2.0))
     rows = -(-len(tags) // per_row) if per_row else 0
-    _require_room(sheet, cell, max(rows, 1) * (cell + 2.0), paper)
+    _require_space(sheet, cell, max(rows, 1) * (cell + 2.0), paper)
     for k, tag in enumerate(tags):
         x = MARGIN_MM + (k % per_row) * (cell + 2.0)
         y = sheet.height - MARGIN_MM - (k // per_row + 1) * (cell + 2.0)
@@ -283,7 +283,7 @@ def _page(paper: str) -> Sheet:
     return Sheet(width=width, height=height)
 
 
-def _require_room(sheet: Sheet, width: float, height: float, paper: str) -> None:
+def _require_space(sheet: Sheet, width: float, height: float, paper: str) -> None:
     room = (sheet.width - 2.0 * MARGIN_MM, sheet.height - 2.0 * MARGIN_MM - FOOT_MM)
     if width > room[0] or height > room[1]:
         raise InputError(

@@ -32,14 +32,14 @@ from weldcal.systems.drivers.ur.faults import RobotUnreachable
 from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight, preflight
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
-from weldcal.systems.host_timing import measure_host
 from weldcal.systems.jobs.weld.settings import feature_standard, plan_poses
-from weldcal.systems.scenario.arm import nominal_arm
+from weldcal.systems.pacing import measure_host
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.cli.options import LOOK, Call, Outcome, command
-from weldcal.tools.commands.robot.check import emit_table, state_of
+from weldcal.tools.commands.robots import emit_table, state_of
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tool import ToolCheck, tool_picture, tool_report
 from weldcal.welding.finger.deformation import TagModel, detect_tag

@@ -9,7 +9,7 @@ import typer
 import yaml
 from numpy.typing import NDArray
 
-from weldcal.calibration.data.tables import read_rows
+from weldcal.calibration.data.checks import read_rows
 from weldcal.models.array_files import read_grey_image
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document

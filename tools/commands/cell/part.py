@@ -82,7 +82,7 @@ def with_plans(
 
 
 def candidates(shape: PartShape) -> list[PartEdge]:
-    """The edges that a person may pick, the concave ones first; tangent edges are no joint."""
+    """The edges that an operator may pick, the concave ones first; tangent edges are no joint."""
     order = {"concave": 0, "flush": 1, "boundary": 2, "convex": 3}
     return sorted((e for e in shape.edges if e.kind in order), key=lambda e: (order[e.kind], e.id))
 

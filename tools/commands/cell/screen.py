@@ -18,9 +18,9 @@ from weldcal.models.workpieces.seam_input import chained
 from weldcal.models.workpieces.seat import JointSection, check_weldable, hard_height
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartJoint, PartShape
 from weldcal.systems.scenario.schema import SeamConfig
+from weldcal.welding.seam.clearance import NoClearance, check_clearance
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam
-from weldcal.welding.seam.room import NoRoom, check_room
 from weldcal.welding.servo.tool_axes import check_ring, least_pipe_m
 
 PIPE_TOOL = "pipe"
@@ -119,12 +119,12 @@ def _obstacle(shape: PartShape, joint: PartJoint, tool: WeldingTool) -> tuple[st
             tip = middle + hard_height(section, tool.tip_radius_m) * edge.up_P
             line = tip + np.linspace(-2e-3, 2e-3, 5)[:, None] * along / np.linalg.norm(along)
             seam = SeamCurve.from_points(line, up=np.tile(edge.up_P, (5, 1)))
-            check_room(shape.mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, 0.0)
+            check_clearance(shape.mesh, RigidTransform(), seam, tool.capsules(), tool.X_FT, 0.0)
     except WeldcalError as error:
         reason = str(error).replace(" at 0 mm of the seam", "").replace(" at 4 mm of the seam", "")
-        if ring is not None and isinstance(error, (NoRoom, InfeasibleSeam)):
+        if ring is not None and isinstance(error, (NoClearance, InfeasibleSeam)):
             reason += least_pipe(shape, joint, tool)
-        return reason, error.short_m if isinstance(error, NoRoom) else math.inf, felt
+        return reason, error.short_m if isinstance(error, NoClearance) else math.inf, felt
     return "", 0.0, felt
 
 

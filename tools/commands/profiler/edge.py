@@ -1,7 +1,6 @@
 """weldcal profiler edge: the pose on the flange from points of one straight edge."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, cast
 
 import numpy as np
@@ -40,7 +39,6 @@ from weldcal.tools.commands.profiler.result import (
     with_warnings,
 )
 from weldcal.tools.report.first_screen import check_limit
-from weldcal.tools.report.profiler_file import ProfilerFile
 
 FAR_FROM_EDGE_MM = 1.0
 FEATURES = ("bar", "step", "apex")
@@ -92,9 +90,13 @@ def edge(
     )
     data = _decided(data, feature, side)
     record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan, seed=call.seed)
-    made, summary = finish_edge(
-        data, feature, side, record, with_warnings(data, found), file.name, call.folder("profiler", file.stem), limit_mm
-    )
+    points, _ = edge_points(data, feature, side)
+    keep = np.asarray(np.isfinite(points).all(axis=1), bool)
+    held = np.zeros(0)
+    if "sigmas_mm" in found:  # the paper's method has no sigmas, and nothing is left out
+        held = edge_held_out(cast(FlangePoses, data.poses())[keep], points[keep], found["sigmas_mm"])
+    folder = call.folder("profiler", file.stem)
+    made, summary = finish(record, with_warnings(data, found), points[keep], held, file.name, folder, limit_mm)
     return outcome_of(call, summary, made)
 
 
@@ -239,25 +241,6 @@ def edge_by_noise(poses: FlangePoses, points: Floats, sigmas: Sigmas) -> tuple[E
             break
         e, factor = other, larger
     return e, sigmas.times(factor)
-
-
-def finish_edge(
-    file: Measurements,
-    feature: str,
-    side: str,
-    record: ProfilerRecord,
-    found: dict[str, Any],
-    source: str,
-    out: Path,
-    limit_mm: float | None,
-) -> tuple[ProfilerFile, dict[str, Any]]:
-    """Write an edge's calibration and its report; the result, and its JSON object without the folder."""
-    points, _ = edge_points(file, feature, side)
-    keep = np.asarray(np.isfinite(points).all(axis=1), bool)
-    held = np.zeros(0)
-    if "sigmas_mm" in found:  # the paper's method has no sigmas, and nothing is left out
-        held = edge_held_out(cast(FlangePoses, file.poses())[keep], points[keep], found["sigmas_mm"])
-    return finish(record, found, points[keep], held, source, out, limit_mm)
 
 
 def edge_held_out(poses: FlangePoses, points: Floats, sigmas_mm: Mapping[str, float]) -> Floats:

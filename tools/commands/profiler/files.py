@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.data.checks import cut_off, read_rows
 from weldcal.calibration.data.poses.readings import PoseReading
-from weldcal.calibration.data.tables import cut_off, read_rows
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.importing import import_profiles
 from weldcal.calibration.profiler.motion import FlangePoses, Floats

@@ -9,10 +9,8 @@ import numpy as np
 import typer
 
 from weldcal.calibration.tablet.detection import Look
-from weldcal.calibration.tablet.planar.files import hand_step_m, load_planar
-from weldcal.calibration.tablet.published.calibration import tablet_stage1, tablet_stage2
-from weldcal.calibration.tablet.published.chain import HTM_NAMES
-from weldcal.calibration.tablet.published.two_stage import AFFINE_NAMES, Sign
+from weldcal.calibration.tablet.planar_files import hand_step_m, load_planar
+from weldcal.calibration.tablet.published import AFFINE_NAMES, HTM_NAMES, Sign, tablet_stage1, tablet_stage2
 from weldcal.calibration.tablet.result import TabletResult, save_tablet_result
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.calibration.tablet.wrist.diagnostics import check_wrist, wrist_diagnostics

@@ -9,8 +9,8 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.tablet.detection import find_landmarks
-from weldcal.calibration.tablet.plane_depth import plane_depth
-from weldcal.calibration.tablet.wrist.fit import WristFit, seen_point
+from weldcal.calibration.tablet.plane_pose import plane_depth
+from weldcal.calibration.tablet.wrist.fit import WristFit, measured_point
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
@@ -141,7 +141,7 @@ def compare(run: Run[AddedVisit], fit: WristFit, seed: int) -> dict[str, object]
         R = RollPitchYaw(
             np.pi + rng.uniform(-lean, lean), rng.uniform(-lean, lean), rng.uniform(-np.pi, np.pi)
         ).ToRotationMatrix()
-        tip = seen_point(fit, X_BF, p_C[:2] / p_C[2]) + R.multiply(truth.p_FP - fit.p_FP)
+        tip = measured_point(fit, X_BF, p_C[:2] / p_C[2]) + R.multiply(truth.p_FP - fit.p_FP)
         misses.append(1e3 * float(np.linalg.norm(R_T.T @ (tip - p_B))))
     turn = (fit.X_FC.rotation().inverse() @ truth.X_FC.rotation()).ToAngleAxis().angle()
     return {

@@ -10,10 +10,17 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.results import software_version
-from weldcal.calibration.tablet.planar.files import PlanarFile, PlanarVisit
-from weldcal.calibration.tablet.planar.fit import PLANAR_NAMES, PlanarConfig, PlanarFit, fit_planar
-from weldcal.calibration.tablet.planar.linear import LINEAR_NAMES, LinearFit, fit_linear
-from weldcal.calibration.tablet.published.two_stage import Sign
+from weldcal.calibration.tablet.planar_files import PlanarFile, PlanarVisit
+from weldcal.calibration.tablet.planar_fit import (
+    LINEAR_NAMES,
+    PLANAR_NAMES,
+    LinearFit,
+    PlanarConfig,
+    PlanarFit,
+    fit_linear,
+    fit_planar,
+)
+from weldcal.calibration.tablet.published import Sign
 from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
 from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.arrays import Array

@@ -15,8 +15,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
 from weldcal.models.tool import FingerCamera, WeldingTool
-from weldcal.systems.drivers.simulated.rendered_finger_camera import with_noise
-from weldcal.systems.drivers.simulated.tag_view import TagView
+from weldcal.systems.drivers.simulated.rendered_finger_camera import TagView, with_noise
 from weldcal.tools.connections import Limited
 
 QUALITY = 97

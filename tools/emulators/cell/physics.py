@@ -1,6 +1,7 @@
-"""The world's physics: one plant step for each frame of the controller, and the record of what the torch really did."""
+"""The world's physics: one plant step for each frame of the controller, and the record and score of the torch."""
 
 import dataclasses as dc
+from typing import ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -8,25 +9,72 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.planning.clearance import lowest_point, self_distance
-from weldcal.models.arms.kinematics import ArmModel, link_frames
+from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
-from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.config import DriverConfig, NoDevice
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
-from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
+from weldcal.systems.jobs.job import job_of
 from weldcal.systems.motion.clear_moves import station_bodies
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
-from weldcal.tools.emulators.cell.arc import Arc
-from weldcal.tools.emulators.cell.world_arm import Repeatability, WorldArm
+from weldcal.tools.emulators.cell.wires import Arc
+from weldcal.tools.report.weld import true_seam
+from weldcal.welding.record.process import path_error
 
+SETTLES = 0.05  # share by which the joints move to the offset of a new stop in a step
 STEP_S = 0.002
 LOG_EVERY = 4  # frames: the servo's period
 COLLISION_EVERY = 20
 STILL = 1e-6  # m/s and rad/s: the plant rests where nothing of it is faster
 STILL_FRAMES = 50  # for so many frames; then its state stays as it is until the controller's joints move
+FEWEST = 30  # points with a burning arc
+WELDED = 0.95  # share of the wanted length
+
+
+@dc.dataclass
+class WorldArm(DriverConfig):
+    """A driver without a controller: the joint servos' reference is a port of the station.
+
+    Made by code, not by a scenario.
+    """
+
+    FOR: ClassVar[tuple[str, ...]] = ("robot",)
+    SIMULATED: ClassVar[bool] = True
+
+
+def ApplyDriverConfig(config: WorldArm, build: StationBuild) -> None:
+    """Export the reference of the joint servos, (12) rad and rad/s."""
+    world = build.require(SimulatedWorld)
+    build.inputs["arm.desired_state"] = world.plant.get_desired_state_input_port(world.arm)
+
+
+class Repeatability:
+    """The small joint offsets, one for each stop, by which the true joints differ from the reported ones."""
+
+    def __init__(self, arm: ArmModel, repeatability_mm: float, seed: int) -> None:
+        self._arm, self._mm, self._seed = arm, repeatability_mm, seed
+        self._stop, self._moved = -1, True
+        self._wanted, self._offset = np.zeros(6), np.zeros(6)
+
+    def true_joints(self, q: Array, qd: Array) -> Array:
+        """The true joints (6,) rad of this step for the reported ones and their velocities (6,) rad/s."""
+        if self._mm == 0.0:
+            return q
+        moves = bool(np.abs(qd).max() > 1e-9)
+        if self._stop < 0 or (moves and not self._moved):
+            self._stop += 1
+            lever = float(np.linalg.norm(jacobian(self._arm, q)[3:]))
+            sigma = 1e-3 * self._mm / lever
+            self._wanted = sigma * np.random.default_rng([self._seed, 7, self._stop]).standard_normal(6)
+            if self._stop == 0:
+                self._offset = self._wanted
+        self._moved = moves
+        if moves:
+            self._offset = self._offset + SETTLES * (self._wanted - self._offset)
+        return np.asarray(q + self._offset)
 
 
 def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
@@ -48,7 +96,7 @@ def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
     if not isinstance(scenario.robot_2, NoDevice):
         raise InputError("The world has one arm: remove robot_2 from its scenario.")
     q_home = np.deg2rad(scenario.home_deg)
-    return make_station(scenario, seed, PreparedRobot(arm, q_home), job_of(scenario).furnish)
+    return make_station(scenario, seed, PreparedRobot(arm, q_home), job_of(scenario).set_up_world)
 
 
 def still(station: Station, q: Array) -> tuple[Simulator, Context]:
@@ -157,3 +205,46 @@ def _tag_on(world: SimulatedWorld, tool: WeldingTool) -> tuple[int, int, RigidTr
     assert world.tool is not None
     plate, tip = (int(world.plant.GetBodyByName(name, world.tool).index()) for name in ("tool_plate", "tip_z"))
     return plate, tip, tool.X_FT.InvertAndCompose(tool.X_FM_rest)
+
+
+def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest: bool) -> dict[str, object]:
+    """The contents of the truth file. `wanted_m` is the arc length to weld; None: the whole seam.
+
+    `state` is what the world can see: waiting (no arc yet), welding, done (the arc has gone off, the arm is at rest,
+    the seam's length is welded and nothing collided), or stopped.
+    """
+    truth = physics.station.truth
+    found: dict[str, object] = {}
+    if truth.X_BC is not None:
+        found["X_BC"] = truth.X_BC.GetAsMatrix4().tolist()
+    if truth.profiler is not None:
+        found["X_FS"] = truth.profiler.X_FS.GetAsMatrix4().tolist()
+        found["p_FTip"], found["sphere_center"] = truth.profiler.p_FTip.tolist(), truth.profiler.center.tolist()
+    seam = true_seam(truth)
+    if seam is None:  # a world without a workpiece
+        return found | {"collisions": physics.collisions, "time_s": physics.time_s}
+    welded_m = 0.0
+    if len(physics.torch) >= FEWEST:
+        error = path_error(np.array(physics.torch), seam)
+        distance = 1e3 * np.hypot(error.lateral, error.height)
+        welded_m = float(error.s.max() - error.s.min())
+        found |= {
+            "torch_mean_mm": float(distance.mean()),
+            "torch_max_mm": float(distance.max()),
+            "torch_lateral_mean_mm": 1e3 * error.mean_m,
+            "torch_lateral_max_mm": 1e3 * error.max_m,
+        }
+    else:
+        found |= {"torch_mean_mm": None, "torch_max_mm": None}
+    whole = welded_m >= WELDED * (seam.length if wanted_m is None else wanted_m)
+    state = "waiting"
+    if physics.arc_on_s:
+        good = whole and physics.collisions == 0
+        state = "welding" if arc_burns else ("done" if good and at_rest else "stopped")
+    return found | {
+        "arc_on_s": physics.arc_on_s,
+        "welded_mm": 1e3 * welded_m,
+        "collisions": physics.collisions,
+        "state": state,
+        "time_s": physics.time_s,
+    }

@@ -22,29 +22,22 @@ from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.systems.drivers.sensors.stamps import unix_now
 from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamera
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.drivers.simulated.streaming_scanner import StreamingScanner
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.drivers.ur.torch.set_points import AnalogSetPoint
+from weldcal.systems.drivers.ur.set_points import AnalogSetPoint
 from weldcal.systems.drivers.ur.touch_probe import UrTouchProbe
-from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.parts import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.emulators.cell.arc import Arc
 from weldcal.tools.emulators.cell.finger_process import FingerSetup, run_finger_camera
-from weldcal.tools.emulators.cell.input_wire import InputWire
-from weldcal.tools.emulators.cell.physics import STEP_S, Physics
-from weldcal.tools.emulators.cell.scanner_process import PROFILER, SCANNER, ScannerSetup, run_scanner
-from weldcal.tools.emulators.cell.scans import Scans
-from weldcal.tools.emulators.cell.score import score
-from weldcal.tools.emulators.cell.stream_process import StreamSetup, run_stream
-from weldcal.tools.emulators.cell.streamer import Streamer
-from weldcal.tools.emulators.cell.touch_probe import TouchProbe
-from weldcal.tools.emulators.cell.waiter import Waiter
-from weldcal.tools.emulators.ur.addresses import take_address
+from weldcal.tools.emulators.cell.physics import STEP_S, Physics, score
+from weldcal.tools.emulators.cell.scanner_process import PROFILER, SCANNER, ScannerSetup, Scans, run_scanner
+from weldcal.tools.emulators.cell.streamer import Streamer, StreamSetup, Waiter, run_stream
+from weldcal.tools.emulators.cell.wires import Arc, InputWire, TouchProbe
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.main import FASTEST, SLOWEST, Emulation
-from weldcal.tools.emulators.ur.process import CONTROL_PORT
+from weldcal.tools.emulators.ur.process import CONTROL_PORT, take_address
 from weldcal.tools.emulators.ur.versions import parse_version
 
 START_LIMIT_S = 120.0

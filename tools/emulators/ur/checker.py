@@ -44,7 +44,7 @@ class Checker:
             self._latched_at, self._rested_since_fault = now, not self._moving
 
     def reset(self) -> None:
-        """A person has acknowledged: motion is allowed again."""
+        """An operator has acknowledged: motion is allowed again."""
         self._latched_at = None
 
     def frame(self, now: float) -> None:

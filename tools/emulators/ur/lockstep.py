@@ -3,8 +3,8 @@
 from typing import Any
 
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.controller.registers import RuntimeState
 from weldcal.tools.emulators.ur.wire.net import Connection
 
 # so far the controller goes past a stream's newest package, and no further apart are those of a stream

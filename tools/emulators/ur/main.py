@@ -19,20 +19,21 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.addresses import loopback_address
-from weldcal.tools.emulators.ur.addresses import (
+from weldcal.tools.emulators.ur.checker import Checker
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.controller.registers import OPERATIONAL_MODES
+from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, Lockstep
+from weldcal.tools.emulators.ur.process import (
+    CONTROL_PORT,
     DASHBOARD_PORT,
     DEFAULT,
     PRIMARY_PORT,
+    READY,
     REAL_TIME_PORT,
     RTDE_PORT,
     SECONDARY_PORT,
 )
-from weldcal.tools.emulators.ur.checker import Checker
-from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES
-from weldcal.tools.emulators.ur.controller.motions import STEP_S
-from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, Lockstep
-from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, LoopWorld, Request
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer

@@ -28,8 +28,7 @@ from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_pr
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.demo import DemoResult
 from weldcal.tools.report.run import RunOptions
-from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
-from weldcal.tools.studies.output import markdown_table
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, markdown_table
 
 SEAM_MM = 30.0
 SHORT = f"welding: {{seam_length_mm: {SEAM_MM}}}"

@@ -1,11 +1,12 @@
-"""Coverage of the stated 95 % regions: shares of simulated calibrations whose regions hold the truth."""
+"""Simulated calibrations without rendering: errors of arms and scanners, and shares of 95 % regions with the truth."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import numpy as np
-from matplotlib.figure import Figure
+import typer
 from pydrake.math import RigidTransform
 from scipy.stats import binom, chi2
 
@@ -18,12 +19,23 @@ from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.pictures import svg
+from weldcal.tools.report.pictures import subplots, svg
 from weldcal.tools.report.render import fixed, write_atomic
-from weldcal.tools.studies.harness import Figures, Row, Study
-from weldcal.tools.worlds import warped_scanner
-from weldcal.tools.worlds.warped_scanner import as_measured, seen_by_a_wrong_scanner, simulated_observations
+from weldcal.tools.studies.harness import Figures, Results, Row, Study, statistics
+from weldcal.tools.worlds import wrong_models
+from weldcal.tools.worlds.arm_cells import calibrate_cell
+from weldcal.tools.worlds.light_runs import LightRuns, study_light_runs
+from weldcal.tools.worlds.wrong_models import (
+    Found,
+    as_measured,
+    judged,
+    measured_by_a_wrong_scanner,
+    simulated_observations,
+    station,
+    study_station,
+)
 
 LEVEL = 0.95
 _ARM_M = 1.5e-4  # per axis, what recorded arms leave of a calibration
@@ -89,7 +101,7 @@ def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = n
     def calibrate(k: int) -> Calibrated:
         rng = np.random.default_rng([seed, poses, k, 3])
         exact, X_BC = simulated_observations(poses, rng)
-        observations, patterns = seen_by_a_wrong_scanner(exact, rng)
+        observations, patterns = measured_by_a_wrong_scanner(exact, rng)
         rigid = estimate_eye_on_base(observations, SolveConfig(seed=seed, hypotheses=60, leave_one_out=False))
         found = from_motion(observations, patterns, usual=True, start=rigid.X_BC)
         assert found.X_BC is not None
@@ -120,8 +132,7 @@ def _inside(
 
 def coverage_picture(studies: list[Coverage]) -> bytes:
     """Shares inside their stated 95 % regions against the number of scans, and the band in which exact regions fall."""
-    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
+    figure, axes = subplots(8.2, 3.6, 1, 2, sharey=True)
     low, high = studies[0].chance()
     for ax, corrected, title in zip(
         axes, (False, True), ("an exact scanner", "a scanner off by 0.2 %, corrected"), strict=True
@@ -132,8 +143,7 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
         ax.axhline(95.0, color="#444", linewidth=1, linestyle="--")
         ax.plot(n, [100 * s.pose for s in chosen], color="#1d5f8a", marker="o", label="X_BC")
         ax.plot(n, [100 * s.point for s in chosen], color="#b08a2e", marker="s", label="the work point")
-        ax.set_xticks(n)
-        ax.set_xlabel("number of scans")
+        ax.set(xticks=n, xlabel="number of scans")
         ax.set_title(title, fontsize=10, loc="left")
         ax.set_ylim(88.0, 100.0)
     axes[0].set_ylabel("inside the stated 95 % region, %")
@@ -146,15 +156,15 @@ def study_warped(poses: int, runs: int, progress: Progress = no_progress) -> Cov
     stated, true = [], []
 
     def calibrate(device: int) -> Calibrated:
-        _, estimate = warped_scanner.calibrate_warped(device, poses)
-        seen = warped_scanner.warped_point(warped_scanner.WORK_C, device)
+        _, estimate = wrong_models.calibrate_warped(device, poses)
+        seen = wrong_models.warped_point(wrong_models.WORK_C, device)
         stated.append(float(np.mean(estimate.held_out.position_m)))
-        true.append(float(np.mean(warped_scanner.new_errors(device, estimate))))
+        true.append(float(np.mean(wrong_models.new_errors(device, estimate))))
         found = seen if estimate.correction is None else estimate.correction.points(seen)
-        return estimate, warped_scanner.X_BC, estimate.X_BC @ found
+        return estimate, wrong_models.X_BC, estimate.X_BC @ found
 
     name = f"calibrations of {poses} scans by a warped scanner"
-    pose, point = _inside(calibrate, name, runs, progress, warped_scanner.WORK_C)
+    pose, point = _inside(calibrate, name, runs, progress, wrong_models.WORK_C)
     return Coverage(
         poses=poses,
         runs=runs,
@@ -176,7 +186,6 @@ def _coverage_rows(f: Figures) -> Iterable[Row]:
 HONESTY = Study(
     name="flange-honesty",
     what="How often stated 95 % regions hold the truth, and the ratio of held-out to true errors.",
-    figures=lambda results: results["all"],
     header=("scans", "scanner", "X_BC inside", "work point inside", "held-out over true error"),
     rows=_coverage_rows,
     numbers=3,
@@ -193,7 +202,7 @@ def honesty(
     studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
     studies.append(study_warped(12, max(10, runs // 5), call.progress))
     write_atomic(folder / "coverage.svg", coverage_picture(studies))
-    return HONESTY.measured({"all": {"studies": [vars(s) for s in studies]}}, folder).outcome()
+    return HONESTY.found({"studies": [vars(s) for s in studies]}, folder)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,8 +226,8 @@ def study_stated(poses: int, warp_m: float, arm_m: float, runs: int, *, local: b
     seen."""
     stated, true = [], []
     for device in range(runs):
-        observations, patterns = warped_scanner.warped_observations(device, poses, 0, warp_m, arm_m)
-        new, _ = warped_scanner.warped_observations(device, 60, 1, warp_m, arm_m)
+        observations, patterns = wrong_models.warped_observations(device, poses, 0, warp_m, arm_m)
+        new, _ = wrong_models.warped_observations(device, 60, 1, warp_m, arm_m)
         found = calibrate(observations, Steps(patterns=patterns, refine="local" if local else PLAIN))
         correction, refined = found.correction, found.refined
         seen = new if correction is None else [corrected_observation(correction, o) for o in new]
@@ -255,7 +264,6 @@ def _stated_rows(f: Figures) -> Iterable[Row]:
 STATED = Study(
     name="flange-stated",
     what="The stated mean error over the true one, in generated worlds with errors of scanner and arm.",
-    figures=lambda results: results["all"],
     header=("scans", "way", "scanner off, mm", "arm off, mm", "worlds", "true mean error, mm", "stated over true"),
     rows=_stated_rows,
     numbers=5,
@@ -275,4 +283,133 @@ def stated(
             call.progress(f"{poses} scans", k / len(sizes))
             classes.append(study_stated(poses, warp_m, _ARM_M, runs, local=local))
     mean = float(np.mean([s.stated_over_true for s in classes]))
-    return STATED.measured({"all": {"classes": [vars(s) for s in classes], "mean": mean}}, folder).outcome()
+    return STATED.found({"classes": [vars(s) for s in classes], "mean": mean}, folder)
+
+
+def wrong_arm(seed: int, kind: str) -> Mapping[str, object]:
+    """One world, plain and refined."""
+    return {"kind": kind, **asdict(study_station(station(seed, links=kind == "links"), kind))}
+
+
+def _arm_figures(results: Results) -> Figures:
+    kinds = [r["kind"] for r in results.values()]
+    found = [Found(**{k: np.array(v) for k, v in r.items() if k != "kind"}) for r in results.values()]
+    return {"worlds": len(found), "kind": kinds[0], **judged(found)}
+
+
+def _arm_rows(f: Figures) -> Iterable[Row]:
+    yield "error at new scans, plain", f"{f['plain_mm']:.3f} mm mean"
+    yield "error at new scans, refined", f"{f['refined_mm']:.3f} mm mean (ratio {f['ratio']:.2f})"
+    yield "in the stated 95 % region", f"{f['inside_95_percent']:.1f} %"
+    yield "joint offsets within 3 sigma", f"{f['offsets_within_3_sigma_percent']:.1f} %"
+
+
+ARM = Study(
+    name="flange-arm",
+    what="UR10e cells with factory-size errors of the arm, calibrated from 20 planned scans, plain and refined.",
+    case=wrong_arm,
+    figures=_arm_figures,
+    header=("", "found"),
+    rows=_arm_rows,
+)
+
+
+@command("benchmark flange-arm", short_help="Calibrate cells with errors of the arm, and refine them.", hidden=True)
+def arm(
+    call: Call,
+    worlds: Annotated[int, option("--worlds", "N", "Number of simulated cells.", min=1)] = 40,
+    kind: Annotated[
+        str, option("--kind", "KIND", "links: all errors of the arm; joints: zeros of the joints only.")
+    ] = "links",
+) -> Outcome:
+    """Calibrate UR10e cells with factory-size errors of the arm from 20 planned scans, plain and refined, and judge
+    both on new scans."""
+    seeds = range(call.seed, call.seed + worlds)
+    return ARM.outcome(call, {f"world {s}": {"seed": s, "kind": kind} for s in seeds})
+
+
+def _imperfect(found: LightRuns) -> dict[str, object]:
+    ours, rigid = (statistics(1e3 * v, "mean", "rms", "p95", "max") for v in (found.error_m, found.rigid_m))
+    return {
+        "runs": len(found.error_m),
+        "scans_mean": float(np.mean(found.scans)),
+        "at_work_mm": {"mean": ours["mean"], "p95": ours["p95"], "worst": ours["max"]},
+        "rms_at_work_mm": ours["rms"],
+        "expected_mm": float(1e3 * np.sqrt(np.mean(found.expected_m**2))),
+        "inside_95": found.share_inside,
+        "inside_95_chance": list(found.chance()),
+        "rigid_at_work_mm": {"mean": rigid["mean"], "worst": rigid["max"]},
+    }
+
+
+def _imperfect_rows(f: Figures) -> Iterable[Row]:
+    e, (low, high) = f["at_work_mm"], f["inside_95_chance"]
+    yield (
+        "error at the work point",
+        (
+            f"{e['mean']:.3f} mm mean, {e['p95']:.3f} 95 %, {e['worst']:.3f} at most ({f['rms_at_work_mm']:.3f} rms; "
+            f"{f['expected_mm']:.3f} expected), from {f['scans_mean']:.1f} scans"
+        ),
+    )
+    yield (
+        "in the stated 95 % region",
+        f"{100 * f['inside_95']:.1f} % of {f['runs']} (exact regions: {100 * low:.1f} to {100 * high:.1f} %)",
+    )
+    yield "without a scanner correction", "{mean:.3f} mm mean, {worst:.3f} at most".format(**f["rigid_at_work_mm"])
+
+
+IMPERFECT = Study(
+    name="flange-imperfect",
+    what=(
+        "Live calibrations with an imperfect scanner and arm, without rendering: errors, and how often they lie in the"
+        " region."
+    ),
+    header=("", "found"),
+    rows=_imperfect_rows,
+)
+
+
+@command("benchmark flange-imperfect", short_help="Calibrate with an imperfect scanner and arm.", hidden=True)
+def imperfect(
+    call: Call,
+    scenario: Annotated[
+        str, typer.Argument(metavar="[SCENARIO]", help="A scenario with simulated arm and scanner.")
+    ] = "s_groove",
+    runs: Annotated[int, option("--runs", "N", "Number of calibrations, each in its own world.", min=10)] = 200,
+) -> Outcome:
+    """Calibrate with an imperfect scanner and arm, without rendering: errors at the work point, and how often they lie
+    in the stated 95 % region."""
+    folder = IMPERFECT.folder(call)
+    found = study_light_runs(load_scenario(scenario), runs, seed=call.seed, progress=call.progress)
+    return IMPERFECT.found(_imperfect(found), folder)
+
+
+def _start_figures(results: Results) -> Figures:
+    of = results.values()
+    counts: Figures = {k: Counter(str(r.get(k, "failed")) for r in of) for k in ("start", "calibration", "alone")}
+    return {"cells": len(of), **counts, "start_mm": statistics(r.get("start_mm", np.nan) for r in of)}
+
+
+def _start_rows(f: Figures) -> Iterable[Row]:
+    yield from ((k, ", ".join(f"{n} {v}" for v, n in sorted(f[k].items()))) for k in ("start", "calibration", "alone"))
+    yield "error of all starts at the work point", "{median:.0f} mm median, {p95:.0f} mm 95 %".format(**f["start_mm"])
+
+
+START = Study(
+    name="flange-start",
+    what=(
+        "Ray-cast cells of seven arms with a small, far or hidden flange, calibrated without a guess; the start is from"
+        " three scans."
+    ),
+    case=calibrate_cell,
+    figures=_start_figures,
+    header=("", "found"),
+    rows=_start_rows,
+)
+
+
+@command("benchmark flange-start", short_help="Calibrate cells whose flange is small, far or hidden.", hidden=True)
+def start(call: Call, cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 200) -> Outcome:
+    """Calibrate ray-cast cells with a small, far or hidden flange without a guess, and start from the visible arm in
+    three scans."""
+    return START.outcome(call, {f"cell {call.seed + k}": {"seed": call.seed + k} for k in range(cells)})

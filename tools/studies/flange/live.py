@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from weldcal.models.arrays import Array
 from weldcal.systems.cell import build_cell
@@ -17,13 +16,12 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.report.pictures import svg
+from weldcal.tools.report.pictures import subplots, svg
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.weld import calibration_error
-from weldcal.tools.studies.harness import Figures, Row, Study
-from weldcal.tools.studies.targets import Target
-from weldcal.tools.worlds.perfect_world import perfect
-from weldcal.tools.worlds.redrawn import Redrawn, RedrawnStation, bound_covariance, joined, joints_of, redraw
+from weldcal.tools.studies.harness import Figures, Row, Study, Target
+from weldcal.tools.worlds.light_runs import Redrawn, RedrawnStation, bound_covariance, joined, joints_of, redraw
+from weldcal.tools.worlds.scaled_arms import perfect
 
 SCENARIO = "calibrate_only"
 TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
@@ -108,8 +106,7 @@ def live_picture(rows: list[LiveRow]) -> bytes:
     bound."""
     again = joined([r.redrawn for r in rows])
     mm, deg = 1e3, float(np.degrees(1.0))
-    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
+    figure, axes = subplots(8.2, 3.6, 1, 2, sharey=True)
     panels = (
         (again.at_work_m, again.bound_at_work_m, [r.at_work_m for r in rows], mm, TARGET_M, "at the work point, mm"),
         (
@@ -127,8 +124,7 @@ def live_picture(rows: list[LiveRow]) -> bytes:
         ax.ecdf(unit * np.array(live), color="#b08a2e", linewidth=1.2, label=f"live, {len(live)} worlds")
         ax.axvline(unit * target, color="#444", linewidth=1)
         ax.annotate("target", (unit * target, 0.04), xytext=(-4, 0), textcoords="offset points", ha="right", fontsize=9)
-        ax.set_xlim(0.0, 1.25 * unit * target)
-        ax.set_xlabel(name)
+        ax.set(xlim=(0.0, 1.25 * unit * target), xlabel=name)
     axes[0].set_ylabel("share of calibrations within")
     axes[0].legend(
         facecolor="white", edgecolor="none", framealpha=1.0, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 0.15)
@@ -191,7 +187,6 @@ def _live_rows(f: Figures) -> Iterable[Row]:
 LIVE = Study(
     name="flange-live",
     what="The error of the live calibration in simulation, beside the least that its poses, arm and scanner allow.",
-    figures=lambda results: results["all"],
     header=("error", "mean", "rms", "worst", "Cramer-Rao, rms"),
     rows=_live_rows,
     targets=lambda f: (
@@ -221,4 +216,4 @@ def live(
     )
     if redraws:
         write_atomic(folder / "live.svg", live_picture(rows))
-    return LIVE.measured({"all": live_figures(rows, scans, repeatability)}, folder).outcome()
+    return LIVE.found(live_figures(rows, scans, repeatability), folder)

@@ -1,4 +1,4 @@
-"""Calibrations of recorded scans: the errors with few of them, and with halves."""
+"""Calibrations of recorded scans: the errors with few of them, with halves, and with two parts of one cloud."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,26 +8,116 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from pydrake.math import RigidTransform
+from scipy.integrate import quad
+from scipy.optimize import minimize
+from scipy.special import ndtr
+from scipy.stats import norm
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly, solve_jointly
-from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
+from weldcal.calibration.eye_on_base.observations import corrected_observation, fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import mean_interval, position_errors, tilt_errors
+from weldcal.calibration.flange.fit import FlangeFit, fit_flange
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.refinement.local_field import choose_local
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import get_flange
+from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.flange.halves import study_parts
 from weldcal.tools.studies.harness import Figures, Row, Study, statistics
+
+PARTS_OF_A_CLOUD = (2, 4, 8)
+_REACH_M = 0.0015  # about an edge, in which its blur shows
+_INFORMATION = float(quad(lambda z: norm.pdf(z) ** 2 / ndtr(z), -8.0, 12.0)[0])  # of a soft edge of a Poisson process
+
+
+def edge_blur(points_C: Array, fit: FlangeFit, *, outer: bool) -> tuple[float, float]:
+    """Width (m, one sigma) over which the face's points thin out at an edge, and their density (1/m^2) on the face.
+
+    Maximum likelihood of a Poisson process whose density falls as Phi across a circle. Raises ValueError where the edge
+    was not seen.
+    """
+    radius = fit.outer_radius_m if outer else fit.bore_radius_m
+    if radius is None:
+        raise ValueError("the edge was not seen")
+    d = points_C - fit.center_C
+    h = d @ fit.normal_C
+    rho = np.sqrt(np.maximum((d * d).sum(axis=1) - h * h, 0.0))[np.abs(h) < max(3.0 * fit.plane_rms_m, 0.0002)]
+    edges = np.linspace(-_REACH_M, _REACH_M, 61)
+    inward = radius - rho if outer else rho - radius
+    count = np.histogram(inward, edges)[0]
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    area = 2.0 * np.pi * (radius - middle if outer else radius + middle) * (edges[1] - edges[0])
+    inside = middle > 0.5 * _REACH_M
+    density = float(count[inside].sum() / area[inside].sum())
+
+    def cost(p: Array) -> float:
+        expected = density * area * ndtr((middle - p[0]) / np.exp(p[1])) + 1e-3
+        return float((expected - count * np.log(expected)).sum())
+
+    found = minimize(cost, [0.0, np.log(1e-4)], method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-3})
+    return float(np.exp(found.x[1])), density
+
+
+def center_bound(points_C: Array, fit: FlangeFit, parts: int) -> float:
+    """Least rms distance (m) between the centres from two of ``parts`` random parts of a cloud, in the face's plane.
+
+    Information of one edge about a coordinate of its centre: density x circumference x 0.90 / blur / 2, Poisson points,
+    radius free (a full circle's centre does not depend on it); both edges add.
+    """
+    information = 0.0
+    for outer, radius in ((True, fit.outer_radius_m), (False, fit.bore_radius_m)):
+        if radius is not None:
+            blur, density = edge_blur(points_C, fit, outer=outer)
+            information += 0.5 * (density / parts) * 2.0 * np.pi * radius * _INFORMATION / blur
+    return float(np.sqrt(2.0 * 2.0 / information))
+
+
+def study_parts(
+    clouds: list[Array], standard: FlangeStandard, *, draws: int = 4, seed: int = 0, progress: Progress = no_progress
+) -> list[dict[str, float]]:
+    """Divide each cloud (N, 3) m into 2, 4 and 8 random parts and compare the first two. Deterministic for ``seed``.
+
+    Returns a row for each: parts, points in each, rms distance (mm) of two parts' centres, the least that any unbiased
+    estimate could reach (mm), and what the stated covariances expect (mm).
+    """
+    whole: list[tuple[Array, FlangeFit]] = []
+    for points in clouds:
+        try:
+            whole.append((points, fit_flange(points, standard)))
+        except FlangeNotFound:
+            continue
+    rows: list[dict[str, float]] = []
+    for parts in PARTS_OF_A_CLOUD:
+        apart, bound, stated, size = [], [], [], []
+        for k, (points, fit) in enumerate(whole):
+            if k % 6 == 0:
+                progress(
+                    f"{parts} parts of each cloud",
+                    (PARTS_OF_A_CLOUD.index(parts) + k / len(whole)) / len(PARTS_OF_A_CLOUD),
+                )
+            for r in range(draws):
+                part = np.random.default_rng([seed, k, r]).permutation(len(points)) % parts
+                try:
+                    a, b = (fit_flange(points[part == i], standard) for i in (0, 1))
+                except FlangeNotFound:
+                    continue
+                apart.append(float(((a.center_C - b.center_C) ** 2).sum()))
+                stated.append(float(np.trace(a.center_covariance + b.center_covariance)))
+                bound.append(center_bound(points, fit, parts) ** 2)
+                size.append(len(points) // parts)
+        of = {"apart_mm": apart, "bound_mm": bound, "stated_mm": stated}
+        rms = {name: 1e3 * float(np.sqrt(np.mean(v))) if v else float("nan") for name, v in of.items()}
+        rows.append({"parts": parts, "points": int(np.median(size)) if size else 0, **rms})
+    return rows
+
 
 SIZES = (1, 2, 3, 4, 6, 8, 12)
 KEPT = 4  # scans that at least are left to judge by
@@ -49,7 +139,7 @@ def usable_scans(
     """
     data = load_dataset(folder)
     standard = get_flange(data.header.flange)
-    seen = see_flanges(data, standard, seed=seed, tell=lambda done: progress("fitting flanges", share * done))
+    seen = fit_flanges(data, standard, seed=seed, tell=lambda done: progress("fitting flanges", share * done))
     if len(seen.observations) < least:
         raise TooFewPoses(f"{refusal}, and there are {len(seen.observations)}.")
     config = SolveConfig(seed=seed, allow_coplanar=allow_coplanar, leave_one_out=False)
@@ -189,7 +279,6 @@ def _few_rows(f: Figures) -> Iterable[Row]:
 FEW = Study(
     name="flange-few",
     what="Calibrations from few of the recorded scans, judged on the scans that were not used.",
-    figures=lambda results: results["all"],
     header=("scans", "median mm", "95 % mm", "tilt deg", "scanner corrected", "draws refused"),
     rows=_few_rows,
     numbers=5,
@@ -204,7 +293,7 @@ def few(
 ) -> Outcome:
     """Calibrate from 1, 2, 3, 4, 6, 8 or 12 of the scans and measure the error on the scans that were not used."""
     folder, found = FEW.folder(call), study_few_scans(dataset, draws, call.seed, progress=call.progress)
-    return FEW.measured({"all": _few(found, draws)}, folder).outcome()
+    return FEW.found(_few(found, draws), folder)
 
 
 def _halves_rows(f: Figures) -> Iterable[Row]:
@@ -216,7 +305,6 @@ def _halves_rows(f: Figures) -> Iterable[Row]:
 HALVES = Study(
     name="flange-halves",
     what="The held-out error that random halves of recorded scans state, against the error on the other halves.",
-    figures=lambda results: results["all"],
     header=("", "found"),
     rows=_halves_rows,
 )
@@ -234,7 +322,7 @@ def halves(
     """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the
     other half."""
     folder, found = HALVES.folder(call), study_halves(dataset, draws, call.seed, call.progress, local=local)
-    return HALVES.measured({"all": found}, folder).outcome()
+    return HALVES.found(found, folder)
 
 
 def _part_rows(f: Figures) -> Iterable[Row]:
@@ -245,7 +333,6 @@ def _part_rows(f: Figures) -> Iterable[Row]:
 PARTS = Study(
     name="flange-parts",
     what="The distance between the flange centres from two parts of one recorded cloud, and its lower bound.",
-    figures=lambda results: results["all"],
     header=("points each", "apart, rms mm", "least possible mm", "stated mm"),
     rows=_part_rows,
     numbers=3,
@@ -260,4 +347,4 @@ def parts(call: Call, dataset: DatasetArgument) -> Outcome:
         raise InputError(f"'{dataset}' holds no clouds to divide. Give a dataset with scans.")
     folder, clouds = PARTS.folder(call), [data.cloud(id) for id in data.clouds]
     rows = study_parts(clouds, get_flange(data.header.flange), seed=call.seed, progress=call.progress)
-    return PARTS.measured({"all": {"rows": rows}}, folder).outcome()
+    return PARTS.found({"rows": rows}, folder)

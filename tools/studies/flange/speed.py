@@ -15,8 +15,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, switch
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.flange.cells import arm, imperfect
-from weldcal.tools.studies.flange.coverage import honesty, stated
+from weldcal.tools.studies.flange.coverage import arm, honesty, imperfect, stated
 from weldcal.tools.studies.flange.live import live
 from weldcal.tools.studies.flange.recorded import few, halves, parts
 from weldcal.tools.studies.flange.scans import frames, hidden, holes
@@ -189,7 +188,6 @@ SPEED = Study(
     what=(
         "Processor time to find the flange in a scan, beside the paper's loop, an Open3D chain and a PCL-style search."
     ),
-    figures=lambda results: results["all"],
     header=("method and scan", "median ms", "least ms", "", "centre off, mm"),
     rows=_speed_rows,
     numbers=4,
@@ -206,7 +204,7 @@ def speed(
     """Time the detection of the flange in a scan and compare with the paper's loop, an Open3D chain and a PCL-style
     search."""
     folder, rows = SPEED.folder(call), run_flange_benchmark(call.seed, loop=loop, progress=call.progress)
-    return SPEED.measured({"all": {"rows": rows}}, folder).outcome()
+    return SPEED.found({"rows": rows}, folder)
 
 
 @command("benchmark flange", short_help="Measure how the flange is found, and what is stated.")

@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.corners import refine_with_corners
-from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
 from weldcal.calibration.hand_eye.mountings import MOUNTINGS
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out, opencv_solve
-from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise
+from weldcal.calibration.hand_eye.problem import Loss, Noise, Problem, Scaled, full_problem, linearise
 from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     as_transform,
@@ -31,10 +30,10 @@ from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, swit
 from weldcal.tools.cli.subject import one_of
 from weldcal.tools.report.render import fixed
 from weldcal.tools.studies.hand_eye.cells import hand_eye_cells, mountings
+from weldcal.tools.studies.hand_eye.cells import hand_eye_pictures as pictures
 from weldcal.tools.studies.hand_eye.conventions import hand_eye_conventions as conventions
-from weldcal.tools.studies.hand_eye.pictures import hand_eye_pictures as pictures
 from weldcal.tools.studies.harness import Figures, Row, Study, Table
-from weldcal.tools.worlds.hand_eye_mistakes import fuzz
+from weldcal.tools.worlds.hand_eye import fuzz
 
 _PLAIN = HandEyeConfig(folds=0)
 _SHARE = 0.02  # by which a method must be better to count as ahead
@@ -388,7 +387,6 @@ def _checks(figures: Figures) -> Iterable[Table]:
 SETS = Study(
     name="hand-eye",
     what="The hand-eye solvers beside OpenCV's seven methods on public sets, and checks in simulation.",
-    figures=lambda results: results["all"],
     rows=_set_rows,
     others=_checks,
     header=(
@@ -414,7 +412,7 @@ def hand_eye_sets(
     """Compare the hand-eye solvers with OpenCV's on public data, and test them in simulation."""
     folder = SETS.folder(call)
     found = run_hand_eye_benchmark(data, quick=quick, seed=call.seed, progress=call.progress)
-    return SETS.measured({"all": found.summary()}, folder).outcome()
+    return SETS.found(found.summary(), folder)
 
 
 @command("benchmark hand-eye", short_help="Compare the hand-eye solvers with OpenCV's.", options=FARM)

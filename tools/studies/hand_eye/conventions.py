@@ -13,7 +13,7 @@ from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.calibration.hand_eye.pairs.conventions import ReadingDecision, agreements, decide
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.studies.harness import Figures, Results, Row, Study, Table
-from weldcal.tools.worlds.written_poses import WrittenSet, written_set
+from weldcal.tools.worlds.hand_eye import WrittenSet, written_set
 
 SIGMAS = 6.0
 """Without noise, the residual of the next reading in units of the noise, from which on the data determine the

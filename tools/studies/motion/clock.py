@@ -8,8 +8,8 @@ from scipy.stats import binom, chi2
 
 from weldcal.calibration.geometry.se3 import difference
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
+from weldcal.calibration.motion.expected import recorded_stream
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.planning.moves import recorded_stream
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
 from weldcal.tools.worlds.moves import DELAY_S, cube_moves, exact_errors, observed_frames
@@ -29,12 +29,9 @@ def one_run(
 
     Returns:
         errors (7,) of X_BC's six and the clock's offset (rad, m, s), the same in sigmas, the NEES of X_BC over its six,
-            the
-        error of the offset against the mean delay of the recording's own frames (ms), the error of a point in the
-            middle of
-        the work (mm), the turn (deg). With device times also the errors in sigmas (7,) of a least-squares fit that
-            knows the
-        motion exactly: what the draws themselves are.
+        the error of the offset against the mean delay of the recording's own frames (ms), the error of a point in the
+        middle of the work (mm), the turn (deg). With device times also the errors in sigmas (7,) of a least-squares fit
+        that knows the motion exactly: what the draws themselves are.
     """
     device, linear = clock == "device", index % 2 == 1
     rng = np.random.default_rng([seed, index, int(device)])

@@ -7,8 +7,7 @@ from typing import Annotated
 from weldcal.models.scanner_streams import get_stream
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.options import Call, command, option, switch
-from weldcal.tools.worlds.disturbance import disturbance_of
-from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
+from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, disturbance_of, write_motion_dataset
 
 
 @command("reproduce motion-data", short_help="Write a simulated recording in motion with its truth.")

@@ -16,9 +16,8 @@ from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent,
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option, switch
-from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
-from weldcal.tools.studies.targets import Target, all_met
-from weldcal.tools.worlds.features import Change, FeatureWorld, WorldConfig, simulate
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, Target, all_met, whole
+from weldcal.tools.worlds.moves import Change, FeatureWorld, WorldConfig, simulate
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
 WITHIN_S = 2.0

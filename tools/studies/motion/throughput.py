@@ -1,5 +1,4 @@
-"""Measures frames per second sustained and the time from arrival to estimate: half a megapixel, beside an arm's control
-in real time.
+"""Measures frames per second sustained and the time from arrival to estimate, beside an arm's control in real time.
 
 Frames are rendered beforehand and replayed at the scanner's rate on the wall clock. The queue, the estimator and its
 process are the cell's own; the arm's control is a simulated arm at 500 Hz in the same Diagram.
@@ -23,17 +22,20 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.models.scanners import depth_to_points
 from weldcal.systems.background import OwnProcess
-from weldcal.systems.drivers.simulated.streaming.replay import FrameReplay
+from weldcal.systems.drivers.simulated.streaming_scanner import FrameReplay
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand
-from weldcal.systems.motion.frame_queue import FrameQueue
-from weldcal.systems.motion.pose_recorder import PoseRecorder
+from weldcal.systems.motion.buffers import FrameQueue, PoseRecorder
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
-from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
+from weldcal.tools.cli.subject import one_of
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.targets import Target, print_targets
+from weldcal.tools.studies.harness import Target, print_targets
+from weldcal.tools.studies.motion.clock import benchmark_clock
+from weldcal.tools.studies.motion.drift import benchmark_drift
+from weldcal.tools.studies.motion.whole_body import benchmark_whole_body
 from weldcal.tools.worlds.motion import MotionOptions, MotionWorld
 
 _POLL_S = 0.004
@@ -199,3 +201,10 @@ def _replayed(
         behind_ms=tuple(behind),
         load_average=os.getloadavg()[0],
     )
+
+
+@command("benchmark motion", short_help="Measure calibration in motion: speed, clock, drift.", options=FARM)
+@one_of("speed", speed=benchmark_speed, clock=benchmark_clock, drift=benchmark_drift, whole_body=benchmark_whole_body)
+def benchmark_motion(call: Call) -> None:
+    """Measure calibration in motion: the speed of fits beside an arm's control, the stated clock and pose, the drift
+    test, or tracking by a link."""

@@ -14,12 +14,12 @@ from weldcal.calibration.motion.drift.watch import DriftHistory, watch
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.kinematics import load_arm
-from weldcal.models.arms.link_mesh import link_index
+from weldcal.models.arms.urdf import link_index
 from weldcal.tools.cli.options import Call, Outcome, command, option
-from weldcal.tools.commands.monitor_body import see_link
+from weldcal.tools.commands.monitor_body import track_link
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.targets import Target, all_met, print_targets
+from weldcal.tools.studies.harness import Target, all_met, print_targets
 from weldcal.tools.worlds.motion import MotionOptions, MotionWorld, write_motion_dataset
 
 LINK = "wrist_1_link"
@@ -76,7 +76,7 @@ def run_whole_body(
         found["flange"] = watch(result, seen.observed, motion, X_FR=data.X_FR, dropped=seen.refused)
         known = replace(result, clock=None)
         for name, fused in (("mesh", False), ("fused", True)):
-            frames, body_motion, X_LR, refused = see_link(
+            frames, body_motion, X_LR, refused = track_link(
                 data,
                 known,
                 standard,

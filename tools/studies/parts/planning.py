@@ -17,7 +17,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.parts.plates import (
+from weldcal.tools.worlds.parts.scans import (
     PLANNED,
     REFUSED,
     TROUBLES,

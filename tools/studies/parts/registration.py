@@ -21,7 +21,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.worlds.parts.scenes import REFUSALS, PartScene, Subject, scan_scene, scanned_mesh, subject
+from weldcal.tools.worlds.parts.scans import REFUSALS, PartScene, Subject, scan_scene, scanned_mesh, subject
 from weldcal.tools.worlds.parts.step_parts import PARTS
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_part

@@ -20,11 +20,13 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
 from weldcal.tools.report.pictures import OURS, plain, svg
 from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, whole
-from weldcal.tools.studies.profiler.edge import TARGETS, edge_figures, edge_targets
-from weldcal.tools.studies.profiler.sphere import (
-    METHODS,
+from weldcal.tools.studies.profiler.papers import (
+    SPHERE_METHODS,
+    TARGETS,
     WorldResult,
     cloud_of,
+    edge_figures,
+    edge_targets,
     joint_records,
     measured,
     named_figures,
@@ -33,7 +35,7 @@ from weldcal.tools.studies.profiler.sphere import (
     sphere_targets,
 )
 from weldcal.tools.worlds.edge_trials import fixed_edge_trials, made_edge_trials, rms
-from weldcal.tools.worlds.profiler_parts import MM, WorldData, fixed_worlds, made_worlds
+from weldcal.tools.worlds.profiler import MM, WorldData, fixed_worlds, made_worlds
 
 TRIALS = {"free": 20}
 WORLDS, GROOVES, BOSSES = 8, 3, 2
@@ -44,8 +46,7 @@ def one_seed(seed: int | None = None, data: str | None = None) -> Mapping[str, o
 
     Returns:
         values and bounds (mm or deg) by the names of their targets, and the squared errors of the edge's trials in
-            units of
-        the bound.
+        units of the bound.
     """
     if data is not None:
         trials = {n: fixed_edge_trials(Path(data), n) for n in TARGETS}
@@ -216,11 +217,11 @@ def _sphere(worlds: Iterable[WorldData], seed: int) -> tuple[list[WorldResult], 
     for k, world in enumerate(worlds):
         features = seam_features(world)
         for method, record in joint_records(world).items():
-            results.append(measured(k, method, record, world, features, boss=method == METHODS[3]))
+            results.append(measured(k, method, record, world, features, boss=method == SPHERE_METHODS[3]))
         for name, value in world_bounds(world, features, 1000 * seed + k).items():
             bound[name].append(value)
     points = float(np.mean(bound["points"]))
-    return results, named_figures(dict.fromkeys(METHODS[2:], points), bound["seam"], bound["boss"])
+    return results, named_figures(dict.fromkeys(SPHERE_METHODS[2:], points), bound["seam"], bound["boss"])
 
 
 # of the fixed files' worlds: what each error's sigma really is

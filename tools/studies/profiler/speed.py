@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.profiler.edge.joint import edge_starts
 from weldcal.calibration.profiler.edge.model import EdgeState
-from weldcal.calibration.profiler.edge.start import edge_starts
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.options import FARM, Call, Outcome, command, option
@@ -40,7 +40,7 @@ def benchmark_speed(
 ) -> Outcome:
     """Time the profiler's calibration by an edge and compare it with the published method and a grid search."""
     folder = SPEED.folder(call)
-    return SPEED.measured({"all": time_methods(call.seed, data, call.progress)}, folder).outcome()
+    return SPEED.found(time_methods(call.seed, data, call.progress), folder)
 
 
 @command("benchmark profiler", short_help="Measure the profiler's calibration: speed, or seeds.", options=FARM)
@@ -99,7 +99,6 @@ def _lines(figures: Figures) -> Iterable[Row]:
 SPEED = Study(
     name="profiler",
     what="Time of a profiler's calibration by an edge without a guess, the paper's method and a grid search.",
-    figures=lambda results: results["all"],
     header=("method", "poses", "median ms", "most ms", "processor ms", "most ms", "optimum found", "off deg", "off mm"),
     rows=_lines,
     numbers=7,

@@ -1,14 +1,12 @@
 """Benchmark of the hardware link under faults: a matrix of faults, and random sequences of them."""
 
 from collections import Counter
-from collections.abc import Sequence as Several
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.pacing import no_long_garbage_collections
-from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.cli.options import FARM, Call, command, option
 from weldcal.tools.cli.options import Outcome as Printed
 from weldcal.tools.cli.subject import one_of
@@ -16,13 +14,11 @@ from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.harness import statistics
-from weldcal.tools.studies.robot.jobs import jobs
-from weldcal.tools.studies.robot.stream import TRANSPORT, one_transport, stream
+from weldcal.tools.studies.robot.stream import TRANSPORT, jobs, one_transport, stream
 from weldcal.tools.studies.robot.wired import soak, wired_faults
 from weldcal.tools.worlds.robot.bench import Bench
 from weldcal.tools.worlds.robot.cases import AT_START, RUNNING
-from weldcal.tools.worlds.robot.fault_run import FaultOutcome, run_case
-from weldcal.tools.worlds.robot.sequences import Sequence, run_sequence
+from weldcal.tools.worlds.robot.fault_run import FaultOutcome, FaultSequence, run_case, run_sequence
 
 OUTCOME_COLUMNS = (
     "name",
@@ -57,7 +53,7 @@ class FaultReport:
     """All outcomes and all sequences."""
 
     outcomes: list[FaultOutcome]
-    sequences: list[Sequence]
+    sequences: list[FaultSequence]
 
     def summary(self) -> dict[str, object]:
         """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names the results that are
@@ -86,43 +82,12 @@ class FaultReport:
         }
 
 
-def run_fault_benchmark(
-    out: Path,
-    *,
-    address: str | None = None,
-    sequences: int = 20,
-    seconds: float = 60.0,
-    seed: int = 0,
-    transport: str = NATIVE,
-    progress: Progress = no_progress,
-) -> FaultReport:
-    """The matrix, then the random sequences, each on a controller of its own; faults.csv and sequences.csv grow row by
-    row."""
-    report = FaultReport([], [])
-    share = 150.0 / (150.0 + sequences * seconds)
-
-    cases = RUNNING + AT_START
-    with emulator_process(host=address, seed=seed) as emulator, no_long_garbage_collections():
-        bench = Bench(emulator, transport=transport)
-        for k, case in enumerate(cases):  # each must be able to start after the one before
-            progress(case.name, share * k / len(cases))
-            report.outcomes.append(run_case(bench, case, hasty=False))
-            write_atomic(out / "faults.csv", _table(OUTCOME_COLUMNS, report.outcomes))
-    for k in range(sequences):
-        progress(f"sequence {k + 1} of {sequences}", share + (1.0 - share) * k / sequences)
-        with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
-            report.sequences.append(run_sequence(Bench(emulator, transport=transport), seed + k, seconds))
-        write_atomic(out / "sequences.csv", _table(SEQUENCE_COLUMNS, report.sequences))
-    write_json(out / "robot_faults.json", report.summary())
-    return report
-
-
-def _spread(values: Several[float | None]) -> dict[str, float]:
+def _spread(values: Sequence[float | None]) -> dict[str, float]:
     found = [value for value in values if value is not None]
     return statistics(found, "median", "max") if found else {}
 
 
-def _table(columns: tuple[str, ...], rows: Several[object]) -> str:
+def _table(columns: tuple[str, ...], rows: Sequence[object]) -> str:
     return csv_text(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
 
 
@@ -150,16 +115,23 @@ def faults(
 ) -> Printed:
     """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say
     why."""
-    result = run_fault_benchmark(
-        call.folder("benchmark", "robot-faults"),
-        address=call.given["address"],
-        sequences=sequences,
-        seconds=seconds,
-        seed=call.seed,
-        transport=one_transport(transport),
-        progress=call.progress,
-    )
-    return Printed(result.summary(), rows={outcome.name: outcome.line for outcome in result.outcomes})
+    out, address, seed = call.folder("benchmark", "robot-faults"), call.given["address"], call.seed
+    transport = one_transport(transport)
+    report, cases = FaultReport([], []), RUNNING + AT_START
+    share = 150.0 / (150.0 + sequences * seconds)
+    with emulator_process(host=address, seed=seed) as emulator, no_long_garbage_collections():
+        bench = Bench(emulator, transport=transport)
+        for k, case in enumerate(cases):  # each must be able to start after the one before
+            call.progress(case.name, share * k / len(cases))
+            report.outcomes.append(run_case(bench, case, hasty=False))
+            write_atomic(out / "faults.csv", _table(OUTCOME_COLUMNS, report.outcomes))
+    for k in range(sequences):
+        call.progress(f"sequence {k + 1} of {sequences}", share + (1.0 - share) * k / sequences)
+        with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
+            report.sequences.append(run_sequence(Bench(emulator, transport=transport), seed + k, seconds))
+        write_atomic(out / "sequences.csv", _table(SEQUENCE_COLUMNS, report.sequences))
+    write_json(out / "robot_faults.json", report.summary())
+    return Printed(report.summary(), rows={outcome.name: outcome.line for outcome in report.outcomes})
 
 
 @command("benchmark robot", short_help="Measure the robot link and the cell by wire.", options=("address", *FARM))

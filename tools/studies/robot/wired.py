@@ -21,8 +21,7 @@ from weldcal.tools.emulators.cell.process import WiredWorld, wired_world
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.report.files import mappings_csv, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study
-from weldcal.tools.studies.output import markdown_table
+from weldcal.tools.studies.harness import Cases, Figures, Results, Row, Study, markdown_table
 from weldcal.tools.worlds.robot.wired_job import DEVICES, FAULTS, OF_THE_CONTROLLER, PHASES, Happening, run_job
 
 SEAM_MM = 20.0

@@ -1,33 +1,314 @@
-"""`weldcal reproduce tablet`: the tablet paper's tables, the signs and the models, with targets."""
+"""Reproduces the tablet paper: its tables, stages, signs and models, with targets; and times each calibration."""
 
 import time
-from collections.abc import Iterable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.planar.fit import fit_plane_motion, hand_over
-from weldcal.calibration.tablet.published.calibration import StageResult
-from weldcal.calibration.tablet.published.two_stage import Sign
+from weldcal.calibration.tablet.planar_fit import (
+    PlanarConfig,
+    fit_linear,
+    fit_planar,
+    fit_plane_motion,
+    hand_over,
+    solve_closed_form,
+    touched_rays,
+)
+from weldcal.calibration.tablet.published import (
+    PUBLISHED_EVALUATIONS,
+    PUBLISHED_POPULATION,
+    Fitness,
+    Model,
+    Sign,
+    StageResult,
+    evolve,
+    fitness,
+    hand_to_touch,
+    place_landmarks,
+    stage1_residuals,
+    tablet_stage1,
+    tablet_stage2,
+)
 from weldcal.calibration.tablet.touches import TabletTouches
+from weldcal.models.arrays import Array
 from weldcal.tools.cli.options import Call, Outcome, command, option
 from weldcal.tools.console import Progress
-from weldcal.tools.report.pictures import OURS, THEIRS, svg
+from weldcal.tools.report.files import write_json
+from weldcal.tools.report.pictures import OURS, THEIRS, subplots, svg
 from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.harness import Figures, Row, Study, Table
-from weldcal.tools.studies.tablet.study import (
-    PUBLISHED_EVALUATIONS,
-    Reproduced,
-    compare_models,
-    compare_signs,
-    dh_by_eq_20,
-    held_out,
-    reproduce_stages,
+from weldcal.tools.studies.harness import Figures, Row, Study, Table, Target, all_met
+from weldcal.tools.worlds.tablet import (
+    STAGE_1,
+    TABLE_NUMBER,
+    TOUCHING_MM,
+    TabletTrial,
+    printed_stage,
+    published_touches,
+    simulate_trial,
 )
-from weldcal.tools.studies.targets import Target, all_met
-from weldcal.tools.worlds.tablet import STAGE_1, TABLE_NUMBER, TOUCHING_MM, printed_stage, published_touches
+
+MODELS: tuple[Model, ...] = ("htm", "dh")
+
+
+@dataclass(frozen=True)
+class Reproduced:
+    """One stage of one chain: the fast solver's, and one by differential evolution per seed."""
+
+    model: Model
+    stage: int
+    ours: StageResult
+    evolved: tuple[StageResult, ...]
+    seconds: float
+    evolved_seconds: float
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds: the four fits together, and one evaluation of the objective, alone and in a crowd."""
+
+    four_fits: float
+    one_evaluation: float
+    crowd_evaluation: float
+
+
+@dataclass(frozen=True)
+class SignRow:
+    """Hand positions against the tablet alone, no camera: rms per axis (mm) and leave-one-out mean (mm) for one
+    sign."""
+
+    sign: Sign
+    rigid_mm: float
+    scaled_mm: float
+    left_out_mm: float
+
+
+@dataclass(frozen=True)
+class ModelRow:
+    """One model on the published data: unknowns, mean error of the hand in sample and left out, largest left out
+    (mm)."""
+
+    name: str
+    unknowns: int
+    in_sample_mm: float
+    left_out_mm: float
+    worst_mm: float
+
+
+@dataclass(frozen=True)
+class HeldOutRow:
+    """One model on simulated trials: mean error of the hand on unseen queries (mm)."""
+
+    name: str
+    trials: int
+    mean_mm: float
+
+
+def reproduce_stages(touches: TabletTouches, seeds: tuple[int, ...]) -> tuple[tuple[Reproduced, ...], Cost]:
+    """Tables 7, 8, 10, 11: stage 2 starts from the printed stage 1, as theirs did but for the rounding."""
+    found = []
+    begin = time.perf_counter()
+    fast: dict[tuple[Model, int], tuple[StageResult, float]] = {}
+    for model in MODELS:
+        for stage in (1, 2):
+            start = time.perf_counter()
+            fit = (
+                tablet_stage1(touches, model)
+                if stage == 1
+                else tablet_stage2(touches, STAGE_1[model].parameters, model)
+            )
+            fast[model, stage] = fit, time.perf_counter() - start
+    four_fits = time.perf_counter() - begin
+    for (model, stage), (fit, seconds) in fast.items():
+        start = time.perf_counter()
+        evolved = tuple(_evolved(touches, model, stage, seed) for seed in seeds)
+        found.append(
+            Reproduced(model, stage, fit, evolved, seconds, (time.perf_counter() - start) / max(len(seeds), 1))
+        )
+    return tuple(found), Cost(four_fits, *evaluation_seconds(touches))
+
+
+def _evolved(touches: TabletTouches, model: Model, stage: int, seed: int) -> StageResult:
+    if stage == 1:
+        return tablet_stage1(touches, model, minimiser=lambda r, search: evolve(r, search, seed))
+    return tablet_stage2(
+        touches, STAGE_1[model].parameters, model, minimiser=lambda r, search: evolve(r, search, seed, 200, 1000)
+    )
+
+
+def evaluation_seconds(touches: TabletTouches) -> tuple[float, float]:
+    """Seconds of one evaluation of Eq. 17, alone and as one of 10,000 at once (medians)."""
+    x = STAGE_1["htm"].parameters[None]
+    crowd = np.repeat(x, PUBLISHED_POPULATION, axis=0)
+
+    def objective(parameters: Array) -> Array:
+        r = stage1_residuals(touches, parameters, "htm", Sign.PRINTED)
+        return np.asarray(np.sqrt((r**2).sum(axis=2)).sum(axis=1) / 9.0)
+
+    return median_seconds(lambda: objective(x), 300), median_seconds(lambda: objective(crowd), 5) / len(crowd)
+
+
+def median_seconds(work: Callable[[], object], repeats: int) -> float:
+    """Median of the wall-clock seconds that the work takes."""
+    work()
+    taken = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - start)
+    return float(np.median(taken))
+
+
+def dh_by_eq_20(touches: TabletTouches) -> dict[str, Fitness]:
+    """The printed DH parameters under Eq. 20 as written and as computed, and the optimum of the written one."""
+    x = STAGE_1["dh"].parameters
+    return {
+        "printed parameters, translation added to the error": fitness(stage1_residuals(touches, x, "dh", Sign.PRINTED)),
+        "printed parameters, Eq. 20 as written": fitness(stage1_residuals(touches, x, "dh", Sign.PRINTED, False)),
+        "optimum, Eq. 20 as written": tablet_stage1(touches, "dh", dh_offset_in_error=False).fitness,
+    }
+
+
+def compare_signs(touches: TabletTouches) -> tuple[SignRow, ...]:
+    """The camera-free test: tablet points, moved by the touching error with each sign, against the hand positions."""
+    n, rows = len(touches.hand_m), []
+    for sign in Sign:
+        points = touches.pitch_m * (touches.landmark_px - sign * touches.delta_px)
+
+        def error(keep: NDArray[np.bool_], free: bool, p: Array = points) -> Array:
+            x = fit_plane_motion(p[keep], touches.hand_m[keep], touches.theta_rad[keep], free)
+            return hand_over(x, p, touches.theta_rad) - touches.hand_m
+
+        every = np.ones(n, dtype=bool)
+        left_out = [np.linalg.norm(error(np.arange(n) != i, True)[i]) for i in range(n)]
+        rigid, scaled = (1e3 * float(np.sqrt((error(every, free) ** 2).mean())) for free in (False, True))
+        rows.append(SignRow(sign, rigid, scaled, 1e3 * float(np.mean(left_out))))
+    return tuple(rows)
+
+
+def compare_models(touches: TabletTouches) -> tuple[ModelRow, ...]:
+    """Leave one landmark out, published data, hand error; each model against the target of its own sign."""
+    n, rows = len(touches.hand_m), []
+    for sign in (Sign.PRINTED, Sign.CORRECTED):
+        own = two_stage_errors(touches, np.ones(n, dtype=bool), sign)
+        left_out = np.array([np.array(two_stage_errors(touches, np.arange(n) != i, sign))[:, i] for i in range(n)])
+        for k, (stages, unknowns) in enumerate((("1", 12), ("1 + 2", 22))):
+            title = f"paper, stage {stages}, sign {'as printed' if sign < 0 else 'corrected'}"
+            rows.append(_model_row(title, unknowns, own[k], left_out[:, k]))
+    planar = fit_planar(touches, PlanarConfig(free_scale=True))
+    rows.append(_model_row("PnP, similarity, pen", 6 + 6, planar.residuals_m, planar.leave_one_out_m))
+    linear = fit_linear(touches)
+    rows.append(_model_row("closed form", 6, linear.residuals_m, linear.leave_one_out_m))
+    return tuple(rows)
+
+
+def two_stage_errors(touches: TabletTouches, keep: NDArray[np.bool_], sign: Sign) -> tuple[Array, Array]:
+    """Hand errors (n, 2) m of the paper's stage 1 and of both its stages, fitted to some landmarks, at all of them,
+    against their own r' (Eq. 20)."""
+    fitted = touches.pick(keep)
+    first, second = _two_stages(fitted, sign)
+    target = touches.hand_m + 1e-3 * sign * place_landmarks(touches, first, "htm").correction[0]
+    asked = (
+        hand_to_touch(fitted, first, affine, touches.uv_px, touches.depth_m, touches.theta_rad)
+        for affine in (None, second)
+    )
+    of_one, of_both = (np.asarray(a - target) for a in asked)
+    return of_one, of_both
+
+
+def _two_stages(touches: TabletTouches, sign: Sign) -> tuple[Array, Array]:
+    first = tablet_stage1(touches, "htm", sign).parameters
+    return first, tablet_stage2(touches, first, "htm", sign).parameters
+
+
+def _model_row(name: str, unknowns: int, own: Array, left_out: Array) -> ModelRow:
+    distance = 1e3 * np.linalg.norm(left_out, axis=1)
+    in_sample = 1e3 * float(np.linalg.norm(own, axis=1).mean())
+    return ModelRow(name, unknowns, in_sample, float(distance.mean()), float(distance.max()))
+
+
+def held_out(seed: int, trials: int, published_trials: int) -> tuple[HeldOutRow, ...]:
+    """Every model on simulated trials, at 16 queries each that it did not see; the paper's scheme on the first few."""
+    made = [simulate_trial((seed, k)) for k in range(trials)]
+    few = made[:published_trials]
+
+    def two_stage(sign: Sign) -> Callable[[TabletTrial], Array]:
+        def asked(t: TabletTrial) -> Array:
+            first, second = _two_stages(t.touches, sign)
+            return hand_to_touch(t.touches, first, second, t.query_uv_px, t.query_depth_m, t.query_theta_rad)
+
+        return asked
+
+    def linear(t: TabletTrial) -> Array:
+        return fit_linear(t.touches).hand_to_touch(t.query_rays, t.query_theta_rad)
+
+    def planar(step_m: float) -> Callable[[TabletTrial], Array]:
+        def asked(t: TabletTrial) -> Array:
+            fit = fit_planar(t.touches, PlanarConfig(step_m=step_m), leave_one_out=False)
+            return fit.hand_to_touch(t.query_rays, t.query_theta_rad)
+
+        return asked
+
+    return (
+        _held_out_row("paper, both stages, sign as printed", few, two_stage(Sign.PRINTED)),
+        _held_out_row("paper, both stages, sign corrected", few, two_stage(Sign.CORRECTED)),
+        _held_out_row("closed form", made, linear),
+        _held_out_row("PnP, rigid, pen: least squares", made, planar(0.0)),
+        _held_out_row("PnP, rigid, pen: hands rounded to 1 mm", made, planar(1e-3)),
+    )
+
+
+def _held_out_row(name: str, trials: list[TabletTrial], asked: Callable[[TabletTrial], Array]) -> HeldOutRow:
+    errors = [np.linalg.norm(asked(t) - t.query_hand_m, axis=1).mean() for t in trials]
+    return HeldOutRow(name, len(trials), 1e3 * float(np.mean(errors)))
+
+
+@command("benchmark tablet", short_help="Time the tablet calibrations and the published search.")
+def benchmark_tablet(call: Call) -> Mapping[str, object]:
+    """Time each tablet calibration and compare it with the published search."""
+    folder = call.folder("benchmark", "tablet")
+    found = times(call.seed, call.progress)
+    write_json(folder / "benchmark.json", found)
+    return found
+
+
+def times(seed: int, progress: Progress) -> dict[str, object]:
+    """Time every calibration on the published data (closed form also on a simulated trial)."""
+    touches = published_touches()
+    progress("closed form", 0.0)
+    rays, hand, theta = touched_rays(touches).T.copy(), touches.hand_m.T.copy(), touches.theta_rad
+    closed = median_seconds(lambda: solve_closed_form(rays, hand, theta), 5000)
+    trial = simulate_trial((seed, 0)).touches
+    other = touched_rays(trial).T.copy(), trial.hand_m.T.copy(), trial.theta_rad
+    simulated = median_seconds(lambda: solve_closed_form(*other), 5000)
+    checked = median_seconds(lambda: fit_linear(touches), 500)
+    progress("PnP", 0.3)
+    config = PlanarConfig(free_scale=True)
+    planar = median_seconds(lambda: fit_planar(touches, config, leave_one_out=False), 100)
+    progress("two stages", 0.5)
+    stage1 = tablet_stage1(touches)
+    two_stages = median_seconds(lambda: tablet_stage2(touches, tablet_stage1(touches).parameters), 3)
+    alone, crowd = evaluation_seconds(touches)
+    published = PUBLISHED_EVALUATIONS * alone
+    return {
+        "state": "done",
+        "closed_form_us": 1e6 * closed,
+        "closed_form_simulated_us": 1e6 * simulated,
+        "closed_form_checked_us": 1e6 * checked,
+        "pnp_us": 1e6 * planar,
+        "two_stages_s": two_stages,
+        "stage_1_evaluations": stage1.evaluations,
+        "evaluation_us": 1e6 * alone,
+        "evaluation_in_crowd_us": 1e6 * crowd,
+        "published_search_extrapolated_s": published,
+        "published_search_in_crowds_extrapolated_s": PUBLISHED_EVALUATIONS * crowd,
+        "closed_form_times_faster": published / closed,
+        "two_stages_times_faster": 2.0 * published / two_stages,
+        "closed_form_in_evaluations": closed / alone,
+    }
+
 
 PUBLISHED_TRIALS = 20
 # What the reproduction must reach: mm, seconds
@@ -178,8 +459,7 @@ def _table(r: Reproduced) -> dict[str, object]:
 def sign_residuals(touches: TabletTouches) -> bytes:
     """For each sign of Eq. 20: the nine hand positions, and by how much a similarity of the tablet and a pen miss
     them."""
-    picture = Figure(figsize=(9.6, 3.0), layout="constrained")
-    every = picture.subplots(1, 3, sharex=True, sharey=True)
+    picture, every = subplots(9.6, 3.0, 1, 3, sharex=True, sharey=True)
     for axes, sign in zip(every, Sign, strict=True):
         points = touches.pitch_m * (touches.landmark_px - sign * touches.delta_px)
         x = fit_plane_motion(points, touches.hand_m, touches.theta_rad, free_scale=True)
@@ -190,8 +470,7 @@ def sign_residuals(touches: TabletTouches) -> bytes:
         axes.plot(*hand.T, "o", color="black", ms=3)
         rms = float(np.sqrt((e**2).mean()))
         axes.set_title(f"{SIGN_WORDS[sign]}: {rms:.2f} mm per axis", fontsize=10)
-        axes.set_aspect("equal")
-        axes.set_xlabel("hand x, mm")
+        axes.set(aspect="equal", xlabel="hand x, mm")
         axes.margins(0.15)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)

@@ -9,8 +9,7 @@ import numpy as np
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress
 from weldcal.tools.worlds.weld.budgets import NOMINAL
-from weldcal.tools.worlds.weld.case import WeldCase, run_case, study_config
-from weldcal.tools.worlds.weld.metrics import RunMetrics, judge
+from weldcal.tools.worlds.weld.case import RunMetrics, WeldCase, judge, run_case, study_config
 from weldcal.tools.worlds.weld.plant import StudyRun, simulate
 from weldcal.tools.worlds.weld.seams import TrueSeam, get_seam
 from weldcal.welding.seam.curve import SeamCurve

@@ -14,8 +14,7 @@ from weldcal.tools.console import Progress
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.plots_weld import WeldTrace, along_the_weld, paths
 from weldcal.tools.report.render import fixed, write_atomic
-from weldcal.tools.studies.harness import RUNS, Figures, Measured, Study
-from weldcal.tools.studies.targets import Target, verdict
+from weldcal.tools.studies.harness import RUNS, Figures, Measured, Study, Target, verdict
 from weldcal.tools.studies.weld.rows import (
     CHORDS,
     COMPARED,
@@ -28,8 +27,7 @@ from weldcal.tools.studies.weld.rows import (
     run_cases,
     run_turn,
 )
-from weldcal.tools.worlds.weld.case import WeldCase, study_config
-from weldcal.tools.worlds.weld.metrics import RunMetrics
+from weldcal.tools.worlds.weld.case import RunMetrics, WeldCase, study_config
 from weldcal.tools.worlds.weld.plant import COLUMNS, PHASES, StudyRun
 from weldcal.welding.record.process import path_error, speed_along
 from weldcal.welding.seam.chord_map import chord_map

@@ -27,10 +27,10 @@ class MadePart:
 
     name: str
     shape: Any
-    joint: str
     line_mm: Floats
     length_mm: float
-    opening_deg: float
+    joint: str = "fillet"
+    opening_deg: float = 90.0
     up: tuple[float, float, float] | None = None
 
     def write(self, folder: Path) -> tuple[Path, Path]:
@@ -185,14 +185,7 @@ def pipe_on_plate() -> MadePart:
     pipe = less(cylinder((0, 0, -1), 80.0, 61.0), cylinder((0, 0, -2), 72.0, 70.0))
     shape = fused(box((-120, -120, -12), (240, 240, 12)), pipe)
     line = _arc(80.0, math.radians(-150.0), math.radians(-30.0), 0.0)
-    return MadePart(
-        name="pipe_on_plate",
-        shape=shape,
-        joint="fillet",
-        line_mm=line,
-        length_mm=80.0 * math.radians(120.0),
-        opening_deg=90.0,
-    )
+    return MadePart(name="pipe_on_plate", shape=shape, line_mm=line, length_mm=80.0 * math.radians(120.0))
 
 
 def box_corner() -> MadePart:
@@ -203,13 +196,7 @@ def box_corner() -> MadePart:
     )
     line = _straight((-90, 0, -10), (90, 0, -10))
     return MadePart(
-        name="box_corner",
-        shape=shape,
-        joint="v_groove",
-        line_mm=line,
-        length_mm=180.0,
-        opening_deg=90.0,
-        up=(0.0, -1.0, 1.0),
+        name="box_corner", shape=shape, joint="v_groove", line_mm=line, length_mm=180.0, up=(0.0, -1.0, 1.0)
     )
 
 
@@ -217,14 +204,7 @@ def bracket() -> MadePart:
     """An angle bracket with two holes and a gusset beyond the seam's end."""
     shape = fused(box((-80, -50, -10), (160, 100, 10)), box((-80, 20, 0), (160, 10, 60)))
     shape = less(shape, cylinder((-40, -25, -20), 8.0, 40.0), cylinder((40, -25, -20), 8.0, 40.0))
-    return MadePart(
-        name="bracket",
-        shape=shape,
-        joint="fillet",
-        line_mm=_straight((-80, 20, 0), (80, 20, 0)),
-        length_mm=160.0,
-        opening_deg=90.0,
-    )
+    return MadePart(name="bracket", shape=shape, line_mm=_straight((-80, 20, 0), (80, 20, 0)), length_mm=160.0)
 
 
 def bent_sheet() -> MadePart:
@@ -246,39 +226,20 @@ def bent_sheet() -> MadePart:
     a = np.linspace(-math.asin(80.0 / 300.0), math.asin(80.0 / 300.0), 33)
     line = np.column_stack([300.0 * np.sin(a), np.full(len(a), -4.0), 300.0 * np.cos(a)]) - [0.0, 0.0, 300.0]
     return MadePart(
-        name="bent_sheet",
-        shape=moved(shape, (0, 0, -300)),
-        joint="fillet",
-        line_mm=line,
-        length_mm=600.0 * math.asin(80.0 / 300.0),
-        opening_deg=90.0,
+        name="bent_sheet", shape=moved(shape, (0, 0, -300)), line_mm=line, length_mm=600.0 * math.asin(80.0 / 300.0)
     )
 
 
 def lap() -> MadePart:
     """A sheet of 6 mm on another: the seam runs along the upper sheet's edge."""
     shape = assembly(box((-100, -80, -6), (200, 100, 6)), box((-100, 0, 0), (200, 80, 6)))
-    return MadePart(
-        name="lap",
-        shape=shape,
-        joint="lap",
-        line_mm=_straight((-100, 0, 0), (100, 0, 0)),
-        length_mm=200.0,
-        opening_deg=90.0,
-    )
+    return MadePart(name="lap", shape=shape, joint="lap", line_mm=_straight((-100, 0, 0), (100, 0, 0)), length_mm=200.0)
 
 
 def straight_web() -> MadePart:
     """A T of a plate and a web of 10 mm, one solid."""
     shape = fused(box((-100, -60, -10), (200, 120, 10)), box((-100, -5, 0), (200, 10, 50)))
-    return MadePart(
-        name="straight_web",
-        shape=shape,
-        joint="fillet",
-        line_mm=_straight((-100, -5, 0), (100, -5, 0)),
-        length_mm=200.0,
-        opening_deg=90.0,
-    )
+    return MadePart(name="straight_web", shape=shape, line_mm=_straight((-100, -5, 0), (100, -5, 0)), length_mm=200.0)
 
 
 def curved_web() -> MadePart:
@@ -287,9 +248,7 @@ def curved_web() -> MadePart:
     web = turned([(190, 0, -1), (200, 0, -1), (200, 0, 45), (190, 0, 45)], (0, 0, 0), (0, 0, 1), 2.0 * half)
     shape = fused(box((130, -100, -10), (120, 200, 10)), turned_about_z(web, -half))
     line = _arc(200.0, -half, half, 0.0)
-    return MadePart(
-        name="curved_web", shape=shape, joint="fillet", line_mm=line, length_mm=400.0 * half, opening_deg=90.0
-    )
+    return MadePart(name="curved_web", shape=shape, line_mm=line, length_mm=400.0 * half)
 
 
 def butt() -> MadePart:
@@ -309,14 +268,7 @@ def butt() -> MadePart:
 def two_solids() -> MadePart:
     """A T as an assembly: the web rests on the plate as a body of its own."""
     shape = assembly(box((-90, -60, -10), (180, 120, 10)), box((-90, 0, 0), (180, 8, 60)))
-    return MadePart(
-        name="two_solids",
-        shape=shape,
-        joint="fillet",
-        line_mm=_straight((-90, 0, 0), (90, 0, 0)),
-        length_mm=180.0,
-        opening_deg=90.0,
-    )
+    return MadePart(name="two_solids", shape=shape, line_mm=_straight((-90, 0, 0), (90, 0, 0)), length_mm=180.0)
 
 
 def bevelled_plates() -> MadePart:

@@ -20,7 +20,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.drivers.ur.wire.dashboard import ask
+from weldcal.systems.drivers.ur.wire.line import ask
 from weldcal.systems.drivers.ur.wire.transport import NATIVE
 from weldcal.systems.pacing import real_time_priority
 from weldcal.tools.emulators.ur.main import HOME

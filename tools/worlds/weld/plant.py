@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.tools.worlds.weld.budgets import Budget, planned_seam, roughness
+from weldcal.tools.worlds.weld.budgets import Budget, WeldUnknowns, draw_world, planned_seam, roughness
 from weldcal.tools.worlds.weld.groove import DROP_M, SEAT_M, Groove, TipPlace
 from weldcal.tools.worlds.weld.seams import TrueSeam
-from weldcal.tools.worlds.weld.unknowns import WeldUnknowns, draw_world
 from weldcal.welding.numerics import Array, norm
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.feel_start import with_touch_place

@@ -129,7 +129,7 @@ def _finish(
         raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
     pitch = groove.pitch_m
     refuse_gap(f, line, slices, profile, config.steepest_wall_rad)
-    first, last, gaps = seen_extent(f, line, profile, slices, groove)
+    first, last, gaps = measured_extent(f, line, profile, slices, groove)
     gaps = [_unmeasured(gap, slices) for gap in gaps]
     if groove.closed:
         first, last = 0.0, line.length
@@ -284,7 +284,7 @@ def _close(line: Floats, over: int = 8) -> None:
     line[-over:] += share[::-1] * gap
 
 
-def seen_extent(
+def measured_extent(
     f: Floats, line: SmoothLine, profile: Profile, slices: Slices, groove: CoarseGroove
 ) -> tuple[float, float, list[tuple[float, float]]]:
     """Arc lengths where the groove begins and ends, and the gaps in between that were not seen."""

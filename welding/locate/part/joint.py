@@ -235,7 +235,7 @@ class FitUp:
 
 
 FIT_UP = {"gap": ("mm", 1e3), "misalignment": ("mm", 1e3), "angle": ("deg", 180.0 / math.pi)}
-"""The quantities of a fit-up, with the unit in which a person reads them."""
+"""The quantities of a fit-up, with the unit in which an operator reads them."""
 
 
 SHOWN_BY = {"butt": tuple(FIT_UP), "v_groove": ("angle",), "fillet": ("gap", "angle"), "lap": ("gap",)}

@@ -3,9 +3,13 @@
 import dataclasses as dc
 
 from weldcal.systems.drivers.sensors.acquisition import Source
-from weldcal.systems.drivers.sensors.genicam.components import get_profile, picture_of
-from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
-from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
+from weldcal.systems.drivers.sensors.genicam.device import (
+    Component,
+    GenicamDevice,
+    GenicamSource,
+    get_profile,
+    picture_of,
+)
 from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_camera
 from weldcal.systems.drivers.sensors.wired_camera import (

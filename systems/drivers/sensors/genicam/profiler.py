@@ -4,9 +4,14 @@ import dataclasses as dc
 import math
 
 from weldcal.systems.drivers.sensors.acquisition import Source
-from weldcal.systems.drivers.sensors.genicam.components import UNIT_SCALING, get_profile, profile_of
-from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
-from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
+from weldcal.systems.drivers.sensors.genicam.device import (
+    UNIT_SCALING,
+    Component,
+    GenicamDevice,
+    GenicamSource,
+    get_profile,
+    profile_of,
+)
 from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_profiler import (

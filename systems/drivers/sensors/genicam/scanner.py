@@ -3,9 +3,13 @@
 import dataclasses as dc
 
 from weldcal.systems.drivers.sensors.acquisition import Source
-from weldcal.systems.drivers.sensors.genicam.components import cloud_of, get_profile
-from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
-from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
+from weldcal.systems.drivers.sensors.genicam.device import (
+    Component,
+    GenicamDevice,
+    GenicamSource,
+    cloud_of,
+    get_profile,
+)
 from weldcal.systems.drivers.sensors.own_process import SourceProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud

@@ -14,7 +14,7 @@ GRAVITY_OUTPUT = "target_gravity"
 MOUNTING_TOLERANCE_RAD = float(np.deg2rad(5.0))  # a mounting is set in whole degrees, and meant within a few
 # A pendant shows hundredths of a kilogram and millimetres; a weighed tool is known no better than this.
 MASS_TOLERANCE_KG = 0.05
-COG_TOLERANCE_M = 0.005
+COG_TOLERANCE_M = 0.005  # as many steps of the display: 0.5 N m at 10 kg
 
 # whether it is right, what was found, and the operator action where it is not
 Finding = tuple[bool, str, str]

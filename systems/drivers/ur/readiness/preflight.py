@@ -33,9 +33,19 @@ from weldcal.systems.drivers.ur.readiness.load import (
     mounting_finding,
     payload_finding,
 )
-from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, SET_POINTS, UPPER_OFFSET, ranges, register_names
-from weldcal.systems.drivers.ur.wire.dashboard import ask
-from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
+from weldcal.systems.drivers.ur.wire.line import ask
+from weldcal.systems.drivers.ur.wire.rtde_client import (
+    DOUBLES,
+    IN_USE,
+    NOT_FOUND,
+    RTDE_PORT,
+    SET_POINTS,
+    UPPER_OFFSET,
+    RtdeProbe,
+    Value,
+    ranges,
+    register_names,
+)
 
 POLYSCOPE_X = 10
 OLDEST_5, OLDEST_X = (5, 12), (10, 10)
@@ -70,11 +80,11 @@ WAITS_FOR = {
 
 
 RUNNING, NORMAL, REDUCED, STOPPED = 7, 1, 2, 1
-FULL_SPEED = 0.99
-TCP_ZERO = 1e-6
+FULL_SPEED = 0.99  # a choice: full but for rounding; a slider at 98 % is reported
+TCP_ZERO = 1e-6  # m or rad: rounding; a pendant sets steps of 0.01 mm
 LOCAL = "LOCAL"
 LIMIT_MARGIN_RAD = float(np.deg2rad(5.0))
-REST_RAD_S = 0.005
+REST_RAD_S = 0.005  # a choice: 0.3 deg/s; a jogged arm turns at some deg/s, and twice as much would still find it
 
 CHECKS = (
     "answer",

@@ -1,4 +1,4 @@
-"""A small RTDE client: reads selected outputs once, checks whether inputs are free, and writes claimed inputs.
+"""A small RTDE client: reads outputs once, checks whether inputs are free, and writes the registers it claims.
 
 Packages of protocol version 2 are big endian: uint16 size (header included), uint8 type, payload.
 """
@@ -16,8 +16,8 @@ from weldcal.systems.drivers.ur.wire.line import SocketLine
 
 RTDE_PORT = 30004
 IN_USE, NOT_FOUND = "IN_USE", "NOT_FOUND"
-FREQUENCY_HZ = 125.0
-SLOWEST_HZ = 1.0
+FREQUENCY_HZ = 125.0  # the rate of CB3, which every controller has; values are read once
+SLOWEST_HZ = 1.0  # a choice: the slowest whole rate; nothing reads these packages
 PROTOCOL_VERSION = 2
 MAX_NAMES_BYTES = 2048
 
@@ -36,6 +36,9 @@ CODES = {
 }
 
 Value = float | int | bool | tuple[float, ...] | tuple[int, ...]
+# The command and its numbers, from register 0 or (upper registers) 24 on.
+# Two more numbers are the set points of the power source, where they are wired.
+INTEGERS, DOUBLES, SET_POINTS, UPPER_OFFSET = 1, 8, 2, 24
 
 
 class NotFinite(RobotUnreachable):
@@ -197,3 +200,24 @@ def _groups(names: Sequence[str]) -> list[list[str]]:
             size = len(name) + 1
         groups[-1].append(name)
     return [group for group in groups if group]
+
+
+def register_names(offset: int, doubles: int = DOUBLES) -> list[str]:
+    """The names, from a register on."""
+    integers = [f"input_int_register_{i}" for i in range(offset, offset + INTEGERS)]
+    return integers + [f"input_double_register_{i}" for i in range(offset, offset + doubles)]
+
+
+def ranges(names: list[str]) -> str:
+    """Register names as ranges, such as: int 24-31, double 24-41."""
+    parts = []
+    for kind in ("int", "double"):
+        numbers = sorted(int(name.rpartition("_")[2]) for name in names if name.startswith(f"input_{kind}_"))
+        runs: list[list[int]] = []
+        for number in numbers:
+            if runs and number == runs[-1][-1] + 1:
+                runs[-1].append(number)
+            else:
+                runs.append([number])
+        parts += [f"{kind} {run[0]}" + (f"-{run[-1]}" if len(run) > 1 else "") for run in runs]
+    return ", ".join(parts)

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
 
-from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET
-from weldcal.systems.drivers.ur.torch.set_points import ANALOG, MASK, VALUE, Level, OffSwitch
-from weldcal.systems.drivers.ur.wire.dashboard import SCRIPT_PORT
-from weldcal.systems.drivers.ur.wire.line import SocketLine
-from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, RtdeProbe
+from weldcal.systems.drivers.ur.set_points import ANALOG, MASK, VALUE, Level, OffSwitch
+from weldcal.systems.drivers.ur.wire.line import SCRIPT_PORT, SocketLine
+from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, UPPER_OFFSET, RtdeProbe
 from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream
 
 AUTO, NATIVE, UR_RTDE = "auto", "native", "ur_rtde"
@@ -18,8 +16,8 @@ AUTO, NATIVE, UR_RTDE = "auto", "native", "ur_rtde"
 NO_COMMAND, VELOCITY, SPEED_STOP, SET_PAYLOAD, STOP_SCRIPT = 0, 9, 15, 17, 255
 READY, DONE = 1, 2
 PLAYING = 2
-LINE_LIMIT_S = 2.0
-LOOK_S = 0.01
+LINE_LIMIT_S = 2.0  # a choice: a controller accepts within ms, or after a lost packet within 1 s
+LOOK_S = 0.01  # five frames of the controller: far shorter than an answer is awaited
 # On two cores jobs over ur_rtde had 115 of 50,702 velocities over 8 ms late, natively 6 of 50,376 (docs/hardware.md);
 # three were not tried.
 ENOUGH_CORES = 4

@@ -20,12 +20,14 @@ from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
 
 from weldcal.systems.drivers.ur.faults import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.torch.set_points import Level
+from weldcal.systems.drivers.ur.set_points import Level
 from weldcal.systems.drivers.ur.wire import transport
 from weldcal.systems.drivers.ur.wire.rtde_client import RTDE_PORT, NotFinite
 
 READS = 5  # of a state, until no package arrives meanwhile
+# a quarter of the controller's frame: a state is read at most so late; half of it doubles the wake-ups
 WAKES_S = 0.0005
+# a choice: the off is sent within a frame of 2 ms, and a pass of 4 ms must not wait for a lost link
 OFF_LIMIT_S = 0.005
 # What the library decodes, in its own type table, and how it is read; a name that it lacks would shift all that follow.
 GETTERS = {

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from weldcal.systems.drivers.sensors.cell_time import FollowedTime, HostTime
+from weldcal.systems.drivers.sensors.stamps import FollowedTime, HostTime
 
 
 def test_the_hosts_time_is_its_monotonic_clock() -> None:

@@ -17,8 +17,8 @@ import pytest
 from tests.systems.drivers.sensors.scripted import wait_until
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, DeviceFault
-from weldcal.systems.drivers.sensors.files.source import KEEP_ALIVE, LISTING_SHARE, FolderSource, NewFiles, TcpTrigger
 from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
+from weldcal.systems.drivers.sensors.folder_source import KEEP_ALIVE, LISTING_SHARE, FolderSource, NewFiles, TcpTrigger
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, acquire
 
 Start = Callable[..., Acquisition[Cloud]]

@@ -16,8 +16,14 @@ from numpy.typing import NDArray
 from tests.systems.drivers.sensors.scripted import wait_until
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, DeviceFault, DeviceLost, Garbage
-from weldcal.systems.drivers.sensors.genicam.components import cloud_of, get_profile, picture_of, profile_of, profiles
-from weldcal.systems.drivers.sensors.genicam.device import Component
+from weldcal.systems.drivers.sensors.genicam.device import (
+    Component,
+    cloud_of,
+    get_profile,
+    picture_of,
+    profile_of,
+    profiles,
+)
 from weldcal.systems.drivers.sensors.genicam.finger_camera import GenicamFingerCamera
 from weldcal.systems.drivers.sensors.genicam.profiler import GenicamProfiler, GenicamProfiles
 from weldcal.systems.drivers.sensors.genicam.scanner import GenicamClouds, GenicamScanner

@@ -10,8 +10,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from weldcal.systems.drivers.sensors.acquisition import AcquiredFrame, Acquisition
-from weldcal.systems.drivers.sensors.cell_time import HostTime
-from weldcal.systems.drivers.sensors.stamps import Stamp
+from weldcal.systems.drivers.sensors.stamps import HostTime, Stamp
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanStream
 from weldcal.systems.messages import ScanStream
 from weldcal.systems.wall_clock import WallClock

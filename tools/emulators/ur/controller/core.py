@@ -6,10 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.tools.emulators.ur.controller.events import ErrorCode, ScriptStopped, Started, Stopped
-from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, MotionRefused
-from weldcal.tools.emulators.ur.controller.registers import Registers
+from weldcal.tools.emulators.ur.controller.registers import (
+    ErrorCode,
+    Registers,
+    RobotMode,
+    RuntimeState,
+    SafetyMode,
+    ScriptStopped,
+    Started,
+    Stopped,
+)
 from weldcal.tools.emulators.ur.controller.state import POWER_STEP_S, ControllerState
 from weldcal.tools.emulators.ur.script.builtins import script_functions
 from weldcal.tools.emulators.ur.script.program import Program

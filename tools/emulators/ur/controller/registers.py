@@ -1,11 +1,127 @@
-"""Registers and terminals that RTDE and scripts read and write; values outlive programs."""
+"""What clients of the controller read and write: registers, terminals, modes as in RTDE, and events."""
 
+import enum
 from dataclasses import dataclass
 
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 N_NUMBERS = 48
 N_BITS = 128
+
+
+class RuntimeState(enum.IntEnum):
+    """What the program does."""
+
+    STOPPING = 0
+    STOPPED = 1
+    PLAYING = 2
+    PAUSING = 3
+    PAUSED = 4
+    RESUMING = 5
+
+
+class RobotMode(enum.IntEnum):
+    """What the arm's power does."""
+
+    NO_CONTROLLER = -1
+    DISCONNECTED = 0
+    CONFIRM_SAFETY = 1
+    BOOTING = 2
+    POWER_OFF = 3
+    POWER_ON = 4
+    IDLE = 5
+    BACKDRIVE = 6
+    RUNNING = 7
+    UPDATING_FIRMWARE = 8
+
+
+class SafetyMode(enum.IntEnum):
+    """What the safety system does."""
+
+    NORMAL = 1
+    REDUCED = 2
+    PROTECTIVE_STOP = 3
+    RECOVERY = 4
+    SAFEGUARD_STOP = 5
+    SYSTEM_EMERGENCY_STOP = 6
+    ROBOT_EMERGENCY_STOP = 7
+    VIOLATION = 8
+    FAULT = 9
+
+
+# as the dashboard names them; the order is the number that MasterboardData carries [M]
+OPERATIONAL_MODES = ("NONE", "MANUAL", "AUTOMATIC")
+MOVING = frozenset({SafetyMode.NORMAL, SafetyMode.REDUCED})
+_EMERGENCY = frozenset({SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP})
+POWERLESS = _EMERGENCY | {SafetyMode.VIOLATION, SafetyMode.FAULT}
+
+
+def safety_status_bits(mode: SafetyMode) -> int:
+    """RTDE's safety_status_bits: one bit a mode, bit 7 for any emergency stop, bit 10 for stopped due to safety."""
+    bits = 1 << (mode if mode >= SafetyMode.VIOLATION else mode - 1)
+    bits |= (mode in _EMERGENCY) << 7
+    return bits | (mode not in MOVING | {SafetyMode.RECOVERY}) << 10
+
+
+@dataclass(frozen=True)
+class Started:
+    """A program began; `text` is its name."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """A program ended; `text` is its name."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Text:
+    """textmsg."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Popup:
+    """A window on the pendant."""
+
+    text: str
+    title: str
+    warning: bool
+    error: bool
+    blocking: bool
+
+
+@dataclass(frozen=True)
+class ScriptStopped:
+    """A script that does not compile, or that stops at a mistake; line and column count from 1."""
+
+    text: str
+    line: int
+    column: int
+
+
+@dataclass(frozen=True)
+class ErrorCode:
+    """A numbered report such as C209A0; `level` is 1 information, 2 warning, 3 violation, 4 fault."""
+
+    code: int
+    argument: int
+    level: int
+    text: str
+
+
+@dataclass(frozen=True)
+class SafetyChanged:
+    """The safety mode has changed to the one with this number."""
+
+    mode: int
+
+
+Event = Started | Stopped | Text | Popup | ScriptStopped | ErrorCode | SafetyChanged
 
 
 class Registers:

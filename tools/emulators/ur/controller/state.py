@@ -8,12 +8,22 @@ from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
-from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
-from weldcal.tools.emulators.ur.controller.compliance import ElasticContact, ForceSensor
-from weldcal.tools.emulators.ur.controller.events import ErrorCode, Event, SafetyChanged
-from weldcal.tools.emulators.ur.controller.modes import MOVING, POWERLESS, RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.arm import ElasticContact, EmulatedArm, ForceSensor
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
-from weldcal.tools.emulators.ur.controller.registers import Payload, Registers, Terminals, Watchdog
+from weldcal.tools.emulators.ur.controller.registers import (
+    MOVING,
+    POWERLESS,
+    ErrorCode,
+    Event,
+    Payload,
+    Registers,
+    RobotMode,
+    RuntimeState,
+    SafetyChanged,
+    SafetyMode,
+    Terminals,
+    Watchdog,
+)
 from weldcal.tools.emulators.ur.versions import Version
 
 START_TIMESTAMP_S = 100.0  # a controller has been on for a while; some clients wait for more than 40 s

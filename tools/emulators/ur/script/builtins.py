@@ -11,14 +11,19 @@ from typing import Any
 
 from weldcal.tools.emulators.ur.controller.registers import register_index
 from weldcal.tools.emulators.ur.controller.state import ControllerState
-from weldcal.tools.emulators.ur.script.answers import CALCULATIONS, READS, REGISTERS, Answers
-from weldcal.tools.emulators.ur.script.dynamics import Dynamics
-from weldcal.tools.emulators.ur.script.forces import Forces
+from weldcal.tools.emulators.ur.script.answers import (
+    CALCULATIONS,
+    DIGITAL,
+    READS,
+    REGISTERS,
+    Answers,
+    TerminalFunctions,
+)
+from weldcal.tools.emulators.ur.script.arithmetic import TEXTS
+from weldcal.tools.emulators.ur.script.forces import Dynamics, Forces
 from weldcal.tools.emulators.ur.script.motions import Motions
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.sockets import Sockets
-from weldcal.tools.emulators.ur.script.terminals import DIGITAL, TerminalFunctions
-from weldcal.tools.emulators.ur.script.texts import TEXTS
 
 BLOCKING = frozenset(
     {

@@ -22,7 +22,7 @@ from weldcal.tools.emulators.ur.controller.poses import matrix
 from weldcal.tools.emulators.ur.script.answers import positive, six
 from weldcal.tools.emulators.ur.script.arithmetic import Pose
 from weldcal.tools.emulators.ur.script.compiler import Slices
-from weldcal.tools.emulators.ur.script.dynamics import mass_matrix
+from weldcal.tools.emulators.ur.script.forces import mass_matrix
 from weldcal.tools.emulators.ur.script.sockets import Sockets
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 

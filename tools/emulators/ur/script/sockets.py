@@ -8,13 +8,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from weldcal.tools.emulators.ur.controller.events import Popup, Text
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
-from weldcal.tools.emulators.ur.script.arithmetic import EFFORT, Effort
+from weldcal.tools.emulators.ur.controller.registers import Popup, Text
+from weldcal.tools.emulators.ur.script.arithmetic import EFFORT, Effort, text_of
 from weldcal.tools.emulators.ur.script.compiler import Slices
 from weldcal.tools.emulators.ur.script.forces import Forces
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
-from weldcal.tools.emulators.ur.script.texts import text_of
 
 OPEN_LIMIT_S = 0.02
 OPEN_FRAMES = 4  # [M] how long a connection takes
@@ -59,7 +58,7 @@ class Sockets(Forces):
     def popup(
         self, s: Any, title: str = "Popup", warning: bool = False, error: bool = False, blocking: bool = False
     ) -> Slices:
-        """One that blocks waits until a person closes it: the dashboard's `close popup`."""
+        """One that blocks waits until an operator closes it: the dashboard's `close popup`."""
         c = self._controller
         c.note(f"popup: {title}: {text_of(s)}")
         c.tell(Popup(text_of(s), text_of(title), warning, error, blocking))

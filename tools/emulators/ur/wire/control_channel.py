@@ -9,10 +9,10 @@ import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.checker import Checker
-from weldcal.tools.emulators.ur.controller.compliance import ElasticContact, ForceSensor
+from weldcal.tools.emulators.ur.controller.arm import ElasticContact, ForceSensor
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.controller.registers import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.lockstep import Lockstep
 from weldcal.tools.emulators.ur.wire.dashboard import IDLE_PROGRAM
 from weldcal.tools.emulators.ur.wire.net import Connection, LinkFaults, Network, Server

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.registers import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
 
 FIRST_IS_ONE = ("ur10e", *(name for name in CONTROLLER_MODELS if name != "ur10e"))
@@ -21,7 +21,7 @@ def serial_number(arm: str) -> str:
 
 
 class DashboardServer(Server):
-    """Commands that a person or a client may give."""
+    """Commands that an operator or a client may give."""
 
     kind = "dashboard"
 

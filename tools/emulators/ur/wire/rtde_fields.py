@@ -8,8 +8,13 @@ from typing import Any
 
 from weldcal.models.arms.kinematics import link_frames
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, safety_status_bits
-from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS
+from weldcal.tools.emulators.ur.controller.registers import (
+    N_BITS,
+    N_NUMBERS,
+    RobotMode,
+    RuntimeState,
+    safety_status_bits,
+)
 
 # struct codes (big endian) by RTDE type
 CODES = {

@@ -6,18 +6,21 @@ from collections.abc import Callable
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.dh import dh_parameters
-from weldcal.tools.emulators.ur.controller.events import (
+from weldcal.tools.emulators.ur.controller.poses import dh_parameters
+from weldcal.tools.emulators.ur.controller.registers import (
+    OPERATIONAL_MODES,
     ErrorCode,
     Event,
     Popup,
+    RobotMode,
+    RuntimeState,
     SafetyChanged,
+    SafetyMode,
     ScriptStopped,
     Started,
     Text,
 )
-from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
-from weldcal.tools.emulators.ur.script.lexer import split_programs
+from weldcal.tools.emulators.ur.script.parser import split_programs
 from weldcal.tools.emulators.ur.script.program import LONGEST_SCRIPT
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
 

@@ -11,13 +11,20 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
-from weldcal.calibration.eye_on_base.observations import FlangeObservations, corrected_observation, see_flanges
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, corrected_observation, fit_flanges
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published.algorithm1 import Algorithm1State, algorithm1_start, algorithm1_step
-from weldcal.calibration.published.icp import Verification, icp_error, make_verification, sight
+from weldcal.calibration.published.algorithm1 import (
+    Algorithm1State,
+    Verification,
+    algorithm1_start,
+    algorithm1_step,
+    icp_error,
+    make_verification,
+    sight,
+)
 from weldcal.calibration.published.pipeline import (
     Method,
     PublishedVerification,
@@ -214,7 +221,7 @@ def study_clouds(
 
 def read_material(data: Dataset, standard: FlangeStandard, seed: int) -> Material:
     """Fit every cloud both ways; clouds that either method refuses are left out of the comparison."""
-    seen = see_flanges(data, standard, seed=seed)
+    seen = fit_flanges(data, standard, seed=seed)
     good = {o.id: o for o in seen.observations}
     clouds = {id: data.cloud(id) for id in data.clouds if id in good}
     circles, faces, _ = find_centres(clouds, seed=seed)

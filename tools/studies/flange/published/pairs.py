@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import k_fold, position_errors
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid_sets
+from weldcal.calibration.geometry.se3 import fit_rigid_sets
 from weldcal.calibration.published.pipeline import all_pairs
 from weldcal.models.arrays import Array
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_all_rigid_sets
+from weldcal.calibration.geometry.se3 import fit_all_rigid_sets
 from weldcal.models.arrays import Array
 from weldcal.tools.console import Progress
 

@@ -1,1 +1,0 @@
-"""Tracks a link of the arm in scans taken in motion, by a model of its surface."""

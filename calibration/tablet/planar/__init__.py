@@ -1,1 +1,0 @@
-"""Tablet calibration from touches that move in the tablet's plane."""

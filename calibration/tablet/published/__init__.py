@@ -1,1 +1,0 @@
-"""The two-stage calibration of the tablet paper."""

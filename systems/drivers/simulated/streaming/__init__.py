@@ -1,1 +1,0 @@
-"""Scanners that stream, in simulation."""
