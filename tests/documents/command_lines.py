@@ -42,7 +42,6 @@ SHORT = (
     ),
     (r"(benchmark hand-eye) --data \S+", r"\1 --quick"),
     (r"(benchmark hand-eye --what mountings)( --light)?.* --runs.*", r"\1\2 --runs 1 --scenario eye_on_base"),
-    (r"benchmark robot-faults$", "benchmark robot-faults --sequences 1 --seconds 5"),
     (r"benchmark robot$", "benchmark robot --minutes 0.2"),
     (r"(benchmark flange --what live) --seeds 12 --redraws 200", r"\1 --seeds 1 --redraws 5 --scans 4"),
     (r"(benchmark flange --what honesty) --runs 500", r"\1 --runs 10"),

@@ -333,8 +333,8 @@ def test_variables_of_a_server_are_set_and_read() -> None:
 
 
 def named_on_the_page(mark: str) -> list[str]:
-    """The names in the block after a mark of docs/ur_emulator.md."""
-    page = (ROOT / "docs" / "ur_emulator.md").read_text()
+    """The names in the block after a mark of docs/reference/urscript_functions.md."""
+    page = (ROOT / "docs" / "reference" / "urscript_functions.md").read_text()
     return page.partition(f"<!-- {mark} -->\n```text\n")[2].partition("```")[0].split()
 
 

@@ -101,8 +101,8 @@ def called(text: str) -> set[str]:
 
 
 def test_the_guard_calls_only_what_its_documentation_lists() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "robot_faults.md").read_text(encoding="utf-8")
-    section = text.partition("## What the guard script needs")[2].partition("\nThere are no threads")[0]
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "guard_script.md").read_text(encoding="utf-8")
+    section = text.partition("# What the guard script needs")[2].partition("\nThere are no threads")[0]
     rows = [row.split("|")[1] for row in section.splitlines() if row.startswith("| `")]
     listed = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     digital, analog = ({name for name in listed if kind in name} for kind in ("digital", "analog"))

@@ -144,7 +144,7 @@ def test_the_heat_is_summed_up_where_it_is_known() -> None:
 
 
 def test_every_column_is_in_the_document_with_its_unit_and_frame(repository: Path) -> None:
-    document = (repository / "docs" / "weld_log.md").read_text()
+    document = (repository / "docs" / "reference" / "weld_log_columns.md").read_text()
     for c in COLUMNS:
         assert re.search(rf"^\| `{c.name}` \| {re.escape(c.unit) or '-'} \| {c.frame or '-'} \| {re.escape(c.meaning)} \|$", document, re.M), c.name  # fmt: skip
 
