@@ -18,8 +18,8 @@ READY, DONE = 1, 2
 PLAYING = 2
 LINE_LIMIT_S = 2.0  # a choice: a controller accepts within ms, or after a lost packet within 1 s
 LOOK_S = 0.01  # five frames of the controller: far shorter than an answer is awaited
-# On two cores jobs over ur_rtde had 115 of 50,702 velocities over 8 ms late, natively 6 of 50,376 (`benchmark robot-jobs`);
-# three were not tried.
+# On two cores jobs over ur_rtde had 115 of 50,702 velocities over 8 ms late, natively 6 of 50,376
+# (`benchmark robot-jobs`); three were not tried.
 ENOUGH_CORES = 4
 
 
