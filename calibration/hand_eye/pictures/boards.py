@@ -202,11 +202,11 @@ def _check(kind: str, found: dict[str, Any], text: str) -> None:
             f"--board '{text[:60]}': the markers ({1e3 * found['inner']:g} mm) must be smaller than the squares."
         )
     if "dictionary" in found:
-        most = len(dictionary(found["dictionary"]).bytesList)
+        most, name = len(dictionary(found["dictionary"]).bytesList), found["dictionary"]
         needed = {"tag": found.get("id", 0) + 1, "charuco": grid[0] * grid[1] // 2}.get(kind, grid[0] * grid[1])
         if needed > most:
             raise DatasetError(
-                f"--board '{text[:60]}': the dictionary {found['dictionary']} has {most} markers of {needed} needed."
+                f"--board '{text[:60]}': the dictionary {name} has {most} markers, and {needed} are needed."
             )
 
 
