@@ -14,6 +14,7 @@ import tempfile
 import threading
 from collections import Counter
 from contextlib import redirect_stdout
+from functools import cache
 from inspect import CO_OPTIMIZED
 from pathlib import Path
 from types import FrameType
@@ -28,22 +29,23 @@ LAWS, DRIVER = "welding/servo/laws.py", "systems/drivers/ur/rtde.py"
 SCANS = 6
 
 
+@cache
+def _real(path: str) -> str:
+    """A file's path without links: an editable install imports the package through one."""
+    return os.path.realpath(path)
+
+
 class Calls:
     """The calls of functions of the package, by file below the project's root and name."""
 
     def __init__(self) -> None:
         self.found: Counter[tuple[str, str]] = Counter()
         self._root = f"{ROOT}/"
+        self._folders = tuple(f"{ROOT}/{name}/" for name in ("models", "calibration", "welding", "systems", "tools"))
 
     def __call__(self, frame: FrameType, event: str, _: Any) -> None:
-        path = frame.f_code.co_filename
-        if (
-            event == "call"
-            and frame.f_code.co_flags & CO_OPTIMIZED
-            and path.startswith(self._root)
-            and path.endswith(".py")
-            and "/tests/" not in path
-        ):
+        path = _real(frame.f_code.co_filename)
+        if event == "call" and frame.f_code.co_flags & CO_OPTIMIZED and path.startswith(self._folders):
             self.found[path.removeprefix(self._root), frame.f_code.co_qualname] += 1
 
     def start(self) -> None:
