@@ -156,7 +156,7 @@ class SetUpWorld(Protocol):
     def __call__(
         self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
     ) -> WorldSetup:
-        """Draw the furnishing with the run's random numbers."""
+        """Draw the job's objects with the run's random numbers."""
 
 
 def make_station(

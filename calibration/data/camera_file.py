@@ -18,7 +18,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import LARGEST_DOCUMENT, LARGEST_NUMBER, read_text
 
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "camk", "mtx", "m1", "m", "cammatrix", "intrinsic", "intrinsics",
-    "kmatrix", "matrix")  # fmt: skip
+           "kmatrix", "matrix")  # fmt: skip
 _DISTORTION = (
     "distortioncoefficients",
     "distortioncoeffs",

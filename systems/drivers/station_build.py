@@ -60,7 +60,7 @@ class StationBuild:
     present configuration.
 
     `parts` are further objects of the station, looked up by type: the simulated world, and the parts of a job's
-    furnishing. `closables` are closed with the station.
+    setup. `closables` are closed with the station.
     """
 
     builder: DiagramBuilder

@@ -78,8 +78,8 @@ def under_straightedge(X_BE: RigidTransform, width_m: float) -> Array:
 
 def box_mesh(center: list[float], size: list[float]) -> TriMesh:
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6,
-        4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
     return TriMesh(corners * size + center, np.array(faces))
 
 
