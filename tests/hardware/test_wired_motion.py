@@ -95,5 +95,7 @@ def test_the_monitor_finds_the_stand_that_the_world_knocks(
     assert found.report is not None
     moves = [(event.time_s - knocked, 1e3 * event.translation_m) for event in found.report.moves]
     assert len(moves) == 1, moves
-    assert abs(moves[0][0]) < 0.3, moves
+    # 0.3 s of the scanner's rate, in frames for the same reason
+    early, late = sorted((knocked, knocked + moves[0][0]))
+    assert ((frames > early) & (frames <= late)).sum() <= 3, (moves, frames)
     assert moves[0][1] == pytest.approx(KNOCK_MM, abs=0.3), moves
