@@ -180,12 +180,20 @@ def test_a_hand_eye_result_is_in_the_frame_that_is_given(tmp_path: Path, monkeyp
     assert published(tmp_path / "panda", monkeypatch)[0] == "panda_link8"
 
 
-def test_other_programs_results_are_exported_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("on_hand", "frame"), [(False, "base_link"), (True, "left_tool0")])
+def test_the_frame_that_another_program_names_is_the_parent(
+    on_hand: bool, frame: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     q = X_C.rotation().ToQuaternion()
     numbers = dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), (*X_C.translation(), *q.wxyz()), strict=True))
-    text = {"parameters": {"calibration_type": "eye_on_base"}, "transform": {k: float(v) for k, v in numbers.items()}}
+    frames = {"robot_base_frame": "base_link", "robot_effector_frame": "left_tool0"}
+    text = {
+        "parameters": {"eye_on_hand": on_hand, **frames},
+        "transformation": {k: float(v) for k, v in numbers.items()},
+    }
     (tmp_path / "found.yaml").write_text(json.dumps(text))
-    export(tmp_path / "found.yaml", "--ros2", tmp_path, "--parent", "base_link")
+    export(tmp_path / "found.yaml", "--ros2", tmp_path, "--robot", "ur5e")
+    assert published(tmp_path, monkeypatch)[0] == frame
     assert np.allclose(published(tmp_path, monkeypatch)[2], X_C.GetAsMatrix4(), atol=1e-8)
 
 
@@ -269,6 +277,15 @@ def test_what_a_result_does_not_say_is_asked_for(tmp_path: Path) -> None:
     bare = (tmp_path / "X.txt", "--robot", "ur10e", "--drake-directives", tmp_path / "a.yaml")
     assert "does not name the mounting" in export(*bare, code=1)
     assert "ends in .dmd.yaml" in export(unnamed, "--drake-directives", tmp_path / "a.xml", code=1)
+
+
+def test_a_pose_of_another_link_needs_its_parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = hand_eye(tmp_path / "hand_eye.yaml", "eye_on_arm_target_on_base", "X_LC")
+    assert "does not name the mounting" in export(result, "--ros2", tmp_path / "ros", code=1)
+    export(result, "--ros2", tmp_path / "ros", "--parent", "forearm_link")
+    parent, _, X = published(tmp_path / "ros", monkeypatch)
+    assert parent == "forearm_link"
+    assert np.allclose(X, X_C.GetAsMatrix4(), atol=1e-8)
 
 
 def test_earlier_files_stay_unless_overwritten(tmp_path: Path) -> None:

@@ -79,6 +79,7 @@ class ExportedPose:
         file: the file that states it.
         document: the file's content where it is a YAML or JSON mapping, else empty.
         robot: name of the robot, or empty.
+        frame: the tf frame that the file states the pose in, as easy_handeye2 writes it, or empty.
     """
 
     X: RigidTransform
@@ -86,6 +87,7 @@ class ExportedPose:
     file: Path
     document: Mapping[str, Any]
     robot: str
+    frame: str = ""
 
     def notes(self) -> tuple[str, ...]:
         """Sentences for a user of the pose alone."""
@@ -215,6 +217,8 @@ def read_pose(result: Path, robot: str | None, pose: str | None) -> ExportedPose
     document = read_document(file) if file.suffix.lower() in (".yaml", ".yml", ".json") else {}
     document = document if isinstance(document, Mapping) else {}
     named = robot or str(document.get("robot") or "")
+    frames = document.get("parameters")
+    key = "robot_effector_frame" if given.mounting == "eye_in_hand" else "robot_base_frame"
     X = given.readings[0].X
     return ExportedPose(
         X=RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]),
@@ -222,6 +226,7 @@ def read_pose(result: Path, robot: str | None, pose: str | None) -> ExportedPose
         file=file,
         document=document,
         robot=get_robot(named).name if named and not named.lower().endswith(".urdf") else named,
+        frame=str(frames.get(key) or "") if isinstance(frames, Mapping) else "",
     )
 
 
@@ -268,6 +273,8 @@ def placed(
     what = "flange" if given.mounting == "eye_in_hand" else "base"
     if parent is None and not of_ros:
         return X, f"{ARM}{what}", ""
+    if parent is None and given.frame:
+        return X, given.frame, ""
     if parent is None:
         usual = frames[0] if frames else OTHER_FRAMES.get(given.robot, {}).get(given.mounting or "")
         if usual is None and given.robot and given.mounting:
