@@ -1,4 +1,4 @@
-"""`weldcal export`: writes a calibrated pose for ROS 2 (launch file, static transform, xacro) or as Drake directives."""
+"""Write a calibrated pose for ROS 2 (launch file, static transform, xacro) or as Drake directives: weldcal export."""
 
 import math
 import re
@@ -123,7 +123,7 @@ def export(
         option(
             "--parent",
             "FRAME",
-            "Frame that the pose is stated in. With --drake-directives: a frame of your own model, such as panda::panda_link0.",
+            "Frame that the pose is stated in. With --drake-directives: a frame of your own model: panda::panda_link0.",
             show_default="base_link or tool0",
         ),
     ] = None,
@@ -143,7 +143,7 @@ def export(
         bool,
         switch(
             "--from-controller/--from-tf",
-            "For a UR robot: where the poses of the calibration came from. The controller's base is turned to base_link.",
+            "For a UR robot: the source of its poses. The controller's base is turned to base_link.",
         ),
     ] = True,
     pose: Annotated[
@@ -284,7 +284,7 @@ def placed(
         if usual is None:
             lacks = "robot" if given.mounting else "mounting"
             raise InputError(
-                f"'{given.file.name}' does not name the {lacks}: give the frame that its pose is stated in with --parent"
+                f"'{given.file.name}' does not name the {lacks}: give the frame that its pose is in with --parent"
                 + (", or the robot with --robot." if given.mounting else ".")
             )
         parent = usual
@@ -317,7 +317,8 @@ def ros2_files(given: ExportedPose, folder: Path, X: RigidTransform, parent: str
     )
     kind = "EYE-IN-HAND" if given.mounting == "eye_in_hand" else "EYE-TO-HAND"
     launch = (
-        f'"""{kind}: {parent} -> {child}, written by {software_version()} from {given.file.name}."""\n\n{_comment(given)}'
+        f'"""{kind}: {parent} -> {child}, written by {software_version()} from {given.file.name}."""\n\n'
+        f"{_comment(given)}"
         "from launch import LaunchDescription\nfrom launch_ros.actions import Node\n\n\n"
         "def generate_launch_description():\n"
         f'    """Publish the pose of {child} in {parent}: metres, quaternion x y z w."""\n'
@@ -336,8 +337,7 @@ def ros2_files(given: ExportedPose, folder: Path, X: RigidTransform, parent: str
 def drake_files(
     given: ExportedPose, path: Path, X: RigidTransform, parent: str, child: str, *, station: bool
 ) -> dict[Path, str]:
-    """The directives by their path: of the child frame alone, or of a station with arm, flange and scanner, and the
-    models that it names.
+    """The Drake directives of the child frame, or of arm, flange and scanner with their models, by their paths.
 
     Raises:
         InputError: no name of a YAML file; the robot is not known, or its arm is not drawn.
