@@ -93,7 +93,10 @@ COMMON: dict[str, tuple[Any, object]] = {
     ),
     "seed": (Annotated[int, option("--seed", "N", "Seed of all random numbers; the first of several.", min=0)], 0),
     "json": (Annotated[bool, switch("--json", "Print the result as one JSON object, the last line of stdout.")], False),
-    "verbose": (Annotated[bool, typer.Option("--verbose", "-v", help="Print every figure, not only the verdict.")], False),
+    "verbose": (
+        Annotated[bool, typer.Option("--verbose", "-v", help="Print every figure, not only the verdict.")],
+        False,
+    ),
     "debug": (Annotated[bool, switch("--debug", "Show the traceback of an internal error.")], False),
 }
 """Every common option with its default, by the name of its parameter."""

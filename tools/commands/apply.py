@@ -24,7 +24,8 @@ def apply(
     to: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[FILE]", help=f"File to write ({', '.join(FORMS)}); without it CLOUD_corrected.ply, here.",
+            metavar="[FILE]",
+            help=f"File to write ({', '.join(FORMS)}); without it CLOUD_corrected.ply, here.",
             show_default=False,
         ),
     ] = None,
@@ -94,5 +95,11 @@ def write_points(path: Path, points: Array) -> None:
         if not o3d.io.write_point_cloud(str(path), cloud):
             raise InputError(f"'{path}' cannot be written: check that its folder exists and is writable.")
     else:
-        np.savetxt(path, flat, fmt="%.9g", delimiter="," if suffix == ".csv" else " ", comments="",
-                   header="x,y,z" if suffix == ".csv" else "")
+        np.savetxt(
+            path,
+            flat,
+            fmt="%.9g",
+            delimiter="," if suffix == ".csv" else " ",
+            comments="",
+            header="x,y,z" if suffix == ".csv" else "",
+        )
