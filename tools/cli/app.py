@@ -38,7 +38,7 @@ PANELS = {
     ),
     "Weld": ("demo", "weld", "part", "new", "finger", "tool"),
     "Robot": ("robots", "check-robot", "check-cell", "emulate-ur", "emulate-cell"),
-    "Data": ("import", "schema", "print-board"),
+    "Data": ("import", "export", "schema", "print-board"),
     "Look": ("view", "replay"),
     "Develop": ("dev",),
 }
