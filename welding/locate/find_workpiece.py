@@ -15,13 +15,13 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 from scipy.spatial import cKDTree
 
-from weldcal.models.errors import InputError
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
 from weldcal.welding.locate.bent_registration import RADIUS_SHARE, flattened, into_plate
 from weldcal.welding.locate.planes import (
     PLANE_BAND_M,
     Floats,
+    finite_points,
     into,
     point_pitch,
     robust_plane,
@@ -111,11 +111,7 @@ def find_workpiece(
         WorkpieceNotFound, AmbiguousWorkpiece: in a sentence; InputError for a scan of the wrong shape.
     """
     config = config or FindConfig()
-    points = np.asarray(points_B, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
-    points = points.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
+    (points,) = finite_points([points_B])
     if len(points) < config.fine.min_points:
         raise WorkpieceNotFound(f"The scan has only {len(points)} points: move the workpiece into view.")
     # A thinned scan is enough to find the place; the final registration uses all points.

@@ -21,8 +21,8 @@ from weldcal.welding.locate.part.joint import MOST_M, REACH_M, FitUp, MeasuredJo
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.registration import register_prepared
 from weldcal.welding.locate.part.result import PartConfig, PartRegistration
-from weldcal.welding.locate.part.scan import finite_points, prepare
-from weldcal.welding.locate.planes import Floats
+from weldcal.welding.locate.part.scan import prepare
+from weldcal.welding.locate.planes import Floats, finite_points
 from weldcal.welding.locate.registration import register_workpiece
 
 METHODS = ("cad", "cloud")

@@ -17,12 +17,20 @@ import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform
 
-from weldcal.models.errors import InputError
 from weldcal.models.mesh import inside_loops
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.bent_registration import register_bent
 from weldcal.welding.locate.outline_fit import by_the_edge, fit_outline, outermost, slide
-from weldcal.welding.locate.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, thinned, upward_planes
+from weldcal.welding.locate.planes import (
+    PLANE_BAND_M,
+    Floats,
+    finite_points,
+    into,
+    point_pitch,
+    robust_plane,
+    thinned,
+    upward_planes,
+)
 from weldcal.welding.locate.pose_covariance import pose_covariance
 from weldcal.welding.locate.registration_result import (
     RegistrationConfig,
@@ -53,11 +61,7 @@ def register_workpiece(
     """
     config = config or RegistrationConfig()
     eye = None if eye_B is None else np.asarray(eye_B, dtype=np.float64)
-    points = np.asarray(points_B, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
-    points = points.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
+    (points,) = finite_points([points_B])
     if math.isfinite(workpiece.bend_radius_m):
         return register_bent(points, workpiece, X_BP_guess, config, eye)
     half = 0.5 * np.array(workpiece.size_m[:2])

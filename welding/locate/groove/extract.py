@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.errors import WeldcalError
 from weldcal.welding.locate.bent_face import LEAST_RADIUS_M, BentFace, find_bent_faces
 from weldcal.welding.locate.groove.measure import measure_groove
 from weldcal.welding.locate.groove.seam import GrooveConfig, GrooveNotFound, GrooveSeam, SeveralGrooves
 from weldcal.welding.locate.groove.search import find_grooves
-from weldcal.welding.locate.planes import Floats, thinned
+from weldcal.welding.locate.planes import Floats, finite_points, thinned
 from weldcal.welding.seam.curve import SeamCurve
 
 MOST_RADIUS_M = 1.0  # over 0.3 m a larger radius sags by 11 mm or less, and counts as flat
@@ -42,11 +42,7 @@ def extract_groove(
         GrooveNotFound, SeveralGrooves, GrooveTooNarrow, GrooveUncertain: in a sentence; InputError: wrong shape.
     """
     config = config or GrooveConfig()
-    points = np.asarray(points_A, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise InputError(f"A cloud has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
-    points = points.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
+    (points,) = finite_points([points_A])
     if len(points) < 1000:
         raise GrooveNotFound(f"The cloud has only {len(points)} points: move the workpiece into view.")
     bent, points, failures = bent_seams(points, config, start_A)

@@ -24,10 +24,9 @@ from weldcal.welding.locate.part.rivals import (
     same_set,
     turned_poses,
 )
-from weldcal.welding.locate.part.scan import PreparedScan, finite_points, prepare
+from weldcal.welding.locate.part.scan import PreparedScan, prepare
 from weldcal.welding.locate.part.search import LARGE_GATES, LARGE_M, rough_places, sinks
-
-Floats = npt.NDArray[np.float64]
+from weldcal.welding.locate.planes import Floats, finite_points
 
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
