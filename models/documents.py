@@ -52,7 +52,7 @@ def parse_document(name: str, text: str, kind: str = "YAML") -> Any:
         raise InputError(f"'{name}' needs more memory than there is: give a smaller file.") from None
     except Exception as e:  # PyYAML and its constructors raise several types; a mark says the line
         raise InputError(f"'{name}' cannot be read as {kind}{_where(e, text)}.") from e
-    _check_size(name, document)
+    _weight(name, document, 0, {})
     return document
 
 
@@ -119,13 +119,11 @@ def _check_events(name: str, text: str) -> None:
             raise _too_much(name)
 
 
-def _check_size(name: str, document: Any) -> None:
-    """An alias of an alias ... of YAML is a small text and an endless document."""
-    _weight(name, document, 0, {})
-
-
 def _weight(name: str, value: Any, level: int, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
-    """Values and levels of a document, aliases in full; each part is looked at once."""
+    """Values and levels of a document, aliases in full; each part is looked at once.
+
+    An alias of an alias ... of YAML is a small text and an endless document.
+    """
     if not isinstance(value, Mapping | list | tuple):
         return 1, 1
     if id(value) in known or level > DEEPEST:

@@ -147,11 +147,6 @@ class WeldingTool:
         return Seat((into_left - into_right) / (2.0 * c), (into_left + into_right) / (2.0 * s))
 
     @property
-    def seat_side_m(self) -> float:
-        """How far a loaded tip's centre lies to the left of the groove's middle, m."""
-        return self.seat.aside_m
-
-    @property
     def seat_sink_m(self) -> float:
         """How far a loaded tip's centre lies below a hard ball's in the same groove, m."""
         return self.seat.below_m

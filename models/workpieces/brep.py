@@ -382,9 +382,7 @@ def _end_of(face: SolidFace, edge: Any) -> tuple[Floats, Floats, Floats] | None:
         straight if face.flat else curve.GetType() == GeomAbs_CurveType.GeomAbs_Circle
     ):
         return None
-    point, along = gp_Pnt(), gp_Vec()
-    curve.D1(0.5 * (curve.FirstParameter() + curve.LastParameter()), point, along)
-    p, t = array_of(point), unit(array_of(along))
+    p, t, _ = middle_of(curve, curve.FirstParameter(), curve.LastParameter())
     n = face.normal(p)
     m = np.cross(t, n)
     inner = face.foot(p + IN_MM * m)

@@ -13,7 +13,6 @@ from weldcal.models.mesh import TriMesh
 Floats = npt.NDArray[np.float64]
 
 UNITS_M = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
-KINDS = ("concave", "flush", "convex", "smooth", "boundary")
 
 
 @dataclass(frozen=True, eq=False)

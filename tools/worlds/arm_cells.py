@@ -12,8 +12,8 @@ import open3d as o3d
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.eye_on_base.arm_start import arm_shape, find_arm
-from weldcal.models.arms.chain import Chain, chain_frames, chain_inverse, load_chain
-from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arms.chain import Chain, chain_inverse, load_chain
+from weldcal.models.arms.kinematics import joint_frames, known_arms, load_arm
 from weldcal.models.arms.urdf import link_solids
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -85,7 +85,7 @@ class ArmCell:
 
 def _frames(chain: Chain, q: Array) -> list[Array]:
     """Poses (4, 4) of base, links and flange in B."""
-    frames = [np.eye(4), *chain_frames(chain, q)]
+    frames = [np.eye(4), *joint_frames(chain.stack, q)]
     return [*frames, frames[-1] @ chain.X_LF]
 
 

@@ -107,7 +107,7 @@ def _refine(
         slant = math.acos(min(1.0, float(sight @ X_BP.rotation().matrix()[:, 2]) / float(np.linalg.norm(sight))))
     band = max(4.0 * sigma, 0.0003)
     pitch = point_pitch(into(X_PQ, p[above])[:, :2])
-    inset, fit_rms = 0.0, math.inf
+    inset = 0.0
     for gate in (0.008, 0.004, 0.002):
         p = into(X_BP, near_edge)
         # Points a little below the face are the side of the plate and would shift the edges that face the scanner.
@@ -115,19 +115,16 @@ def _refine(
         rims, edges = outermost(face, outline, max(gate, 2.0 * pitch), pitch)
         if len(edges) < 40 or len(np.unique(edges % 2)) < 2:
             raise not_found(workpiece, "too little of its outline is in view.")
-        X_PP, inset, fit_rms, in_plane = fit_outline(rims, edges, outline, pitch, slant, sigma)
+        X_PP, inset, in_plane = fit_outline(rims, edges, outline, pitch, slant, sigma)
         X_BP = X_BP @ X_PP
 
     p = into(X_BP, points)
     supported, contradicted = agreement(p, workpiece, band, pitch, inset, config)
-    inside = inside_loops(p[:, :2], [core])
-    on_face = (np.abs(p[:, 2]) < band) & inside
+    on_face = (np.abs(p[:, 2]) < band) & inside_loops(p[:, :2], [core])
     covariance = pose_covariance(p[on_face], in_plane, pitch)
     return WorkpieceRegistration(
         X_BP=X_BP,
         rms_m=float(np.sqrt(np.mean(np.square(p[on_face, 2])))),
-        outline_rms_m=fit_rms,
-        inlier_fraction=float(np.count_nonzero(on_face) / np.count_nonzero(inside)),
         supported=supported,
         contradicted=contradicted,
         confidence=max(0.0, supported - contradicted),

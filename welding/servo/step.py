@@ -20,7 +20,7 @@ from weldcal.welding.servo.contact import (
     with_progress,
 )
 from weldcal.welding.servo.faults import advance, angles, fault, finish, goes_on, raised, unlit, watch
-from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
+from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step, mean_residual
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig, weave_at
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
@@ -65,19 +65,14 @@ def wait_for_arc(
         advanced=(state.advanced[0], sample.time),
     )
     torch = config.torch
+    reason = None
     if not state.arc_seen and waited > torch.ignition_limit_s:
-        return (
-            state,
-            share * V_stop,
-            f"The arc was not established within {torch.ignition_limit_s:g} s; check the power source, wire and gas.",
+        reason = (
+            f"The arc was not established within {torch.ignition_limit_s:g} s; check the power source, wire and gas."
         )
-    if state.arc_seen and waited > torch.arc_lost_s:
-        return (
-            state,
-            share * V_stop,
-            f"The arc went out for {torch.arc_lost_s:g} s; check the power source, wire and gas.",
-        )
-    return state, share * V_stop, None
+    elif state.arc_seen and waited > torch.arc_lost_s:
+        reason = f"The arc went out for {torch.arc_lost_s:g} s; check the power source, wire and gas."
+    return state, share * V_stop, reason
 
 
 _THERE_M = 0.3e-3  # from the plan: a tip that is not used has come down
@@ -236,12 +231,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
 def _tip_residual(state: WeldingState) -> Array:
     """Mean offset of the newest tactile points from the moved plan, (2,) m to the left and up."""
     assert state.plan_fit is not None
-    points, curve = state.refined.points[-8:], state.plan_fit.curve
-    if not len(points):
-        return np.zeros(2)
-    s = curve.project(points, state.s_tip, 0.02)
-    gap = points - curve.position(s)
-    return np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
+    return mean_residual(state.refined.points[-8:], state.plan_fit.curve, state.s_tip)
 
 
 def _weld(

@@ -114,7 +114,6 @@ def _rolled(seam: GrooveSeam, face: BentFace, start: str) -> GrooveSeam:
     def along(x: float) -> float:
         return float(np.interp(x, seam.s, s))
 
-    middle = seam.root[len(seam.root) // 2]
     return replace(
         seam,
         curve=SeamCurve.from_points(root, up=face.up(seam.root)),
@@ -126,6 +125,5 @@ def _rolled(seam: GrooveSeam, face: BentFace, start: str) -> GrooveSeam:
         corners=tuple(along(c) for c in seam.corners),
         apexes=face.rolled(seam.apexes.reshape(-1, 3)),
         start=seam.start.replace("the point given", start),
-        X_AF=face.at(float(middle[0]), float(middle[1]), 0.0),
         bend_radius=face.radius_m,
     )

@@ -261,10 +261,8 @@ def _finish(
         closed=groove.closed,
         ends_seen=ends_seen,
         start=word,
-        X_AF=groove.X_AQ,
         pitch=pitch,
         face_sigma=groove.sigma_m,
-        n_sections=len(slices.s),
     )
 
 

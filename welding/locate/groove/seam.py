@@ -5,7 +5,6 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.math import RigidTransform
 
 from weldcal.models.errors import WeldcalError
 from weldcal.welding.locate.groove.search import SearchConfig
@@ -73,7 +72,7 @@ class GrooveSeam:
     sideways and in height gaps                 (from, to) arc lengths that were bridged and not seen; corners, apexes
     arc lengths of tight corners, and (K,3) where the two sides meet there ends_seen            whether first and last
     end lie at the edge of the face, not at the edge of what was seen start                a phrase that says which end
-    is the start X_AF                 the face: origin on it, z up out of it; bend_radius of a face bent over a
+    is the start bend_radius          of a face bent over a
     cylinder, negative for a hollow one
     """
 
@@ -92,10 +91,8 @@ class GrooveSeam:
     closed: bool
     ends_seen: tuple[bool, bool]
     start: str
-    X_AF: RigidTransform
     pitch: float
     face_sigma: float
-    n_sections: int
     bend_radius: float = math.inf
 
     @property

@@ -467,10 +467,8 @@ def _result(best: _Judged, runner_up: float, note: str, model: PartModel, matter
         covariance=best.fit.covariance,
         rms_m=best.fit.rms_m,
         agreement=a.met,
-        violation=a.passed,
         seen=a.seen,
         confidence=confidence,
-        runner_up=runner_up,
         summary="",
     )
     at = model.points[::300] if matters_P is None else np.asarray(matters_P)
