@@ -147,8 +147,10 @@ def _too_much(name: str) -> InputError:
 
 @dataclass(frozen=True)
 class DocumentSection:
-    """A mapping of a document; its getters raise InputError naming ``file`` and key where a value is missing or
-    wrong."""
+    """A mapping of a document.
+
+    Its getters raise InputError naming ``file`` and key where a value is missing or wrong.
+    """
 
     file: str
     values: Mapping[Any, Any]
@@ -250,8 +252,10 @@ class DocumentSection:
 
 
 def as_number(value: Any) -> float:
-    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text); NaN for anything else, true and false
-    included."""
+    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text).
+
+    NaN for anything else, true and false included.
+    """
     try:
         return math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):

@@ -271,7 +271,8 @@ def wall(loop: Floats, z_low_m: float, z_high_m: float) -> TriMesh:
 def revolve(profile: Floats, segments: int) -> TriMesh:
     """The surface of a profile (N,2) of (radius, z) turned about z; material lies to the left of the profile's travel.
 
-    A profile from axis to axis, or one that ends where it begins, gives a watertight mesh; points on the axis become one vertex.
+    A profile from axis to axis, or one that ends where it begins, gives a watertight mesh; points on the axis become
+    one vertex.
     """
     profile = np.asarray(profile, dtype=np.float64)
     if (profile[:, 0] < 0.0).any():

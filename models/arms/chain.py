@@ -25,8 +25,10 @@ _MAX_STEP_RAD = 0.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Chain:
-    """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis;
-    ``X_LF`` the flange in the last joint's frame; limits (n,) rad and rad/s."""
+    """n joints in a row: ``stack`` (n, 4, 4) is the pose of each joint in its parent at zero angle, its z the axis.
+
+    ``X_LF`` the flange in the last joint's frame; limits (n,) rad and rad/s.
+    """
 
     name: str
     joint_names: tuple[str, ...]
@@ -53,8 +55,9 @@ def is_urdf(name: str) -> bool:
 
 
 def load_chain(name: str, kinematics: Path | None = None) -> Chain:
-    """The arm of that name, or of a URDF file, as a chain; ``kinematics``: the file of one Universal Robots arm (see
-    load_arm).
+    """The arm of that name, or of a URDF file, as a chain.
+
+    ``kinematics``: the file of one Universal Robots arm (see load_arm).
 
     Raises InputError naming the known ones, where its file is not one, or for ``kinematics`` of another arm.
     """
@@ -125,8 +128,10 @@ def chain_poses(chain: Chain, q: Array) -> Array:
 
 
 def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
-    """Geometric Jacobian (6, n) of the flange: [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq.
-    3.30)."""
+    """Geometric Jacobian (6, n) of the flange.
+
+    [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq. 3.30).
+    """
     X = joint_frames(chain.stack, np.asarray(q, dtype=float))
     return jacobian_of(X, (X[-1] @ chain.X_LF)[:3, 3])
 

@@ -342,8 +342,10 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Array:
 
 @cache
 def _drake() -> Any:
-    """pydrake.math, imported at the first call: the process that supervises a robot has an ArmModel and no use for
-    it."""
+    """pydrake.math, imported at the first call.
+
+    The process that supervises a robot has an ArmModel and no use for it.
+    """
     return importlib.import_module("pydrake.math")
 
 

@@ -109,8 +109,10 @@ def arm_urdf(arm: ArmModel, model_name: str | None = None) -> str:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Radii of an arm's housings, and its size by joint relative to the UR10e: lengths of housings grow with their
-    radii."""
+    """Radii of an arm's housings, and its size by joint relative to the UR10e.
+
+    Lengths of housings grow with their radii.
+    """
 
     big: float
     mid: float

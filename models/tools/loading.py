@@ -151,8 +151,11 @@ _SIZES = ("box_mm", "cylinder_mm", "capsule_mm", "sphere_mm", "mesh")
 
 @dc.dataclass(frozen=True, eq=False, kw_only=True)
 class LoadedTool:
-    """A tool of a file: the tool, its camera's picture size and focal length, its finger calibration's path (""
-    without), and the pose X_FW of the torch (z along the wire)."""
+    """A tool of a file.
+
+    The tool, its camera's picture size and focal length, its finger calibration's path ("" without), and the pose X_FW
+    of the torch (z along the wire).
+    """
 
     name: str
     file: Path
@@ -310,8 +313,10 @@ def _check_sizes(file: str, part: ToolPart) -> None:
 
 
 def _tip_frame(file: str, part: ToolPart) -> tuple[RotationMatrix, float, float]:
-    """R_FT (z_T against the finger's axis, x_T from the torch to the tip), and the torch point (-chord, 0, height) in
-    T, m."""
+    """Compute R_FT, and the torch point (-chord, 0, height) in T, m.
+
+    z_T points against the finger's axis, x_T from the torch to the tip.
+    """
     z = -_unit(part.tip.axis)
     to_tip = (np.array(part.tip.xyz_mm) - np.array(part.torch.xyz_mm)) / 1e3
     level = to_tip - (to_tip @ z) * z

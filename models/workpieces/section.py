@@ -41,8 +41,10 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """The free space between two walls, seen from one point of a cut: angles from x towards y, rad, and the walls'
-    normals."""
+    """The free space between two walls, seen from one point of a cut.
+
+    Angles from x towards y, rad, and the walls' normals.
+    """
 
     low_rad: float
     high_rad: float
@@ -112,9 +114,9 @@ def _distance(a: Floats, d: Floats) -> Floats:
 
 
 def crossings(section: Section, radius: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Where a circle about the origin meets the outline: angles (K,) ascending, points (K,2), normals (K,2), and -1 or 1 (K,).
+    """Find where a circle about the origin meets the outline: angles (K,), points (K,2), normals (K,2), signs (K,).
 
-    The last is 1 where a turn from x towards y enters the material.
+    The angles ascend. A sign is 1 where a turn from x towards y enters the material, else -1.
     """
     a, d = section.segments[:, 0], section.segments[:, 1] - section.segments[:, 0]
     qa, qb, qc = np.vecdot(d, d), np.vecdot(a, d), np.vecdot(a, a) - radius**2

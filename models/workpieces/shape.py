@@ -75,8 +75,10 @@ class PartJoint:
 
 @dataclass(frozen=True, eq=False)
 class PartShape:
-    """A part in its frame P, m: its mesh, its edges by ascending id, the file's unit in m, its bodies and its
-    joints."""
+    """A part in its frame P, m.
+
+    Its mesh, its edges by ascending id, the file's unit in m, its bodies and its joints.
+    """
 
     name: str
     mesh: TriMesh

@@ -168,7 +168,7 @@ def _refine(
 
 
 def _fit(seen: _Seen, outline: Floats, radius: float, slants_rad: Floats) -> tuple[RigidTransform, float, Floats]:
-    """The small motion of P in P that fits face and rims, the inset, and the covariance (6,6), rotation then translation."""
+    """Fit the small motion of P in P to face and rims: it, the inset, and the covariance (6,6), rotation first."""
     a, inward = outline[seen.edges], inward_normals(outline)[seen.edges]
     pitch = seen.pitch
     # A floor independent of the number of points: a real plate deviates from a cylinder in a few long waves.
@@ -218,8 +218,10 @@ def _fit(seen: _Seen, outline: Floats, radius: float, slants_rad: Floats) -> tup
 
 
 def _slants(outline: Floats, radius: float, eye_P: Floats | None) -> Floats:
-    """For each edge (k,) the angle between the face's normal at its middle and the sight: the ends of the plate
-    lean."""
+    """For each edge (k,) the angle between the face's normal at its middle and the sight.
+
+    The ends of the plate lean.
+    """
     middle = 0.5 * (outline + np.roll(outline, -1, axis=0))
     angle = middle[:, 0] / radius
     if eye_P is None:

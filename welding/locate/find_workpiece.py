@@ -214,8 +214,10 @@ def _bent_places(points: Floats, workpiece: Workpiece, rng: np.random.Generator)
 def _correlate(
     q: Floats, workpiece: Workpiece, only: tuple[float, ...] | None = None
 ) -> list[tuple[float, RigidTransform]]:
-    """The few best poses of the outline in one plane: turns by template (`only` these, where given), places by
-    correlation."""
+    """The few best poses of the outline in one plane.
+
+    Turns by template (`only` these, where given), places by correlation.
+    """
     cell = CELL_M
     reach = 0.5 * float(np.hypot(*workpiece.size_m[:2]))
     corner = q[:, :2].min(axis=0) - 0.3 * reach

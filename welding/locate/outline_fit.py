@@ -100,8 +100,9 @@ def outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tuple
 def fit_outline(
     rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float, slant_rad: float | None, noise: float
 ) -> tuple[RigidTransform, float, Floats]:
-    """Fit the in-plane motion that puts outermost points (M,2) on their edges; the inset, m, and the
-    covariance (3,3) of x, y and turn.
+    """Fit the in-plane motion that puts outermost points (M,2) on their edges.
+
+    The inset, m, and the covariance (3,3) of x, y and turn.
 
     The scanner's last point on the face lies up to a pitch inside the edge; that inset is one more unknown, the same at
     all edges and held near half a pitch, so that it cancels where opposite edges are seen.

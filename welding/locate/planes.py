@@ -72,8 +72,10 @@ def plane_frame(normal: Floats, center: Floats) -> RigidTransform:
 def upward_planes(
     sample: Floats, steepest_rad: float, least_points: int, rng: np.random.Generator, most: int = 4
 ) -> list[RigidTransform]:
-    """Up to `most` planes through points (N,3) whose normals lie within an angle of z, most points first, as frames
-    Q."""
+    """Find up to `most` planes through points (N,3) whose normals lie within an angle of z, as frames Q.
+
+    Most points first.
+    """
     planes: list[RigidTransform] = []
     rest = sample
     steepest = math.cos(steepest_rad)

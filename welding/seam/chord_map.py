@@ -1,5 +1,7 @@
-"""Computes the motion that a planned seam requires of a tool whose torch trails its tip: turn, speed and travel
-angle."""
+"""Computes the motion that a planned seam requires of a tool whose torch trails its tip.
+
+Turn, speed and travel angle.
+"""
 
 import math
 from dataclasses import dataclass
@@ -131,8 +133,10 @@ def chord_map(
 
 
 def _ends(plan: SeamCurve, tip: float, torch: float, tip_left: float) -> tuple[float, float, float]:
-    """(tip direction . u, torch direction . u, distance m) of a pair of arc lengths; on the inside of a bend the tip's
-    path is shorter."""
+    """(tip direction . u, torch direction . u, distance m) of a pair of arc lengths.
+
+    On the inside of a bend the tip's path is shorter.
+    """
     x, y, z, tx, ty, tz, nx, ny, nz, _, _, _, curvature = plan.frame_numbers(tip)
     at_x, at_y, at_z, to_x, to_y, to_z, *_ = plan.frame_numbers(torch)
     x, y, z = x - at_x, y - at_y, z - at_z

@@ -47,8 +47,9 @@ def begin_feeling_back(state: WeldingState, now: float) -> WeldingState:
 def feel_start_step(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig
 ) -> tuple[WeldingState, tuple[float, float, float], str | None, bool]:
-    """One tick: back until contact is lost or six millimetres past the plan's start; then up, and into the groove
-    again.
+    """One tick: back until contact is lost or six millimetres past the plan's start.
+
+    Then up, and into the groove again.
 
     Args:
         before: the state before this tick's frame, `is_new`: whether there is one.
@@ -98,8 +99,10 @@ def feel_start_step(
 
 
 def _start_found(before: WeldingState, state: WeldingState, now: float, config: ServoConfig) -> WeldingState:
-    """The state after contact was lost: the last uncertain points are dropped, and the seam starts where contact
-    ended."""
+    """The state after contact was lost.
+
+    The last uncertain points are dropped, and the seam starts where contact ended.
+    """
     assert before.measurement is not None
     assert state.plan_fit is not None
     felt = state.touch.felt[: max(0, len(state.touch.felt) - config.refinement.frames_to_commit)]

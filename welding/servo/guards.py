@@ -120,8 +120,11 @@ def guarded_joint_velocity(
 def _guarded(
     J: Array, V: Array, bound: Array, row_scale: Array, stop: float, slow: float, q_dot: Array
 ) -> tuple[float, float, float]:
-    """Fill q_dot (6,), which is zero; returns sigma_min, the share of the wanted velocity that is left (0: stopped),
-    and that near a singularity (below 0: an input is not finite)."""
+    """Fill q_dot (6,), which is zero.
+
+    Returns sigma_min, the share of the wanted velocity that is left (0: stopped), and that near a singularity (below 0:
+    an input is not finite).
+    """
     if not (np.isfinite(J).all() and np.isfinite(V).all() and np.isfinite(bound).all()):
         return 0.0, 0.0, -1.0
     scaled, wanted = J * row_scale.reshape(6, 1), V * row_scale

@@ -29,8 +29,10 @@ from weldcal.welding.servo.track import torch_target
 
 
 def start_arc(state: WeldingState, curve: SeamCurve) -> float:
-    """Arc length m on the moved plan at which the arc starts: the measured start of the groove, else the planned
-    one."""
+    """Arc length m on the moved plan at which the arc starts.
+
+    The measured start of the groove, else the planned one.
+    """
     return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
 
 
@@ -46,8 +48,9 @@ def with_arc(state: WeldingState, sample: ServoSample) -> WeldingState:
 def wait_for_arc(
     state: WeldingState, sample: ServoSample, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, Array, str | None]:
-    """One tick with the torch on and no arc: the next state, the motion (6,) that ramps to rest, and the reason to
-    stop.
+    """One tick with the torch on and no arc.
+
+    The next state, the motion (6,) that ramps to rest, and the reason to stop.
 
     No time of standing counts as a lack of progress.
     """
@@ -149,9 +152,9 @@ def _touch(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
     feels_start = config.felt and config.touch.feel_start and get_law(config.law).guarded
+    assert state.plan_fit is not None
+    seam, along, ready, problem = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False, None
     if not config.felt:
-        assert state.plan_fit is not None
-        seam, along, ready, problem = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False, None
         gap = seam.position - sample.X_BT.translation()
         aside, above = dot(gap, seam.normal), dot(gap, seam.up)
         seated = math.hypot(aside, above) < _THERE_M
@@ -161,8 +164,6 @@ def _touch(
         assert state.plan_fit is not None
         seam, seated = state.plan_fit.curve.frame(state.s_tip), False
     else:
-        assert state.plan_fit is not None
-        seam, along, ready = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False
         state, lateral, upward, problem, seated = touch_step(state, sample, is_new, seam, config)
     if problem is not None:
         return _rest(fault(state, problem), config)
@@ -315,8 +316,10 @@ def _weld(
 
 
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
-    """The tip's wanted lateral and upward speed, m/s: from the deflection in TRACK, from the moved plan in COAST and
-    FINISH."""
+    """The tip's wanted lateral and upward speed, m/s.
+
+    From the deflection in TRACK, from the moved plan in COAST and FINISH.
+    """
     deflection = config.deflection
     if state.phase == Phase.TRACK:
         # A late frame shows where the tip was, not where it is: its correction fades out.
@@ -344,8 +347,10 @@ def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoCon
 
 
 def _rest(state: WeldingState, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
-    """The answer in DONE and FAULT: the last motion ramps to zero with the arc off, by ticks: the clock may be
-    faulty."""
+    """The answer in DONE and FAULT: the last motion ramps to zero with the arc off, by ticks.
+
+    The clock may be faulty.
+    """
     share = clip(1.0 - state.stopped_ticks * config.period_s / config.limits.ramp_s, 0.0, 1.0)
     state = changed(state, torch_on=False, stopped_ticks=state.stopped_ticks + 1)
     return _answer(state, share * state.V_stop, config, Diagnostics())

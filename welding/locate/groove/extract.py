@@ -1,5 +1,4 @@
-"""Extracts the weld seam of a V-groove from a point cloud without a drawing, on flat faces and on faces bent over a
-cylinder.
+"""Extracts the weld seam of a V-groove from a point cloud without a drawing, on flat faces and on bent ones.
 
 Openings in faces are found coarsely (search); slices across them are fitted with a V (section), each slice with points
 of its own; the offsets of the centres are smoothed along the line, the line is moved by them until it converges
@@ -80,8 +79,10 @@ def _mm(p: Floats) -> str:
 def bent_seams(
     points: Floats, config: GrooveConfig, start_A: npt.ArrayLike | None
 ) -> tuple[list[GrooveSeam], Floats, list[WeldcalError]]:
-    """Grooves of all bent faces in a cloud (N,3) m, the points outside these faces, and the errors of grooves
-    refused."""
+    """Find the grooves of all bent faces in a cloud (N,3) m.
+
+    Returns the seams, the points outside these faces, and the errors of grooves refused.
+    """
     seams: list[GrooveSeam] = []
     failures: list[WeldcalError] = []
     rng = np.random.default_rng(config.search.seed)
@@ -106,8 +107,10 @@ def bent_seams(
 
 
 def _rolled(seam: GrooveSeam, face: BentFace, start: str) -> GrooveSeam:
-    """Roll the seam of an unrolled face back onto the cylinder, in the cloud's frame, with the arc lengths of its root
-    there."""
+    """Roll the seam of an unrolled face back onto the cylinder, in the cloud's frame.
+
+    The arc lengths are those of its root there.
+    """
     root = face.rolled(seam.root)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(root, axis=0), axis=1))])
 

@@ -1,5 +1,7 @@
-"""Data of a V-groove: the expected profile, the measured seam with its sigmas, limits, and the errors that refuse
-it."""
+"""Data of a V-groove.
+
+The expected profile, the measured seam with its sigmas, limits, and the errors that refuse it.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -63,8 +65,9 @@ class Profile:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GrooveSeam:
-    """A measured V-groove, sampled every millimetre of arc length from its start; metres, radians, in the cloud's frame
-    A.
+    """A measured V-groove, sampled every millimetre of arc length from its start.
+
+    Metres, radians, in the cloud's frame A.
 
     curve                the root as a seam; at a sharp corner it and `root` are rounded with a radius of 0.5 mm root,
     left, right    (N,3) root and shoulder lines, left as one travels; s (N,) arc length of the root depth, angle

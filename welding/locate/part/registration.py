@@ -220,8 +220,10 @@ def _screened(
 def _fine(
     scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 5
 ) -> list[_Judged]:
-    """Fit the best starts finely, different ones only, best first; after `enough` a good and clean one ends the
-    search."""
+    """Fit the best starts finely, different ones only, best first.
+
+    After `enough` a good and clean one ends the search.
+    """
     judged: list[_Judged] = []
     for X in starts[:most]:
         known = [j.agreement for j in judged]

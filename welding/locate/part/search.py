@@ -222,8 +222,10 @@ def _places_for(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Scene:
-    """What the search compares: heights (H,W), NaN: none, their limits around a cell, and the transforms of the
-    masks."""
+    """What the search compares: heights (H,W), NaN.
+
+    None, their limits around a cell, and the transforms of the masks.
+    """
 
     top: npt.NDArray[np.floating]
     lowest: npt.NDArray[Any]
