@@ -24,12 +24,12 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.inverse import continued_solution, inverse_kinematics, nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, link_frames
-from weldcal.models.arms.urdf import arm_urdf
+from weldcal.models.arms.urdf import arm_urdf, placed_solid
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import Depth, noisy_depth
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
-from weldcal.models.mesh import TriMesh, merge, revolve
+from weldcal.models.mesh import TriMesh, merge
 from weldcal.models.scanner_streams import ScannerStream, mixed_exposure
 from weldcal.models.scanners import ScannerPreset
 
@@ -196,7 +196,6 @@ def reachable_start(arm: ArmModel, X_BF: RigidTransform) -> Array:
 
 Pixels = npt.NDArray[np.intp]
 
-_SEGMENTS = 192  # of a turned body
 _THICK_M = 0.012
 _NODES = (
     5  # exact arm poses over the readout; rows between them are interpolated, which bends by less than 0.1 micrometre
@@ -247,27 +246,10 @@ def arm_bodies(arm: ArmModel, flange: FlangeStandard) -> list[RigidBody]:
     bodies = [RigidBody(6, flange_mesh(flange, _THICK_M))]
     for link in root.iter("link"):
         for visual in link.iter("visual"):
-            origin, geometry, material = (visual.find(tag) for tag in ("origin", "geometry", "material"))
-            assert origin is not None
-            assert geometry is not None
+            material, number = visual.find("material"), arm.link_names.index(link.get("name", ""))
             assert material is not None
-            xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=np.float64) for key in ("xyz", "rpy"))
-            mesh = _solid(geometry[0]).transformed(RigidTransform(RollPitchYaw(rpy), xyz))
-            bodies.append(
-                RigidBody(arm.link_names.index(link.get("name", "")), mesh, _DARK.get(material.get("name", ""), 0.0))
-            )
+            bodies.append(RigidBody(number, placed_solid(visual), _DARK.get(material.get("name", ""), 0.0)))
     return bodies
-
-
-def _solid(shape: ET.Element) -> TriMesh:
-    if shape.tag == "cylinder":
-        r, half = float(shape.get("radius", "0")), 0.5 * float(shape.get("length", "0"))
-        return revolve(np.array([(0.0, -half), (r, -half), (r, half), (0.0, half)]), _SEGMENTS)
-    a, _, c = (float(shape.get(key, "0")) for key in "abc")
-    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)
-    profile = np.column_stack([a * np.cos(angle), c * np.sin(angle)])
-    profile[[0, -1], 0] = 0.0
-    return revolve(profile, _SEGMENTS)
 
 
 class MovingScene:

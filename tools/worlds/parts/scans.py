@@ -180,7 +180,7 @@ PLANNED, REFUSED = "planned", "refused"
 class Trouble:
     """A kind of scene. others: objects beside the part; drawing: what is looked for, None: the part itself.
 
-    Must: what the answer has to be, empty where a plan with an honest sigma and a refusal are both right.
+    `must`: what the answer has to be, empty where a plan with an honest sigma and a refusal are both right.
     """
 
     name: str
