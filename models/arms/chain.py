@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.models.arms.kinematics import ArmModel, jacobian_of, joint_frames, known_arms, load_arm
+from weldcal.models.arms.kinematics import ArmModel, joint_frames, known_arms, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.documents import did_you_mean
 from weldcal.models.errors import InputError
@@ -133,7 +133,9 @@ def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
     [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq. 3.30).
     """
     X = joint_frames(chain.stack, np.asarray(q, dtype=float))
-    return jacobian_of(X, (X[-1] @ chain.X_LF)[:3, 3])
+    p = (X[-1] @ chain.X_LF)[:3, 3]
+    z = X[:, :3, 2]
+    return np.vstack([z.T, np.cross(z, p - X[:, :3, 3]).T])
 
 
 def chain_inverse(chain: Chain, X_BF: RigidTransform, near: ArrayLike | None = None, *, seed: int = 0) -> Array | None:

@@ -227,19 +227,14 @@ def kinematics_and_jacobian(arm: ArmModel, q: Array, p_FP: Array = _ORIGIN) -> t
     X = joint_frames(arm.stack, q)
     R = X[5, :3, :3]
     p = R @ p_FP + X[5, :3, 3]
-    return R, p, jacobian_of(X, p)
-
-
-def jacobian_of(X: Array, p: Array) -> Array:
-    """The geometric Jacobian (6, n) of a point p (3,) m moved by joints at X (n, 4, 4), see kinematics_and_jacobian."""
     z0, z1, z2 = z = X[:, :3, 2].T
     r0, r1, r2 = p[:, None] - X[:, :3, 3].T
-    J = np.empty((6, len(X)))
+    J = np.empty((6, 6))
     J[:3] = z
     J[3] = z1 * r2 - z2 * r1
     J[4] = z2 * r0 - z0 * r2
     J[5] = z0 * r1 - z1 * r0
-    return J
+    return R, p, J
 
 
 def sigma_min(J: ArrayLike, length: float = 1.0) -> float:
