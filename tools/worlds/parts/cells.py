@@ -68,8 +68,10 @@ class PartTrial:
         """
         if refine not in REFINEMENTS:
             raise InputError(f"--refine must be {', '.join(REFINEMENTS[:-1])} or {REFINEMENTS[-1]}, not '{refine}'.")
-        off = {"translation_mm": 1.0, "rotation_deg": 0.3} if located_by == "drawing" else {}
-        return cls(located_by=located_by, seam_mm=seam_mm, refine=refine, arm_mm=arm_mm, **off)
+        mm, deg = (1.0, 0.3) if located_by == "drawing" else (cls.translation_mm, cls.rotation_deg)
+        return cls(
+            located_by=located_by, translation_mm=mm, rotation_deg=deg, seam_mm=seam_mm, refine=refine, arm_mm=arm_mm
+        )
 
     def calibration(self) -> Mapping[str, object]:
         """The keys of the scenario's calibration, besides the guess of the mounting."""
