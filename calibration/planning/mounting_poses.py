@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.hand_eye.problem import linearise
+from weldcal.calibration.planning.calibration_poses import random_view
 from weldcal.calibration.planning.mounting_scene import FLANGE, Bodies, MountingScene
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import jacobian, sigma_min
@@ -159,7 +159,7 @@ def _pool(
 
 def _by_view(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> tuple[Array, Array | None] | str:
     """Draw how the scanner sees the circle, and ask for the joints."""
-    X_CR = _random_view(scene, plan, rng)
+    X_CR = random_view(rng, scene.scanner, scene.radius_m, plan.image_margin, plan.theta_max_rad)
     if X_CR is None:
         return "the circle does not fit into the scanner's field of view"
     q_2 = None
@@ -188,29 +188,6 @@ def _by_joints(scene: MountingScene, plan: MountingPlan, rng: np.random.Generato
     if not ((q >= scene.arm.position_lower) & (q <= scene.arm.position_upper)).all():
         return "a joint is at its limit"
     return q, None
-
-
-def _random_view(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> RigidTransform | None:
-    s, r = scene.scanner, scene.radius_m
-    span = plan.image_margin * (s.far_m - s.near_m)
-    z = rng.uniform(s.near_m + span, s.far_m - span)
-    place = []
-    for f, c, size in ((s.fx, s.cx, s.width), (s.fy, s.cy, s.height)):
-        free = plan.image_margin * size
-        low, high = (free - c) / f * z + r, (size - 1 - free - c) / f * z - r
-        if low >= high:
-            return None
-        place.append(rng.uniform(low, high))
-    p = np.array([*place, z])
-    sight = -p / np.linalg.norm(p)
-    tilt = float(np.arccos(rng.uniform(np.cos(plan.theta_max_rad), 1.0)))
-    side = np.cross(sight, [1.0, 0.0, 0.0])
-    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight) @ (side / np.linalg.norm(side))
-    normal = exp_rotation(tilt * side) @ sight
-    x = np.cross([0.0, 1.0, 0.0], normal)
-    x /= np.linalg.norm(x)
-    R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal]))
-    return RigidTransform(R @ RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi)), p)
 
 
 def _refuse(scene: MountingScene, bodies: Bodies, plan: MountingPlan, q: Array, q_2: Array | None) -> str | None:

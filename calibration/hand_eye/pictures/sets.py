@@ -130,18 +130,36 @@ def picture_set(
     pictures = [sized(p, size) for p in pictures]
     file = None if camera is None else camera[1]
     K, dist, free, pictures = estimate_camera(pictures, board, size, file, named is not None and named.name)
-    return _paired(
-        pictures=pictures,
-        board=board,
-        robot=robot,
-        mode=mode,
-        stated=stated or StatedForms(),
+    C = np.tile(np.eye(4), (len(pictures), 1, 1))
+    for k, picture in enumerate(pictures):
+        if not picture.why:
+            poses = solutions(picture.points, board, K, dist)
+            if poses:
+                C[k] = poses[0][1]
+            else:
+                pictures[k] = replace(picture, why="Its points give no pose of the board.")
+    found, labels = _imported(pictures, C, board, robot, mode, source, stated or StatedForms())
+    rows = np.asarray(found.rows[1], dtype=np.int64)
+    turned = [replace(p, points=p.points[board.symmetries[int(f)]]) for p, f in zip(pictures, labels, strict=True)]
+    paired = set(rows.tolist())
+    turned = [
+        p if p.why or k in paired else replace(p, why="No robot pose belongs to it.") for k, p in enumerate(turned)
+    ]
+    pairs = PosePairs(
         source=source,
+        robot=found.robot,
+        camera=found.camera,
+        mode=mode,
+        img=np.stack([turned[k].points for k in rows]),
+        obj=board.points,
         K=K,
         dist=dist,
-        free=free,
-        camera="" if camera is None or len(free) else camera[0].name,
+        reading=found.reading,
+        notes=found.notes,
+        ids=tuple(turned[k].name for k in rows),
     )
+    stated_by = "" if camera is None or len(free) else camera[0].name
+    return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=stated_by, free=free)
 
 
 def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str | None) -> Listing:
@@ -172,40 +190,24 @@ def _robot(folder: Path, stated: StatedForms, skip: frozenset[Path], unit: str |
     return replace(lists[0], unit=lists[0].unit or unit or "")
 
 
-def _paired(
-    *,
-    pictures: list[Picture],
-    board: Board,
-    robot: Listing,
-    mode: str,
-    stated: StatedForms,
-    source: str,
-    K: Array,
-    dist: Array,
-    free: NDArray[np.int64],
-    camera: str,
-) -> PictureSet:
-    """Pairs of the robot's and the boards' poses; flips of symmetric boards follow from the robot's rotations."""
-    C = np.tile(np.eye(4), (len(pictures), 1, 1))
-    for k, picture in enumerate(pictures):
-        if not picture.why:
-            found = solutions(picture.points, board, K, dist)
-            if found:
-                C[k] = found[0][1]
-            else:
-                pictures[k] = replace(picture, why="Its points give no pose of the board.")
+def _imported(
+    pictures: Sequence[Picture], C: Array, board: Board, robot: Listing, mode: str, source: str, stated: StatedForms
+) -> tuple[ImportedPairs, NDArray[np.int64]]:
+    """Pairs of the robot's and the boards' poses C (n, 4, 4), and the order of points (n,) of each picture.
+
+    Flips of symmetric boards follow from the robot's rotations.
+    """
     name = f"{pictures[0].name} ... {pictures[-1].name}"
-    labels = np.zeros(len(pictures), dtype=np.int64)
     stated = replace(stated, robot_poses=robot.name, camera_poses=name, unit=None, camera_known=True)
     problem: InconsistentPoses | DatasetError | None = None
     for numbered in _numbered(robot, pictures):
-        choices: list[NDArray[np.int64]] = [labels]
+        choices = [np.zeros(len(pictures), dtype=np.int64)]
         if len(board.symmetries) > 1:
             choices = _flips(numbered, _listing(name, pictures, C), pictures, board)
         for choice in choices:
             listing = _listing(name, pictures, _flipped(C, choice, board))
             try:
-                found_pairs = import_pairs([numbered, listing], source, mode, stated)
+                return import_pairs([numbered, listing], source, mode, stated), choice
             except WrongScale as why:
                 size = 1e3 * board.size * why.factor
                 problem = InconsistentPoses(
@@ -216,44 +218,8 @@ def _paired(
                 break
             except (InconsistentPoses, DatasetError) as why:
                 problem = problem or why
-                continue
-            return _set(found_pairs, pictures, choice, board, mode, source, K, dist, free, camera)
     assert problem is not None
     raise problem
-
-
-def _set(
-    found: ImportedPairs,
-    pictures: list[Picture],
-    labels: NDArray[np.int64],
-    board: Board,
-    mode: str,
-    source: str,
-    K: Array,
-    dist: Array,
-    free: NDArray[np.int64],
-    camera: str,
-) -> PictureSet:
-    rows = np.asarray(found.rows[1], dtype=np.int64)
-    turned = [replace(p, points=p.points[board.symmetries[int(f)]]) for p, f in zip(pictures, labels, strict=True)]
-    paired = set(rows.tolist())
-    turned = [
-        p if p.why or k in paired else replace(p, why="No robot pose belongs to it.") for k, p in enumerate(turned)
-    ]
-    pairs = PosePairs(
-        source=source,
-        robot=found.robot,
-        camera=found.camera,
-        mode=mode,
-        img=np.stack([turned[k].points for k in rows]),
-        obj=board.points,
-        K=K,
-        dist=dist,
-        reading=found.reading,
-        notes=found.notes,
-        ids=tuple(turned[k].name for k in rows),
-    )
-    return PictureSet(pairs=pairs, pictures=tuple(turned), rows=rows, board=board, camera=camera, free=free)
 
 
 def _listing(name: str, pictures: Sequence[Picture], C: Array) -> Listing:
