@@ -20,8 +20,11 @@ _OPEN_SIGMA = 10.0  # what the covariance says of an open direction, in the same
 
 @dataclass(frozen=True)
 class Diversity:
-    """How the poses differ: n and distinct; largest turn (deg) between poses; spread (deg) of the turns along their
-    three principal directions; spread of positions in units of length; smallest share of the turn off the main axis."""
+    """How the poses differ: n and distinct; largest turn (deg) between poses.
+
+    Spread (deg) of the turns along their three principal directions; spread of positions in units of length; smallest
+    share of the turn off the main axis.
+    """
 
     n: int
     distinct: int
@@ -136,8 +139,10 @@ def _check_points(p: Array, allow_coplanar: bool) -> None:
 
 @dataclass(frozen=True)
 class Determinacy:
-    """Directions of the unknowns (m,) that stay open, their names, sentences on vague ones, and the condition number of
-    the scaled information."""
+    """Directions of the unknowns (m,) that stay open, with their names.
+
+    Besides: sentences on vague directions, and the condition number of the scaled information.
+    """
 
     directions: tuple[Array, ...]
     names: tuple[str, ...]

@@ -59,9 +59,11 @@ class PlannerConfig:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPose:
-    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR; ``gain`` in log determinant of the information
-    of X_BC, and ``sigma_m``, the predicted standard deviation (3-D) of a scanned point at the work point once this pose
-    is in."""
+    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR.
+
+    ``gain`` in log determinant of the information of X_BC, and ``sigma_m``, the predicted standard deviation (3-D) of a
+    scanned point at the work point once this pose is in.
+    """
 
     X_BF: RigidTransform
     q: Array
@@ -81,8 +83,9 @@ def plan_calibration_poses(
     config: PlannerConfig | None = None,
     tool: Sequence[Capsule] = (),
 ) -> list[PlannedPose]:
-    """Plan ``n`` (>= 4) flange poses, most informative first: greedy D-optimal on the information of X_BC about the
-    work point.
+    """Plan ``n`` (>= 4) flange poses, most informative first.
+
+    Greedy D-optimal on the information of X_BC about the work point.
 
     A constant bias of the feature in the flange counts as unknown too, so tilts and turns of the flange are valued.
     ``tool`` are capsules in the frame F that must clear the table and must not hide the feature. Deterministic for
@@ -241,8 +244,10 @@ def _sigma_at_work(information: Array) -> float:
 
 
 def _greedy(pool: list[PlannedPose], n: int, X_BC: RigidTransform, config: PlannerConfig) -> list[PlannedPose]:
-    """The ``n`` poses of the pool that in turn add most to the log determinant of the information, apart from each
-    other."""
+    """Choose the ``n`` poses that in turn add most to the log determinant of the information.
+
+    They keep apart from each other.
+    """
     if not pool:
         return []
     work = _work_point(config, X_BC, [c.X_BR for c in pool])

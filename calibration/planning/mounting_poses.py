@@ -47,7 +47,9 @@ class MountingPlan:
 @dataclass(frozen=True, eq=False)
 class MountingPose:
     """A pose to visit: joints (6,) rad of the first and, where there is one, the second arm; X_CR that is expected.
-    ``via_home``: the straight way from the pose before it is not free, the one through home is."""
+
+    ``via_home``: the straight way from the pose before it is not free, the one through home is.
+    """
 
     q: Array
     q_2: Array | None
@@ -56,9 +58,11 @@ class MountingPose:
 
 
 def plan_mounting_poses(scene: MountingScene, n: int, held_out: int, plan: MountingPlan) -> tuple[MountingPose, ...]:
-    """Plan ``n`` poses, most informative first (greedy, D-optimal in the unknowns), then ``held_out`` drawn at random,
-    then all others that would do. Each of the first n + held_out has a free way from home, the second arm going first,
-    and is reached on it or from the pose before (the first held-out one from home). Deterministic for ``plan.seed``.
+    """Plan ``n`` poses, most informative first, then ``held_out`` drawn at random, then all others that would do.
+
+    The order is greedy and D-optimal in the unknowns. Each of the first n + held_out has a free way from home, the
+    second arm going first, and is reached on it or from the pose before (the first held-out one from home).
+    Deterministic for ``plan.seed``.
 
     Raises:
         UnreachableScanner: one sentence that names the commonest obstacle.
@@ -81,9 +85,11 @@ def plan_mounting_poses(scene: MountingScene, n: int, held_out: int, plan: Mount
 
 
 def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: Array | float, sigma_rad: float) -> Array:
-    """Information of observations of the circle at some poses (k, m + 3, m + 3): of the free unknowns, in the order of
-    the solver, and of a constant bias of the centre in its own frame. ``sigma_m``: of the centre, one for all or (3,)
-    along the circle's own axes."""
+    """Information of observations of the circle at some poses (k, m + 3, m + 3).
+
+    Of the free unknowns, in the order of the solver, and of a constant bias of the centre in its own frame.
+    ``sigma_m``: of the centre, one for all or (3,) along the circle's own axes.
+    """
     observations = [
         scene.observation(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses
     ]
@@ -113,8 +119,10 @@ def _at(pose: MountingPose) -> tuple[Array, Array | None]:
 def _way(
     bodies: Bodies, start: tuple[Array, Array | None], end: tuple[Array, Array | None], plan: MountingPlan
 ) -> bool:
-    """Whether one arm after the other, the second first, gets from start to end, and back home in the opposite
-    order."""
+    """Test whether one arm after the other, the second first, gets from start to end.
+
+    The way back home has the opposite order.
+    """
     between = (start[0], end[1])
     if bodies.scene.two and not bodies.clear(start, between, plan.table_z_m, plan.step_rad):
         return False
@@ -122,8 +130,10 @@ def _way(
 
 
 def _chain(bodies: Bodies, poses: Sequence[MountingPose], n: int, plan: MountingPlan) -> list[MountingPose]:
-    """The first n poses with a free way from home (the way home is the same backwards), each reached from the one
-    before it where that is free too."""
+    """Return the first n poses with a free way from home.
+
+    The way home is the same backwards. Each pose is reached from the one before it where that is free too.
+    """
     home = (bodies.scene.q_home, bodies.scene.q_home_2)
     kept: list[MountingPose] = []
     for pose in poses:

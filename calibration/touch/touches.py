@@ -92,8 +92,9 @@ def around(points_C: Array, p_C: Array, within_m: float, name: str, least: int =
 
 
 def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
-    """Point (3,) m, unit normal (3,) towards the camera and its standard deviation (m) of the plane through points (n,
-    3).
+    """Fit the plane through points (n, 3), its normal (3,) towards the camera.
+
+    Returns a point (3,) m, the unit normal and the standard deviation (m).
 
     Total least squares with Tukey's weights, the scale from the median. The deviation is that of the plane's distance
     where the points are.
@@ -113,8 +114,9 @@ def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
 def fit_touched_sphere(
     points_C: Array, radius_m: float, correction: ScannerCorrection | None = None
 ) -> tuple[Array, float]:
-    """Centre (3,) m, as the scanner gives it, and its standard deviation (m) of a sphere of known radius through points
-    (n, 3) of its near side.
+    """Fit a sphere of known radius through points (n, 3) of its near side.
+
+    Returns its centre (3,) m, as the scanner gives it, and its standard deviation (m).
 
     Gauss-Newton on distances with Tukey's weights; the points are corrected first, because the radius is the true one,
     and the centre is returned uncorrected. The deviation is the largest of the three axes.

@@ -1,5 +1,7 @@
-"""Read pose pairs: npz, tables, documents and samples of other tools, with corners and joint angles where a file has
-them."""
+"""Read pose pairs.
+
+Npz, tables, documents and samples of other tools, with corners and joint angles where a file has them.
+"""
 
 import re
 from collections.abc import Mapping
@@ -33,11 +35,14 @@ LENGTHS = UNITS
 
 @dataclass(frozen=True, kw_only=True)
 class PosePairs:
-    """Pose pairs in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE of a
-    second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
-    published answer where there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where
-    given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how
-    each list was understood; ``notes``: sentences about it; ``ids``: names of the rows, or empty."""
+    """Pose pairs in metres.
+
+    ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE of a second robot or None,
+    ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the published answer where
+    there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where given (NaN: not seen).
+    ``q`` (n, joints) rad: joint angles of the robot that moved, where given. ``reading``: how each list was understood;
+    ``notes``: sentences about it; ``ids``: names of the rows, or empty.
+    """
 
     source: str
     robot: Array

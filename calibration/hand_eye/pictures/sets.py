@@ -1,5 +1,7 @@
-"""Read pictures of a board with the robot's poses: pair them, and turn symmetric boards as the robot's rotations
-say."""
+"""Read pictures of a board with the robot's poses.
+
+Pair them, and turn symmetric boards as the robot's rotations say.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +15,7 @@ from weldcal.calibration.data.poses.listing import Listing, listing_of
 from weldcal.calibration.data.poses.lists import folder_lists, together
 from weldcal.calibration.data.poses.names import mounting_name, number_of, whose
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
-from weldcal.calibration.geometry.se3 import nearest_rotation, pose
+from weldcal.calibration.geometry.se3 import angle_of, nearest_rotation, pose
 from weldcal.calibration.hand_eye.pairs.conventions import UNITS
 from weldcal.calibration.hand_eye.pairs.files import PosePairs
 from weldcal.calibration.hand_eye.pairs.importing import ImportedPairs, StatedForms, WrongScale, import_pairs
@@ -237,8 +239,10 @@ def _listing(name: str, pictures: Sequence[Picture], C: Array) -> Listing:
 
 
 def _numbered(robot: Listing, pictures: Sequence[Picture]) -> list[Listing]:
-    """The robot's poses with the numbers of the pictures, where rows have no names and there are more rows than
-    pictures: counted from 0 or 1."""
+    """Number the robot's poses as the pictures, where rows have no names and there are more rows than pictures.
+
+    They are counted from 0 or 1.
+    """
     numbers = [number_of(Path(p.name).stem) for p in pictures]
     if robot.ids or len(robot) == len(pictures) or None in numbers:
         return [robot]
@@ -267,8 +271,10 @@ def _turn(board: Board, order: NDArray[np.int64]) -> Array:
 
 
 def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: Board) -> list[NDArray[np.int64]]:
-    """Orders of the points of each picture that agree best with the angles of the robot's relative rotations, most
-    likely first."""
+    """Order the points of each picture by the robot's relative rotations, the most likely orders first.
+
+    The angles of the relative rotations must agree.
+    """
     rows_r, rows_c, _ = together(robot, camera)
     good = robot.good[rows_r] & camera.good[rows_c]
     rows_r, rows_c = rows_r[good], rows_c[good]
@@ -282,10 +288,10 @@ def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: 
             continue
         a, b = slice(max(shift, 0), max(shift, 0) + m), slice(max(-shift, 0), max(-shift, 0) + m)
         turned = np.einsum("nij,sjk->nsik", C[b], turns)
-        theirs = angles(np.einsum("asji,btjk->abstik", turned, turned, optimize=True))
+        theirs = angle_of(np.einsum("asji,btjk->abstik", turned, turned, optimize=True))
         for reading in robot.readings:
             R = reading.X[rows_r[a], :3, :3]
-            ours = angles(np.einsum("aji,bjk->abik", R, R, optimize=True))
+            ours = angle_of(np.einsum("aji,bjk->abik", R, R, optimize=True))
             cost = np.minimum(np.abs(theirs - ours[:, :, None, None]), 0.5)
             labels, value = _least(cost)
             whole = np.zeros(len(pictures), dtype=np.int64)
@@ -299,15 +305,11 @@ def _flips(robot: Listing, camera: Listing, pictures: Sequence[Picture], board: 
     return [labels for _, labels in best[:8]] or [np.zeros(len(pictures), dtype=np.int64)]
 
 
-def angles(R: Array) -> Array:
-    """Angles (...) rad of rotations (..., 3, 3)."""
-    trace = np.einsum("...ii->...", R)
-    return np.asarray(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
-
-
 def _least(cost: Array) -> tuple[NDArray[np.int64], float]:
-    """Labels (n,) of least total cost[a, b, label a, label b]: coordinate descent from the labels that each picture
-    alone suggests."""
+    """Labels (n,) of least total cost[a, b, label a, label b].
+
+    Coordinate descent from the labels that each picture alone suggests.
+    """
     n = len(cost)
     best: tuple[NDArray[np.int64], float] | None = None
     each = np.arange(n)

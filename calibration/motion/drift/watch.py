@@ -41,8 +41,10 @@ _ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show i
 
 @dataclass(frozen=True)
 class BackgroundMove:
-    """``share`` of the predicted move that the still background made in the camera, with its sigma, from so many
-    pixels: 1 where the scanner moved, 0 where the base did."""
+    """How much of the predicted move the still background made in the camera.
+
+    ``share`` is 1 where the scanner moved and 0 where the base did; with its ``sigma``, from so many ``pixels``.
+    """
 
     share: float
     sigma: float
@@ -59,8 +61,9 @@ class BackgroundMove:
 
 
 def background_move(before: Sequence[Array], after: Sequence[Array], X_AB: RigidTransform) -> BackgroundMove | None:
-    """Compare organised clouds (H, W, 3) m of before and after a change, a still thing at p before being at X_AB p in
-    the camera after it if the scanner moved.
+    """Compare organised clouds (H, W, 3) m of before and after a change.
+
+    If the scanner moved, a still thing at p before is at X_AB p in the camera after it.
 
     Each pixel's median over the frames shows what stands still; the arm passes through. Along the normal, a still
     surface at p moves by n . (X_AB p - p) under its ray, and the share of it that shows is a weighted mean over all
@@ -189,8 +192,10 @@ def watch(
 def drift_config(
     sigma_position_m: float, clock_sigma_s: float | None, config: DriftConfig | None = None
 ) -> DriftConfig:
-    """The test's settings for a calibration: its spread of scanner and arm is that of the field, where it states a
-    larger one."""
+    """The test's settings for a calibration.
+
+    Its spread of scanner and arm is that of the field, where it states a larger one.
+    """
     config = config or DriftConfig()
     spread = float(np.clip(sigma_position_m, config.filter.field.sigma_m, _MOST_SPREAD_M))
     clock = max(_CLOCK_S, 3.0 * (clock_sigma_s if clock_sigma_s is not None else 10.0 * _CLOCK_S))
@@ -283,8 +288,10 @@ def _tested(
 
 
 def _lateness(rows: Rows, noise: FrameNoise) -> tuple[Array, NDArray[np.bool_]]:
-    """How much later than nominal each frame was most probably taken (N,) s, and which frames show something else
-    (N,)."""
+    """Return how much later than nominal each frame was most probably taken (N,) s, and the gross frames (N,).
+
+    Gross frames show something else.
+    """
     u = rows.derivatives[:, :, CLOCK]
     factors = np.repeat([noise.center, noise.normal], [3, 2])
     S = rows.covariances * np.outer(factors, factors)

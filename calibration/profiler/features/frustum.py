@@ -42,8 +42,9 @@ class Frustum:
 
 
 def fit_frustum(points: ArrayLike) -> Frustum:
-    """Fit the frustum in a cloud (n, 3) m that shows its base plate, its top and its four sides, whatever its
-    orientation.
+    """Fit the frustum in a cloud (n, 3) m that shows its base plate, its top and its four sides.
+
+    Its orientation may be any.
 
     Raises:
         FeatureNotFound: fewer planes, or not like a frustum. InputError: not a cloud.
@@ -79,8 +80,10 @@ def _normals(p: Floats) -> Floats:
 
 
 def _main_direction(normals: Floats) -> Floats:
-    """The direction that most normals have: base and top are parallel; the sides' mean outward direction says which way
-    is up."""
+    """The direction that most normals have: base and top are parallel.
+
+    The sides' mean outward direction says which way is up.
+    """
     outer = normals.T @ normals
     _, vectors = np.linalg.eigh(outer)
     up = vectors[:, 2]
@@ -138,8 +141,10 @@ def _across(p: Floats, up: Floats) -> Floats:
 
 
 def _refined(p: Floats, labels: NDArray[np.intp]) -> list[Floats]:
-    """Planes (4,) [normal, d] by Tukey's weights; labels of points near a neighbouring plane are taken away, in
-    place."""
+    """Planes (4,) [normal, d] by Tukey's weights.
+
+    Labels of points near a neighbouring plane are taken away, in place.
+    """
     planes = [_plane(p[labels == k]) for k in range(6)]
     for _ in range(3):
         distance = np.abs(np.column_stack([p @ q[:3] - q[3] for q in planes]))
