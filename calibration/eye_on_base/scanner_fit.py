@@ -18,7 +18,7 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.robust import chi2_share, cross_rows, rotation_of
+from weldcal.calibration.geometry.robust import MAD, chi2_share, cross_rows, rotation_of
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
 from weldcal.models.compiled import compiled
@@ -264,7 +264,7 @@ def _gauss_newton(
 @compiled()
 def _spread(e: Array, count: int) -> float:
     """Standard deviation of residuals, half of it from their middle: a few wild ones do not set it."""
-    limit = 4.0 * 1.4826 * np.median(np.abs(e))
+    limit = 4.0 * MAD * np.median(np.abs(e))
     return np.sqrt((np.minimum(np.abs(e), limit) ** 2).sum() / count)  # type: ignore[no-any-return]
 
 

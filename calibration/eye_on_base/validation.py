@@ -47,6 +47,11 @@ def tilt_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Ar
     return np.array(out)
 
 
+def _plain(config: SolveConfig) -> Solve:
+    """The plain estimate, which takes the scanner as it is."""
+    return lambda observations: (estimate_eye_on_base(observations, config).X_BC, ScannerCorrection())
+
+
 def k_fold(
     observations: Sequence[Observation],
     *,
@@ -74,9 +79,7 @@ def k_fold(
             held = set(test.tolist())
             train = [o for i, o in enumerate(observations) if i not in held]
             try:
-                X, correction = (
-                    (estimate_eye_on_base(train, plain).X_BC, ScannerCorrection()) if solve is None else solve(train)
-                )
+                X, correction = (solve or _plain(plain))(train)
             except InputError:
                 continue
             errors[r, test] = position_errors(X, [corrected_observation(correction, observations[i]) for i in test])
@@ -168,11 +171,7 @@ def convergence(
         for k, m in enumerate(counts):
             rows = slice(r * n, r * n + n - int(m))
             try:
-                X, correction = (
-                    (estimate_eye_on_base(shuffled[:m], config).X_BC, ScannerCorrection())
-                    if solve is None
-                    else solve(shuffled[:m])
-                )
+                X, correction = (solve or _plain(config))(shuffled[:m])
                 seen = correction.points(np.array([o.p_CR for o in shuffled[m:]]))
                 p_B = np.array([o.p_BR for o in shuffled[m:]])
                 held_out[rows, k] = np.linalg.norm(X.multiply(seen.T).T - p_B, axis=1)

@@ -22,6 +22,7 @@ from weldcal.calibration.flange.face import (
 )
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
@@ -136,7 +137,7 @@ def _noise(z: Array, rays: tuple[Array, Array], plane: PlaneFit) -> float:
     with np.errstate(invalid="ignore"):
         bend = np.abs(d[:, 4:] + d[:, :-4] - 2.0 * d[:, 2:-2])[np.abs(d[:, 2:-2]) < 3.0 * plane.rms]
     bend = bend[np.isfinite(bend)]
-    return float(np.median(bend)) * 1.4826 / np.sqrt(6.0) if len(bend) else 0.0
+    return float(np.median(bend)) * MAD / np.sqrt(6.0) if len(bend) else 0.0
 
 
 def _window(

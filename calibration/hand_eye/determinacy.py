@@ -30,7 +30,6 @@ class Diversity:
     distinct: int
     turn_deg: float
     turn_spread_deg: tuple[float, float, float]
-    position_spread: tuple[float, float, float]
 
     def sentence(self) -> str:
         """One line for an operator."""
@@ -56,13 +55,12 @@ def diversity(problem: Problem) -> Diversity:
     places = np.linalg.svd(p, compute_uv=False) / np.sqrt(len(p))
     first = [log_rotation(X[:, :3, :3] @ X[0, :3, :3].T) for X in stated]
     largest = max(float(np.linalg.norm(v, axis=1).max()) for v in first)
-    s, q = np.degrees(spread), places
+    s = np.degrees(spread)
     return Diversity(
         n,
         _distinct(stated, float(np.sqrt((places**2).sum()))),
         float(np.degrees(largest)),
         (float(s[0]), float(s[1]), float(s[2])),
-        (float(q[0]), float(q[1]), float(q[2])),
     )
 
 

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.errors import UndeterminedPoses
 from weldcal.calibration.geometry.robust import f_quantile
 from weldcal.calibration.geometry.se3 import IDENTITY, as_transform, difference, inverse
-from weldcal.calibration.hand_eye.choice import USUAL_DISCORD_RAD, solve
+from weldcal.calibration.hand_eye.choice import USUAL_DISCORD_RAD, Choice, solve
 from weldcal.calibration.hand_eye.determinacy import (
     Diversity,
     check_poses,
@@ -216,14 +216,7 @@ def solve_problem(
     diverse = check_poses(problem, allow_coplanar=config.allow_coplanar)
     samples, repeats = problem, one_per_pose(problem, known, join=config.join_repeats)
     problem, observation = repeats.problem, repeats.observation
-    choice = solve(
-        problem,
-        known,
-        seed=config.seed,
-        starts=starts,
-        max_outliers=config.max_outliers,
-        usual_discord=config.usual_discord_rad,
-    )
+    choice = _choice(problem, known, config, starts)
     keep = choice.fit.keep
     used = problem if keep.all() else problem.pick(keep)
     if not keep.all():
@@ -288,6 +281,11 @@ def solve_problem(
     )
 
 
+def _choice(problem: Problem, known: State, config: HandEyeConfig, starts: tuple[State, ...]) -> Choice:
+    outliers, discord = config.max_outliers, config.usual_discord_rad
+    return solve(problem, known, seed=config.seed, starts=starts, max_outliers=outliers, usual_discord=discord)
+
+
 def _refuse_open(
     problem: Problem, directions: tuple[Array, ...], names: tuple[str, ...], config: HandEyeConfig
 ) -> None:
@@ -323,14 +321,7 @@ def _held_out(
             continue
         try:
             check_poses(problem.pick(train), allow_coplanar=config.allow_coplanar)
-            choice = solve(
-                problem.pick(train),
-                known,
-                seed=config.seed,
-                starts=starts,
-                max_outliers=config.max_outliers,
-                usual_discord=config.usual_discord_rad,
-            )
+            choice = _choice(problem.pick(train), known, config, starts)
         except WeldcalError:
             continue
         rest = samples.pick(test)

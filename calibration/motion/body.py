@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.motion_dataset import FrameTime, MotionDataset, RobotStream
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.geometry.se3 import as_transform, frames_along
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
@@ -197,7 +198,7 @@ class BodyTracker:
         q = p_C @ X_LC[:3, :3].T + X_LC[:3, 3]
         n = self.model.normals[index]
         e = ((q - self.model.points[index]) * n).sum(axis=1)
-        limit = 3.0 * 1.4826 * float(np.median(np.abs(e))) + 1e-5
+        limit = 3.0 * MAD * float(np.median(np.abs(e))) + 1e-5
         good = np.abs(e) < limit
         rms = float(np.sqrt(np.mean(e[good] ** 2)))
         if rms > _WORST_RMS_M:

@@ -79,7 +79,7 @@ def offset_from_line(time: Array, points_P: Array, X_FP: Array, motion: Continuo
         scale = MAD * float(np.median(np.abs(flat(x) * scale))) + 1e-9
         unit = np.array([scale] * 4 + [1e-3])
         x = least_squares(flat, x, loss="soft_l1", f_scale=_SOFT, x_scale=unit).x
-    sigma = offset_sigma(flat, x, unit, time, _SOFT, _BLOCK_S)
+    sigma = max(offset_sigma(flat, x, unit, time, _SOFT, _BLOCK_S))
     offset = start + float(x[4])
     if sigma > _OPEN_S or abs(offset) > _WIDEST_S - 2.0 * _STEP_S:
         raise UndeterminedPoses(
@@ -92,13 +92,18 @@ def offset_from_line(time: Array, points_P: Array, X_FP: Array, motion: Continuo
     return LineClock(offset, float(sigma), a, b / np.linalg.norm(b), rms, before)
 
 
-def offset_sigma(f: Callable[[Array], Array], x: Array, unit: Array, time: Array, soft: float, block_s: float) -> float:
+def offset_sigma(
+    f: Callable[[Array], Array], x: Array, unit: Array, time: Array, soft: float, block_s: float
+) -> tuple[float, float]:
     """Standard deviation of the last unknown of a soft-L1 fit, with errors that are common within blocks of time.
 
     Args:
         f: residuals, those of each of the times (n,) s one after the other, in sigmas, of the unknowns x (K,).
         unit: (K,) sizes of the unknowns, for differences; soft: residual from which on they count less.
         block_s: length of a block.
+
+    Returns:
+        By the scatter of the residuals, and as the fit states it for independent ones.
     """
     steps = 1e-3 * np.diag(unit)
     J = np.stack([(f(x + h) - f(x - h)) / (2.0 * h.sum()) for h in steps], axis=1)
@@ -113,7 +118,7 @@ def offset_sigma(f: Callable[[Array], Array], x: Array, unit: Array, time: Array
     errors, single = (inverse_N @ sums.T)[-1], (inverse_N @ scores.T)[-1]
     common = float(errors @ errors) * len(sums) / max(len(sums) - 1, 1)
     # never below errors that are independent from one time to the next
-    return float(np.sqrt(max(common, float(single @ single))))
+    return float(np.sqrt(max(common, float(single @ single)))), float(np.sqrt(inverse_N[-1, -1]))
 
 
 def _line(q: Array) -> tuple[Array, Array]:

@@ -276,7 +276,7 @@ def synchronise(streams: PoseStreams, *, mounting: str = "eye_in_hand", source: 
         unit = np.concatenate([np.repeat([scales[0], scales[1]], 3)] * 2 + [[1e-3]])
         fit = least_squares(flat, x, loss="soft_l1", f_scale=_SOFT, x_scale=unit)
         x = fit.x
-    sigma = offset_sigma(flat, x, unit, t, _SOFT, _BLOCK_S)
+    sigma = offset_sigma(flat, x, unit, t, _SOFT, _BLOCK_S)[0]
     offset = start + float(x[12])
     A, B = poses_of(x)
     r = residuals(x) * np.repeat(scales, 3)

@@ -12,7 +12,7 @@ from weldcal.calibration.data.checks import check_reach, row_numbers, table_rows
 from weldcal.calibration.data.clouds import read_cloud
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.robust import TUKEY
+from weldcal.calibration.geometry.robust import MAD, TUKEY
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -106,7 +106,7 @@ def fit_touched_plane(points_C: Array) -> tuple[Array, Array, float]:
         away = points_C - middle
         n = np.linalg.eigh((away * w[:, None]).T @ away)[1][:, 0]
         e = away @ n
-        scale = max(1.4826 * float(np.median(np.abs(e))), 1e-7)
+        scale = max(MAD * float(np.median(np.abs(e))), 1e-7)
         w = np.maximum(1.0 - (e / (TUKEY * scale)) ** 2, 0.0) ** 2
     return middle, n if n @ middle < 0.0 else -n, scale / float(np.sqrt(w.sum()))
 
@@ -129,7 +129,7 @@ def fit_touched_sphere(
         v = p - c
         d = np.linalg.norm(v, axis=1)
         e, J = d - radius_m, -v / d[:, None]
-        scale = max(1.4826 * float(np.median(np.abs(e))), 1e-7)
+        scale = max(MAD * float(np.median(np.abs(e))), 1e-7)
         w = np.maximum(1.0 - (e / (TUKEY * scale)) ** 2, 0.0) ** 2
         N = (J * w[:, None]).T @ J
         c = c - np.linalg.solve(N + 1e-9 * np.eye(3), (J * w[:, None]).T @ e)

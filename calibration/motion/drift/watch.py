@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import DEVICE
 from weldcal.calibration.data.scanner_correction import correction_from_document
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.motion.drift.hypotheses import FilterConfig
 from weldcal.calibration.motion.drift.residuals import CLOCK, FrameNoise, Rows, measured_noise, rows_of
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
@@ -88,7 +89,7 @@ def background_move(before: Sequence[Array], after: Sequence[Array], X_AB: Rigid
     for _ in range(6):
         share = float((weight * told * expected).sum() / max(float((weight * expected**2).sum()), 1e-18))
         e = told - share * expected
-        scale = 1.4826 * float(np.median(np.abs(e))) + 1e-7
+        scale = MAD * float(np.median(np.abs(e))) + 1e-7
         weight = (np.abs(e) < _CLIP * scale).astype(float)
     sigma = float(np.sqrt(_CORRELATED * scale**2 / max(float((weight * expected**2).sum()), 1e-18)))
     return BackgroundMove(share, sigma, int(weight.sum()))
@@ -100,7 +101,7 @@ def _median(clouds: Sequence[Array]) -> tuple[Array, Mask]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # pixels that no frame measured
         middle = np.nanmedian(z, axis=0)
-        spread = 1.4826 * np.nanmedian(np.abs(z - middle), axis=0)
+        spread = MAD * np.nanmedian(np.abs(z - middle), axis=0)
         ray = np.nanmedian(np.stack([c[..., :2] / c[..., 2:] for c in clouds]), axis=0)
     seen = np.isfinite(z).mean(axis=0) >= _SEEN
     point = np.concatenate([ray * middle[..., None], middle[..., None]], axis=-1)
@@ -225,19 +226,8 @@ def _tested(
 
     def rows_with(p_C: Array, n_C: Array) -> Rows:
         """The residuals with these centres and normals of the frames."""
-        return rows_of(
-            result.X_BC,
-            pivot,
-            clock.times[order],
-            at.p[order],
-            at.n[order],
-            at.v[order],
-            at.turn[order],
-            p_C[order],
-            n_C[order],
-            frames.covariance[order],
-            frames.normal_sigma[order],
-        )
+        seen = (p_C, n_C, frames.covariance, frames.normal_sigma)
+        return rows_of(result.X_BC, pivot, *(a[order] for a in (clock.times, at.p, at.n, at.v, at.turn, *seen)))
 
     rows = rows_with(frames.p_C, frames.n_C)
     usual = clock.jitter_s or (_DEVICE_JITTER_S if clock.clock.kind == DEVICE else _ARRIVAL_JITTER_S)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
 from weldcal.calibration.errors import FeatureNotFound
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 
@@ -166,7 +167,7 @@ def _plane(p: Floats) -> Floats:
         _, vectors = np.linalg.eigh((weight[:, None] * (p - mean)).T @ (p - mean))
         n = vectors[:, 0]
         r = (p - mean) @ n
-        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-7)
+        sigma = max(MAD * float(np.median(np.abs(r))), 1e-7)
         weight = np.clip(1.0 - (r / (TUKEY * sigma)) ** 2, 0.0, None) ** 2
     return np.array([*n, n @ mean])
 

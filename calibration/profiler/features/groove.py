@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
 
 from weldcal.calibration.errors import FeatureNotFound
+from weldcal.calibration.geometry.robust import MAD
 from weldcal.calibration.profiler.motion import Floats
 from weldcal.models.errors import InputError
 
@@ -150,7 +151,7 @@ def _line(x: Floats, z: Floats) -> _Line:
     for _ in range(10):
         across = 1.0 / np.hypot(1.0, b)
         r = (z - a - b * (x - x0)) * across
-        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-7)
+        sigma = max(MAD * float(np.median(np.abs(r))), 1e-7)
         weight = np.clip(1.0 - (r / (TUKEY * sigma)) ** 2, 0.0, None) ** 2
         a, b = _orthogonal(x - x0, z, weight)
     # of Tukey's estimate at 4 sigma, which uses nine tenths of what the samples say
