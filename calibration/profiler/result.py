@@ -62,12 +62,13 @@ def worst_direction(normal_matrix: Floats) -> str:
     return f"{kind} ({part[0]:.2f}, {part[1]:.2f}, {part[2]:.2f}) of the flange"
 
 
-def refuse_open(covariance: Floats, best: Floats, rivals: Sequence[Floats], advice: str) -> None:
+def refuse_open(covariance: Floats, best: Floats, rivals: Sequence[Floats], what: str, advice: str) -> None:
     """Refuse what a covariance (6, 6), which is local, does not show: another mounting as good, or hardly a rotation.
 
     Args:
         covariance: of the estimate; best: its R_FS (3, 3).
-        rivals: rotations of other optima that explain the data as well; advice: what to do.
+        rivals: rotations of other optima that explain the data as well.
+        what: points or scans, for the message; advice: what to do besides tilting the flange.
 
     Raises:
         DegenerateMotion: a rival lies apart from the best, or the rotation is uncertain by five degrees.
@@ -77,11 +78,13 @@ def refuse_open(covariance: Floats, best: Floats, rivals: Sequence[Floats], advi
         angle = float(angle_of(best.T @ other))
         if angle > max(APART_RAD, 5.0 * sigma):
             raise DegenerateMotion(
-                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these scans alike: {advice}"
+                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these {what} alike: tilt the"
+                f" flange more, about two axes, and {advice}"
             )
     if sigma > OPEN_RAD:
         raise DegenerateMotion(
-            f"These scans leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: {advice}"
+            f"These {what} leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange"
+            f" further, about two axes, and {advice}"
         )
 
 

@@ -201,8 +201,8 @@ def edge_joint(
     state, cost = fits[0]
     estimate = _estimate(state, poses, p, sigma_robot_m, sigmas)
     rivals = [other.rotation for other, its in fits if CAUCHY**2 * (its - cost) < RIVAL**2]
-    advice = "turn the flange further, about two axes, and let the edge cross the laser line at different places."
-    refuse_open(estimate.covariance, estimate.rotation, rivals, advice)
+    advice = "let the edge cross the laser line at different places."
+    refuse_open(estimate.covariance, estimate.rotation, rivals, "points", advice)
     return estimate
 
 

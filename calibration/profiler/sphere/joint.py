@@ -203,8 +203,8 @@ def sphere_joint(
             x[: 9 + 3 * layout.tip] = result.x
             _, result = problem.solved(R, np.zeros(3), x)
     estimate = _estimate(problem, R, result.x)
-    advice = "turn the flange further, about two axes, and cut the sphere on both sides of its middle."
-    refuse_open(estimate.covariance, about, rivals, advice)
+    advice = "cut the sphere on both sides of its middle."
+    refuse_open(estimate.covariance, about, rivals, "scans", advice)
     wrong, n = estimate.wrong_poses, len(data.poses)
     if not wrong or len(wrong) > MOST_WRONG * n or n - len(wrong) < MINIMUM_POSES:
         return estimate
