@@ -361,7 +361,7 @@ def _inverse(information: Array, free: tuple[int, ...]) -> tuple[Array, Array]:
 
 
 def _determined(fit: ClockFit, places: PlaceErrors) -> tuple[Array, tuple[str, ...], list[tuple[str, str]]]:
-    """Return the covariance of the unknowns about the pivot, and names of those that the motion leaves open or vague."""
+    """Return the covariance of the unknowns about the pivot, and names of those that the motion leaves open or weak."""
     inverse, _ = _inverse(fit.information, fit.free)
     inverse = inverse + places.excess(inverse)
     sigma = np.sqrt(np.diag(inverse))

@@ -78,8 +78,8 @@ def refuse_open(covariance: Floats, best: Floats, rivals: Sequence[Floats], what
         angle = float(angle_of(best.T @ other))
         if angle > max(APART_RAD, 5.0 * sigma):
             raise DegenerateMotion(
-                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these {what} alike: tilt the"
-                f" flange more, about two axes, and {advice}"
+                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these {what} alike: tilt"
+                f" the flange more, about two axes, and {advice}"
             )
     if sigma > OPEN_RAD:
         raise DegenerateMotion(
