@@ -237,7 +237,7 @@ def fit_with_offset(p_B: Array, p_C: Array, R_B: Array) -> tuple[Array, Array, A
     for k in range(3):
         A[:, k, 3 * k : 3 * k + 3] = p_C
     A[:, :, 9:12], A[:, :, 12:] = np.eye(3), -R_B
-    x = np.linalg.lstsq(A.reshape(-1, 15), p_B.ravel(), rcond=1e-9)[0]
+    x = np.asarray(np.linalg.lstsq(A.reshape(-1, 15), p_B.ravel(), rcond=1e-9)[0], dtype=float)
     return nearest_rotation(x[:9].reshape(3, 3)), x[9:12], x[12:]
 
 
