@@ -23,7 +23,7 @@ from weldcal.models.result_files import require_whole, write_atomic
 
 RESULT_FILE = "tablet.yaml"
 _CONFIGURATION = "eye_in_hand_tablet"
-PARENT, CHILD = "flange", "camera_optical_frame"
+PARENT, CHILD = "tool0", "camera_optical_frame"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -332,7 +332,7 @@ def _pose(result: TabletResult) -> list[tuple[str, str]]:
         *sigma_rows(np.array(result.X_FC_covariance)),
         ("pen tip on the flange, mm", fixed_row(1e3 * np.array(result.p_FP_m), 3)),
         ("one sigma of the tip, mm", fixed_row(1e3 * pen, 3)),
-        ("ROS 2", export_ros2(result.X_FC, "flange", "camera_optical_frame").strip()),
+        ("ROS 2", export_ros2(result.X_FC, "tool0", "camera_optical_frame").strip()),
     ]
 
 
